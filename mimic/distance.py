@@ -1,0 +1,167 @@
+"""How far apart two embodiments are: the link-pair kernel, its weights, and the reduction to one number."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from mimic import spatial
+from mimic.kinematics import LinkStates
+
+RotationMeasure = Literal["cosine", "angle"]
+Reduction = Literal["mean", "frobenius"]
+
+
+@struct.dataclass
+class DistanceWeights:
+    """Weights of the four parts of the pair distance (paper, eq. 19); numbers, or arrays that broadcast."""
+
+    translation: Any = 0.0
+    rotation: Any = 1.0
+    linear_velocity: Any = 0.0
+    angular_velocity: Any = 0.0
+
+
+PAPER_WEIGHTS = DistanceWeights(translation=0.0, rotation=1.0, linear_velocity=0.001, angular_velocity=0.01)
+"""What the paper uses in all dynamic simulations."""
+
+
+@struct.dataclass
+class PairDistances:
+    """The unweighted parts of the distance between two links: chain lengths, rad, chain lengths/s, rad/s."""
+
+    translation: Float[Array, "*pairs"]
+    rotation: Float[Array, "*pairs"]
+    linear_velocity: Float[Array, "*pairs"]
+    angular_velocity: Float[Array, "*pairs"]
+
+
+Weights = DistanceWeights | Callable[[PairDistances], DistanceWeights]
+Correspondence = Float[Array, "expert learner"] | Callable[[Float[Array, "expert learner"]], Float[Array, "expert learner"]]
+
+
+def adaptive_weights(distances: PairDistances) -> DistanceWeights:
+    """Weights that balance translation and rotation: a_tr = d_tr, a_rot = (2/pi)(2 - d_tr) (paper, eq. 24)."""
+    translation = distances.translation
+    return DistanceWeights(translation=translation, rotation=2 / jnp.pi * (2 - translation))
+
+
+def rotation_distance(
+    direction_a: Float[Array, "3"], direction_b: Float[Array, "3"], measure: RotationMeasure = "cosine"
+) -> Float[Array, ""]:
+    """Angle beta between two link directions, in [0, pi].
+
+    Args:
+      direction_a: unit x-axis of the first link's frame, in the base frame.
+      direction_b: the same for the second link.
+      measure: "cosine" is the smooth (pi/2)(1 - cos beta) (paper, eq. 17), "angle" is beta itself (paper, eq. 15).
+
+    Raises:
+      ValueError: an unknown measure.
+    """
+    a, b = spatial.vector(direction_a), spatial.vector(direction_b)
+    if measure == "cosine":
+        # (pi/2)(1 - cos beta) of unit vectors, written so that it is exactly 0 at a match: 1 - cos beta = |a - b|^2 / 2
+        difference = spatial.subtract(a, b)
+        return 0.25 * jnp.pi * spatial.dot(difference, difference)
+    if measure == "angle":
+        sine, cosine = spatial.norm(spatial.cross(a, b)), spatial.dot(a, b)
+        return jnp.arctan2(sine, cosine)
+    raise ValueError(f"rotation: expected 'cosine' or 'angle', got {measure!r}")
+
+
+def link_distances(
+    expert_states: LinkStates, learner_states: LinkStates, weights: Weights, *, rotation: RotationMeasure = "cosine"
+) -> Float[Array, "expert learner"]:
+    """Distance of every pair of an expert's and a learner's link, D' (paper, eqs. 8 and 19).
+
+    Args:
+      expert_states: link states of one arm (normalized, to compare arms of different size).
+      learner_states: link states of the other.
+      weights: constants, or a function of the unweighted distances of a pair, as `adaptive_weights`.
+      rotation: the rotational measure, see `rotation_distance`.
+
+    Raises:
+      ValueError: an unknown measure, or candidate points with a weight on what they lack.
+    """
+
+    def pair_distance(a: LinkStates, b: LinkStates) -> Float[Array, ""]:
+        parts = _pair_distances(a, b, rotation)
+        alpha = weights(parts) if callable(weights) else weights
+        return (
+            alpha.translation * parts.translation
+            + alpha.rotation * parts.rotation
+            + alpha.linear_velocity * parts.linear_velocity
+            + alpha.angular_velocity * parts.angular_velocity
+        )
+
+    if not callable(weights):
+        _check_candidate_points(expert_states, learner_states, weights)
+    over_learner = jax.vmap(pair_distance, in_axes=(None, 0))
+    return jax.vmap(over_learner, in_axes=(0, None))(expert_states, learner_states)
+
+
+def embodiment_distance(
+    expert_states: LinkStates,
+    learner_states: LinkStates,
+    correspondence: Correspondence,
+    weights: Weights,
+    *,
+    rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
+) -> Float[Array, ""]:
+    """Distance between two embodiments: the corresponding links' distances, reduced to one number (paper, Algorithm 1).
+
+    Args:
+      expert_states: link states of the expert.
+      learner_states: link states of the learner.
+      correspondence: W [n, n_hat], or a function that makes it of the link distances, as `hard_correspondence`.
+      weights: see `link_distances`.
+      rotation: see `link_distances`.
+      reduction: "mean" of all n n_hat entries of W o D' (paper), or their "frobenius" norm.
+
+    Raises:
+      ValueError: W of another shape, an unknown measure or reduction.
+    """
+    distances = link_distances(expert_states, learner_states, weights, rotation=rotation)
+    matrix = correspondence(distances) if callable(correspondence) else jnp.asarray(correspondence, distances.dtype)
+    if matrix.shape != distances.shape:
+        raise ValueError(
+            f"correspondence: expected shape {distances.shape} (expert links, learner links), got {matrix.shape}"
+        )
+    weighted = matrix * distances
+    if reduction == "mean":
+        return jnp.mean(weighted)
+    if reduction == "frobenius":
+        square = jnp.sum(weighted * weighted)
+        nonzero = square > 0
+        return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, square, 1)), 0)
+    raise ValueError(f"reduction: expected 'mean' or 'frobenius', got {reduction!r}")
+
+
+def _pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> PairDistances:
+    def apart(x: Array | None, y: Array | None) -> Array:
+        if x is None or y is None:
+            return jnp.zeros((), a.position.dtype)
+        return spatial.norm(spatial.subtract(spatial.vector(x), spatial.vector(y)))
+
+    no_direction = a.direction is None or b.direction is None
+    return PairDistances(
+        translation=apart(a.position, b.position),
+        rotation=jnp.zeros((), a.position.dtype) if no_direction else rotation_distance(a.direction, b.direction, measure),
+        linear_velocity=apart(a.linear_velocity, b.linear_velocity),
+        angular_velocity=apart(a.angular_velocity, b.angular_velocity),
+    )
+
+
+def _check_candidate_points(a: LinkStates, b: LinkStates, weights: DistanceWeights) -> None:
+    needs = {"rotation": "direction", "angular_velocity": "angular_velocity"}
+    for weight, field in needs.items():
+        value = getattr(weights, weight)
+        missing = getattr(a, field) is None or getattr(b, field) is None
+        if missing and (isinstance(value, jax.core.Tracer) or np.any(np.asarray(value) != 0)):
+            raise ValueError(f"weights: candidate points have no {field}, so the {weight} weight must be 0, got {value}")

@@ -1,0 +1,198 @@
+"""Frames, twists and link states of an embodiment: one sample per call, batched by `jax.vmap`."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from mimic import spatial
+from mimic.embodiment import Embodiment
+from mimic.spatial import Rotation, Vector
+
+
+@struct.dataclass
+class Frames:
+    """Link frames T_0i in the base frame: position [n, 3] [m] and rotation [n, 3, 3], whose first column is the link direction."""
+
+    position: Float[Array, "links 3"]
+    rotation: Float[Array, "links 3 3"]
+
+
+@struct.dataclass
+class LinkStates:
+    """What the metric compares, each [n, 3] in the base frame.
+
+    Attributes:
+      position: origins of the link frames, divided by the chain length where normalized, else [m].
+      direction: unit x-axes of the link frames; None for candidate points.
+      linear_velocity: of the origins, divided by the chain length [1/s] where normalized, else [m/s].
+      angular_velocity: spatial angular velocity [rad/s]; None for candidate points.
+    """
+
+    position: Float[Array, "links 3"]
+    direction: Float[Array, "links 3"] | None
+    linear_velocity: Float[Array, "links 3"]
+    angular_velocity: Float[Array, "links 3"] | None
+
+
+class _JointFrame(NamedTuple):
+    """A body that moves with a joint: its rotation from the zero pose, the joint's anchor, and how both move."""
+
+    rotation: Rotation
+    anchor: Vector
+    angular_velocity: Vector
+    linear_velocity: Vector
+
+
+def forward_kinematics(arm: Embodiment, qpos: Float[Array, " joints"]) -> Frames:
+    """Link frames (paper, eq. 5).
+
+    Args:
+      arm: the embodiment.
+      qpos: joint angles [rad].
+
+    Raises:
+      ValueError: `qpos` is not one angle for each joint.
+    """
+    qpos, arm = _prepare(arm, qpos, "qpos")
+    frames = _joint_frames(arm, qpos, None)
+    positions, rotations = [], []
+    for link, joint in enumerate(arm.link_joint):
+        position, _ = _link_point(arm, frames, link, joint)
+        rotation = tuple(spatial.vector(row) for row in arm.link_rotation[link])
+        positions.append(position)
+        rotations.append(spatial.compose(frames[joint + 1].rotation, rotation))
+    return Frames(
+        position=spatial.stack(positions, qpos.dtype),
+        rotation=jnp.stack([spatial.stack(rotation, qpos.dtype) for rotation in rotations]),
+    )
+
+
+def link_states(
+    arm: Embodiment,
+    qpos: Float[Array, " joints"],
+    qvel: Float[Array, " joints"] | None = None,
+    *,
+    normalized: bool = True,
+) -> LinkStates:
+    """Positions, directions and velocities of the links (paper, eqs. 8-10).
+
+    Args:
+      arm: the embodiment.
+      qpos: joint angles [rad].
+      qvel: joint velocities [rad/s]; at rest where None.
+      normalized: divide positions and linear velocities by the chain length.
+
+    Raises:
+      ValueError: `qpos` or `qvel` is not one number for each joint.
+    """
+    qpos, arm = _prepare(arm, qpos, "qpos")
+    if qvel is not None:
+        qvel, _ = _prepare(arm, qvel, "qvel")
+    frames = _joint_frames(arm, qpos, qvel)
+    unit = 1 / arm.link_lengths.sum() if normalized else 1
+    columns: tuple[list[Vector], ...] = ([], [], [], [])
+    for link, joint in enumerate(arm.link_joint):
+        position, lever = _link_point(arm, frames, link, joint)
+        frame = frames[joint + 1]
+        velocity = spatial.add(frame.linear_velocity, spatial.cross(frame.angular_velocity, lever))
+        direction = spatial.rotate(frame.rotation, spatial.vector(arm.link_rotation[link, :, 0]))
+        state = spatial.scale(unit, position), direction, spatial.scale(unit, velocity), frame.angular_velocity
+        for column, value in zip(columns, state, strict=True):
+            column.append(value)
+    return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
+
+
+def candidate_points(states: LinkStates) -> LinkStates:
+    """Positions and linear velocities alone (paper, eq. 11)."""
+    return states.replace(direction=None, angular_velocity=None)
+
+
+def body_twists(
+    arm: Embodiment, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]
+) -> Float[Array, "links 6"]:
+    """Body twists [omega, v] of the link frames, by the recursion over adjoint maps (paper, eq. 7).
+
+    Units: omega [rad/s] and v [m/s], both in the link's own frame.
+
+    Args:
+      arm: the embodiment.
+      qpos: joint angles [rad].
+      qvel: joint velocities [rad/s].
+
+    Raises:
+      ValueError: `qpos` or `qvel` is not one number for each joint.
+    """
+    qpos, arm = _prepare(arm, qpos, "qpos")
+    qvel, _ = _prepare(arm, qvel, "qvel")
+    omega, v = spatial.ZERO, spatial.ZERO
+    twists = [(omega, v)]
+    for joint in range(arm.num_joints):
+        axis, anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
+        turn = spatial.axis_rotation(axis, qpos[joint])
+        shift = spatial.subtract(anchor, spatial.rotate(turn, anchor))  # exp(q S) = [turn, shift]
+        omega, v = _inverse_adjoint(turn, shift, omega, v)
+        omega = spatial.add(omega, spatial.scale(qvel[joint], axis))
+        v = spatial.add(v, spatial.scale(qvel[joint], spatial.cross(anchor, axis)))
+        twists.append((omega, v))
+    rows = []
+    for link, joint in enumerate(arm.link_joint):
+        rotation = tuple(spatial.vector(row) for row in arm.link_rotation[link])
+        omega, v = _inverse_adjoint(rotation, spatial.vector(arm.link_position[link]), *twists[joint + 1])
+        rows.append(jnp.stack([jnp.asarray(x, qpos.dtype) for x in (*omega, *v)]))
+    return jnp.stack(rows)
+
+
+def _inverse_adjoint(rotation: Rotation, position: Vector, omega: Vector, v: Vector) -> tuple[Vector, Vector]:
+    """Ad of T^-1 on a twist, T = [rotation, position]."""
+    back = spatial.transpose(rotation)
+    return spatial.rotate(back, omega), spatial.rotate(back, spatial.add(v, spatial.cross(omega, position)))
+
+
+def _joint_frames(arm: Embodiment, qpos: Array, qvel: Array | None) -> list[_JointFrame]:
+    """The base, then the body behind each joint."""
+    frames = [_JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)]
+    previous_anchor = spatial.ZERO  # in the zero pose
+    for joint in range(arm.num_joints):
+        parent = frames[-1]
+        axis, zero_anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
+        lever = spatial.rotate(parent.rotation, spatial.subtract(zero_anchor, previous_anchor))
+        angular_velocity = parent.angular_velocity
+        linear_velocity = spatial.add(parent.linear_velocity, spatial.cross(angular_velocity, lever))
+        if qvel is not None:
+            spin = spatial.scale(qvel[joint], spatial.rotate(parent.rotation, axis))
+            angular_velocity = spatial.add(angular_velocity, spin)
+        rotation = spatial.compose(parent.rotation, spatial.axis_rotation(axis, qpos[joint]))
+        frames.append(_JointFrame(rotation, spatial.add(parent.anchor, lever), angular_velocity, linear_velocity))
+        previous_anchor = zero_anchor
+    return frames
+
+
+def _link_point(arm: Embodiment, frames: list[_JointFrame], link: int, joint: int) -> tuple[Vector, Vector]:
+    """A link frame's origin, and the lever from the anchor of the joint that moves it."""
+    zero_anchor = spatial.vector(arm.joint_anchor[joint]) if joint >= 0 else spatial.ZERO
+    zero_lever = spatial.subtract(spatial.vector(arm.link_position[link]), zero_anchor)
+    lever = spatial.rotate(frames[joint + 1].rotation, zero_lever)
+    return spatial.add(frames[joint + 1].anchor, lever), lever
+
+
+def _prepare(arm: Embodiment, values: Array, what: str) -> tuple[Array, Embodiment]:
+    """The values as a floating array, and the arm in its dtype."""
+    values = jnp.asarray(values)
+    if values.shape != (arm.num_joints,):
+        raise ValueError(
+            f"{what}: expected shape ({arm.num_joints},), one number for each joint of {arm.name}, got {values.shape}"
+            + ("; batch with jax.vmap" if values.ndim > 1 else "")
+        )
+    values = values.astype(jnp.result_type(values.dtype, jnp.float32)) if not _floating(values) else values
+    return values, _cast(arm, values.dtype)
+
+
+def _floating(values: Array) -> bool:
+    return jnp.issubdtype(values.dtype, jnp.floating)
+
+
+def _cast(arm: Embodiment, dtype) -> Embodiment:
+    fields = ("joint_axis", "joint_anchor", "link_position", "link_rotation", "link_lengths")
+    return arm.replace(**{field: jnp.asarray(getattr(arm, field), dtype) for field in fields})
