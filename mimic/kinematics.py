@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -60,12 +61,11 @@ def forward_kinematics(arm: Embodiment, qpos: Float[Array, " joints"]) -> Frames
     positions, rotations = [], []
     for link, joint in enumerate(arm.link_joint):
         position, _ = _link_point(arm, frames, link, joint)
-        rotation = tuple(spatial.vector(row) for row in arm.link_rotation[link])
         positions.append(position)
-        rotations.append(spatial.compose(frames[joint + 1].rotation, rotation))
+        rotations.append(spatial.compose(frames[joint + 1].rotation, spatial.rotation(arm.link_rotation[link])))
     return Frames(
         position=spatial.stack(positions, qpos.dtype),
-        rotation=jnp.stack([spatial.stack(rotation, qpos.dtype) for rotation in rotations]),
+        rotation=spatial.stack([sum(rotation, ()) for rotation in rotations], qpos.dtype).reshape(-1, 3, 3),
     )
 
 
@@ -91,7 +91,7 @@ def link_states(
     if qvel is not None:
         qvel, _ = _prepare(arm, qvel, "qvel")
     frames = _joint_frames(arm, qpos, qvel)
-    unit = 1 / arm.link_lengths.sum() if normalized else 1
+    unit = 1 / float(arm.link_lengths.sum()) if normalized else 1.0
     columns: tuple[list[Vector], ...] = ([], [], [], [])
     for link, joint in enumerate(arm.link_joint):
         position, lever = _link_point(arm, frames, link, joint)
@@ -138,10 +138,10 @@ def body_twists(
         twists.append((omega, v))
     rows = []
     for link, joint in enumerate(arm.link_joint):
-        rotation = tuple(spatial.vector(row) for row in arm.link_rotation[link])
-        omega, v = _inverse_adjoint(rotation, spatial.vector(arm.link_position[link]), *twists[joint + 1])
-        rows.append(jnp.stack([jnp.asarray(x, qpos.dtype) for x in (*omega, *v)]))
-    return jnp.stack(rows)
+        rotation, position = spatial.rotation(arm.link_rotation[link]), spatial.vector(arm.link_position[link])
+        omega, v = _inverse_adjoint(rotation, position, *twists[joint + 1])
+        rows.append((*omega, *v))
+    return spatial.stack(rows, qpos.dtype)
 
 
 def _inverse_adjoint(rotation: Rotation, position: Vector, omega: Vector, v: Vector) -> tuple[Vector, Vector]:
@@ -195,4 +195,5 @@ def _floating(values: Array) -> bool:
 
 def _cast(arm: Embodiment, dtype) -> Embodiment:
     fields = ("joint_axis", "joint_anchor", "link_position", "link_rotation", "link_lengths")
+    if all(isinstance(getattr(arm, field), np.ndarray) for field in fields): return arm
     return arm.replace(**{field: jnp.asarray(getattr(arm, field), dtype) for field in fields})

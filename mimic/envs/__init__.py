@@ -1,0 +1,55 @@
+"""MJX environments: `make` one by name, `environments` lists the names."""
+
+import importlib.resources
+from typing import Any
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mimic.config import explain, schema
+from mimic.envs.config import EnvConfig
+from mimic.envs.imitation import ImitationEnv
+
+_PRESETS = importlib.resources.files("mimic") / "conf" / "env"
+
+
+def environments() -> tuple[str, ...]:
+    """Names of the environments that `make` knows."""
+    return tuple(sorted(path.name.removesuffix(".yaml") for path in _PRESETS.iterdir() if path.name.endswith(".yaml")))
+
+
+def env_config(name: str, **overrides: Any) -> EnvConfig:
+    """The config of an environment.
+
+    Args:
+      name: one of `environments()`.
+      overrides: fields of `EnvConfig`; a nested config takes a dict, as in `demonstrations={"count": 1}`.
+
+    Raises:
+      ValueError: an unknown name or field, or a value of the wrong type or out of range.
+    """
+    if name not in environments():
+        raise ValueError(f"unknown environment {name!r}; valid are {', '.join(environments())}")
+    preset = OmegaConf.load(str(_PRESETS / f"{name}.yaml"))
+    del preset["defaults"]  # Hydra's; the schema is merged here
+    try:
+        merged = OmegaConf.merge(schema(EnvConfig), preset, overrides)
+        return OmegaConf.to_object(merged)  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        raise ValueError(explain(error)) from error
+
+
+def make(name: str, **overrides: Any) -> ImitationEnv:
+    """An environment with its training demonstrations.
+
+    Args:
+      name: one of `environments()`.
+      overrides: see `env_config`.
+
+    Raises:
+      ValueError: an unknown name or field, a value of the wrong type or out of range, or demonstrations that do not fit.
+    """
+    return ImitationEnv(env_config(name, **overrides))
+
+
+__all__ = ["EnvConfig", "ImitationEnv", "env_config", "environments", "make"]

@@ -1,0 +1,155 @@
+"""An arm as the environments use it: its embodiment, and a lean MuJoCo model that moves exactly its free joints."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from mimic.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
+
+# Planar arms are ours to define: slender rods, whose joints feel about as heavy for their size as the Panda's.
+_PLANAR_MASS = 1.0  # kg/m
+_PLANAR_ARMATURE = 0.02  # kg m^2
+_PLANAR_DAMPING = 0.1  # N m s/rad
+_PLANAR_VELOCITY_LIMIT = 2.5  # rad/s
+
+_IGNORED = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
+
+
+@dataclasses.dataclass(frozen=True)
+class ArmConfig:
+    """Which arm.
+
+    Attributes:
+      model: "panda", "planar", or the path of an MJCF file.
+      locked: joint names or numbers, or a mapping from these to angles [rad].
+      link_lengths: of a planar arm [m].
+      base: body that the chain starts behind (MJCF file).
+      tip: body or site that the chain ends at (MJCF file).
+    """
+
+    model: str = "panda"
+    locked: Any = ()
+    link_lengths: list[float] = dataclasses.field(default_factory=list)
+    base: str | None = None
+    tip: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """An embodiment and the MuJoCo model that simulates it: one degree of freedom per joint, in the same order."""
+
+    embodiment: Embodiment
+    model: mujoco.MjModel
+
+
+def build_arm(config: ArmConfig, limits: Limits = "none") -> Arm:
+    """The arm that a config describes.
+
+    Raises:
+      ValueError: what `panda`, `planar_arm` and `load_mjcf` refuse.
+    """
+    if config.model == "planar":
+        embodiment = planar_arm(config.link_lengths)
+        source = _planar_model(embodiment)
+        embodiment, source, angles = load_arm(source, name=embodiment.name, locked=config.locked, limits=limits)
+        return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles))
+    is_panda = config.model == "panda"
+    embodiment, source, angles = load_arm(
+        panda_path() if is_panda else config.model,
+        name="panda" if is_panda else None,
+        locked=config.locked,
+        base=config.base,
+        tip=config.tip,
+        limits=limits,
+    )
+    return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles))
+
+
+def simulation_model(
+    source: mujoco.MjModel, joint_names: tuple[str, ...], locked: Mapping[str, float] | None = None
+) -> mujoco.MjModel:
+    """The bodies, inertias and named joints of a model and nothing else: no geoms, actuators, constraints, contacts or gravity.
+
+    Bodies that no remaining joint moves are fused into their parents.
+
+    Args:
+      source: any model.
+      joint_names: hinges to keep.
+      locked: angle [rad] of joints that are removed, by name; other joints are removed at their zero.
+    """
+    locked = locked or {}
+    spec = mujoco.MjSpec()
+    spec.compiler.fusestatic = True
+    spec.compiler.autolimits = False
+    spec.option.disableflags = int(_IGNORED)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    bodies = {0: spec.worldbody}
+    for body_id in range(1, source.nbody):
+        body = source.body(body_id)
+        position, quaternion = np.array(body.pos), np.array(body.quat)
+        joint_ids = range(source.body_jntadr[body_id], source.body_jntadr[body_id] + source.body_jntnum[body_id])
+        for joint_id in joint_ids:  # a removed joint turns its body for good
+            joint = source.joint(joint_id)
+            if joint.name not in joint_names and joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE:
+                angle = locked.get(joint.name, 0.0) - float(source.qpos0[joint.qposadr[0]])
+                position, quaternion = _turned(position, quaternion, joint, angle)
+        copy = bodies[int(source.body_parentid[body_id])].add_body(pos=position, quat=quaternion)
+        bodies[body_id] = copy
+        if source.body_mass[body_id] > 0:
+            copy.explicitinertial = True
+            copy.mass, copy.ipos, copy.iquat = float(body.mass[0]), body.ipos, body.iquat
+            copy.inertia = body.inertia
+        for joint_id in joint_ids:
+            joint = source.joint(joint_id)
+            if joint.name in joint_names:
+                copy.add_joint(
+                    name=joint.name,
+                    type=mujoco.mjtJoint.mjJNT_HINGE,
+                    axis=joint.axis,
+                    pos=joint.pos,
+                    ref=float(source.qpos0[joint.qposadr[0]]),
+                    armature=float(joint.armature[0]),
+                    damping=float(joint.damping[0]),
+                )
+    return spec.compile()
+
+
+def effective_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
+    """Inertia [kg m^2] that each joint feels while the others are free, 1 / (M^-1)_ii: [joints]."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    inverse = np.zeros((model.nv, model.nv))
+    mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))
+    return 1 / np.diag(inverse)
+
+
+def _turned(position: np.ndarray, quaternion: np.ndarray, joint: Any, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of a body in its parent after a turn about one of its hinges."""
+    turn, turned, before, after = np.zeros(4), np.zeros(4), np.zeros(3), np.zeros(3)
+    mujoco.mju_axisAngle2Quat(turn, joint.axis, angle)
+    mujoco.mju_mulQuat(turned, quaternion, turn)
+    mujoco.mju_rotVecQuat(before, joint.pos, quaternion)
+    mujoco.mju_rotVecQuat(after, joint.pos, turned)
+    return position + before - after, turned
+
+
+def _planar_model(arm: Embodiment) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.modelname = arm.name
+    parent, start = spec.worldbody, 0.0
+    for name, joint_name, length in zip(arm.link_names, arm.joint_names, arm.link_lengths, strict=True):
+        body = parent.add_body(pos=[start, 0, 0])
+        body.add_joint(name=joint_name, axis=[0, 0, 1], armature=_PLANAR_ARMATURE, damping=_PLANAR_DAMPING)
+        body.add_site(name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, length, 0, 0], size=[0.01, 0, 0])
+        mass = _PLANAR_MASS * length
+        inertia = mass * length**2 / 12
+        body.explicitinertial = True
+        body.mass, body.ipos, body.inertia = mass, [length / 2, 0, 0], [inertia / 100, inertia, inertia]
+        parent, start = body, float(length)
+    numeric = spec.add_numeric(name="velocity_limit", size=arm.num_joints)
+    numeric.data = [_PLANAR_VELOCITY_LIMIT] * arm.num_joints
+    return spec.compile()

@@ -1,0 +1,129 @@
+"""What defines an environment. The presets in mimic/conf/env fill these in; `make` and the command line override them."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+
+from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
+from mimic.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
+from mimic.embodiment import LIMITS, Embodiment
+from mimic.envs.arms import ArmConfig
+
+CORRESPONDENCES = ("overlap", "hard", "soft")
+
+
+@dataclasses.dataclass(frozen=True)
+class MetricConfig:
+    """The distance that is the reward.
+
+    Attributes:
+      translation, rotation, linear_velocity, angular_velocity: weights (paper's values by default).
+      adaptive: the paper's distance-dependent weights for translation and rotation instead.
+      rotation_measure: "cosine" or "angle".
+      correspondence: "overlap" (static), "hard" or "soft" (by distance).
+      xi: sharpness of the soft correspondence, below 0.
+      reduction: "mean" or "frobenius".
+    """
+
+    translation: float = 0.0
+    rotation: float = 1.0
+    linear_velocity: float = 0.001
+    angular_velocity: float = 0.01
+    adaptive: bool = False
+    rotation_measure: str = "cosine"
+    correspondence: str = "overlap"
+    xi: float = -10.0
+    reduction: str = "mean"
+
+    def __post_init__(self) -> None:
+        _check_choice("correspondence", self.correspondence, CORRESPONDENCES)
+        _check_choice("rotation_measure", self.rotation_measure, ("cosine", "angle"))
+        _check_choice("reduction", self.reduction, ("mean", "frobenius"))
+        if not self.xi < 0:
+            raise ValueError(f"xi: expected a number below 0 (soft minimum), got {self.xi}")
+        for name in ("translation", "rotation", "linear_velocity", "angular_velocity"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: expected a weight of at least 0, got {getattr(self, name)}")
+
+    def make_weights(self) -> Weights:
+        """The weights as the metric takes them."""
+        velocities = {"linear_velocity": self.linear_velocity, "angular_velocity": self.angular_velocity}
+        if self.adaptive:
+            return lambda distances: adaptive_weights(distances).replace(**velocities)
+        return DistanceWeights(self.translation, self.rotation, **velocities)
+
+    def make_correspondence(self, expert: Embodiment, learner: Embodiment) -> Correspondence:
+        """W, or the function that makes it of the link distances."""
+        made: dict[str, Callable[[], Correspondence]] = {
+            "overlap": lambda: overlap_correspondence(expert, learner),
+            "hard": lambda: hard_correspondence,
+            "soft": lambda: partial(soft_correspondence, xi=self.xi),
+        }
+        return made[self.correspondence]()
+
+
+@dataclasses.dataclass(frozen=True)
+class DemonstrationConfig:
+    """What the expert does.
+
+    Attributes:
+      path: a file of demonstrations; they are recorded where it is empty.
+      count: demonstrations to train on.
+      held_out: demonstrations to test on, never trained on.
+      seed: of the recorded goals.
+    """
+
+    path: str = ""
+    count: int = 124
+    held_out: int = 32
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.count < 1 or self.held_out < 1:
+            raise ValueError(f"demonstrations: expected count and held_out of at least 1, got {self.count}, {self.held_out}")
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvConfig:
+    """An imitation environment.
+
+    Attributes:
+      name: of the preset.
+      expert, learner: the arms.
+      limits: "none" (zero pose, paper) or "hardware" (ready pose, the maker's joint ranges).
+      metric: the reward.
+      demonstrations: what is imitated.
+      horizon: steps of an episode.
+      control_dt: time that a torque is held [s].
+      substeps: physics steps in a control step.
+      preview: expert steps that the learner sees beyond the present one; 0 is the paper.
+      action_scale: of the torque range; 1 is twice the torque that takes a joint to its rated speed in one control step.
+      speed_bound: joint speed [rad/s] at which an episode ends as a runaway.
+    """
+
+    name: str = ""
+    expert: ArmConfig = dataclasses.field(default_factory=ArmConfig)
+    learner: ArmConfig = dataclasses.field(default_factory=ArmConfig)
+    limits: str = "none"
+    metric: MetricConfig = dataclasses.field(default_factory=MetricConfig)
+    demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
+    horizon: int = 50
+    control_dt: float = 0.1
+    substeps: int = 5
+    preview: int = 1
+    action_scale: float = 1.0
+    speed_bound: float = 30.0
+
+    def __post_init__(self) -> None:
+        _check_choice("limits", self.limits, LIMITS)
+        for name, least in (("horizon", 1), ("substeps", 1), ("preview", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+        for name in ("control_dt", "action_scale", "speed_bound"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
+
+
+def _check_choice(name: str, value: str, valid: tuple[str, ...]) -> None:
+    if value not in valid:
+        raise ValueError(f"{name}: expected one of {', '.join(valid)}, got {value!r}")

@@ -1,0 +1,213 @@
+"""The imitation environment: a torque-controlled learner is rewarded for being like the expert."""
+
+import copy
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import Env, State
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from mimic.distance import embodiment_distance
+from mimic.embodiment import Embodiment
+from mimic.envs.arms import Arm, build_arm, effective_inertia
+from mimic.envs.config import EnvConfig
+from mimic.envs.demonstrations import Demonstrations, load_demonstrations, record_demonstrations
+from mimic.envs.physics import make_advance
+from mimic.kinematics import LinkStates, link_states
+
+_OFFERED_SPEED_FACTOR = 2.0  # the largest torque takes a joint from rest to this multiple of its rated speed in one step
+
+
+@struct.dataclass
+class ArmState:
+    """All that an episode carries.
+
+    Attributes:
+      qpos: learner's joint angles [rad].
+      qvel: learner's joint velocities [rad/s].
+      step: control steps since the demonstration began.
+      demonstration: index of the one that is imitated.
+      key: for the demonstrations of later episodes.
+    """
+
+    qpos: Float[Array, " joints"]
+    qvel: Float[Array, " joints"]
+    step: Int[Array, ""]
+    demonstration: Int[Array, ""]
+    key: Array
+
+
+class ImitationEnv(Env):
+    """One learner imitating one of the demonstrations; a brax environment over MJX.
+
+    Reward: minus the embodiment distance to the expert at the new step. Observation: link states of the learner, of the
+    expert, and of the expert `preview` steps ahead, as one vector. Action: a torque for each joint in [-1, 1], scaled by
+    `torque_scale`. The episode ends at the horizon, a true end: there is nothing to imitate after it.
+
+    Args:
+      config: see `EnvConfig`.
+      demonstrations: what is imitated; the config's training demonstrations where None.
+
+    Attributes:
+      expert, learner: the embodiments.
+      correspondence, weights: of the reward.
+      demonstrations: what is imitated.
+      torque_scale: [joints] largest torque [N m].
+
+    Raises:
+      ValueError: arms or demonstrations that do not fit the config.
+    """
+
+    def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
+        self.config = config
+        expert, learner = build_arm(config.expert, config.limits), build_arm(config.learner, config.limits)
+        self.expert, self.learner = expert.embodiment, learner.embodiment
+        self.weights = config.metric.make_weights()
+        self.correspondence = config.metric.make_correspondence(self.expert, self.learner)
+        self.torque_scale = jnp.asarray(_torque_scale(learner, config))
+        self._arm, self._expert_arm = learner, expert
+        self._advance = make_advance(learner.model, config.control_dt / config.substeps, config.substeps)
+        if demonstrations is None:
+            demonstrations = training_and_held_out(config, expert)[0]
+        self._set_demonstrations(demonstrations)
+
+    def with_demonstrations(self, demonstrations: Demonstrations) -> "ImitationEnv":
+        """The same environment on other demonstrations."""
+        env = copy.copy(self)
+        env._set_demonstrations(demonstrations)
+        return env
+
+    def _set_demonstrations(self, demonstrations: Demonstrations) -> None:
+        demonstrations.check_fits(self.expert, self.config.control_dt, self.config.horizon)
+        self.demonstrations = demonstrations
+        over_time = jax.vmap(link_states, in_axes=(None, 0, 0))
+        table = jax.jit(jax.vmap(over_time, in_axes=(None, 0, 0)))  # the expert's link states, made once
+        qpos, qvel = (jnp.asarray(x, jnp.float32) for x in (demonstrations.qpos, demonstrations.qvel))
+        self.expert_states: LinkStates = table(self.expert, qpos, qvel)
+
+    def reset(self, rng: Array) -> State:
+        """A new episode: the learner at rest in its home pose, a random demonstration from its first step."""
+        arm_state = self.start(rng)
+        zero = jnp.zeros(())
+        metrics = {"distance": zero, "torque_saturation": zero, "runaway": zero}
+        return State(arm_state, self.observe(arm_state), zero, zero, metrics, {})
+
+    def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
+        """The first state of an episode, of a random demonstration where none is named."""
+        key_demonstration, key_next = jax.random.split(key)
+        if demonstration is None:
+            demonstration = jax.random.randint(key_demonstration, (), 0, self.demonstrations.count)
+        home = jnp.asarray(self.learner.home, jnp.float32)
+        zero = jnp.zeros((), jnp.int32)
+        return ArmState(home, jnp.zeros_like(home), zero, jnp.asarray(demonstration, jnp.int32), key_next)
+
+    def step(self, state: State, action: Float[Array, " joints"]) -> State:
+        """Holds a torque for one control step."""
+        before: ArmState = state.pipeline_state  # type: ignore[assignment]
+        command = jnp.clip(action, -1.0, 1.0)
+        qpos, qvel = self._advance(before.qpos, before.qvel, command * self.torque_scale)
+        step = before.step + 1
+        runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # also where not a number
+        remaining = (self.config.horizon - step).astype(jnp.float32)
+        distance = jnp.where(runaway, self._worst_distance, self.distance(qpos, qvel, before.demonstration, step))
+        penalty = jnp.where(runaway, 1.0 + remaining, 1.0)  # as if it stayed this bad: ending early never pays
+        done = (runaway | (step >= self.config.horizon)).astype(jnp.float32)
+        after = before.replace(qpos=qpos, qvel=qvel, step=step)
+        metrics = {
+            **state.metrics,
+            "distance": distance,
+            "torque_saturation": jnp.any(jnp.abs(command) > 0.99).astype(jnp.float32),
+            "runaway": runaway.astype(jnp.float32),
+        }
+        return state.replace(
+            pipeline_state=after, obs=self.observe(after), reward=-distance * penalty, done=done, metrics=metrics
+        )
+
+    def distance(
+        self, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"], demonstration: Array, step: Array
+    ) -> Float[Array, ""]:
+        """Embodiment distance of a learner's joint state to a demonstration at a step."""
+        metric = self.config.metric
+        return embodiment_distance(
+            self._expert_at(demonstration, step),
+            link_states(self.learner, qpos, qvel),
+            self.correspondence,
+            self.weights,
+            rotation=metric.rotation_measure,  # type: ignore[arg-type]
+            reduction=metric.reduction,  # type: ignore[arg-type]
+        )
+
+    @property
+    def _worst_distance(self) -> float:
+        """What a runaway costs a step: all corresponding links opposite, at the opposite ends of the workspace."""
+        metric, n, n_hat = self.config.metric, self.expert.num_links, self.learner.num_links
+        per_pair = np.pi * metric.rotation + 2 * metric.translation + 4 * metric.adaptive
+        return float(per_pair * (n + n_hat) / (n * n_hat))
+
+    def _expert_at(self, demonstration: Array, step: Array) -> LinkStates:
+        last = self.demonstrations.horizon
+        return jax.tree.map(lambda table: table[demonstration, jnp.minimum(step, last)], self.expert_states)
+
+    def observe(self, state: ArmState) -> Float[Array, " observation"]:
+        seen = [link_states(self.learner, state.qpos, state.qvel)]
+        seen += [self._expert_at(state.demonstration, state.step + ahead) for ahead in range(self.config.preview + 1)]
+        return jnp.concatenate([leaf.ravel() for states in seen for leaf in jax.tree.leaves(states)])
+
+    @property
+    def observation_size(self) -> int:
+        """Twelve numbers for each link that is seen."""
+        return 12 * (self.learner.num_links + (self.config.preview + 1) * self.expert.num_links)
+
+    @property
+    def action_size(self) -> int:
+        """One torque for each joint."""
+        return self.learner.num_joints
+
+    @property
+    def backend(self) -> str:
+        """What simulates."""
+        return "mjx"
+
+
+def _torque_scale(arm: Arm, config: EnvConfig) -> np.ndarray:
+    """Largest torque of each joint [N m]: what gets it well beyond its rated speed in one step, at most its limit.
+
+    The full torque of a Panda would take its light joints to tens of rad/s within a step, where nothing can be learned.
+    """
+    embodiment: Embodiment = arm.embodiment
+    inertia = effective_inertia(arm.model, np.asarray(embodiment.home))
+    rated = np.where(np.isfinite(embodiment.velocity_limit), embodiment.velocity_limit, np.pi)
+    torque = config.action_scale * _OFFERED_SPEED_FACTOR * rated * inertia / config.control_dt
+    return np.minimum(torque, embodiment.torque_limit).astype(np.float32)
+
+
+def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple[Demonstrations, Demonstrations]:
+    """The demonstrations of a config, split: the first `count` are trained on, the next `held_out` are not.
+
+    Raises:
+      ValueError: a file that cannot be read, does not fit the expert, or holds too few.
+    """
+    expert = expert or build_arm(config.expert, config.limits)
+    wanted = config.demonstrations
+    if wanted.path:
+        loaded = load_demonstrations(wanted.path)
+        loaded.check_fits(expert.embodiment, config.control_dt, config.horizon)
+        if loaded.count < wanted.count + wanted.held_out:
+            raise ValueError(
+                f"demonstrations: {wanted.path!r} holds {loaded.count}, but count={wanted.count} to train on and "
+                f"held_out={wanted.held_out} are asked for"
+            )
+    else:
+        loaded = record_demonstrations(
+            expert,
+            wanted.count + wanted.held_out,
+            seed=wanted.seed,
+            horizon=config.horizon,
+            dt=config.control_dt,
+            substeps=config.substeps,
+        )
+    training = loaded.select(slice(0, wanted.count))
+    held_out = loaded.select(slice(wanted.count, wanted.count + wanted.held_out))
+    return training, held_out
