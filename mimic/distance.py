@@ -137,9 +137,7 @@ def embodiment_distance(
     if reduction == "mean":
         return jnp.mean(weighted)
     if reduction == "frobenius":
-        square = jnp.sum(weighted * weighted)
-        nonzero = square > 0
-        return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, square, 1)), 0)
+        return spatial.safe_sqrt(jnp.sum(weighted * weighted))
     raise ValueError(f"reduction: expected 'mean' or 'frobenius', got {reduction!r}")
 
 

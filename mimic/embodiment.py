@@ -173,10 +173,10 @@ def from_chain(chain: Chain, *, name: str, home: np.ndarray | None = None, frame
     joints, links = chain.joints, chain.links
     directions = [(link.end - link.start) / link.length for link in links]
     return Embodiment(
-        joint_axis=np.stack([joint.axis for joint in joints]),
-        joint_anchor=np.stack([joint.anchor for joint in joints]),
-        link_position=np.stack([link.start + frame_at * (link.end - link.start) for link in links]),
-        link_rotation=np.stack([_rotation_to(direction) for direction in directions]),
+        joint_axis=_tidy([joint.axis for joint in joints]),
+        joint_anchor=_tidy([joint.anchor for joint in joints]),
+        link_position=_tidy([link.start + frame_at * (link.end - link.start) for link in links]),
+        link_rotation=_tidy([_rotation_to(direction) for direction in directions]),
         link_lengths=np.array([link.length for link in links]),
         joint_range=np.array([joint.range for joint in joints]),
         torque_limit=np.array([joint.torque_limit for joint in joints]),
@@ -187,6 +187,19 @@ def from_chain(chain: Chain, *, name: str, home: np.ndarray | None = None, frame
         link_names=tuple(link.name for link in links),
         link_joint=tuple(link.joint for link in links),
     )
+
+
+def _tidy(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Stacked, with rounding errors around -1, 0 and 1 taken out: what is known to be zero is never computed."""
+    array = np.stack(arrays)
+    nearest = np.round(array)
+    return np.where(np.abs(array - nearest) < 1e-14, nearest, array)
+
+
+def _snap(values: np.ndarray) -> np.ndarray:
+    """Values that quaternions and sines left within 1e-12 of -1, 0 or 1 become it: exact ones cost nothing (`spatial`)."""
+    nearest = np.clip(np.round(values), -1, 1)
+    return np.where(np.abs(values - nearest) < 1e-12, nearest, values)
 
 
 def _rotation_to(direction: np.ndarray) -> np.ndarray:

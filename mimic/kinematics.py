@@ -91,7 +91,7 @@ def link_states(
     if qvel is not None:
         qvel, _ = _prepare(arm, qvel, "qvel")
     frames = _joint_frames(arm, qpos, qvel)
-    unit = 1 / float(arm.link_lengths.sum()) if normalized else 1.0
+    unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
     columns: tuple[list[Vector], ...] = ([], [], [], [])
     for link, joint in enumerate(arm.link_joint):
         position, lever = _link_point(arm, frames, link, joint)
@@ -195,5 +195,6 @@ def _floating(values: Array) -> bool:
 
 def _cast(arm: Embodiment, dtype) -> Embodiment:
     fields = ("joint_axis", "joint_anchor", "link_position", "link_rotation", "link_lengths")
-    if all(isinstance(getattr(arm, field), np.ndarray) for field in fields): return arm
+    if all(isinstance(getattr(arm, field), np.ndarray) for field in fields):
+        return arm  # known while tracing: see `spatial`
     return arm.replace(**{field: jnp.asarray(getattr(arm, field), dtype) for field in fields})

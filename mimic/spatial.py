@@ -22,6 +22,11 @@ IDENTITY: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 ZERO: Vector = (0.0, 0.0, 0.0)
 
 
+def scalar(number: Any) -> Scalar:
+    """A Python float where it is a NumPy number."""
+    return float(number) if isinstance(number, np.generic | np.ndarray) else number
+
+
 def vector(array: Float[Any, "3"]) -> Vector:
     """The components of an array; Python floats where it is a NumPy array."""
     if isinstance(array, np.ndarray):

@@ -1,0 +1,55 @@
+"""What other packages' versions make necessary; everything of this kind is here."""
+
+import importlib.metadata
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+_log = logging.getLogger(__name__)
+_SLOW_CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
+
+
+def needs_cpu_flag(jaxlib_version: str | None = None) -> bool:
+    """Whether XLA's CPU backend needs its fusion emitters turned off.
+
+    Before jaxlib 0.11 they make batched kinematics several hundred times slower; from 0.11 on the flag is unknown to XLA,
+    which aborts on it.
+    """
+    version = jaxlib_version or importlib.metadata.version("jaxlib")
+    major, minor = (int(part) for part in version.split(".")[:2])
+    return (major, minor) < (0, 11)
+
+
+def prepare_cpu() -> None:
+    """Sets that flag where it is needed; must run before JAX starts its backend."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if not needs_cpu_flag() or "xla_cpu_use_fusion_emitters" in flags:
+        return
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    if bridge is not None and bridge.backends_are_initialized():
+        _log.warning("JAX was started before mimic was imported: on a CPU import mimic first, or set XLA_FLAGS=%s; "
+                     "without it kinematics run several hundred times slower", _SLOW_CPU_FLAG)  # fmt: skip
+        return
+    os.environ["XLA_FLAGS"] = f"{flags} {_SLOW_CPU_FLAG}".strip()
+
+
+def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
+    """Copies of a pytree on all devices, along a new first axis.
+
+    JAX removed its function of this name in 0.10, and brax 0.14 still calls it. This one replicates through `jax.pmap`, so
+    that the result is sharded just as pmap's own results are: brax then compiles its training epoch once and not twice.
+    """
+    import jax
+
+    replicate = jax.pmap(lambda _, x: x, in_axes=(0, None), devices=list(devices))
+    return replicate(jax.numpy.arange(len(devices)), tree)
+
+
+def mend_brax() -> None:
+    """Gives brax the function that it calls and JAX no longer has."""
+    import jax
+
+    if not hasattr(jax, "device_put_replicated"):
+        jax.device_put_replicated = device_put_replicated  # type: ignore[attr-defined]
