@@ -6,10 +6,10 @@ product is left for TF32 to round. Scalars that are Python floats are known whil
 computed, which leaves about a fifth of a Panda's forward kinematics.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -90,7 +90,8 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 def norm(a: Vector) -> Scalar:
     """Euclidean norm whose gradient is zero, not NaN, at the origin."""
-    return safe_sqrt(dot(a, a))
+    square = dot(a, a)
+    return math.sqrt(square) if isinstance(square, float) else safe_sqrt(square)
 
 
 def safe_sqrt(square: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -1,0 +1,195 @@
+"""The best that an arm can do: the motion of the learner that is nearest to a pose and velocity of the expert."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
+from mimic.embodiment import Embodiment
+from mimic.kinematics import LinkStates, link_states
+
+_POSES = 1024  # random poses that are tried, without a descent, to find the starts
+_SEARCH_STEP, _POLISH_STEP = 0.1, 0.03  # rad: first step of a descent; it shrinks to nothing along a cosine
+_FAST, _SLOW = 0.9, 0.99  # decay of the running means of gradient and squared gradient
+
+
+class ClosestMotion(NamedTuple):
+    """The learner's joint state that is nearest to the expert's, and how far it still is.
+
+    Attributes:
+      qpos: [T, joints] [rad].
+      qvel: [T, joints] [rad/s].
+      distance: [T].
+    """
+
+    qpos: Float[Array, "time joints"]
+    qvel: Float[Array, "time joints"]
+    distance: Float[Array, " time"]
+
+
+def kinematic_bound(
+    expert: Embodiment,
+    learner: Embodiment,
+    qpos: Float[Array, "time expert_joints"],
+    qvel: Float[Array, "time expert_joints"],
+    correspondence: Correspondence,
+    weights: Weights,
+    *,
+    rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
+    starts: int = 4,
+    iterations: int = 40,
+    seed: int = 0,
+) -> Float[Array, " time"]:
+    """What no controller can go below at each step: the distance of the `closest_motion`; same arguments."""
+    return closest_motion(
+        expert,
+        learner,
+        qpos,
+        qvel,
+        correspondence,
+        weights,
+        rotation=rotation,
+        reduction=reduction,
+        starts=starts,
+        iterations=iterations,
+        seed=seed,
+    ).distance
+
+
+def closest_motion(
+    expert: Embodiment,
+    learner: Embodiment,
+    qpos: Float[Array, "time expert_joints"],
+    qvel: Float[Array, "time expert_joints"],
+    correspondence: Correspondence,
+    weights: Weights,
+    *,
+    rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
+    starts: int = 4,
+    iterations: int = 40,
+    seed: int = 0,
+) -> ClosestMotion:
+    """Minimises the embodiment distance over the learner's joint angles and velocities, at each step by itself.
+
+    The metric has local minima, so this searches in three steps. Many random poses are compared with the expert, each share
+    of them giving the start of one descent; one more starts at the expert's own angles and velocities in the joints that both
+    arms have. Then the best of these and those of the neighbouring times are refined: what is found at one time is found
+    at all. A descent is Adam with a step that shrinks along a cosine, which copes with the kinks that the norms in the metric
+    have at a match. The best point that was seen is returned, with its true distance.
+
+    Angles stay within the joint range where that is less than a full turn; velocities are free, so that this is a bound for
+    any actuation.
+
+    Args:
+      expert: n joints.
+      learner: its n_hat joints are optimised.
+      qpos: [T, n] the expert's joint angles [rad].
+      qvel: [T, n] the expert's joint velocities [rad/s].
+      correspondence: see `embodiment_distance`.
+      weights: see `embodiment_distance`.
+      rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
+      starts: descents for each step, besides the one from the expert's own angles.
+      iterations: gradient steps of a descent; the refinement takes twice as many.
+      seed: of the random poses.
+
+    Raises:
+      ValueError: `qpos` or `qvel` is not [T, n], or fewer than one start or iteration.
+    """
+    qpos, qvel = jnp.asarray(qpos), jnp.asarray(qvel)
+    if qpos.ndim != 2 or qpos.shape[1] != expert.num_joints or qvel.shape != qpos.shape:
+        raise ValueError(
+            f"qpos, qvel: expected shape [time, {expert.num_joints}] for {expert.name}, got {qpos.shape} and {qvel.shape}"
+        )
+    if starts < 1 or iterations < 1:
+        raise ValueError(f"starts, iterations: expected at least 1, got {starts} and {iterations}")
+    expert_states = jax.vmap(lambda *motion: link_states(expert, *motion))(qpos, qvel)
+    poses = _random_poses(learner, -(-_POSES // starts) * starts, seed, qpos.dtype)
+    pose_states = jax.vmap(lambda pose: link_states(learner, pose))(poses)
+
+    def distance(states: LinkStates, learner_states: LinkStates) -> Array:
+        return embodiment_distance(
+            states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
+        )
+
+    def descend(states: LinkStates, start_qpos: Array, start_qvel: Array, count: int, step: float) -> ClosestMotion:
+        objective = lambda motion: distance(states, link_states(learner, *motion))  # noqa: E731
+        ends = jax.vmap(lambda *start: _descend(objective, start, learner, count, step))(start_qpos, start_qvel)
+        return jax.tree.map(lambda x: x[jnp.argmin(ends.distance)], ends)
+
+    def search(states: LinkStates, expert_qpos: Array, expert_qvel: Array) -> ClosestMotion:
+        tried = jax.vmap(lambda pose: distance(states, pose))(pose_states).reshape(starts, -1)
+        chosen = poses.reshape(starts, -1, learner.num_joints)[jnp.arange(starts), jnp.argmin(tried, axis=1)]
+        own_qpos, own_qvel = _shared_joints(expert, learner, expert_qpos, expert_qvel)
+        start_qpos = jnp.concatenate([own_qpos[None], chosen])
+        return descend(states, start_qpos, jnp.broadcast_to(own_qvel, start_qpos.shape), iterations, _SEARCH_STEP)
+
+    def refine(states: LinkStates, start_qpos: Array, start_qvel: Array) -> ClosestMotion:
+        return descend(states, start_qpos, start_qvel, 2 * iterations, _POLISH_STEP)
+
+    found = jax.vmap(search)(expert_states, qpos, qvel)
+    return jax.vmap(refine)(expert_states, _with_neighbours(found.qpos), _with_neighbours(found.qvel))
+
+
+def _with_neighbours(values: Float[Array, "time joints"]) -> Float[Array, "time 3 joints"]:
+    """Each time's values, with those before and after it."""
+    before, after = jnp.concatenate([values[:1], values[:-1]]), jnp.concatenate([values[1:], values[-1:]])
+    return jnp.stack([values, before, after], axis=1)
+
+
+def _descend(
+    distance: Callable[[tuple[Array, Array]], Array],
+    start: tuple[Array, Array],
+    learner: Embodiment,
+    iterations: int,
+    first_step: float,
+) -> ClosestMotion:
+    """Adam with a step that shrinks to zero along a cosine, keeping the best point."""
+    lower, upper = _pose_limits(learner)
+
+    def iterate(carry: Any, count: Array) -> tuple[Any, None]:
+        motion, mean, square, best = carry
+        value, gradient = jax.value_and_grad(distance)(motion)
+        better = value < best.distance
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), ClosestMotion(*motion, value), best)
+        mean = jax.tree.map(lambda m, g: _FAST * m + (1 - _FAST) * g, mean, gradient)
+        square = jax.tree.map(lambda s, g: _SLOW * s + (1 - _SLOW) * g * g, square, gradient)
+        size = 0.5 * first_step * (1 + jnp.cos(jnp.pi * count / iterations))
+        bias = jnp.sqrt(1 - _SLOW ** (count + 1)) / (1 - _FAST ** (count + 1))
+        qpos, qvel = jax.tree.map(
+            lambda x, m, s: x - size * bias * m / (jnp.sqrt(s) + jnp.finfo(s.dtype).tiny ** 0.25), motion, mean, square
+        )
+        return ((jnp.clip(qpos, lower, upper), qvel), mean, square, best), None
+
+    zero = jax.tree.map(jnp.zeros_like, start)
+    start = jnp.clip(start[0], lower, upper), start[1]
+    best = ClosestMotion(*start, jnp.asarray(jnp.inf, start[0].dtype))
+    counts = jnp.arange(iterations, dtype=start[0].dtype)
+    return jax.lax.scan(iterate, (start, zero, zero, best), counts)[0][3]
+
+
+def _pose_limits(arm: Embodiment) -> tuple[np.ndarray, np.ndarray]:
+    """Joint ranges; infinite for a joint that can do a full turn."""
+    lower, upper = np.asarray(arm.joint_range, np.float32).T
+    full = upper - lower >= 2 * np.pi - 1e-4
+    return np.where(full, -np.inf, lower), np.where(full, np.inf, upper)
+
+
+def _random_poses(arm: Embodiment, count: int, seed: int, dtype: Any) -> Float[Array, "count joints"]:
+    lower, upper = np.asarray(arm.joint_range).T
+    return jnp.asarray(np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)), dtype)
+
+
+def _shared_joints(
+    expert: Embodiment, learner: Embodiment, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]
+) -> tuple[Array, Array]:
+    """The expert's angles and velocities in the joints that both arms have by name, zero in the others."""
+    index = [expert.joint_names.index(name) if name in expert.joint_names else -1 for name in learner.joint_names]
+    shared = np.array(index) >= 0
+    return jnp.where(shared, qpos[np.array(index)], 0), jnp.where(shared, qvel[np.array(index)], 0)
