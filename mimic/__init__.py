@@ -1,0 +1,79 @@
+"""mimic: a metric between robot arms of different build, and imitation learning with it, in JAX and MJX.
+
+The core functions are pure and take one sample; batch them with `jax.vmap`.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from mimic import compat
+
+compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
+
+from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence  # noqa: E402
+from mimic.distance import (  # noqa: E402
+    PAPER_WEIGHTS,
+    DistanceWeights,
+    PairDistances,
+    adaptive_weights,
+    embodiment_distance,
+    link_distances,
+    rotation_distance,
+)
+from mimic.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
+from mimic.envs import env_config, environments, make  # noqa: E402
+from mimic.envs.demonstrations import Demonstrations, load_demonstrations, record_demonstrations  # noqa: E402
+from mimic.imitation import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
+from mimic.kinematics import (  # noqa: E402
+    Frames,
+    LinkStates,
+    body_twists,
+    candidate_points,
+    forward_kinematics,
+    link_states,
+)
+
+if TYPE_CHECKING:
+    from mimic.envs.imitation import ImitationEnv
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "PAPER_WEIGHTS",
+    "ClosestMotion",
+    "Demonstrations",
+    "DistanceWeights",
+    "Embodiment",
+    "Frames",
+    "ImitationEnv",
+    "LinkStates",
+    "PairDistances",
+    "adaptive_weights",
+    "body_twists",
+    "candidate_points",
+    "closest_motion",
+    "embodiment_distance",
+    "env_config",
+    "environments",
+    "forward_kinematics",
+    "hard_correspondence",
+    "kinematic_bound",
+    "link_distances",
+    "link_states",
+    "load_demonstrations",
+    "load_mjcf",
+    "make",
+    "overlap_correspondence",
+    "panda",
+    "planar_arm",
+    "record_demonstrations",
+    "rotation_distance",
+    "soft_correspondence",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "ImitationEnv":  # brax and MJX, which take seconds to import
+        from mimic.envs.imitation import ImitationEnv
+
+        return ImitationEnv
+    raise AttributeError(f"module 'mimic' has no attribute {name!r}")

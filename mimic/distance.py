@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.core import Tracer
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic import spatial
@@ -14,11 +16,15 @@ from mimic.kinematics import LinkStates
 
 RotationMeasure = Literal["cosine", "angle"]
 Reduction = Literal["mean", "frobenius"]
+ROTATION_MEASURES = ("cosine", "angle")
+REDUCTIONS = ("mean", "frobenius")
+
+_PARTS = ("translation", "rotation", "linear_velocity", "angular_velocity")
 
 
 @struct.dataclass
 class DistanceWeights:
-    """Weights of the four parts of the pair distance (paper, eq. 19); numbers, or arrays that broadcast."""
+    """Weights of the four parts of the pair distance (paper, eq. 19): numbers, or arrays that broadcast to [n, n_hat]."""
 
     translation: Any = 0.0
     rotation: Any = 1.0
@@ -41,7 +47,9 @@ class PairDistances:
 
 
 Weights = DistanceWeights | Callable[[PairDistances], DistanceWeights]
-Correspondence = Float[Array, "expert learner"] | Callable[[Float[Array, "expert learner"]], Float[Array, "expert learner"]]
+Correspondence = (
+    Float[ArrayLike, "expert learner"] | Callable[[Float[Array, "expert learner"]], Float[Array, "expert learner"]]
+)
 
 
 def adaptive_weights(distances: PairDistances) -> DistanceWeights:
@@ -63,15 +71,13 @@ def rotation_distance(
     Raises:
       ValueError: an unknown measure.
     """
+    _check_choice("rotation", measure, ROTATION_MEASURES)
     a, b = spatial.vector(direction_a), spatial.vector(direction_b)
-    if measure == "cosine":
-        # (pi/2)(1 - cos beta) of unit vectors, written so that it is exactly 0 at a match: 1 - cos beta = |a - b|^2 / 2
-        difference = spatial.subtract(a, b)
-        return 0.25 * jnp.pi * spatial.dot(difference, difference)
-    if measure == "angle":
-        sine, cosine = spatial.norm(spatial.cross(a, b)), spatial.dot(a, b)
-        return jnp.arctan2(sine, cosine)
-    raise ValueError(f"rotation: expected 'cosine' or 'angle', got {measure!r}")
+    if measure == "angle":  # atan2, because the derivative of arccos is infinite at a match
+        return jnp.arctan2(spatial.norm(spatial.cross(a, b)), spatial.dot(a, b))
+    # 1 - cos beta = |a - b|^2 / 2 for unit vectors: written so, it is 0 at a match to the last digit
+    difference = spatial.subtract(a, b)
+    return 0.25 * jnp.pi * spatial.dot(difference, difference)
 
 
 def link_distances(
@@ -82,27 +88,23 @@ def link_distances(
     Args:
       expert_states: link states of one arm (normalized, to compare arms of different size).
       learner_states: link states of the other.
-      weights: constants, or a function of the unweighted distances of a pair, as `adaptive_weights`.
+      weights: constants, or a function of the unweighted distances of one pair, as `adaptive_weights`.
       rotation: the rotational measure, see `rotation_distance`.
 
     Raises:
       ValueError: an unknown measure, or candidate points with a weight on what they lack.
     """
-
-    def pair_distance(a: LinkStates, b: LinkStates) -> Float[Array, ""]:
-        parts = _pair_distances(a, b, rotation)
-        alpha = weights(parts) if callable(weights) else weights
-        return (
-            alpha.translation * parts.translation
-            + alpha.rotation * parts.rotation
-            + alpha.linear_velocity * parts.linear_velocity
-            + alpha.angular_velocity * parts.angular_velocity
-        )
-
+    _check_choice("rotation", rotation, ROTATION_MEASURES)
     if not callable(weights):
         _check_candidate_points(expert_states, learner_states, weights)
-    over_learner = jax.vmap(pair_distance, in_axes=(None, 0))
-    return jax.vmap(over_learner, in_axes=(0, None))(expert_states, learner_states)
+    over_learner = jax.vmap(lambda a, b: _pair_distances(a, b, rotation), in_axes=(None, 0))
+    parts = jax.vmap(over_learner, in_axes=(0, None))(expert_states, learner_states)
+    alpha = jax.vmap(jax.vmap(weights))(parts) if callable(weights) else weights
+    total, dtype = 0.0, parts.translation.dtype
+    for part in _PARTS:
+        weight = _known(getattr(alpha, part), dtype)  # a constant 0 costs nothing, in time and in NaNs
+        total = spatial.plus(total, spatial.times(weight, getattr(parts, part)))
+    return jnp.broadcast_to(jnp.asarray(total, dtype), parts.translation.shape)
 
 
 def embodiment_distance(
@@ -114,7 +116,7 @@ def embodiment_distance(
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
 ) -> Float[Array, ""]:
-    """Distance between two embodiments: the corresponding links' distances, reduced to one number (paper, Algorithm 1).
+    """Distance between two embodiments: the corresponding links' distances, reduced to a number (paper, Algorithm 1).
 
     Args:
       expert_states: link states of the expert.
@@ -125,10 +127,11 @@ def embodiment_distance(
       reduction: "mean" of all n n_hat entries of W o D' (paper), or their "frobenius" norm.
 
     Raises:
-      ValueError: W of another shape, an unknown measure or reduction.
+      ValueError: W of another shape, an unknown measure or reduction, or what `link_distances` refuses.
     """
+    _check_choice("reduction", reduction, REDUCTIONS)
     distances = link_distances(expert_states, learner_states, weights, rotation=rotation)
-    matrix = correspondence(distances) if callable(correspondence) else jnp.asarray(correspondence, distances.dtype)
+    matrix = jnp.asarray(correspondence(distances) if callable(correspondence) else correspondence, distances.dtype)
     if matrix.shape != distances.shape:
         raise ValueError(
             f"correspondence: expected shape {distances.shape} (expert links, learner links), got {matrix.shape}"
@@ -136,30 +139,39 @@ def embodiment_distance(
     weighted = matrix * distances
     if reduction == "mean":
         return jnp.mean(weighted)
-    if reduction == "frobenius":
-        return spatial.safe_sqrt(jnp.sum(weighted * weighted))
-    raise ValueError(f"reduction: expected 'mean' or 'frobenius', got {reduction!r}")
+    return spatial.safe_sqrt(jnp.sum(weighted * weighted))
 
 
 def _pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> PairDistances:
+    zero = jnp.zeros((), a.position.dtype)  # of what candidate points lack
+
     def apart(x: Array | None, y: Array | None) -> Array:
         if x is None or y is None:
-            return jnp.zeros((), a.position.dtype)
+            return zero
         return spatial.norm(spatial.subtract(spatial.vector(x), spatial.vector(y)))
 
     no_direction = a.direction is None or b.direction is None
     return PairDistances(
         translation=apart(a.position, b.position),
-        rotation=jnp.zeros((), a.position.dtype) if no_direction else rotation_distance(a.direction, b.direction, measure),
+        rotation=zero if no_direction else rotation_distance(a.direction, b.direction, measure),
         linear_velocity=apart(a.linear_velocity, b.linear_velocity),
         angular_velocity=apart(a.angular_velocity, b.angular_velocity),
     )
 
 
+def _known(weight: Any, dtype: Any) -> Any:
+    """A weight as a Python float where it is a number, else as an array of the dtype."""
+    return float(weight) if isinstance(weight, int | float | np.number) else jnp.asarray(weight, dtype)
+
+
 def _check_candidate_points(a: LinkStates, b: LinkStates, weights: DistanceWeights) -> None:
-    needs = {"rotation": "direction", "angular_velocity": "angular_velocity"}
-    for weight, field in needs.items():
-        value = getattr(weights, weight)
+    for part, field in (("rotation", "direction"), ("angular_velocity", "angular_velocity")):
+        weight = getattr(weights, part)
         missing = getattr(a, field) is None or getattr(b, field) is None
-        if missing and (isinstance(value, jax.core.Tracer) or np.any(np.asarray(value) != 0)):
-            raise ValueError(f"weights: candidate points have no {field}, so the {weight} weight must be 0, got {value}")
+        if missing and not isinstance(weight, Tracer) and np.any(np.asarray(weight) != 0):
+            raise ValueError(f"weights: candidate points have no {field}, so {part} must weigh 0, got {weight}")
+
+
+def _check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{what}: expected one of {', '.join(choices)}, got {value!r}")

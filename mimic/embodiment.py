@@ -1,5 +1,6 @@
-"""Embodiments: what the metric knows of an arm. Planar chains, the Panda, and a serial chain of hinges from any MJCF."""
+"""Embodiments: what the metric knows of an arm. Planar chains, the Panda, a serial chain of hinges from any MJCF."""
 
+import dataclasses
 import importlib.resources
 import os
 from collections.abc import Sequence
@@ -10,19 +11,20 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.chain import Chain, Joint, Link, Locked, lock, read_chain, resolve_locked
+from mimic.chain import Chain, Joint, Link, Locked, lock, resolve_locked
+from mimic.mjcf import model_name, read_chain, read_model
 
 Limits = Literal["none", "hardware"]
 LIMITS = ("none", "hardware")
-READY_POSE = "ready"  # the keyframe that `limits="hardware"` starts from and locks at
 
 
 @struct.dataclass
 class Embodiment:
     """A serial chain of links with hinge joints, in the base frame (paper, eqs. 5-6).
 
-    A frozen pytree: the arrays are leaves, names and structure are static. Arrays are float64; functions cast them to the
-    dtype of the pose that they are given.
+    A frozen pytree: the arrays are leaves, names and structure are static. The constructors make NumPy arrays in
+    float64, and functions compute in the dtype of the pose that they are given. An arm that a function closes over is
+    known while JAX traces and costs less than one that `jax.jit` is given as an argument (see `mimic.spatial`).
 
     Attributes:
       joint_axis: [num_joints, 3] unit axes in the zero pose.
@@ -56,10 +58,12 @@ class Embodiment:
 
     @property
     def num_joints(self) -> int:
+        """How many joints are free."""
         return len(self.joint_names)
 
     @property
     def num_links(self) -> int:
+        """How many links the metric compares."""
         return len(self.link_names)
 
     @property
@@ -69,7 +73,7 @@ class Embodiment:
 
 
 def planar_arm(link_lengths: Sequence[float] | Float[Array, " n"], *, frame_at: float = 0.5) -> Embodiment:
-    """A planar chain with one joint about z at the start of each link, straight along x in its zero pose (paper, eq. 6).
+    """A planar chain along x in its zero pose, with a joint about z at the start of each link (paper, eq. 6).
 
     Args:
       link_lengths: [n] lengths [m], each above 0.
@@ -80,7 +84,7 @@ def planar_arm(link_lengths: Sequence[float] | Float[Array, " n"], *, frame_at: 
     """
     lengths = np.asarray(link_lengths, float)
     if lengths.ndim != 1 or lengths.size == 0 or not np.all(np.isfinite(lengths)) or np.any(lengths <= 0):
-        raise ValueError(f"link_lengths: expected one or more lengths above 0, got {np.array2string(lengths)}")
+        raise ValueError(f"link_lengths: expected one or more finite lengths above 0 [m], got {lengths.tolist()}")
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
     points = np.stack([ends, 0 * ends, 0 * ends], axis=1)
     joints = tuple(Joint(f"joint{i + 1}", np.array([0.0, 0.0, 1.0]), points[i]) for i in range(lengths.size))
@@ -97,11 +101,11 @@ def panda(*, locked: Locked = (), merge_locked: bool = True, limits: Limits = "n
     """The 7-joint Panda, or what is left of it with joints locked.
 
     Args:
-      locked: joint names ("joint3") or numbers (3), locked at 0, or at the ready pose under `limits="hardware"`; a mapping
-        {"joint3": angle} gives the angles [rad].
+      locked: joint names ("joint3") or numbers (3), locked at 0, or at the ready pose under `limits="hardware"`; a
+        mapping {"joint3": angle} gives the angles [rad].
       merge_locked: a locked joint makes one link of the two that it connects (paper); else both stay.
-      limits: "none" starts at the zero pose and lets every joint turn within [-pi, pi] (paper; the real arm cannot reach it);
-        "hardware" has the maker's joint ranges and starts at the ready pose.
+      limits: "none" starts at the zero pose and lets every joint turn within [-pi, pi] (paper; the real arm cannot
+        reach it); "hardware" has the maker's joint ranges and starts at the ready pose.
 
     Raises:
       ValueError: an unknown or duplicate joint, all joints locked, or an unknown `limits`.
@@ -117,10 +121,11 @@ def load_mjcf(
     tip: str | None = None,
     merge_locked: bool = True,
 ) -> Embodiment:
-    """A serial chain of hinges from any MJCF.
+    """A serial chain of hinges from any MJCF, with the joint ranges and limits that the model states.
 
-    Links are the capsule sites named link… where the model has them, else the segments from each joint's anchor to the next,
-    the last one ending at `tip`. The base frame is that of the body before the first hinge.
+    Links are the capsule sites named link… where the model has them (`fromto` gives start and end), else the segments
+    from each joint's anchor to the next, the last one ending at `tip`. The base frame is that of the body before the
+    first hinge.
 
     Args:
       path_or_model: an MJCF file, or a compiled model.
@@ -130,9 +135,13 @@ def load_mjcf(
       merge_locked: as for `panda`.
 
     Raises:
-      ValueError: a file that is missing or no MJCF, no hinge, a branch, a loop, or a name that the model lacks.
+      ValueError: a file that is missing or no MJCF, no hinge, a branch, a loop, a name that the model lacks, or what
+        `panda` refuses.
     """
-    return load_arm(path_or_model, locked=locked, base=base, tip=tip, merge_locked=merge_locked, limits="hardware")[0]
+    model = _model(path_or_model)
+    chain = read_chain(model, base, tip)
+    angles = resolve_locked(locked, tuple(joint.name for joint in chain.joints))
+    return _locked_embodiment(chain, angles, model_name(model), merge_locked)
 
 
 def load_arm(
@@ -145,43 +154,42 @@ def load_arm(
     merge_locked: bool = True,
     limits: Limits = "hardware",
 ) -> tuple[Embodiment, mujoco.MjModel, dict[str, float]]:
-    """An embodiment, the model that it was read from, and the angles [rad] of its locked joints by name."""
+    """An embodiment, the model that it was read from, and the angles [rad] of its locked joints by name.
+
+    As `load_mjcf`, but joints are locked where the arm starts: see `limits` of `panda`.
+    """
     if limits not in LIMITS:
         raise ValueError(f"limits: expected one of {', '.join(LIMITS)}, got {limits!r}")
-    model = path_or_model if isinstance(path_or_model, mujoco.MjModel) else _read_mjcf(path_or_model)
+    model = _model(path_or_model)
     chain = read_chain(model, base, tip)
-    joint_names = tuple(joint.name for joint in chain.joints)
-    home = _home(model, joint_names) if limits == "hardware" else dict.fromkeys(joint_names, 0.0)
-    angles = resolve_locked(locked, joint_names, home)
-    free = [joint_name for joint_name in joint_names if joint_name not in angles]
-    if name is None:
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_MODEL, 0) or model.names[: model.names.index(b"\0")].decode()
-    embodiment = from_chain(
-        lock(chain, angles, merge_locked),
-        name=name + "".join(f"-{joint}" for joint in angles),
-        home=np.array([home[joint_name] for joint_name in free]),
-    )
     if limits == "none":
-        embodiment = embodiment.replace(joint_range=np.tile([-np.pi, np.pi], (len(free), 1)))
-    return embodiment, model, angles
+        free = (dataclasses.replace(joint, range=(-np.pi, np.pi), home=0.0) for joint in chain.joints)
+        chain = Chain(tuple(free), chain.links)
+    home = {joint.name: joint.home for joint in chain.joints}
+    angles = resolve_locked(locked, tuple(home), home)
+    return _locked_embodiment(chain, angles, name or model_name(model), merge_locked), model, angles
 
 
-def from_chain(chain: Chain, *, name: str, home: np.ndarray | None = None, frame_at: float = 0.5) -> Embodiment:
-    """The embodiment of a chain; `home` is the zero pose where it is not given."""
+def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
+    """The embodiment of a chain.
+
+    Raises:
+      ValueError: `frame_at` is out of range.
+    """
     if not 0 <= frame_at <= 1:
         raise ValueError(f"frame_at: expected a share of the link in [0, 1], got {frame_at}")
     joints, links = chain.joints, chain.links
     directions = [(link.end - link.start) / link.length for link in links]
     return Embodiment(
-        joint_axis=_tidy([joint.axis for joint in joints]),
-        joint_anchor=_tidy([joint.anchor for joint in joints]),
-        link_position=_tidy([link.start + frame_at * (link.end - link.start) for link in links]),
-        link_rotation=_tidy([_rotation_to(direction) for direction in directions]),
+        joint_axis=_snap(np.stack([joint.axis for joint in joints])),
+        joint_anchor=_snap(np.stack([joint.anchor for joint in joints])),
+        link_position=_snap(np.stack([link.start + frame_at * (link.end - link.start) for link in links])),
+        link_rotation=_snap(np.stack([_rotation_to(direction) for direction in directions])),
         link_lengths=np.array([link.length for link in links]),
         joint_range=np.array([joint.range for joint in joints]),
         torque_limit=np.array([joint.torque_limit for joint in joints]),
         velocity_limit=np.array([joint.velocity_limit for joint in joints]),
-        home=np.zeros(len(joints)) if home is None else home,
+        home=np.array([joint.home for joint in joints]),
         name=name,
         joint_names=tuple(joint.name for joint in joints),
         link_names=tuple(link.name for link in links),
@@ -189,45 +197,25 @@ def from_chain(chain: Chain, *, name: str, home: np.ndarray | None = None, frame
     )
 
 
-def _tidy(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    """Stacked, with rounding errors around -1, 0 and 1 taken out: what is known to be zero is never computed."""
-    array = np.stack(arrays)
-    nearest = np.round(array)
-    return np.where(np.abs(array - nearest) < 1e-14, nearest, array)
+def _model(path_or_model: str | os.PathLike[str] | mujoco.MjModel) -> mujoco.MjModel:
+    return path_or_model if isinstance(path_or_model, mujoco.MjModel) else read_model(path_or_model)
+
+
+def _locked_embodiment(chain: Chain, angles: dict[str, float], name: str, merge: bool) -> Embodiment:
+    return from_chain(lock(chain, angles, merge), name="-".join([name, *angles]))
 
 
 def _snap(values: np.ndarray) -> np.ndarray:
-    """Values that quaternions and sines left within 1e-12 of -1, 0 or 1 become it: exact ones cost nothing (`spatial`)."""
+    """Values that quaternions and sines left within 1e-12 of -1, 0 or 1, made exact: those cost nothing (`spatial`)."""
     nearest = np.clip(np.round(values), -1, 1)
     return np.where(np.abs(values - nearest) < 1e-12, nearest, values)
 
 
 def _rotation_to(direction: np.ndarray) -> np.ndarray:
     """The smallest rotation that carries the x-axis onto a unit direction."""
-    x_axis = np.array([1.0, 0.0, 0.0])
-    cosine = direction[0]
-    if cosine < -1 + 1e-12:  # opposite: half a turn about z
+    cosine, square_sine = direction[0], direction[1] ** 2 + direction[2] ** 2
+    if cosine < 0 and square_sine < 1e-24:  # opposite: half a turn about z
         return np.diag([-1.0, -1.0, 1.0])
-    axis = np.cross(x_axis, direction)
-    skew = np.cross(np.eye(3), axis)
-    return np.eye(3) + skew + skew @ skew / (1 + cosine)
-
-
-def _home(model: mujoco.MjModel, joint_names: tuple[str, ...]) -> dict[str, float]:
-    """The pose of the keyframe `ready`, else zero, moved into the joint ranges."""
-    key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, READY_POSE)
-    home = {}
-    for joint_name in joint_names:
-        joint = model.joint(joint_name)
-        angle = float(model.key_qpos[key, joint.qposadr[0]]) if key >= 0 else 0.0
-        home[joint_name] = float(np.clip(angle, *joint.range)) if model.jnt_limited[joint.id] else angle
-    return home
-
-
-def _read_mjcf(path: str | os.PathLike[str]) -> mujoco.MjModel:
-    if not os.path.isfile(path):
-        raise ValueError(f"no MJCF file at {os.fspath(path)!r}")
-    try:
-        return mujoco.MjModel.from_xml_path(os.fspath(path))
-    except ValueError as error:
-        raise ValueError(f"{os.fspath(path)!r} is not an MJCF model that MuJoCo reads: {' '.join(str(error).split())}") from error
+    factor = 1 / (1 + cosine) if cosine > 0 else (1 - cosine) / square_sine  # equal; neither cancels where it is used
+    skew = np.cross(np.eye(3), np.cross([1.0, 0.0, 0.0], direction))
+    return np.eye(3) + skew + factor * skew @ skew

@@ -1,5 +1,6 @@
 """Frames, twists and link states of an embodiment: one sample per call, batched by `jax.vmap`."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -9,12 +10,17 @@ from jaxtyping import Array, Float
 
 from mimic import spatial
 from mimic.embodiment import Embodiment
-from mimic.spatial import Rotation, Vector
+from mimic.spatial import Rotation, Scalar, Vector
 
 
 @struct.dataclass
 class Frames:
-    """Link frames T_0i in the base frame: position [n, 3] [m] and rotation [n, 3, 3], whose first column is the link direction."""
+    """Link frames T_0i in the base frame.
+
+    Attributes:
+      position: [n, 3] origins [m].
+      rotation: [n, 3, 3], whose first column is the link's direction.
+    """
 
     position: Float[Array, "links 3"]
     rotation: Float[Array, "links 3 3"]
@@ -56,7 +62,7 @@ def forward_kinematics(arm: Embodiment, qpos: Float[Array, " joints"]) -> Frames
     Raises:
       ValueError: `qpos` is not one angle for each joint.
     """
-    qpos, arm = _prepare(arm, qpos, "qpos")
+    qpos = _prepare(arm, qpos, "qpos")
     frames = _joint_frames(arm, qpos, None)
     positions, rotations = [], []
     for link, joint in enumerate(arm.link_joint):
@@ -87,9 +93,9 @@ def link_states(
     Raises:
       ValueError: `qpos` or `qvel` is not one number for each joint.
     """
-    qpos, arm = _prepare(arm, qpos, "qpos")
+    qpos = _prepare(arm, qpos, "qpos")
     if qvel is not None:
-        qvel, _ = _prepare(arm, qvel, "qvel")
+        qvel = _prepare(arm, qvel, "qvel")
     frames = _joint_frames(arm, qpos, qvel)
     unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
     columns: tuple[list[Vector], ...] = ([], [], [], [])
@@ -106,7 +112,7 @@ def link_states(
 
 def candidate_points(states: LinkStates) -> LinkStates:
     """Positions and linear velocities alone (paper, eq. 11)."""
-    return states.replace(direction=None, angular_velocity=None)
+    return dataclasses.replace(states, direction=None, angular_velocity=None)
 
 
 def body_twists(
@@ -124,8 +130,8 @@ def body_twists(
     Raises:
       ValueError: `qpos` or `qvel` is not one number for each joint.
     """
-    qpos, arm = _prepare(arm, qpos, "qpos")
-    qvel, _ = _prepare(arm, qvel, "qvel")
+    qpos = _prepare(arm, qpos, "qpos")
+    qvel = _prepare(arm, qvel, "qvel")
     omega, v = spatial.ZERO, spatial.ZERO
     twists = [(omega, v)]
     for joint in range(arm.num_joints):
@@ -177,24 +183,18 @@ def _link_point(arm: Embodiment, frames: list[_JointFrame], link: int, joint: in
     return spatial.add(frames[joint + 1].anchor, lever), lever
 
 
-def _prepare(arm: Embodiment, values: Array, what: str) -> tuple[Array, Embodiment]:
-    """The values as a floating array, and the arm in its dtype."""
+def _chain_length(arm: Embodiment) -> Scalar:
+    length = arm.chain_length
+    return float(length) if isinstance(length, np.floating) else length
+
+
+def _prepare(arm: Embodiment, values: Array, what: str) -> Array:
+    """One floating number for each joint."""
     values = jnp.asarray(values)
     if values.shape != (arm.num_joints,):
         raise ValueError(
             f"{what}: expected shape ({arm.num_joints},), one number for each joint of {arm.name}, got {values.shape}"
             + ("; batch with jax.vmap" if values.ndim > 1 else "")
         )
-    values = values.astype(jnp.result_type(values.dtype, jnp.float32)) if not _floating(values) else values
-    return values, _cast(arm, values.dtype)
-
-
-def _floating(values: Array) -> bool:
-    return jnp.issubdtype(values.dtype, jnp.floating)
-
-
-def _cast(arm: Embodiment, dtype) -> Embodiment:
-    fields = ("joint_axis", "joint_anchor", "link_position", "link_rotation", "link_lengths")
-    if all(isinstance(getattr(arm, field), np.ndarray) for field in fields):
-        return arm  # known while tracing: see `spatial`
-    return arm.replace(**{field: jnp.asarray(getattr(arm, field), dtype) for field in fields})
+    is_floating = jnp.issubdtype(values.dtype, jnp.floating)
+    return values if is_floating else values.astype(jnp.result_type(values.dtype, jnp.float32))

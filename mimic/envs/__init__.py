@@ -1,14 +1,16 @@
 """MJX environments: `make` one by name, `environments` lists the names."""
 
 import importlib.resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig
-from mimic.envs.imitation import ImitationEnv
+
+if TYPE_CHECKING:
+    from mimic.envs.imitation import ImitationEnv
 
 _PRESETS = importlib.resources.files("mimic") / "conf" / "env"
 
@@ -39,7 +41,7 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
         raise ValueError(explain(error)) from error
 
 
-def make(name: str, **overrides: Any) -> ImitationEnv:
+def make(name: str, **overrides: Any) -> "ImitationEnv":
     """An environment with its training demonstrations.
 
     Args:
@@ -49,7 +51,9 @@ def make(name: str, **overrides: Any) -> ImitationEnv:
     Raises:
       ValueError: an unknown name or field, a value of the wrong type or out of range, or demonstrations that do not fit.
     """
+    from mimic.envs.imitation import ImitationEnv  # brax and MJX, which take seconds to import
+
     return ImitationEnv(env_config(name, **overrides))
 
 
-__all__ = ["EnvConfig", "ImitationEnv", "env_config", "environments", "make"]
+__all__ = ["EnvConfig", "env_config", "environments", "make"]

@@ -87,6 +87,12 @@ class Demonstrations:
             raise ValueError(f"demonstrations: {self.horizon} steps long, but an episode of the environment has {horizon}")
 
 
+def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations:
+    """The demonstrations of both, of one arm and time step."""
+    join = {key: np.concatenate([getattr(first, key), getattr(second, key)]) for key in ("qpos", "qvel", "goals")}
+    return dataclasses.replace(first, **join)
+
+
 def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
     """Reads and validates a file that `Demonstrations.save` wrote, or one made like it.
 

@@ -131,7 +131,7 @@ class ImitationEnv(Env):
         """Embodiment distance of a learner's joint state to a demonstration at a step."""
         metric = self.config.metric
         return embodiment_distance(
-            self._expert_at(demonstration, step),
+            self.expert_at(demonstration, step),
             link_states(self.learner, qpos, qvel),
             self.correspondence,
             self.weights,
@@ -146,13 +146,15 @@ class ImitationEnv(Env):
         per_pair = np.pi * metric.rotation + 2 * metric.translation + 4 * metric.adaptive
         return float(per_pair * (n + n_hat) / (n * n_hat))
 
-    def _expert_at(self, demonstration: Array, step: Array) -> LinkStates:
+    def expert_at(self, demonstration: Array, step: Array) -> LinkStates:
+        """The expert's link states at a step of a demonstration."""
         last = self.demonstrations.horizon
         return jax.tree.map(lambda table: table[demonstration, jnp.minimum(step, last)], self.expert_states)
 
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
+        """What the learner sees: its own link states, then the expert's now and at the steps ahead."""
         seen = [link_states(self.learner, state.qpos, state.qvel)]
-        seen += [self._expert_at(state.demonstration, state.step + ahead) for ahead in range(self.config.preview + 1)]
+        seen += [self.expert_at(state.demonstration, state.step + ahead) for ahead in range(self.config.preview + 1)]
         return jnp.concatenate([leaf.ravel() for states in seen for leaf in jax.tree.leaves(states)])
 
     @property

@@ -1,0 +1,160 @@
+"""What defines a training run. `python -m mimic.train` fills these in from mimic/conf and the command line."""
+
+import dataclasses
+from typing import Any
+
+from mimic.envs.config import EnvConfig
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # Two cores: few environments, many gradient steps on each sample, since the physics is what costs.
+    "cpu": {
+        "num_timesteps": 1_700_000,
+        "num_envs": 512,
+        "unroll_length": 10,
+        "batch_size": 128,
+        "num_minibatches": 32,
+        "num_updates_per_batch": 8,
+        "learning_rate": 1e-3,
+        "hidden_layers": [128, 128],
+        "evaluations": 12,
+    },
+    # One GPU: as many environments as keep it busy; a batch is 8192 short stretches of motion.
+    "gpu": {
+        "num_timesteps": 30_000_000,
+        "num_envs": 4096,
+        "unroll_length": 10,
+        "batch_size": 512,
+        "num_minibatches": 32,
+        "num_updates_per_batch": 8,
+        "learning_rate": 1e-3,
+        "hidden_layers": [256, 256],
+        "evaluations": 15,
+    },
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig:
+    """Brax PPO. A field that is None takes its value from the preset.
+
+    Attributes:
+      name: "ppo".
+      preset: "cpu", "gpu", or "auto": by the backend that JAX found.
+      num_timesteps: environment steps to train for.
+      num_envs: arms at once.
+      unroll_length: steps of an arm in a batch.
+      batch_size: unrolls in a minibatch.
+      num_minibatches: minibatches in a batch; batch_size * num_minibatches must be a multiple of num_envs.
+      num_updates_per_batch: passes over a batch.
+      learning_rate: of Adam at the start.
+      final_learning_rate: as a share of it at the end; the decay is linear.
+      discounting: of the reward.
+      gae_lambda: of the advantage estimate.
+      entropy_cost: reward for a wide action distribution.
+      clipping_epsilon: of the policy ratio.
+      max_grad_norm: gradients are clipped to it.
+      reward_scaling: of the reward inside PPO.
+      hidden_layers: widths of policy and value network.
+      evaluations: how often the policy is evaluated and saved.
+    """
+
+    name: str = "ppo"
+    preset: str = "auto"
+    num_timesteps: int | None = None
+    num_envs: int | None = None
+    unroll_length: int | None = None
+    batch_size: int | None = None
+    num_minibatches: int | None = None
+    num_updates_per_batch: int | None = None
+    learning_rate: float | None = None
+    final_learning_rate: float = 0.05
+    discounting: float = 0.8
+    gae_lambda: float = 0.9
+    entropy_cost: float = 1e-3
+    clipping_epsilon: float = 0.2
+    max_grad_norm: float = 1.0
+    reward_scaling: float = 10.0
+    hidden_layers: list[int] | None = None
+    evaluations: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.preset not in ("auto", *PRESETS):
+            raise ValueError(f"trainer.preset: expected one of auto, {', '.join(PRESETS)}, got {self.preset!r}")
+        if self.name != "ppo":
+            raise ValueError(f"trainer.name: expected 'ppo', got {self.name!r}")
+
+    def resolve(self, backend: str) -> "PPOConfig":
+        """The same with every field filled in, and the preset's name.
+
+        Raises:
+          ValueError: numbers out of range, or batch sizes that PPO cannot divide.
+        """
+        name = self.preset if self.preset != "auto" else "cpu" if backend == "cpu" else "gpu"
+        open_fields = {key: value for key, value in PRESETS[name].items() if getattr(self, key) is None}
+        resolved = dataclasses.replace(self, preset=name, **open_fields)
+        resolved._check()
+        return resolved
+
+    def _check(self) -> None:
+        whole = ("num_timesteps", "num_envs", "unroll_length", "batch_size", "num_minibatches", "num_updates_per_batch")
+        for key in (*whole, "evaluations"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"trainer.{key}: expected at least 1, got {getattr(self, key)}")
+        for key in ("learning_rate", "max_grad_norm", "reward_scaling", "clipping_epsilon"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"trainer.{key}: expected a number above 0, got {getattr(self, key)}")
+        for key in ("discounting", "gae_lambda", "final_learning_rate"):
+            if not 0 <= getattr(self, key) <= 1:
+                raise ValueError(f"trainer.{key}: expected a number in [0, 1], got {getattr(self, key)}")
+        layers = self.hidden_layers or []
+        if not layers or min(layers) < 1:
+            raise ValueError(f"trainer.hidden_layers: expected one or more widths above 0, got {layers}")
+        unrolls = self.batch_size * self.num_minibatches  # type: ignore[operator]
+        if unrolls % self.num_envs:  # type: ignore[operator]
+            raise ValueError(
+                f"trainer: batch_size * num_minibatches = {self.batch_size} * {self.num_minibatches} = {unrolls} must be a "
+                f"multiple of num_envs = {self.num_envs}"
+            )
+
+    @property
+    def steps_per_batch(self) -> int:
+        """Environment steps between two updates of the policy that collects them."""
+        return self.batch_size * self.num_minibatches * self.unroll_length  # type: ignore[operator]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """A training run.
+
+    Attributes:
+      env: see `EnvConfig`.
+      trainer: see `PPOConfig`.
+      seed: of networks, exploration and resets.
+      run_dir: where everything is written; runs/ENV-TRAINER-seedSEED-TIME where empty.
+      resume: a run directory to go on from.
+      compilation_cache: folder where JAX keeps compiled programs between runs; none where empty.
+    """
+
+    env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+    trainer: PPOConfig = dataclasses.field(default_factory=PPOConfig)
+    seed: int = 0
+    run_dir: str = ""
+    resume: str = ""
+    compilation_cache: str = "~/.cache/mimic/jax"
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateConfig:
+    """An evaluation of a trained policy.
+
+    Attributes:
+      run: the run directory.
+      checkpoint: environment steps of the checkpoint; the last one where 0.
+      out: file that the report is written to; printed only where empty.
+      compilation_cache: see `TrainConfig`.
+    """
+
+    run: str = ""
+    checkpoint: int = 0
+    out: str = ""
+    compilation_cache: str = "~/.cache/mimic/jax"

@@ -1,0 +1,142 @@
+"""How good a controller is: every demonstration once, against the kinematic bound and against holding still."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from mimic.distance import rotation_distance
+from mimic.envs.demonstrations import Demonstrations, concatenate
+from mimic.envs.imitation import ImitationEnv
+from mimic.imitation import kinematic_bound
+from mimic.kinematics import link_states
+
+Controller = Callable[[Array], Array]  # observation -> action
+SPLITS = ("train", "held_out")
+
+
+@struct.dataclass
+class Rollouts:
+    """What a controller did on each demonstration.
+
+    Attributes:
+      distance: [demonstrations, T] embodiment distance after each step.
+      angle_error: [demonstrations, learner links] mean angle to the corresponding expert links [rad].
+      torque_saturation: [demonstrations, T] 1 where a torque is at its limit.
+    """
+
+    distance: Float[Array, "demonstrations time"]
+    angle_error: Float[Array, "demonstrations links"]
+    torque_saturation: Float[Array, "demonstrations time"]
+
+
+class Evaluator:
+    """Evaluates controllers on the training and the held-out demonstrations of an environment.
+
+    Args:
+      env: the training environment.
+      held_out: demonstrations that are not trained on.
+
+    Attributes:
+      training_env: the environment that was given.
+      env: the same environment on all demonstrations, training first.
+      lower_bound, hold_distance: [demonstrations, T].
+    """
+
+    def __init__(self, env: ImitationEnv, held_out: Demonstrations):
+        self.training_env = env
+        self._num_train = env.demonstrations.count
+        self.env = env.with_demonstrations(concatenate(env.demonstrations, held_out))
+        self.lower_bound = np.asarray(_lower_bound(self.env))
+        self.hold_distance = np.asarray(_hold_distance(self.env))
+
+    def rollout(self, controller: Controller) -> Rollouts:
+        """Runs a controller on every demonstration; to be jitted by the caller, with the controller's parameters inside."""
+        env = self.env
+        links = _correspondence_weights(env)
+
+        def one(demonstration: Array) -> Rollouts:
+            arm_state = env.start(jax.random.PRNGKey(0), demonstration)
+            state = env.reset(jax.random.PRNGKey(0)).replace(pipeline_state=arm_state, obs=env.observe(arm_state))
+
+            def step(state, _):
+                state = env.step(state, controller(state.obs))
+                angles = _angle_errors(env, state.pipeline_state, links)
+                return state, (state.metrics["distance"], angles, state.metrics["torque_saturation"])
+
+            _, (distance, angles, saturation) = jax.lax.scan(step, state, None, length=env.config.horizon)
+            return Rollouts(distance, angles.mean(axis=0), saturation)
+
+        return jax.vmap(one)(jnp.arange(env.demonstrations.count))
+
+    @property
+    def parts(self) -> dict[str, slice]:
+        """Which demonstrations are trained on, and which are held out."""
+        return {"train": slice(0, self._num_train), "held_out": slice(self._num_train, None)}
+
+    def summary(self, rollouts: Rollouts) -> dict[str, Any]:
+        """The quality figures of a controller, each for the training and the held-out demonstrations where it has two."""
+        distance = np.asarray(rollouts.distance)
+        parts = self.parts
+
+        def mean(values: np.ndarray) -> dict[str, float]:
+            return {split: float(values[part].mean()) for split, part in parts.items()}
+
+        mean_distance, bound, hold = mean(distance), mean(self.lower_bound), mean(self.hold_distance)
+        gap = {split: (mean_distance[split] - bound[split]) / (hold[split] - bound[split]) for split in SPLITS}
+        angles = np.degrees(np.asarray(rollouts.angle_error)[parts["train"]].mean(axis=0))
+        return {
+            "optimality_gap": gap,
+            "mean_distance": mean_distance,
+            "lower_bound": bound,
+            "hold_distance": hold,
+            "link_angle_error_deg": float(angles.mean()),
+            "link_angle_error_deg_by_link": dict(zip(self.env.learner.link_names, map(float, angles), strict=True)),
+            "torque_saturation": float(np.asarray(rollouts.torque_saturation)[parts["train"]].mean()),
+        }
+
+
+def _lower_bound(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
+    metric, demonstrations = env.config.metric, env.demonstrations
+
+    def bound(qpos: Array, qvel: Array) -> Array:
+        return kinematic_bound(
+            env.expert,
+            env.learner,
+            qpos,
+            qvel,
+            env.correspondence,
+            env.weights,
+            rotation=metric.rotation_measure,  # type: ignore[arg-type]
+            reduction=metric.reduction,  # type: ignore[arg-type]
+        )
+
+    after_start = slice(1, env.config.horizon + 1)
+    qpos, qvel = (jnp.asarray(x[:, after_start], jnp.float32) for x in (demonstrations.qpos, demonstrations.qvel))
+    return jax.jit(jax.vmap(bound))(qpos, qvel)
+
+
+def _hold_distance(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
+    home = jnp.asarray(env.learner.home, jnp.float32)
+    steps = jnp.arange(1, env.config.horizon + 1)
+    over_time = jax.vmap(lambda demonstration, step: env.distance(home, 0 * home, demonstration, step), (None, 0))
+    return jax.jit(jax.vmap(over_time, (0, None)))(jnp.arange(env.demonstrations.count), steps)
+
+
+def _correspondence_weights(env: ImitationEnv) -> Float[Array, "expert learner"]:
+    """How much each expert link counts for a learner link: columns sum to 1; all alike where W depends on the state."""
+    if callable(env.correspondence):
+        return jnp.full((env.expert.num_links, env.learner.num_links), 1 / env.expert.num_links)
+    matrix = jnp.asarray(env.correspondence)
+    return matrix / matrix.sum(axis=0)
+
+
+def _angle_errors(env: ImitationEnv, arm_state: Any, links: Array) -> Float[Array, " links"]:
+    expert = env.expert_at(arm_state.demonstration, arm_state.step).direction
+    learner = link_states(env.learner, arm_state.qpos).direction
+    angle = jax.vmap(lambda a: jax.vmap(lambda b: rotation_distance(a, b, "angle"))(learner))(expert)
+    return (links * angle).sum(axis=0)

@@ -1,0 +1,58 @@
+"""Pictures of a run: how it learned, and how near the learner stays to the expert."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+
+from mimic.trainers.evaluation import Evaluator, Rollouts  # noqa: E402
+
+_COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
+_LABELS = {"train": "training demonstrations", "held_out": "held-out demonstrations"}
+
+
+def plot_training(metrics: Path, out: Path, *, title: str) -> None:
+    """Optimality gap over environment steps, from the metrics of a run."""
+    with metrics.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    steps = [int(row["step"]) for row in rows]
+    figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    for split, colour in _COLOURS.items():
+        gap = [100 * float(row[f"quality/optimality_gap.{split}"]) for row in rows]
+        axes.plot(steps, gap, "o-", markersize=3, color=colour, label=_LABELS[split])
+    axes.set(xlabel="environment steps", ylabel="optimality gap [%]", title=title, yscale="log")
+    axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+    axes.yaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    _save(figure, out)
+
+
+def plot_quality(evaluator: Evaluator, rollouts: Rollouts, out: Path, *, title: str) -> None:
+    """Mean distance over the time of an episode, between the kinematic bound and holding still."""
+    dt = evaluator.env.config.control_dt
+    parts = evaluator.parts
+    figure, all_axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
+    for axes, (split, part) in zip(all_axes, parts.items(), strict=True):
+        time = dt * np.arange(1, evaluator.env.config.horizon + 1)
+        distance = np.asarray(rollouts.distance)[part]
+        low, high = np.quantile(distance, [0.1, 0.9], axis=0)
+        axes.plot(time, evaluator.hold_distance[part].mean(axis=0), ":", color="grey", label="holding the start pose")
+        axes.fill_between(time, low, high, color=_COLOURS[split], alpha=0.2, lw=0, label="policy, 10 to 90 %")
+        axes.plot(time, distance.mean(axis=0), color=_COLOURS[split], label="policy, mean")
+        axes.plot(time, evaluator.lower_bound[part].mean(axis=0), "k--", lw=1, label="lower bound")
+        axes.set(xlabel="time [s]", title=f"{title}, {_LABELS[split]}", ylim=(0, None))
+        axes.grid(alpha=0.3)
+    all_axes[0].set_ylabel("embodiment distance")
+    all_axes[0].legend(fontsize="small")
+    _save(figure, out)
+
+
+def _save(figure: Any, out: Path) -> None:
+    figure.savefig(out, dpi=150)
+    plt.close(figure)

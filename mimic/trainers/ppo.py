@@ -1,0 +1,187 @@
+"""Brax PPO on an imitation environment: called as the library that it is, watched from its callback."""
+
+import functools
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo import train as brax_ppo
+
+from mimic import compat
+from mimic.envs.imitation import ImitationEnv
+from mimic.envs.wrappers import wrap_for_training
+from mimic.trainers.checkpoints import save_checkpoint
+from mimic.trainers.config import PPOConfig
+from mimic.trainers.evaluation import Controller
+
+Params = Any  # observation statistics, policy parameters, value parameters
+OnEvaluation = Callable[[int, Params, dict[str, float]], None]
+
+
+class Interrupted(Exception):
+    """Training was stopped by a signal after a checkpoint was written."""
+
+    def __init__(self, signal_number: int):
+        super().__init__(signal.Signals(signal_number).name)
+        self.signal_number = signal_number
+
+
+class LearningRate:
+    """A linear decay that brax takes for a number: optax calls it, and brax's log shows where it started."""
+
+    def __init__(self, start: float, end: float, updates: int, done: int = 0):
+        self.start = start
+        self._schedule = optax.linear_schedule(start, end, updates)
+        self._done = done
+
+    def __call__(self, count: jax.Array) -> jax.Array:
+        """Learning rate at an update."""
+        return self._schedule(count + self._done)
+
+    def __jax_array__(self) -> jax.Array:
+        """The rate at the start."""
+        return jnp.asarray(self.start, jnp.float32)
+
+
+def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
+    """Policy and value network of a resolved config."""
+    return _network_factory(config)(
+        observation_size, action_size, preprocess_observations_fn=running_statistics.normalize
+    )
+
+
+def _network_factory(config: PPOConfig) -> Callable[..., ppo_networks.PPONetworks]:
+    hidden = tuple(config.hidden_layers or ())
+    return functools.partial(
+        ppo_networks.make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden
+    )
+
+
+def params_template(config: PPOConfig, observation_size: int, action_size: int) -> Params:
+    """Parameters of the right structure, to restore a checkpoint into."""
+    networks = make_networks(config, observation_size, action_size)
+    key = jax.random.PRNGKey(0)
+    statistics = running_statistics.init_state(specs.Array((observation_size,), jnp.dtype("float32")))
+    return statistics, networks.policy_network.init(key), networks.value_network.init(key)
+
+
+def make_controller(config: PPOConfig, observation_size: int, action_size: int) -> Callable[[Params], Controller]:
+    """The deterministic policy as a function of its parameters."""
+    make_policy = ppo_networks.make_inference_fn(make_networks(config, observation_size, action_size))
+    unused_key = jax.random.PRNGKey(0)
+
+    def controller(params: Params) -> Controller:
+        policy = make_policy(params, deterministic=True)
+        return lambda observation: policy(observation, unused_key)[0]
+
+    return controller
+
+
+def train(
+    env: ImitationEnv,
+    config: PPOConfig,
+    run_dir: Path,
+    *,
+    seed: int,
+    on_evaluation: OnEvaluation,
+    restore: tuple[int, Params] | None = None,
+) -> Params:
+    """Trains a policy; saves a checkpoint before each call of `on_evaluation`.
+
+    Args:
+      env: the environment with its training demonstrations.
+      config: resolved.
+      run_dir: where checkpoints go.
+      seed: of networks, exploration and resets.
+      on_evaluation: called with the environment steps so far, the parameters and brax's training metrics.
+      restore: steps and parameters to go on from. Networks and observation statistics are kept; the moments of the
+        optimiser and the states of the environments start anew.
+
+    Raises:
+      Interrupted: on SIGINT or SIGTERM, after the next checkpoint.
+    """
+    compat.mend_brax()
+    done_steps, params = restore or (0, None)
+    caught: list[int] = []
+    unwritten: dict[str, Any] = {}
+
+    def on_params(step: int, _: Any, params: Params) -> None:
+        step += done_steps
+        save_checkpoint(run_dir, step, params)
+        unwritten.update(step=step, params=params)
+        if step == done_steps:
+            on_evaluation(step, params, {})
+        if caught:
+            raise Interrupted(caught[0])
+
+    def on_metrics(_: int, metrics: dict[str, Any]) -> None:
+        named = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
+        on_evaluation(unwritten["step"], unwritten["params"], named)
+        if caught:
+            raise Interrupted(caught[0])
+
+    with _signals_caught(caught):
+        _, final, _ = brax_ppo.train(
+            progress_fn=on_metrics,
+            policy_params_fn=on_params,
+            **_brax_arguments(env, config, done_steps),
+            restore_params=params,
+            seed=seed + done_steps,
+        )
+    return final
+
+
+def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> dict[str, Any]:
+    updates_per_batch = config.num_minibatches * config.num_updates_per_batch  # type: ignore[operator]
+    updates = config.num_timesteps // config.steps_per_batch * updates_per_batch  # type: ignore[operator]
+    done_updates = done_steps // config.steps_per_batch * updates_per_batch
+    rate: float = config.learning_rate  # type: ignore[assignment]
+    return {
+        "environment": env,
+        "num_timesteps": max(config.num_timesteps - done_steps, 1),  # type: ignore[operator]
+        "num_envs": config.num_envs,
+        "episode_length": env.config.horizon + 1,  # the environment ends first
+        "wrap_env_fn": wrap_for_training,
+        "learning_rate": LearningRate(rate, rate * config.final_learning_rate, updates, done_updates),
+        "entropy_cost": config.entropy_cost,
+        "discounting": config.discounting,
+        "unroll_length": config.unroll_length,
+        "batch_size": config.batch_size,
+        "num_minibatches": config.num_minibatches,
+        "num_updates_per_batch": config.num_updates_per_batch,
+        "normalize_observations": True,
+        "reward_scaling": config.reward_scaling,
+        "clipping_epsilon": config.clipping_epsilon,
+        "gae_lambda": config.gae_lambda,
+        "max_grad_norm": config.max_grad_norm,
+        "network_factory": _network_factory(config),
+        "num_evals": config.evaluations + 1,  # type: ignore[operator]
+        "run_evals": False,  # our evaluator's program is smaller, and it knows the held-out demonstrations
+    }
+
+
+class _signals_caught:  # noqa: N801 - reads as the statement that it is
+    """Notes SIGINT and SIGTERM for the next checkpoint; a second one of a kind acts at once."""
+
+    def __init__(self, caught: list[int]):
+        self._caught = caught
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._note)
+
+    def _note(self, number: int, _: FrameType | None) -> None:
+        self._caught.append(number)
+        signal.signal(number, self._previous[number] or signal.SIG_DFL)
+
+    def __exit__(self, *_: Any) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler or signal.SIG_DFL)
