@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 _log = logging.getLogger(__name__)
+_BRAX_AXIS_NAME = "i"  # brax.training.agents.ppo.train
 _SLOW_CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
 
 
@@ -38,12 +39,13 @@ def prepare_cpu() -> None:
 def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """Copies of a pytree on all devices, along a new first axis.
 
-    JAX removed its function of this name in 0.10, and brax 0.14 still calls it. This one replicates through `jax.pmap`, so
-    that the result is sharded just as pmap's own results are: brax then compiles its training epoch once and not twice.
+    JAX removed its function of this name in 0.10, and brax 0.14 still calls it. This one replicates through `jax.pmap`, with
+    brax's own name for the axis, so that the result is sharded just as what brax's training epoch returns: the epoch is then
+    compiled once and not twice.
     """
     import jax
 
-    replicate = jax.pmap(lambda _, x: x, in_axes=(0, None), devices=list(devices))
+    replicate = jax.pmap(lambda _, x: x, axis_name=_BRAX_AXIS_NAME, in_axes=(0, None), devices=list(devices))
     return replicate(jax.numpy.arange(len(devices)), tree)
 
 

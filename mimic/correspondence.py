@@ -1,6 +1,7 @@
 """Which links of two embodiments belong together: correspondence matrices W [n, n_hat]."""
 
 from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ def soft_correspondence(distances: Float[Array, "expert learner"], *, xi: ArrayL
     Raises:
       ValueError: xi is not a finite number below 0.
     """
-    if not isinstance(xi, Tracer) and not (np.ndim(xi) == 0 and -np.inf < float(xi) < 0):
+    if not isinstance(xi, Tracer) and not (np.ndim(xi) == 0 and -np.inf < float(np.asarray(xi)) < 0):
         raise ValueError(f"xi: expected a finite number below 0, for a soft minimum, got {xi}")
     sharpened = jnp.asarray(xi, distances.dtype) * distances
     return jax.nn.softmax(sharpened, axis=1) + jax.nn.softmax(sharpened, axis=0)
@@ -59,14 +60,13 @@ def overlap_correspondence(expert: Embodiment, learner: Embodiment) -> Float[Arr
     numpy = np if all(isinstance(length, np.ndarray) for length in lengths) else jnp
     (start_a, end_a), (start_b, end_b) = (_laid_on_unit_interval(length, numpy) for length in lengths)
     shared = numpy.minimum(end_a[:, None], end_b[None, :]) - numpy.maximum(start_a[:, None], start_b[None, :])
-    rounding = (
-        4 * sum(shared.shape) * numpy.finfo(shared.dtype).eps
-    )  # neighbours that touch share rounding errors, not length
+    # Neighbours that touch share rounding errors, not length.
+    rounding = 4 * sum(shared.shape) * numpy.finfo(shared.dtype).eps
     shared = numpy.where(shared > rounding, shared, 0)
     return jnp.asarray(shared / (end_a - start_a)[:, None] + shared / (end_b - start_b)[None, :])
 
 
-def _laid_on_unit_interval(lengths: Float[Array, " n"], numpy: ModuleType) -> tuple[Array, Array]:
+def _laid_on_unit_interval(lengths: Float[Any, " n"], numpy: ModuleType) -> tuple[Any, Any]:
     """Where each link starts and ends on its chain of length 1."""
     ends = numpy.cumsum(lengths) / numpy.sum(lengths)
     return numpy.concatenate([numpy.zeros(1, ends.dtype), ends[:-1]]), ends

@@ -24,7 +24,7 @@ _PARTS = ("translation", "rotation", "linear_velocity", "angular_velocity")
 
 @struct.dataclass
 class DistanceWeights:
-    """Weights of the four parts of the pair distance (paper, eq. 19): numbers, or arrays that broadcast to [n, n_hat]."""
+    """Weights of the parts of the pair distance (paper, eq. 19): numbers, or arrays that broadcast to [n, n_hat]."""
 
     translation: Any = 0.0
     rotation: Any = 1.0
@@ -150,10 +150,13 @@ def _pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> P
             return zero
         return spatial.norm(spatial.subtract(spatial.vector(x), spatial.vector(y)))
 
-    no_direction = a.direction is None or b.direction is None
+    if a.direction is None or b.direction is None:
+        rotation = zero
+    else:
+        rotation = rotation_distance(a.direction, b.direction, measure)
     return PairDistances(
         translation=apart(a.position, b.position),
-        rotation=zero if no_direction else rotation_distance(a.direction, b.direction, measure),
+        rotation=rotation,
         linear_velocity=apart(a.linear_velocity, b.linear_velocity),
         angular_velocity=apart(a.angular_velocity, b.angular_velocity),
     )

@@ -12,9 +12,13 @@ from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, 
 from mimic.embodiment import Embodiment
 from mimic.kinematics import LinkStates, link_states
 
-_POSES = 1024  # random poses that are tried, without a descent, to find the starts
-_SEARCH_STEP, _POLISH_STEP = 0.1, 0.03  # rad: first step of a descent; it shrinks to nothing along a cosine
+_POSES = 256  # random poses that are tried, without a descent, to find the starts
+_SEARCH_STEP, _POLISH_STEP = 0.1, 0.03  # first step of a descent [rad, and times the expert's speed]
+_LEAST_SPEED = 1e-2  # rad/s
 _FAST, _SLOW = 0.9, 0.99  # decay of the running means of gradient and squared gradient
+
+
+_Motion = tuple[Array, Array]  # angles and velocities
 
 
 class ClosestMotion(NamedTuple):
@@ -45,8 +49,8 @@ def kinematic_bound(
     iterations: int = 40,
     seed: int = 0,
 ) -> Float[Array, " time"]:
-    """What no controller can go below at each step: the distance of the `closest_motion`; same arguments."""
-    return closest_motion(
+    """What no controller can go below at each step: the distance of the `closest_motions`; same arguments."""
+    return closest_motions(
         expert,
         learner,
         qpos,
@@ -61,7 +65,7 @@ def kinematic_bound(
     ).distance
 
 
-def closest_motion(
+def closest_motions(
     expert: Embodiment,
     learner: Embodiment,
     qpos: Float[Array, "time expert_joints"],
@@ -77,14 +81,15 @@ def closest_motion(
 ) -> ClosestMotion:
     """Minimises the embodiment distance over the learner's joint angles and velocities, at each step by itself.
 
-    The metric has local minima, so this searches in three steps. Many random poses are compared with the expert, each share
-    of them giving the start of one descent; one more starts at the expert's own angles and velocities in the joints that both
-    arms have. Then the best of these and those of the neighbouring times are refined: what is found at one time is found
-    at all. A descent is Adam with a step that shrinks along a cosine, which copes with the kinks that the norms in the metric
-    have at a match. The best point that was seen is returned, with its true distance.
+    The metric has local minima, so this searches. Many random poses are compared with the expert, and the nearest of
+    each share of them starts a descent; one more starts at the expert's own angles in the joints that both arms have by
+    name. Then the best end and those of the neighbouring times are refined: what is found at one time is found at all.
+    A descent is Adam with a step that shrinks along a cosine. It needs no more of the metric than a gradient, so any
+    weights and correspondence will do, and it copes with the kinks that norms have at a match. The best point that was
+    seen is returned, with its true distance.
 
-    Angles stay within the joint range where that is less than a full turn; velocities are free, so that this is a bound for
-    any actuation.
+    Angles stay within the joint range where that is less than a full turn; velocities are free, so that this is a bound
+    for any actuation.
 
     Args:
       expert: n joints.
@@ -105,36 +110,53 @@ def closest_motion(
     qpos, qvel = jnp.asarray(qpos), jnp.asarray(qvel)
     if qpos.ndim != 2 or qpos.shape[1] != expert.num_joints or qvel.shape != qpos.shape:
         raise ValueError(
-            f"qpos, qvel: expected shape [time, {expert.num_joints}] for {expert.name}, got {qpos.shape} and {qvel.shape}"
+            f"qpos, qvel: expected shape [time, {expert.num_joints}] for {expert.name}, got {qpos.shape}, {qvel.shape}"
         )
     if starts < 1 or iterations < 1:
         raise ValueError(f"starts, iterations: expected at least 1, got {starts} and {iterations}")
-    expert_states = jax.vmap(lambda *motion: link_states(expert, *motion))(qpos, qvel)
-    poses = _random_poses(learner, -(-_POSES // starts) * starts, seed, qpos.dtype)
-    pose_states = jax.vmap(lambda pose: link_states(learner, pose))(poses)
 
     def distance(states: LinkStates, learner_states: LinkStates) -> Array:
         return embodiment_distance(
             states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
         )
 
-    def descend(states: LinkStates, start_qpos: Array, start_qvel: Array, count: int, step: float) -> ClosestMotion:
-        objective = lambda motion: distance(states, link_states(learner, *motion))  # noqa: E731
-        ends = jax.vmap(lambda *start: _descend(objective, start, learner, count, step))(start_qpos, start_qvel)
-        return jax.tree.map(lambda x: x[jnp.argmin(ends.distance)], ends)
+    def descend(states: LinkStates, starts: _Motion, speed: Array, count: int, step: float) -> ClosestMotion:
+        objective = lambda motion: distance(states, link_states(learner, motion[0], speed * motion[1]))  # noqa: E731
+        descent = jax.vmap(lambda *start: _descend(objective, start, learner, count, step))
+        ends = descent(starts[0], starts[1] / speed)
+        end_qpos, end_qvel, end_distance = jax.tree.map(lambda x: x[jnp.argmin(ends.distance)], ends)
+        return ClosestMotion(end_qpos, speed * end_qvel, end_distance)
 
-    def search(states: LinkStates, expert_qpos: Array, expert_qvel: Array) -> ClosestMotion:
+    def solve(qpos: Array, qvel: Array) -> ClosestMotion:
+        states = jax.vmap(lambda *motion: link_states(expert, *motion))(qpos, qvel)
+        speed = jnp.maximum(jnp.abs(qvel).max(axis=1), _LEAST_SPEED)  # a descent's unit of velocity
+        first = jax.vmap(_starts(distance, expert, learner, starts, seed))(states, qpos, qvel)
+        search = jax.vmap(lambda *args: descend(*args, iterations, _SEARCH_STEP))
+        refine = jax.vmap(lambda *args: descend(*args, 2 * iterations, _POLISH_STEP))
+        found = search(states, first, speed)
+        return refine(states, (_with_neighbours(found.qpos), _with_neighbours(found.qvel)), speed)
+
+    return jax.jit(solve)(qpos, qvel)
+
+
+closest_motion = closest_motions  # the name that `mimic` exports
+
+
+def _starts(
+    distance: Callable[[LinkStates, LinkStates], Array], expert: Embodiment, learner: Embodiment, starts: int, seed: int
+) -> Callable[[LinkStates, Array, Array], _Motion]:
+    """A function of the expert's states and motion that gives [starts + 1, joints] angles and velocities."""
+
+    def choose(states: LinkStates, expert_qpos: Array, expert_qvel: Array) -> _Motion:
+        poses = _random_poses(learner, -(-_POSES // starts) * starts, seed, expert_qpos.dtype)
+        pose_states = jax.vmap(lambda pose: link_states(learner, pose))(poses)
         tried = jax.vmap(lambda pose: distance(states, pose))(pose_states).reshape(starts, -1)
         chosen = poses.reshape(starts, -1, learner.num_joints)[jnp.arange(starts), jnp.argmin(tried, axis=1)]
         own_qpos, own_qvel = _shared_joints(expert, learner, expert_qpos, expert_qvel)
         start_qpos = jnp.concatenate([own_qpos[None], chosen])
-        return descend(states, start_qpos, jnp.broadcast_to(own_qvel, start_qpos.shape), iterations, _SEARCH_STEP)
+        return start_qpos, jnp.broadcast_to(own_qvel, start_qpos.shape)
 
-    def refine(states: LinkStates, start_qpos: Array, start_qvel: Array) -> ClosestMotion:
-        return descend(states, start_qpos, start_qvel, 2 * iterations, _POLISH_STEP)
-
-    found = jax.vmap(search)(expert_states, qpos, qvel)
-    return jax.vmap(refine)(expert_states, _with_neighbours(found.qpos), _with_neighbours(found.qvel))
+    return choose
 
 
 def _with_neighbours(values: Float[Array, "time joints"]) -> Float[Array, "time 3 joints"]:
@@ -144,14 +166,14 @@ def _with_neighbours(values: Float[Array, "time joints"]) -> Float[Array, "time 
 
 
 def _descend(
-    distance: Callable[[tuple[Array, Array]], Array],
-    start: tuple[Array, Array],
+    distance: Callable[[_Motion], Array],
+    start: _Motion,
     learner: Embodiment,
     iterations: int,
     first_step: float,
 ) -> ClosestMotion:
     """Adam with a step that shrinks to zero along a cosine, keeping the best point."""
-    lower, upper = _pose_limits(learner)
+    lower, upper = _pose_limits(learner, start[0].dtype)
 
     def iterate(carry: Any, count: Array) -> tuple[Any, None]:
         motion, mean, square, best = carry
@@ -174,11 +196,11 @@ def _descend(
     return jax.lax.scan(iterate, (start, zero, zero, best), counts)[0][3]
 
 
-def _pose_limits(arm: Embodiment) -> tuple[np.ndarray, np.ndarray]:
+def _pose_limits(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
     """Joint ranges; infinite for a joint that can do a full turn."""
-    lower, upper = np.asarray(arm.joint_range, np.float32).T
-    full = upper - lower >= 2 * np.pi - 1e-4
-    return np.where(full, -np.inf, lower), np.where(full, np.inf, upper)
+    lower, upper = np.asarray(arm.joint_range).T
+    full = upper - lower >= 2 * np.pi - 1e-4  # a model's text rounds pi
+    return np.where(full, -np.inf, lower).astype(dtype), np.where(full, np.inf, upper).astype(dtype)
 
 
 def _random_poses(arm: Embodiment, count: int, seed: int, dtype: Any) -> Float[Array, "count joints"]:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic import spatial
@@ -52,7 +53,7 @@ class _JointFrame(NamedTuple):
     linear_velocity: Vector
 
 
-def forward_kinematics(arm: Embodiment, qpos: Float[Array, " joints"]) -> Frames:
+def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Frames:
     """Link frames (paper, eq. 5).
 
     Args:
@@ -77,8 +78,8 @@ def forward_kinematics(arm: Embodiment, qpos: Float[Array, " joints"]) -> Frames
 
 def link_states(
     arm: Embodiment,
-    qpos: Float[Array, " joints"],
-    qvel: Float[Array, " joints"] | None = None,
+    qpos: Float[ArrayLike, " joints"],
+    qvel: Float[ArrayLike, " joints"] | None = None,
     *,
     normalized: bool = True,
 ) -> LinkStates:
@@ -116,7 +117,7 @@ def candidate_points(states: LinkStates) -> LinkStates:
 
 
 def body_twists(
-    arm: Embodiment, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]
+    arm: Embodiment, qpos: Float[ArrayLike, " joints"], qvel: Float[ArrayLike, " joints"]
 ) -> Float[Array, "links 6"]:
     """Body twists [omega, v] of the link frames, by the recursion over adjoint maps (paper, eq. 7).
 
@@ -188,7 +189,7 @@ def _chain_length(arm: Embodiment) -> Scalar:
     return float(length) if isinstance(length, np.floating) else length
 
 
-def _prepare(arm: Embodiment, values: Array, what: str) -> Array:
+def _prepare(arm: Embodiment, values: ArrayLike, what: str) -> Array:
     """One floating number for each joint."""
     values = jnp.asarray(values)
     if values.shape != (arm.num_joints,):

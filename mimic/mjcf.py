@@ -10,9 +10,14 @@ from mimic.chain import Chain, Joint, Link, drop_zero_length
 
 READY_POSE = "ready"  # the keyframe that holds a model's own start pose
 
-_HINGE = mujoco.mjtJoint.mjJNT_HINGE
-_CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
-_CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
+# As ints: MuJoCo's enums equal an integer of NumPy's in one order of the operands and not in the other.
+_HINGE = int(mujoco.mjtJoint.mjJNT_HINGE)
+_CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+_COUPLED_JOINTS = int(mujoco.mjtEq.mjEQ_JOINT)
+_CONNECT, _WELD = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
+_SITE = int(mujoco.mjtObj.mjOBJ_SITE)
+_ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
+_NO_BIAS = int(mujoco.mjtBias.mjBIAS_NONE)
 
 
 def read_model(path: str | os.PathLike[str]) -> mujoco.MjModel:
@@ -102,29 +107,26 @@ def _chain_bodies(model: mujoco.MjModel, base: str | None, tip: str | None) -> l
     for joint in (joint for body in jointed if body in line for joint in _joint_ids(model, body)):
         if not _is_hinge(model, joint):
             name = model.joint(joint).name
-            raise ValueError(
-                f"expected hinges only, but joint {name!r} on the chain is none; start behind it with base="
-            )
+            raise ValueError(f"expected hinges only; joint {name!r} on the chain is none: start behind it with base=")
     _refuse_loops(model, hinged)
     return hinged
 
 
 def _refuse_loops(model: mujoco.MjModel, path: list[int]) -> None:
-    """Refuses an equality constraint that holds a body of the chain, or one that is welded to it."""
+    """Refuses an equality constraint on the chain's joints, or between bodies that these joints move apart."""
     for equality in (i for i in range(model.neq) if model.eq_active0[i]):
         kind, objects = model.eq_type[equality], (model.eq_obj1id[equality], model.eq_obj2id[equality])
-        if kind == mujoco.mjtEq.mjEQ_JOINT:
-            tied = [model.jnt_bodyid[joint] for joint in objects if joint >= 0]
-        elif kind in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
-            on_sites = model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE
-            tied = [model.site_bodyid[item] if on_sites else item for item in objects]
+        if kind == _COUPLED_JOINTS:
+            between = {int(model.jnt_bodyid[joint]) for joint in objects if joint >= 0}
+        elif kind in (_CONNECT, _WELD):
+            on_sites = model.eq_objtype[equality] == _SITE
+            first, second = (model.site_bodyid[item] if on_sites else item for item in objects)
+            between = set(_ancestors(model, first)) ^ set(_ancestors(model, second))
         else:
             continue
-        if any(model.body_weldid[body] in path for body in tied):
+        if between & set(path):
             name = model.eq(equality).name or f"number {equality + 1}"
-            raise ValueError(
-                f"the model has a loop: equality constraint {name} ties the chain; expected a serial chain"
-            )
+            raise ValueError(f"expected a serial chain; the model has a loop, closed by equality constraint {name}")
 
 
 def _site_links(
@@ -171,10 +173,9 @@ def _torque_limit(model: mujoco.MjModel, joint_id: int) -> float:
     if model.jnt_actfrclimited[joint_id]:
         limits.append(np.abs(model.jnt_actfrcrange[joint_id]).max())
     for actuator in range(model.nu):
-        on_a_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
-        if on_a_joint and model.actuator_trnid[actuator, 0] == joint_id:
+        if model.actuator_trntype[actuator] == _ON_JOINT and model.actuator_trnid[actuator, 0] == joint_id:
             gear = abs(model.actuator_gear[actuator, 0])
-            is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+            is_motor = model.actuator_biastype[actuator] == _NO_BIAS
             if model.actuator_forcelimited[actuator]:
                 limits.append(gear * np.abs(model.actuator_forcerange[actuator]).max())
             elif model.actuator_ctrllimited[actuator] and is_motor:
@@ -194,7 +195,7 @@ def _joint_ids(model: mujoco.MjModel, body: int) -> range:
 
 
 def _is_hinge(model: mujoco.MjModel, joint: int) -> bool:
-    return model.jnt_type[joint] == _HINGE
+    return int(model.jnt_type[joint]) == _HINGE
 
 
 def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
@@ -221,4 +222,4 @@ def _tip_body(model: mujoco.MjModel, tip: str) -> int:
         return _body_id(model, tip)
     except ValueError as error:
         sites = ", ".join(filter(None, (model.site(s).name for s in range(model.nsite)))) or "none"
-        raise ValueError(f"{error}; and no such site; valid are {sites}") from None
+        raise ValueError(f"{error}, nor a site of that name; valid are {sites}") from None

@@ -1,9 +1,9 @@
 """Small SE(3) algebra on scalar components.
 
 A vector is a tuple of three scalars and a rotation a tuple of three such rows. Nothing here builds a small array, so
-under `jax.vmap` every operation is elementwise over the batch: XLA fuses the whole chain into one program, and no matrix
-product is left for TF32 to round. Scalars that are Python floats are known while JAX traces: what they make zero is never
-computed, which leaves about a fifth of a Panda's forward kinematics.
+under `jax.vmap` every operation is elementwise over the batch: XLA fuses the whole chain into one program, and no
+matrix product is left for TF32 to round. Scalars that are Python floats are known while JAX traces, and what they make
+zero is never computed: that leaves a third of the operations of a Panda's forward kinematics.
 """
 
 import math

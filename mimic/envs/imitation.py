@@ -82,10 +82,8 @@ class ImitationEnv(Env):
     def _set_demonstrations(self, demonstrations: Demonstrations) -> None:
         demonstrations.check_fits(self.expert, self.config.control_dt, self.config.horizon)
         self.demonstrations = demonstrations
-        over_time = jax.vmap(link_states, in_axes=(None, 0, 0))
-        table = jax.jit(jax.vmap(over_time, in_axes=(None, 0, 0)))  # the expert's link states, made once
         qpos, qvel = (jnp.asarray(x, jnp.float32) for x in (demonstrations.qpos, demonstrations.qvel))
-        self.expert_states: LinkStates = table(self.expert, qpos, qvel)
+        self.expert_states: LinkStates = link_state_table(self.expert, qpos, qvel)  # made once; `step` looks them up
 
     def reset(self, rng: Array) -> State:
         """A new episode: the learner at rest in its home pose, a random demonstration from its first step."""
@@ -171,6 +169,16 @@ class ImitationEnv(Env):
     def backend(self) -> str:
         """What simulates."""
         return "mjx"
+
+
+def link_state_table(
+    arm: Embodiment,
+    qpos: Float[Array, "demonstrations time joints"],
+    qvel: Float[Array, "demonstrations time joints"],
+) -> LinkStates:
+    """Link states of whole trajectories: each [demonstrations, time, links, 3]."""
+    over_time = jax.vmap(lambda *motion: link_states(arm, *motion))
+    return jax.jit(jax.vmap(over_time))(qpos, qvel)
 
 
 def _torque_scale(arm: Arm, config: EnvConfig) -> np.ndarray:

@@ -6,14 +6,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.distance import rotation_distance
 from mimic.envs.demonstrations import Demonstrations, concatenate
-from mimic.envs.imitation import ImitationEnv
+from mimic.envs.imitation import ImitationEnv, link_state_table
 from mimic.imitation import kinematic_bound
-from mimic.kinematics import link_states
 
 Controller = Callable[[Array], Array]  # observation -> action
 SPLITS = ("train", "held_out")
@@ -24,13 +23,13 @@ class Rollouts:
     """What a controller did on each demonstration.
 
     Attributes:
+      qpos: [demonstrations, T, joints] learner's joint angles after each step [rad].
       distance: [demonstrations, T] embodiment distance after each step.
-      angle_error: [demonstrations, learner links] mean angle to the corresponding expert links [rad].
       torque_saturation: [demonstrations, T] 1 where a torque is at its limit.
     """
 
+    qpos: Float[Array, "demonstrations time joints"]
     distance: Float[Array, "demonstrations time"]
-    angle_error: Float[Array, "demonstrations links"]
     torque_saturation: Float[Array, "demonstrations time"]
 
 
@@ -57,19 +56,17 @@ class Evaluator:
     def rollout(self, controller: Controller) -> Rollouts:
         """Runs a controller on every demonstration; to be jitted by the caller, with the controller's parameters inside."""
         env = self.env
-        links = _correspondence_weights(env)
 
         def one(demonstration: Array) -> Rollouts:
             arm_state = env.start(jax.random.PRNGKey(0), demonstration)
             state = env.reset(jax.random.PRNGKey(0)).replace(pipeline_state=arm_state, obs=env.observe(arm_state))
 
-            def step(state, _):
+            def step(state: State, _: None) -> tuple[State, Rollouts]:
                 state = env.step(state, controller(state.obs))
-                angles = _angle_errors(env, state.pipeline_state, links)
-                return state, (state.metrics["distance"], angles, state.metrics["torque_saturation"])
+                metrics = state.metrics
+                return state, Rollouts(state.pipeline_state.qpos, metrics["distance"], metrics["torque_saturation"])
 
-            _, (distance, angles, saturation) = jax.lax.scan(step, state, None, length=env.config.horizon)
-            return Rollouts(distance, angles.mean(axis=0), saturation)
+            return jax.lax.scan(step, state, None, length=env.config.horizon)[1]
 
         return jax.vmap(one)(jnp.arange(env.demonstrations.count))
 
@@ -88,7 +85,7 @@ class Evaluator:
 
         mean_distance, bound, hold = mean(distance), mean(self.lower_bound), mean(self.hold_distance)
         gap = {split: (mean_distance[split] - bound[split]) / (hold[split] - bound[split]) for split in SPLITS}
-        angles = np.degrees(np.asarray(rollouts.angle_error)[parts["train"]].mean(axis=0))
+        angles = np.degrees(self._angle_error(rollouts)[parts["train"]].mean(axis=0))
         return {
             "optimality_gap": gap,
             "mean_distance": mean_distance,
@@ -98,6 +95,15 @@ class Evaluator:
             "link_angle_error_deg_by_link": dict(zip(self.env.learner.link_names, map(float, angles), strict=True)),
             "torque_saturation": float(np.asarray(rollouts.torque_saturation)[parts["train"]].mean()),
         }
+
+    def _angle_error(self, rollouts: Rollouts) -> Float[np.ndarray, "demonstrations links"]:
+        """Mean angle [rad] of each learner link to the expert links that correspond to it, by their share in W."""
+        env = self.env
+        expert = np.asarray(env.expert_states.direction)[:, 1 : env.config.horizon + 1]
+        learner = np.asarray(link_state_table(env.learner, rollouts.qpos, jnp.zeros_like(rollouts.qpos)).direction)
+        cosine = np.einsum("dtix,dtjx->dtij", expert, learner)
+        angle = np.arccos(np.clip(cosine, -1, 1)).mean(axis=1)
+        return (angle * _shares(env)).sum(axis=1)
 
 
 def _lower_bound(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
@@ -116,8 +122,10 @@ def _lower_bound(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
         )
 
     after_start = slice(1, env.config.horizon + 1)
-    qpos, qvel = (jnp.asarray(x[:, after_start], jnp.float32) for x in (demonstrations.qpos, demonstrations.qvel))
-    return jax.jit(jax.vmap(bound))(qpos, qvel)
+    # On the host's processor in any case: there the program compiles several times faster, and it runs once.
+    with jax.default_device(jax.devices("cpu")[0]):
+        qpos, qvel = (jnp.asarray(x[:, after_start], jnp.float32) for x in (demonstrations.qpos, demonstrations.qvel))
+        return jax.jit(jax.vmap(bound))(qpos, qvel)
 
 
 def _hold_distance(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
@@ -127,16 +135,8 @@ def _hold_distance(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
     return jax.jit(jax.vmap(over_time, (0, None)))(jnp.arange(env.demonstrations.count), steps)
 
 
-def _correspondence_weights(env: ImitationEnv) -> Float[Array, "expert learner"]:
+def _shares(env: ImitationEnv) -> Float[np.ndarray, "expert learner"]:
     """How much each expert link counts for a learner link: columns sum to 1; all alike where W depends on the state."""
-    if callable(env.correspondence):
-        return jnp.full((env.expert.num_links, env.learner.num_links), 1 / env.expert.num_links)
-    matrix = jnp.asarray(env.correspondence)
+    n, n_hat = env.expert.num_links, env.learner.num_links
+    matrix = np.full((n, n_hat), 1.0) if callable(env.correspondence) else np.asarray(env.correspondence)
     return matrix / matrix.sum(axis=0)
-
-
-def _angle_errors(env: ImitationEnv, arm_state: Any, links: Array) -> Float[Array, " links"]:
-    expert = env.expert_at(arm_state.demonstration, arm_state.step).direction
-    learner = link_states(env.learner, arm_state.qpos).direction
-    angle = jax.vmap(lambda a: jax.vmap(lambda b: rotation_distance(a, b, "angle"))(learner))(expert)
-    return (links * angle).sum(axis=0)

@@ -1,0 +1,50 @@
+"""What all tests share: shapes checked at run time, compiled programs kept, both precisions."""
+
+import importlib.util
+import pathlib
+
+import jax
+import pytest
+from jaxtyping import config as jaxtyping_config
+from jaxtyping import install_import_hook
+
+REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
+
+# Not mimic.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
+CORE = ("chain", "mjcf", "embodiment", "kinematics", "distance", "correspondence", "imitation")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    marks = config.getoption("markexpr")
+    if "gpu" not in marks or "not gpu" in marks:
+        jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_compilation_cache_dir", str(REPOSITORY / ".jax_cache"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    if importlib.util.find_spec("beartype") is not None:
+        install_import_hook([f"mimic.{module}" for module in CORE], "typechecking.check")
+
+    from mimic import compat  # importing mimic after the hook is in place, and before JAX starts
+
+    compat.prepare_cpu()
+
+
+@pytest.fixture
+def x64():
+    """Double precision."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(params=["float64", "float32"])
+def dtype(request: pytest.FixtureRequest):
+    """Runs a test in both precisions."""
+    with jax.enable_x64(request.param == "float64"):
+        yield jax.numpy.dtype(request.param)
+
+
+@pytest.fixture
+def unchecked():
+    """Turns the shape checks off: what a user without them is told about bad input."""
+    jaxtyping_config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping_config.update("jaxtyping_disable", False)

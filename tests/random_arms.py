@@ -1,0 +1,105 @@
+"""Random serial arms as MJCF, and where C MuJoCo says that their links are and how they move."""
+
+import mujoco
+import numpy as np
+
+SEEDS = range(20)
+_REACH = 0.15  # m: offsets of bodies, anchors and link ends in each axis
+
+
+def has_link_sites(seed: int) -> bool:
+    """Whether the arm of this seed marks its links by capsule sites; else they run from anchor to anchor."""
+    return seed % 3 == 0
+
+
+def random_arm(seed: int) -> mujoco.MjModel:
+    """A serial arm of 1 to 9 hinges.
+
+    Random axes, anchors and body rotations, with static bodies at the root, between and behind the moving ones. Some
+    joints have a reference angle other than 0; some bodies of the arms without link sites have two hinges with one
+    anchor, so that the link between these has length zero.
+    """
+    rng = np.random.default_rng(seed)
+    opened, hinges = [], 0
+    while hinges < 1 + seed % 9:
+        if rng.random() < 0.4:
+            opened.append(f"<body {_pose(rng)}>")
+        opened.append(f'<body {_pose(rng)}><geom size="0.02"/>')
+        anchor = _text(rng.uniform(-_REACH, _REACH, 3))
+        twins = not has_link_sites(seed) and hinges + 2 <= 1 + seed % 9 and rng.random() < 0.25
+        for _ in range(2 if twins else 1):
+            hinges += 1
+            ref = rng.choice([0.0, rng.uniform(-1, 1)])
+            opened[-1] += f'<joint name="hinge{hinges}" pos="{anchor}" axis="{_text(rng.normal(size=3))}" ref="{ref}"/>'
+        if has_link_sites(seed):
+            site = f'<site name="link{hinges}" fromto="{_text(rng.uniform(-_REACH, _REACH, 6))}"/>'
+            opened[-1] += site if rng.random() < 0.5 else f"<body {_pose(rng)}>{site}</body>"
+    opened[-1] += f'<site name="tip" type="sphere" pos="{_text(rng.uniform(-_REACH, _REACH, 3))}"/>'
+    xml = f"""<mujoco model="random{seed}">
+      <compiler angle="radian"/>
+      <default><site type="capsule" size="0.01"/></default>
+      <worldbody>{"".join(opened)}{"</body>" * sum(part.count("<body") - part.count("</body") for part in opened)}
+      </worldbody>
+    </mujoco>"""
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def posed(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray | None = None) -> mujoco.MjData:
+    """The model's state, with everything that follows from it computed by MuJoCo."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    data.qvel[:] = 0 if qvel is None else qvel
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def links(model: mujoco.MjModel, data: mujoco.MjData, link_names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """What `link_states` should give, unnormalized, and the links' bodies: from MuJoCo's positions and velocities.
+
+    A link's name says which it is: "link2", or "link2+link3" for links that a locked joint has made one.
+    """
+    base = int(model.body_parentid[model.jnt_bodyid[0]])
+    R_base_world, origin = data.xmat[base].reshape(3, 3).T, data.xpos[base]
+    rows = []
+    for name in link_names:
+        first, last = name.split("+")[0], name.split("+")[-1]
+        (start, _, _), (_, end, body) = _segment(model, data, first), _segment(model, data, last)
+        velocity = np.zeros(6)  # [omega, v] at the body's origin, in the axes of the world
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
+        centre = (start + end) / 2
+        linear = velocity[3:] + np.cross(velocity[:3], centre - data.xpos[body])
+        direction = (end - start) / np.linalg.norm(end - start)
+        rows.append((R_base_world @ (centre - origin), *(R_base_world @ x for x in (direction, linear, velocity[:3]))))
+    position, direction, linear_velocity, angular_velocity = map(np.stack, zip(*rows, strict=True))
+    return {
+        "position": position,
+        "direction": direction,
+        "linear_velocity": linear_velocity,
+        "angular_velocity": angular_velocity,
+    }
+
+
+def link_rotations(model: mujoco.MjModel, data: mujoco.MjData, link_names: tuple[str, ...]) -> np.ndarray:
+    """Rotations [n, 3, 3] of the bodies that carry the links, in the base frame."""
+    base = int(model.body_parentid[model.jnt_bodyid[0]])
+    bodies = [_segment(model, data, name.split("+")[-1])[2] for name in link_names]
+    return np.stack([data.xmat[base].reshape(3, 3).T @ data.xmat[body].reshape(3, 3) for body in bodies])
+
+
+def _segment(model: mujoco.MjModel, data: mujoco.MjData, link: str) -> tuple[np.ndarray, np.ndarray, int]:
+    """Start, end and body of one link: its site, else from its joint's anchor to the next one's, or to the tip."""
+    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, link)
+    if site >= 0:
+        half = data.site_xmat[site].reshape(3, 3)[:, 2] * model.site_size[site, 1]  # z points from end to start
+        return data.site_xpos[site] + half, data.site_xpos[site] - half, int(model.site_bodyid[site])
+    joint = int(link.removeprefix("link")) - 1
+    end = data.xanchor[joint + 1] if joint + 1 < model.njnt else data.site("tip").xpos
+    return data.xanchor[joint], end, int(model.jnt_bodyid[joint])
+
+
+def _pose(rng: np.random.Generator) -> str:
+    return f'pos="{_text(rng.uniform(-_REACH, _REACH, 3))}" quat="{_text(rng.normal(size=4))}"'
+
+
+def _text(numbers: np.ndarray) -> str:
+    return " ".join(map(str, numbers))

@@ -1,0 +1,407 @@
+import dataclasses
+import logging
+import pathlib
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+import random_arms
+
+from mimic.embodiment import load_arm, load_mjcf, panda, panda_path, planar_arm
+from mimic.kinematics import forward_kinematics, link_states
+
+pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
+
+# Craig's DH table from the maker's manual, and the segments that the metric compares, at the zero pose (DESIGN, 4).
+DH = [  # a_{i-1} [m], d_i [m], alpha_{i-1} [rad]
+    (0, 0.333, 0),
+    (0, 0, -np.pi / 2),
+    (0, 0.316, np.pi / 2),
+    (0.0825, 0, np.pi / 2),
+    (-0.0825, 0.384, -np.pi / 2),
+    (0, 0, np.pi / 2),
+    (0.088, 0, np.pi / 2),
+]
+FLANGE = 0.107
+ENDS = [
+    (0, 0, 0),
+    (0, 0, 0.333),
+    (0, 0, 0.491),
+    (0.0825, 0, 0.649),
+    (0, 0, 0.841),
+    (0, 0, 1.033),
+    (0.088, 0, 1.033),
+    (0.088, 0, 0.926),
+]
+
+
+def hinge(name="", axis="0 0 1", pos="0 0 0", inner="", body=""):
+    names = [f'name="{text}"' if text else "" for text in (body, name)]
+    return f'<body {names[0]} pos="{pos}"><joint {names[1]} axis="{axis}"/><geom size="0.01"/>{inner}</body>'
+
+
+def model(worldbody, rest=""):
+    xml = f'<mujoco model="toy"><compiler angle="radian"/><worldbody>{worldbody}</worldbody>{rest}</mujoco>'
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def toy(inner="", rest=""):
+    """Two hinges named a and b, 1 m apart along x, then whatever is inside."""
+    return model(hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B", inner=inner)), rest)
+
+
+TIP = '<site name="tip" pos="0.5 0 0"/>'
+
+
+# --- the Panda --------------------------------------------------------------------------------------------------------
+
+
+def test_panda_has_the_makers_kinematics(x64):
+    """The flange of a random pose, by the DH table."""
+    qpos = np.random.default_rng(0).uniform(-2, 2, 7)
+    T = np.eye(4)
+    for angle, (a, d, alpha) in zip(qpos, DH, strict=True):
+        (sa, ca), (s, c) = (np.sin(alpha), np.cos(alpha)), (np.sin(angle), np.cos(angle))
+        T = T @ [[c, -s, 0, a], [s * ca, c * ca, -sa, -d * sa], [s * sa, c * sa, ca, d * ca], [0, 0, 0, 1]]
+    frames, arm = forward_kinematics(panda(), qpos), panda()
+    np.testing.assert_allclose(frames.rotation[-1, :, 0], T[:3, 2], atol=1e-12)  # rounding: link 7 is along axis 7
+    end = frames.position[-1] + 0.5 * arm.link_lengths[-1] * frames.rotation[-1, :, 0]
+    np.testing.assert_allclose(end, T[:3, 3] + FLANGE * T[:3, 2], atol=1e-12)  # rounding
+
+
+def test_panda_links_are_the_segments_of_the_design(x64):
+    arm = panda()
+    starts, ends = np.array(ENDS[:-1]), np.array(ENDS[1:])
+    states = link_states(arm, np.zeros(7), normalized=False)
+    np.testing.assert_allclose(states.position, (starts + ends) / 2, atol=1e-12)  # rounding
+    np.testing.assert_allclose(states.direction * arm.link_lengths[:, None], ends - starts, atol=1e-12)
+    np.testing.assert_allclose(arm.chain_length, np.linalg.norm(ends - starts, axis=1).sum(), atol=1e-12)
+    assert arm.link_names == tuple(f"link{i + 1}" for i in range(7))
+
+
+def test_panda_limits():
+    paper, real = panda(), panda(limits="hardware")
+    for arm in (paper, real):
+        assert arm.torque_limit.tolist() == [87.0] * 4 + [12.0] * 3
+        assert arm.velocity_limit.tolist() == [2.175] * 4 + [2.61] * 3
+    assert paper.joint_range.tolist() == [[-np.pi, np.pi]] * 7
+    assert not paper.home.any()
+    assert real.joint_range.tolist() == [
+        [-2.8973, 2.8973],
+        [-1.7628, 1.7628],
+        [-2.8973, 2.8973],
+        [-3.0718, -0.0698],
+        [-2.8973, 2.8973],
+        [-0.0175, 3.7525],
+        [-2.8973, 2.8973],
+    ]
+    ready = np.pi * np.array([0, -1 / 4, 0, -3 / 4, 0, 1 / 2, 1 / 4])
+    np.testing.assert_allclose(real.home, ready, atol=1e-6)  # the MJCF has six decimals
+    assert np.all(real.joint_range[:, 0] < real.home) and np.all(real.home < real.joint_range[:, 1])
+
+
+def test_hardware_limits_lock_at_the_ready_pose():
+    locked = panda(locked=(4, "joint6"), merge_locked=False, limits="hardware")
+    full = panda(limits="hardware")
+    np.testing.assert_allclose(locked.home, np.delete(full.home, [3, 5]))
+    here, there = link_states(locked, locked.home), link_states(full, full.home)
+    np.testing.assert_allclose(here.position, there.position, atol=1e-6)  # float32
+    free = panda(locked={4: -1.0, 6: 0.5}, limits="hardware")
+    assert free.joint_names == locked.joint_names  # angles that are given win over the ready pose
+    assert abs(link_states(free, free.home).position - there.position[:5]).max() > 0.01
+
+
+def test_dissimilar_pandas_of_the_paper():
+    four, three = panda(locked=(3, 6, 7)), panda(locked=(2, 3, 6, 7))
+    assert four.joint_names == ("joint1", "joint2", "joint4", "joint5")
+    assert four.link_names == ("link1", "link2+link3", "link4", "link5+link6+link7")
+    assert four.link_joint == (0, 1, 2, 3)
+    assert three.joint_names == ("joint1", "joint4", "joint5")
+    assert three.link_names == ("link1+link2+link3", "link4", "link5+link6+link7")
+    assert (four.num_joints, four.num_links, three.num_joints, three.num_links) == (4, 4, 3, 3)
+    ends = np.array(ENDS)
+    np.testing.assert_allclose(four.link_lengths, np.linalg.norm(np.diff(ends[[0, 1, 3, 4, 7]], axis=0), axis=1))
+    np.testing.assert_allclose(three.link_lengths, np.linalg.norm(np.diff(ends[[0, 3, 4, 7]], axis=0), axis=1))
+    assert four.velocity_limit.tolist() == [2.175, 2.175, 2.175, 2.61]
+    apart = panda(locked=(3, 6, 7), merge_locked=False)
+    assert (apart.num_joints, apart.link_joint) == (4, (0, 1, 1, 2, 3, 3, 3))
+    assert apart.link_lengths.tolist() == panda().link_lengths.tolist()
+
+
+def test_locking_the_first_joint_leaves_a_link_on_the_base():
+    arm = panda(locked="joint1")
+    assert arm.link_joint == (-1, 0, 1, 2, 3, 4, 5)
+    motion = link_states(arm, np.ones(6, np.float32), np.ones(6, np.float32))
+    assert not motion.linear_velocity[0].any() and motion.linear_velocity[1].any()
+
+
+def test_joints_can_be_named_in_any_way():
+    by_name = panda(locked=("joint3", "joint6"))
+    for locked in ([3, 6], (np.int64(3), "joint6"), {"joint3": 0, 6: 0.0}, iter(["joint3", 6])):
+        arm = panda(locked=locked)
+        assert (arm.name, arm.joint_names) == ("panda-joint3-joint6", by_name.joint_names)
+        np.testing.assert_array_equal(arm.link_position, by_name.link_position)
+    assert panda(locked=3).joint_names == panda(locked="joint3").joint_names
+
+
+# --- the pytree -------------------------------------------------------------------------------------------------------
+
+
+def test_embodiment_is_a_frozen_pytree():
+    arm = panda()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        arm.name = "other"  # pyright: ignore[reportAttributeAccessIssue]
+    leaves, structure = jax.tree.flatten(arm)
+    assert all(isinstance(leaf, np.ndarray) for leaf in leaves)
+    again = jax.tree.unflatten(structure, leaves)
+    assert (again.joint_names, again.link_joint) == (arm.joint_names, arm.link_joint)
+    assert structure == jax.tree.structure(panda()) != jax.tree.structure(panda(locked=3))
+
+
+@pytest.mark.parametrize("arm", [panda(), panda(locked={3: 1.0}), load_mjcf(random_arms.random_arm(8))])
+def test_link_frames_are_rotations(arm):
+    for rotation in arm.link_rotation:
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-11)  # entries are exact to 1e-12
+        assert np.linalg.det(rotation) > 0
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-13, 1e-9, 1e-6, 1e-3])
+def test_links_that_point_backwards_have_a_frame(tilt):
+    arm = load_mjcf(toy(f'<site name="tip" pos="-1 {tilt} 0"/>'))
+    rotation = arm.link_rotation[-1]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-11)  # entries are exact to 1e-12
+    np.testing.assert_allclose(rotation[:, 0], [-1, tilt, 0], atol=1e-6)  # cos(1e-3) = 1 - 5e-7
+
+
+# --- planar arms ------------------------------------------------------------------------------------------------------
+
+
+def test_planar_arm():
+    arm = planar_arm([1.0, 0.5], frame_at=1.0)
+    assert (arm.num_joints, arm.num_links, arm.chain_length) == (2, 2, 1.5)
+    assert arm.link_position.tolist() == [[1, 0, 0], [1.5, 0, 0]]
+    assert arm.joint_axis.tolist() == [[0, 0, 1]] * 2
+    assert np.isinf(arm.torque_limit).all() and np.isinf(arm.velocity_limit).all()
+    assert planar_arm(np.array([1.0])).num_links == 1
+
+
+@pytest.mark.parametrize(
+    "lengths", [[], [1.0, 0.0], [-0.1], [1.0, np.nan], [np.inf], [[1.0, 2.0]], 1.0], ids=lambda lengths: str(lengths)
+)
+def test_planar_arm_refuses_bad_lengths(lengths):
+    with pytest.raises(ValueError, match=r"^link_lengths: expected one or more finite lengths above 0 \[m\], got .*$"):
+        planar_arm(lengths)
+
+
+@pytest.mark.parametrize("frame_at", [-0.1, 1.1, np.nan])
+def test_planar_arm_refuses_a_frame_off_the_link(frame_at):
+    with pytest.raises(ValueError, match=r"^frame_at: expected a share of the link in \[0, 1\], got "):
+        planar_arm([1.0], frame_at=frame_at)
+
+
+# --- any MJCF ---------------------------------------------------------------------------------------------------------
+
+
+def test_mjcf_from_path_or_model():
+    arms = [load_mjcf(source) for source in (panda_path(), pathlib.Path(panda_path()))]
+    arms.append(load_mjcf(mujoco.MjModel.from_xml_path(panda_path())))
+    for arm in arms:
+        assert arm.name == "panda"
+        np.testing.assert_array_equal(arm.link_position, panda().link_position)
+        np.testing.assert_array_equal(arm.joint_range, panda(limits="hardware").joint_range)
+        np.testing.assert_array_equal(arm.home, panda(limits="hardware").home)
+    # load_mjcf locks at 0; load_arm, as the environments do, where the arm starts
+    np.testing.assert_array_equal(load_mjcf(panda_path(), locked=[4]).link_position, panda(locked=[4]).link_position)
+    ready, _, angles = load_arm(panda_path(), locked=[4])
+    assert angles == {"joint4": panda(limits="hardware").home[3]} and ready.num_joints == 6
+
+
+def test_links_run_from_anchor_to_anchor_to_tip():
+    arm = load_mjcf(toy(TIP))
+    assert (arm.name, arm.joint_names, arm.link_names) == ("toy", ("a", "b"), ("link1", "link2"))
+    assert arm.link_position.tolist() == [[0.5, 0, 0], [1.25, 0, 0]]
+    assert arm.link_lengths.tolist() == [1, 0.5]
+    assert np.isinf(arm.torque_limit).all()
+
+
+@pytest.mark.parametrize(
+    ("inner", "end"),
+    [
+        (TIP, 0.5),
+        ('<body pos="0.7 0 0"><geom size="0.1"/></body>' + TIP, 0.7),
+        ('<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02"/>', 0.3),
+        ('<geom pos="0.2 0 0" size="0.02"/>', 0.2),
+    ],
+    ids=["site", "body", "capsule", "ball"],
+)
+def test_the_last_link_ends_at_the_farthest_point(inner, end):
+    assert load_mjcf(toy(inner)).link_lengths.tolist() == pytest.approx([1, end])
+
+
+def test_base_and_tip():
+    gripper = '<body name="finger" pos="0.4 0 0"><joint name="f" type="slide"/><geom size="0.01"/></body>' + TIP
+    other = hinge("c", pos="0 1 0", body="C", inner='<site name="side" pos="0 1 0"/>')
+    tree = model(hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B", inner=gripper) + other))
+    assert load_mjcf(tree, tip="tip").link_lengths.tolist() == [1, 0.5]
+    assert load_mjcf(tree, tip="B").joint_names == ("a", "b")
+    assert load_mjcf(tree, tip="side").joint_names == ("a", "c")
+    arm = load_mjcf(tree, base="A", tip="finger")
+    assert (arm.joint_names, arm.link_lengths.tolist()) == (("b",), [pytest.approx(0.4)])
+    assert arm.joint_anchor.tolist() == [[1, 0, 0]]  # in the frame of A
+
+
+def test_unnamed_joints_get_names():
+    arm = load_mjcf(model(hinge(inner=hinge(pos="1 0 0", inner=TIP))))
+    assert arm.joint_names == ("joint1", "joint2")
+    assert load_mjcf(model(hinge(inner=hinge(pos="1 0 0", inner=TIP))), locked=["joint2"]).num_joints == 1
+
+
+def test_links_of_length_zero_are_merged_with_a_message(caplog):
+    wrist = hinge("c", axis="0 1 0", inner=TIP)  # same anchor as b
+    with caplog.at_level(logging.WARNING):
+        arm = load_mjcf(toy(wrist))
+    assert (arm.joint_names, arm.link_names, arm.link_joint) == (("a", "b", "c"), ("link1", "link3"), (0, 2))
+    assert "link2" in caplog.text and "length zero" in caplog.text
+
+
+def test_limits_from_the_model():
+    limited = """<actuator>
+      <motor joint="a" gear="2" ctrllimited="true" ctrlrange="-3 4"/>
+      <position joint="b" kp="100" forcelimited="true" forcerange="-7 7"/>
+    </actuator>
+    <custom><numeric name="velocity_limit" data="1.5 2.5"/></custom>"""
+    arm = load_mjcf(toy(TIP, limited))
+    assert arm.torque_limit.tolist() == [8, 7]
+    assert arm.velocity_limit.tolist() == [1.5, 2.5]
+    narrow = '<mujoco><compiler angle="radian"/><worldbody><body><joint range="0.5 1" limited="true"/>{}</body>'
+    arm = load_mjcf(
+        mujoco.MjModel.from_xml_string(narrow.format('<geom size="1" pos="1 0 0"/>') + "</worldbody></mujoco>")
+    )
+    assert (arm.joint_range.tolist(), arm.home.tolist()) == ([[0.5, 1]], [0.5])
+
+
+def test_links_of_a_gripper_do_not_close_a_loop():
+    finger = '<body name="{0}" pos="0.1 0 0"><joint name="{0}" type="slide"/><geom size="0.01"/></body>'
+    coupled = '<equality><joint joint1="l" joint2="r"/><connect body1="l" body2="r" anchor="0 0 0"/></equality>'
+    assert load_mjcf(toy(finger.format("l") + finger.format("r") + TIP, coupled)).num_joints == 2
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+LOCKED = [
+    (["joint8"], "locked: unknown joint 'joint8'; valid are joint1, .*, joint7 or 1 to 7"),
+    ([0], "locked: unknown joint 0; valid are "),
+    ([8], "locked: unknown joint 8; valid are "),
+    ([-1], "locked: unknown joint -1; valid are "),
+    ([2.5], "locked: unknown joint 2.5; valid are "),
+    ([True], "locked: unknown joint True; valid are "),
+    ([None], "locked: unknown joint None; valid are "),
+    ("Joint3", "locked: unknown joint 'Joint3'; valid are "),
+    (["joint3", "joint3"], "locked: joint 'joint3' is named twice"),
+    (["joint3", 3], "locked: joint 'joint3' is named twice"),
+    ({"joint3": 0.1, 3: 0.1}, "locked: joint 'joint3' is named twice"),
+    ({"joint3": np.nan}, "locked: expected a finite angle .* for joint 'joint3', got nan"),
+    ({"joint3": "bent"}, "locked: expected a finite angle .* for joint 'joint3', got 'bent'"),
+    ({"joint3": None}, "locked: expected a finite angle .* for joint 'joint3', got None"),
+    (range(1, 8), "locked: all 7 joints are locked; at least one must stay free"),
+]
+
+
+@pytest.mark.parametrize("load", [panda, lambda locked: load_mjcf(panda_path(), locked=locked)], ids=["panda", "mjcf"])
+@pytest.mark.parametrize(("locked", "message"), LOCKED, ids=[str(locked) for locked, _ in LOCKED])
+def test_bad_locked_joints_are_refused(load, locked, message):
+    with pytest.raises(ValueError, match=f"^{message}") as error:
+        load(locked=locked)
+    assert "\n" not in str(error.value)
+
+
+def test_unknown_limits_are_refused():
+    with pytest.raises(ValueError, match="^limits: expected one of none, hardware, got 'soft'$"):
+        panda(limits="soft")  # pyright: ignore[reportArgumentType]
+
+
+BRANCH = hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B") + hinge("c", pos="0 1 0", body="C"))
+SLIDE = '<body name="S"><joint name="s" type="slide"/><geom size="0.01"/>' + hinge("a", body="A", inner=TIP) + "</body>"
+STATIC = '<body name="hand" pos="0.5 0 0"><geom size="0.01"/><site name="palm"/></body>'
+MODELS = {
+    "no joint": (lambda: model('<geom size="1"/>'), {}, "the model has no hinge joint$"),
+    "slides only": (lambda: model('<body><joint type="slide"/><geom size="1"/></body>'), {}, "the model has no hinge"),
+    "none behind base": (lambda: toy(TIP), {"base": "B"}, "the model has no hinge joint between base and tip"),
+    "branch": (lambda: model(BRANCH), {}, "the model branches: bodies 'B', 'C' have hinges .*; name one with tip="),
+    "two arms": (lambda: model(hinge("a", body="A") + hinge("b", body="B")), {}, "the model branches: bodies 'A', 'B'"),
+    "slide": (lambda: model(SLIDE), {}, "expected hinges only; joint 's' on the chain is none"),
+    "weld": (
+        lambda: toy(TIP, '<equality><weld name="tie" body1="B"/></equality>'),
+        {},
+        "expected a serial chain; the model has a loop, closed by equality constraint tie$",
+    ),
+    "connect behind the last joint": (
+        lambda: toy(STATIC, '<equality><connect body1="hand" body2="A" anchor="0 0 0"/></equality>'),
+        {},
+        "expected a serial chain; .* number 1$",
+    ),
+    "coupled joints": (
+        lambda: toy(TIP, '<equality><joint joint1="a" joint2="b"/></equality>'),
+        {},
+        "expected a serial chain; .* number 1$",
+    ),
+    "unknown base": (lambda: toy(TIP), {"base": "C"}, "the model has no body 'C'; valid are A, B$"),
+    "unknown tip": (
+        lambda: toy(TIP),
+        {"tip": "top"},
+        "the model has no body 'top'; valid are A, B, nor a site of that name; valid are tip$",
+    ),
+    "no link": (lambda: model('<body><joint/><geom size="1"/></body>'), {}, "the arm has no link of a length above"),
+    "names clash": (
+        lambda: model(hinge("joint2", inner=hinge(pos="1 0 0", inner=TIP))),
+        {},
+        "two joints of the chain are called joint2; name the unnamed ones",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_bad_models_are_refused(case):
+    make, options, message = MODELS[case]
+    with pytest.raises(ValueError, match=f"^{message}") as error:
+        load_mjcf(make(), **options)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_an_active_loop_between_sites_is_refused(active):
+    arm = hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B", inner=STATIC))
+    weld = f'<equality><weld name="tie" site1="palm" site2="wall" active="{str(active).lower()}"/></equality>'
+    tied = model('<site name="wall"/>' + arm, weld)
+    if not active:
+        assert load_mjcf(tied).num_joints == 2
+        return
+    with pytest.raises(ValueError, match="the model has a loop, closed by equality constraint tie$"):
+        load_mjcf(tied)
+
+
+FILES = {
+    "missing": (None, "no MJCF file at '.*arm.xml'$"),
+    "empty": ("", "'.*arm.xml' is not an MJCF model that MuJoCo reads: "),
+    "not xml": ("joint1 = 3", "'.*arm.xml' is not an MJCF model that MuJoCo reads: "),
+    "not mjcf": ("<html><body/></html>", "'.*arm.xml' is not an MJCF model that MuJoCo reads: "),
+    "broken": ("<mujoco><worldbody><body>", "'.*arm.xml' is not an MJCF model that MuJoCo reads: "),
+    "misspelt": ("<mujoco><worldbody><boby/></worldbody></mujoco>", "'.*arm.xml' is not an MJCF model .*boby"),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_bad_files_are_refused(tmp_path, case):
+    content, message = FILES[case]
+    path = tmp_path / "arm.xml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ValueError, match=f"^{message}") as error:
+        load_mjcf(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_directory_is_no_file(tmp_path):
+    with pytest.raises(ValueError, match="^no MJCF file at "):
+        load_mjcf(tmp_path)

@@ -1,0 +1,67 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mimic import spatial
+
+AXES = [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.6, 0.0, -0.8), (2 / 3, -1 / 3, 2 / 3)]
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("angle", [0.0, 1e-9, -0.7, 3.0])
+def test_axis_rotation_is_the_matrix_exponential(x64, axis, angle):
+    skew = jnp.cross(jnp.eye(3), jnp.asarray(axis))
+    actual = spatial.stack(spatial.axis_rotation(axis, jnp.asarray(angle)), jnp.float64)
+    # a Taylor series of 30 terms is exact to rounding for angles up to pi
+    expected, term = jnp.eye(3), jnp.eye(3)
+    for order in range(1, 30):
+        term = term @ skew * angle / order
+        expected = expected + term
+    np.testing.assert_allclose(actual, expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_known_components_change_the_work_and_not_the_result(x64, axis):
+    angle = jnp.asarray(0.4)
+    known = spatial.axis_rotation(axis, angle)
+    traced = spatial.axis_rotation(spatial.vector(jnp.asarray(axis)), angle)
+    vector = jnp.asarray([0.3, -1.2, 0.5])
+    for rotation, other in ((known, traced), (traced, known)):
+        product = spatial.stack(spatial.compose(rotation, spatial.transpose(other)), jnp.float64)
+        np.testing.assert_allclose(product, np.eye(3), atol=1e-15)  # a few roundings of numbers below 1
+    np.testing.assert_allclose(
+        jnp.stack(spatial.cross(axis, spatial.rotate(known, spatial.vector(vector)))),
+        np.cross(axis, np.asarray(spatial.stack(traced, jnp.float64)) @ vector),
+        atol=1e-15,  # as above
+    )
+
+
+def test_known_zeros_are_not_computed():
+    def turn(axis):
+        return jax.make_jaxpr(lambda angle: jnp.stack([*map(jnp.asarray, spatial.axis_rotation(axis, angle)[0])]))(0.3)
+
+    assert "mul" in str(turn(AXES[-1]))
+    assert "mul" not in str(turn(AXES[0]))
+    assert spatial.dot((0.0, 1.0, 0.0), ("unused", 2.0, "unused")) == 2.0
+
+
+def test_vector_of_a_numpy_array_is_known():
+    assert spatial.vector(np.array([0.0, 1.0, 2.0])) == (0.0, 1.0, 2.0)
+    assert all(type(x) is float for x in spatial.vector(np.array([0.0, 1.0, 2.0])))  # np.float64 would promote float32
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-23, 1e-20, 1e-19, 1e-10, 1.0, 1e18])
+def test_norm_has_a_finite_gradient_at_and_near_the_kink(dtype, size):
+    norm = lambda x: spatial.norm(spatial.vector(x))  # noqa: E731
+    value, gradient = jax.jit(jax.value_and_grad(norm))(jnp.asarray([size, 0, 0], dtype))
+    assert value.dtype == gradient.dtype == dtype
+    assert np.isfinite(value) and np.all(np.isfinite(gradient))
+    if size**2 > float(jnp.finfo(dtype).tiny):
+        np.testing.assert_allclose([value, gradient[0]], [size, 1], rtol=1e-6)  # a few float32 roundings
+    else:
+        assert value == 0 and not gradient.any()
+
+
+def test_norm_of_a_known_vector():
+    assert spatial.norm((3.0, 0.0, -4.0)) == 5.0
