@@ -4,7 +4,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -27,13 +27,20 @@ def run(main: Callable[[Any], None], config_name: str) -> None:
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
     def command(config: DictConfig) -> None:
-        main(OmegaConf.to_object(config))
+        try:
+            main(OmegaConf.to_object(config))
+        except (ValueError, OmegaConfBaseException) as error:
+            _refuse(error)
 
     try:
         command()
     except (ValueError, HydraException, OmegaConfBaseException) as error:
-        print(f"error: {_one_line(error)}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
+        _refuse(error)
+
+
+def _refuse(error: BaseException) -> NoReturn:
+    print(f"error: {_one_line(error)}", file=sys.stderr)
+    sys.exit(BAD_INPUT)
 
 
 def overrides() -> list[str]:
@@ -58,9 +65,9 @@ def _one_line(error: BaseException) -> str:
     if typed:
         return explain(typed[-1])
     message = str(error)
-    choice = re.search(r"Could not find '(\w+)/([^']*)'.*?Available options in '\w+':\s*(.*)", message, re.DOTALL)
+    choice = re.search(r"Could not find '(\w+)/([^']*)'\s+Available options in '\w+':((?:\n\t\S+)*)", message)
     if choice:
         group, name, options = choice.groups()
-        valid = ", ".join(sorted(set(options.split("\n\n")[0].split()) - {"schema"}))
+        valid = ", ".join(sorted(set(options.split()) - {"schema"}))
         return f"unknown {group} {name!r}; valid are {valid}"
     return " ".join(message.split())

@@ -1,6 +1,9 @@
 """What other packages' versions make necessary; everything of this kind is here."""
 
+import contextlib
+import importlib
 import importlib.metadata
+import io
 import logging
 import os
 import sys
@@ -34,6 +37,12 @@ def prepare_cpu() -> None:
                      "without it kinematics run several hundred times slower", _SLOW_CPU_FLAG)  # fmt: skip
         return
     os.environ["XLA_FLAGS"] = f"{flags} {_SLOW_CPU_FLAG}".strip()
+
+
+def import_mjx() -> None:
+    """Imports MJX without its two lines about Warp, an optional backend that mimic does not use."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        importlib.import_module("mujoco.mjx")
 
 
 def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:

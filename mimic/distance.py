@@ -100,11 +100,12 @@ def link_distances(
     over_learner = jax.vmap(lambda a, b: _pair_distances(a, b, rotation), in_axes=(None, 0))
     parts = jax.vmap(over_learner, in_axes=(0, None))(expert_states, learner_states)
     alpha = jax.vmap(jax.vmap(weights))(parts) if callable(weights) else weights
-    total, dtype = 0.0, parts.translation.dtype
+    total: Any = 0.0
     for part in _PARTS:
-        weight = _known(getattr(alpha, part), dtype)  # a constant 0 costs nothing, in time and in NaNs
-        total = spatial.plus(total, spatial.times(weight, getattr(parts, part)))
-    return jnp.broadcast_to(jnp.asarray(total, dtype), parts.translation.shape)
+        distances = getattr(parts, part)
+        weight = _weight(part, getattr(alpha, part), distances)  # a constant 0 costs nothing, in time and in NaNs
+        total = spatial.plus(total, spatial.times(weight, distances))
+    return jnp.broadcast_to(jnp.asarray(total, parts.translation.dtype), parts.translation.shape)
 
 
 def embodiment_distance(
@@ -162,9 +163,18 @@ def _pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> P
     )
 
 
-def _known(weight: Any, dtype: Any) -> Any:
-    """A weight as a Python float where it is a number, else as an array of the dtype."""
-    return float(weight) if isinstance(weight, int | float | np.number) else jnp.asarray(weight, dtype)
+def _weight(part: str, value: Any, distances: Array) -> Any:
+    """A weight as a Python float where it is a number, else as an array like the distances."""
+    if isinstance(value, int | float | np.number):
+        return float(value)
+    weight = jnp.asarray(value, distances.dtype)
+    try:
+        return jnp.broadcast_to(weight, distances.shape)
+    except ValueError:
+        raise ValueError(
+            f"weights: expected {part} to broadcast to {distances.shape} (expert links, learner links), "
+            f"got shape {weight.shape}"
+        ) from None
 
 
 def _check_candidate_points(a: LinkStates, b: LinkStates, weights: DistanceWeights) -> None:

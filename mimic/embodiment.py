@@ -9,7 +9,8 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Float
 
 from mimic.chain import Chain, Joint, Link, Locked, lock, resolve_locked
 from mimic.mjcf import model_name, read_chain, read_model
@@ -72,7 +73,7 @@ class Embodiment:
         return self.link_lengths.sum()
 
 
-def planar_arm(link_lengths: Sequence[float] | Float[Array, " n"], *, frame_at: float = 0.5) -> Embodiment:
+def planar_arm(link_lengths: Sequence[float] | Float[ArrayLike, " n"], *, frame_at: float = 0.5) -> Embodiment:
     """A planar chain along x in its zero pose, with a joint about z at the start of each link (paper, eq. 6).
 
     Args:

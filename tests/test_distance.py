@@ -17,7 +17,7 @@ from mimic.distance import (
     rotation_distance,
 )
 from mimic.embodiment import panda, planar_arm
-from mimic.kinematics import candidate_points, link_states
+from mimic.kinematics import LinkStates, candidate_points, link_states
 
 ALL_WEIGHTS = DistanceWeights(translation=2.0, rotation=1.0, linear_velocity=3.0, angular_velocity=0.5)
 SHAPE = (3, 2)  # links of the two arms that gradients are taken with
@@ -31,12 +31,10 @@ CORRESPONDENCES = {
 }
 WEIGHTS = {
     "constant": ALL_WEIGHTS,
-    "paper": PAPER_WEIGHTS,
     "matrix": DistanceWeights(translation=np.ones(SHAPE), rotation=np.linspace(0, 1, 6).reshape(SHAPE)),
     "adaptive": adaptive_weights,
 }
 MEASURES, REDUCTIONS = ("cosine", "angle"), ("mean", "frobenius")
-COMBINATIONS = list(itertools.product(CORRESPONDENCES, WEIGHTS, MEASURES, REDUCTIONS))
 
 
 def states(arm, seed=0, dtype=np.float32):
@@ -94,7 +92,7 @@ def test_embodiment_distance_by_hand(x64):
     nudged = dataclasses.replace(learner, position=learner.position.at[1, 1].add(-1e-9))  # breaks the tie for link 1
     hard = embodiment_distance(expert, nudged, hard_correspondence, ALL_WEIGHTS)
     assert hard == pytest.approx((2 * 1.25 + 2.25 + link_2) / 4, rel=1e-8)  # as far as the tie was broken
-    assert distance([[1, 0], [0, 0]]) == pytest.approx(1.25 / 4, rel=1e-14)
+    assert distance(np.diag([1, 0])) == pytest.approx(1.25 / 4, rel=1e-14)
 
 
 def test_rotation_measures():
@@ -117,7 +115,6 @@ def test_zero_exactly_at_a_match_and_only_there(arm, weights, rotation):
         assert not np.diag(itself).any()
     else:
         np.testing.assert_allclose(np.diag(itself), 0, atol=1e-6)  # |e x e| rounds to 1e-7 in float32
-    assert np.all(np.asarray(link_distances(here, elsewhere, weights, rotation=rotation)) > 0)
     for reduction in REDUCTIONS:
         overlap = overlap_correspondence(arm, arm)
         distance = functools.partial(embodiment_distance, here, weights=weights, rotation=rotation, reduction=reduction)
@@ -212,104 +209,108 @@ def test_float32_stays_float32_under_x64(x64, correspondence, weights):
 # --- gradients --------------------------------------------------------------------------------------------------------
 
 
-def distance_of_motion(combination, expert_motion, learner_motion, expert=EXPERT, learner=LEARNER):
-    """Distance as a function of the two arms' [qpos, qvel]."""
-    correspondence, weights, rotation, reduction = combination
-    return embodiment_distance(
-        link_states(expert, *expert_motion),
-        link_states(learner, *learner_motion),
-        CORRESPONDENCES[correspondence] if isinstance(correspondence, str) else correspondence,
-        WEIGHTS[weights],
-        rotation=rotation,
-        reduction=reduction,
-    )
+def all_distances(correspondence, weights):
+    """The distance by both measures and both reductions, as a function of the states [..., 4, n, 3] of both arms."""
+
+    def distances(a, b):
+        options = itertools.product(MEASURES, REDUCTIONS)
+        pair = LinkStates(*a), LinkStates(*b)
+        return jnp.stack(
+            [embodiment_distance(*pair, correspondence, weights, rotation=m, reduction=r) for m, r in options]
+        )
+
+    return distances
 
 
-@functools.cache
-def generic_motions():
-    rng = np.random.default_rng(7)
-    return rng.uniform(-2, 2, (4, 2, 3)), rng.uniform(-2, 2, (4, 2, 2))
+def generic_states(dtype):
+    return tuple(jnp.stack(jax.tree.leaves(states(arm, seed, dtype))) for seed, arm in enumerate((EXPERT, LEARNER)))
 
 
-@pytest.mark.parametrize("combination", COMBINATIONS, ids=" ".join)
-def test_gradients_equal_finite_differences(x64, combination):
-    experts, learners = map(jnp.asarray, generic_motions())
-    function = functools.partial(distance_of_motion, combination)
-    gradients = jax.vmap(jax.grad(function, argnums=(0, 1)))(experts, learners)
+def singular_states(dtype):
+    """Pairs at which parts of the distance have kinks; the learner's links are the expert's first two."""
+    a = generic_states(dtype)[0]
+    b = a[:, :2]
+    moving, still, turned = jnp.asarray([[1, 1, 0, 0], [0, 1, 0, 0], [1, -1, 1, 1]])[:, :, None, None]
+    tiny = b.at[0].add(1e-20).at[2].add(1e-23)  # squares underflow in float32
+    pairs = [(a, b), (a * moving, b * moving), (a, b * turned), (a, b * moving), (a * still, b * still)]
+    return tuple(jnp.stack(side).astype(dtype) for side in zip(*[*pairs, (a, tiny)], strict=True))
+
+
+def central_differences(function, point, step):
+    """d function / d point, [outputs, *point.shape]."""
+    shifts = step * jnp.eye(point.size).reshape(-1, *point.shape)
+    ahead, behind = (jax.vmap(function)(point + shift) for shift in (shifts, -shifts))
+    return ((ahead - behind) / (2 * step)).T.reshape(-1, *point.shape)
+
+
+@pytest.mark.parametrize("weights", WEIGHTS)
+@pytest.mark.parametrize("correspondence", CORRESPONDENCES)
+def test_gradients_equal_finite_differences(x64, correspondence, weights):
+    function = all_distances(CORRESPONDENCES[correspondence], WEIGHTS[weights])
+    a, b = generic_states(np.float64)
+    gradients = jax.jacrev(function, argnums=(0, 1))(a, b)
     step = 1e-6  # balances the error of the difference, step^2, against that of rounding, 1e-16 / step
-
-    def differences(motions, other, order):
-        shifts = step * jnp.eye(motions[0].size).reshape(-1, *motions[0].shape)
-        at = lambda shift: jax.vmap(lambda m, o: function(*order(m, o)))(motions + shift, other)  # noqa: E731
-        values = jax.vmap(at)(jnp.concatenate([shifts, -shifts]))
-        ahead, behind = jnp.split(values, 2)
-        return ((ahead - behind) / (2 * step)).T.reshape(motions.shape)
-
-    close = {"rtol": 1e-6, "atol": 1e-8}  # 1e-16 / step is 1e-10, with second derivatives of up to 100
-    np.testing.assert_allclose(gradients[0], differences(experts, learners, lambda m, o: (m, o)), **close)
-    np.testing.assert_allclose(gradients[1], differences(learners, experts, lambda m, o: (o, m)), **close)
-    assert abs(gradients[1][:, 0]).max() > 1e-3  # and they are not all 0
+    close = {"rtol": 1e-6, "atol": 1e-8}  # which is 1e-10, times derivatives of up to 100
+    np.testing.assert_allclose(gradients[0], central_differences(lambda x: function(x, b), a, step), **close)
+    np.testing.assert_allclose(gradients[1], central_differences(lambda x: function(a, x), b, step), **close)
+    assert np.all(abs(gradients[1]).max(axis=(1, 2, 3)) > 1e-3)  # and they are not all 0
 
 
-def singular_motions(arm):
-    """Pairs at which parts of the distance have kinks: a match, at rest too, opposite, and a match of poses alone."""
-    qpos, qvel = np.random.default_rng(3).uniform(-2, 2, (2, arm.num_joints))
-    still, half_turn = np.zeros_like(qpos), np.pi * np.eye(arm.num_joints)[0]
-    experts = [(qpos, qvel), (qpos, still), (qpos, qvel), (qpos, qvel), (still, still)]
-    learners = [(qpos, qvel), (qpos, still), (qpos + half_turn, qvel), (qpos, -qvel), (still, still)]
-    return jnp.asarray(experts), jnp.asarray(learners)
+@pytest.mark.parametrize("weights", WEIGHTS)
+@pytest.mark.parametrize("correspondence", CORRESPONDENCES)
+def test_gradients_are_finite_at_the_kinks(correspondence, weights):
+    function = all_distances(CORRESPONDENCES[correspondence], WEIGHTS[weights])
+    pairs = singular_states(np.float32)
+    for transform in (lambda f: f, jax.jit):
+        gradients = transform(jax.vmap(jax.jacrev(function, argnums=(0, 1))))(*pairs)
+        assert all(np.all(np.isfinite(gradient)) for gradient in gradients)
+        assert all(abs(gradient).max() < 100 for gradient in gradients)  # a norm's slope is 1, weights are up to 3
 
 
-@pytest.mark.parametrize("combination", COMBINATIONS, ids=" ".join)
-def test_gradients_are_finite_at_the_kinks(dtype, combination):
-    correspondence, weights, rotation, reduction = combination
-    arm = planar_arm([0.5, 0.25, 0.4])
-    if weights == "matrix":
-        weights = "constant"  # of the other arms' shape
-    if correspondence in ("overlap", "matrix"):
-        correspondence = overlap_correspondence(arm, arm) if correspondence == "overlap" else np.ones((3, 3))
-    function = functools.partial(
-        distance_of_motion, (correspondence, weights, rotation, reduction), expert=arm, learner=arm
+@pytest.mark.parametrize("correspondence", [2 * np.eye(3), hard_correspondence], ids=["overlap", "hard"])
+def test_gradients_are_zero_at_a_match(dtype, correspondence):
+    a = generic_states(dtype)[0]
+    for gradient in jax.jacrev(all_distances(correspondence, ALL_WEIGHTS), argnums=(0, 1))(a, a):
+        assert gradient.dtype == dtype and not gradient.any()
+
+
+@pytest.mark.parametrize("weights", [PAPER_WEIGHTS, adaptive_weights], ids=["paper", "adaptive"])
+def test_gradients_of_the_joint_motion_equal_finite_differences(x64, weights):
+    expert, learner = planar_arm([0.5, 0.3, 0.4]), panda(locked=(1, 3, 5, 6, 7))
+
+    def distances(motion):
+        qpos, qvel = motion[:, :3], motion[:, 3:]
+        a, b = (
+            link_states(arm, q, v) for arm, q, v in ((expert, qpos[0], qvel[0]), (learner, qpos[1, :2], qvel[1, :2]))
+        )
+        return embodiment_distance(a, b, overlap_correspondence(expert, learner), weights)[None]
+
+    motion = jnp.asarray(np.random.default_rng(7).uniform(-2, 2, (2, 6)))
+    step = 1e-6  # as above
+    np.testing.assert_allclose(
+        jax.jacrev(distances)(motion), central_differences(distances, motion, step), rtol=1e-6, atol=1e-8
     )
-    motions = jax.tree.map(lambda x: x.astype(dtype), singular_motions(arm))
-    values, gradients = jax.vmap(jax.value_and_grad(function, argnums=(0, 1)))(*motions)
-    assert values.dtype == dtype and np.all(np.isfinite(values))
-    for gradient in gradients:
-        assert np.all(np.isfinite(gradient))
-        if combination[0] in ("overlap", "hard") and rotation == "cosine" and weights != "adaptive":
-            assert not gradient[:2].any()  # 0 at a match, where nothing but matching links corresponds
 
 
-@pytest.mark.parametrize(
-    "combination", [("overlap", "paper", "cosine", "mean"), ("soft", "adaptive", "angle", "frobenius")], ids=" ".join
-)
-def test_gradients_under_jit_and_vmap(combination):
-    function = jax.value_and_grad(functools.partial(distance_of_motion, combination), argnums=1)
-    experts, learners = (jnp.asarray(x, jnp.float32) for x in generic_motions())
-    plain, compiled = jax.vmap(function)(experts, learners), jax.jit(jax.vmap(function))(experts, learners)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), plain, compiled)  # float32, fused
-    one = function(experts[0], learners[0])
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a[0], b, rtol=1e-4, atol=1e-5), plain, one)
+@pytest.mark.parametrize("locked", [(), (3, 6, 7)], ids=["7 joints", "4 joints"])
+def test_panda_gradients_under_jit_and_vmap(locked):
+    expert, learner = panda(), panda(locked=locked)
+    overlap = overlap_correspondence(expert, learner)
+    kept = np.array([expert.joint_names.index(name) for name in learner.joint_names])
 
+    def distance(motion, expert_motion):
+        return embodiment_distance(
+            link_states(expert, *expert_motion), link_states(learner, *motion), overlap, PAPER_WEIGHTS
+        )
 
-def test_panda_gradient_is_finite_at_a_match_under_jit():
-    arm = panda()
-    overlap = overlap_correspondence(arm, arm)
-
-    @jax.jit
-    @jax.vmap
-    def gradient(expert_motion, learner_motion):
-        return jax.grad(
-            lambda motion: embodiment_distance(
-                link_states(arm, *expert_motion), link_states(arm, *motion), overlap, PAPER_WEIGHTS
-            )
-        )(learner_motion)
-
-    motions = jnp.asarray(np.random.default_rng(0).uniform(-2, 2, (3, 2, 7)), jnp.float32).at[0].set(0)
-    assert not gradient(motions, motions).any()
-    assert np.all(np.isfinite(gradient(motions, motions + 1e-7)))
-    away = gradient(motions, motions + 0.1)
-    assert np.all(np.isfinite(away)) and abs(away).max() > 0.01
+    gradient = jax.jit(jax.vmap(jax.grad(distance)))
+    motions = jnp.asarray(np.random.default_rng(0).uniform(-2, 2, (4, 2, 7)), jnp.float32).at[0].set(0)
+    at_a_match = gradient(motions[:, :, kept], motions)
+    assert np.all(np.isfinite(at_a_match)) and not at_a_match[0].any()  # the zero pose, at rest, matches exactly
+    away = motions[:, :, kept] + 0.1
+    alone = jax.grad(distance)(away[1], motions[1])
+    np.testing.assert_allclose(gradient(away, motions)[1], alone, rtol=1e-4, atol=1e-5)  # float32, fused and not
+    assert abs(alone).max() > 0.01
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
@@ -354,5 +355,8 @@ def test_candidate_points_refuse_weights_on_what_they_lack(part, field):
 
 @pytest.mark.usefixtures("unchecked")
 def test_weights_of_another_shape_are_refused():
-    with pytest.raises(ValueError, match="shape"):
+    expected = (
+        r"^weights: expected rotation to broadcast to \(3, 2\) \(expert links, learner links\), got shape \(3, 3\)$"
+    )
+    with pytest.raises(ValueError, match=expected):
         link_distances(states(EXPERT), states(LEARNER), DistanceWeights(rotation=np.ones((3, 3))))

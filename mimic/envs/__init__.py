@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mimic import compat
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig
 
@@ -51,6 +52,7 @@ def make(name: str, **overrides: Any) -> "ImitationEnv":
     Raises:
       ValueError: an unknown name or field, a value of the wrong type or out of range, or demonstrations that do not fit.
     """
+    compat.import_mjx()
     from mimic.envs.imitation import ImitationEnv  # brax and MJX, which take seconds to import
 
     return ImitationEnv(env_config(name, **overrides))

@@ -82,9 +82,13 @@ class Demonstrations:
                 f"but the expert {arm.name!r} has {', '.join(arm.joint_names)}"
             )
         if abs(self.dt - dt) > 1e-9:
-            raise ValueError(f"demonstrations: recorded with a time step of {self.dt} s, but the environment has {dt} s")
+            raise ValueError(
+                f"demonstrations: recorded with a time step of {self.dt} s, but the environment has {dt} s"
+            )
         if self.horizon < horizon:
-            raise ValueError(f"demonstrations: {self.horizon} steps long, but an episode of the environment has {horizon}")
+            raise ValueError(
+                f"demonstrations: {self.horizon} steps long, but an episode of the environment has {horizon}"
+            )
 
 
 def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations:

@@ -8,27 +8,29 @@ from mimic.envs.config import EnvConfig
 PRESETS: dict[str, dict[str, Any]] = {
     # Two cores: few environments, many gradient steps on each sample, since the physics is what costs.
     "cpu": {
-        "num_timesteps": 1_700_000,
+        "num_timesteps": 2_200_000,
         "num_envs": 512,
         "unroll_length": 10,
         "batch_size": 128,
         "num_minibatches": 32,
         "num_updates_per_batch": 8,
         "learning_rate": 1e-3,
+        "discounting": 0.8,
         "hidden_layers": [128, 128],
-        "evaluations": 12,
+        "evaluations": 10,
     },
     # One GPU: as many environments as keep it busy; a batch is 8192 short stretches of motion.
     "gpu": {
-        "num_timesteps": 30_000_000,
+        "num_timesteps": 25_000_000,
         "num_envs": 4096,
         "unroll_length": 10,
         "batch_size": 512,
         "num_minibatches": 32,
         "num_updates_per_batch": 8,
         "learning_rate": 1e-3,
+        "discounting": 0.9,
         "hidden_layers": [256, 256],
-        "evaluations": 15,
+        "evaluations": 8,
     },
 }
 
@@ -68,7 +70,7 @@ class PPOConfig:
     num_updates_per_batch: int | None = None
     learning_rate: float | None = None
     final_learning_rate: float = 0.05
-    discounting: float = 0.8
+    discounting: float | None = None
     gae_lambda: float = 0.9
     entropy_cost: float = 1e-3
     clipping_epsilon: float = 0.2

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from mimic.config import schema, to_dict
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, concatenate, load_demonstrations
+from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.trainers import ppo, runs
 from mimic.trainers.checkpoints import checkpoint_steps, load_checkpoint
@@ -128,7 +128,9 @@ def _resumed_config(run_dir: Path, overrides: Sequence[str]) -> TrainConfig:
     changes = [override for override in overrides if not override.startswith("resume=")]
     refused = [change for change in changes if not change.startswith("trainer.")]
     if refused:
-        raise ValueError(f"resume: only keys of the trainer can change, as in trainer.num_timesteps=N; got {refused[0]!r}")
+        raise ValueError(
+            f"resume: only keys of the trainer can change, as in trainer.num_timesteps=N; got {refused[0]!r}"
+        )
     merged = OmegaConf.merge(schema(TrainConfig), to_dict(config), OmegaConf.from_dotlist(changes))
     return OmegaConf.to_object(merged)  # type: ignore[return-value]
 
@@ -163,7 +165,7 @@ def _train(
     stopwatch: runs.Stopwatch,
     console: Console,
 ) -> tuple[ppo.Params, int]:
-    """Trains, and after each stretch evaluates, logs and shows how good the policy is: the parameters and steps at the end."""
+    """Trains; evaluates, logs and shows the policy after each stretch. Parameters and steps at the end."""
     log = runs.MetricsLog(run_dir)
     reached = {"step": restore[0] if restore else 0}
     total: int = settings.num_timesteps  # type: ignore[assignment]
