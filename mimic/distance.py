@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from jax.core import Tracer
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Real
 
 from mimic import spatial
 from mimic.kinematics import LinkStates
@@ -47,9 +47,7 @@ class PairDistances:
 
 
 Weights = DistanceWeights | Callable[[PairDistances], DistanceWeights]
-Correspondence = (
-    Float[ArrayLike, "expert learner"] | Callable[[Float[Array, "expert learner"]], Float[Array, "expert learner"]]
-)
+Correspondence = Real[ArrayLike, "expert learner"] | Callable[[Float[Array, "expert learner"]], Float[Array, "expert learner"]]
 
 
 def adaptive_weights(distances: PairDistances) -> DistanceWeights:
@@ -134,9 +132,7 @@ def embodiment_distance(
     distances = link_distances(expert_states, learner_states, weights, rotation=rotation)
     matrix = jnp.asarray(correspondence(distances) if callable(correspondence) else correspondence, distances.dtype)
     if matrix.shape != distances.shape:
-        raise ValueError(
-            f"correspondence: expected shape {distances.shape} (expert links, learner links), got {matrix.shape}"
-        )
+        raise ValueError(f"correspondence: expected shape {distances.shape} (expert links, learner links), got {matrix.shape}")
     weighted = matrix * distances
     if reduction == "mean":
         return jnp.mean(weighted)
@@ -172,8 +168,7 @@ def _weight(part: str, value: Any, distances: Array) -> Any:
         return jnp.broadcast_to(weight, distances.shape)
     except ValueError:
         raise ValueError(
-            f"weights: expected {part} to broadcast to {distances.shape} (expert links, learner links), "
-            f"got shape {weight.shape}"
+            f"weights: expected {part} to broadcast to {distances.shape} (expert links, learner links), got shape {weight.shape}"
         ) from None
 
 

@@ -116,9 +116,7 @@ def closest_motions(
         raise ValueError(f"starts, iterations: expected at least 1, got {starts} and {iterations}")
 
     def distance(states: LinkStates, learner_states: LinkStates) -> Array:
-        return embodiment_distance(
-            states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
-        )
+        return embodiment_distance(states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction)
 
     def descend(states: LinkStates, starts: _Motion, speed: Array, count: int, step: float) -> ClosestMotion:
         objective = lambda motion: distance(states, link_states(learner, motion[0], speed * motion[1]))  # noqa: E731

@@ -116,9 +116,7 @@ def candidate_points(states: LinkStates) -> LinkStates:
     return dataclasses.replace(states, direction=None, angular_velocity=None)
 
 
-def body_twists(
-    arm: Embodiment, qpos: Float[ArrayLike, " joints"], qvel: Float[ArrayLike, " joints"]
-) -> Float[Array, "links 6"]:
+def body_twists(arm: Embodiment, qpos: Float[ArrayLike, " joints"], qvel: Float[ArrayLike, " joints"]) -> Float[Array, "links 6"]:
     """Body twists [omega, v] of the link frames, by the recursion over adjoint maps (paper, eq. 7).
 
     Units: omega [rad/s] and v [m/s], both in the link's own frame.

@@ -275,9 +275,7 @@ def test_limits_from_the_model():
     assert arm.torque_limit.tolist() == [8, 7]
     assert arm.velocity_limit.tolist() == [1.5, 2.5]
     narrow = '<mujoco><compiler angle="radian"/><worldbody><body><joint range="0.5 1" limited="true"/>{}</body>'
-    arm = load_mjcf(
-        mujoco.MjModel.from_xml_string(narrow.format('<geom size="1" pos="1 0 0"/>') + "</worldbody></mujoco>")
-    )
+    arm = load_mjcf(mujoco.MjModel.from_xml_string(narrow.format('<geom size="1" pos="1 0 0"/>') + "</worldbody></mujoco>"))
     assert (arm.joint_range.tolist(), arm.home.tolist()) == ([[0.5, 1]], [0.5])
 
 

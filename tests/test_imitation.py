@@ -107,9 +107,7 @@ def test_more_starts_change_nothing(name):
     expert, learner = ARMS[name]
     motion, correspondence, closest = solved(name)
     more = kinematic_bound(expert, learner, *motion, correspondence, PAPER_WEIGHTS, starts=32, seed=1)
-    np.testing.assert_allclose(
-        closest.distance, more, rtol=0.005, atol=2e-5
-    )  # at a match only the absolute error counts
+    np.testing.assert_allclose(closest.distance, more, rtol=0.005, atol=2e-5)  # at a match only the absolute error counts
 
 
 def test_a_batch_is_a_loop():
@@ -165,9 +163,7 @@ def test_angles_stay_within_the_joint_range():
 def test_bad_input_is_named(unchecked):
     arm = planar_arm([0.5, 0.5])
     good = jnp.zeros((3, 2))
-    bound = functools.partial(
-        kinematic_bound, arm, arm, correspondence=overlap_correspondence(arm, arm), weights=PAPER_WEIGHTS
-    )
+    bound = functools.partial(kinematic_bound, arm, arm, correspondence=overlap_correspondence(arm, arm), weights=PAPER_WEIGHTS)
     for qpos, qvel in ((good[0], good[0]), (good[:, :1], good[:, :1]), (good, good[:2])):
         with pytest.raises(ValueError, match="qpos, qvel: expected shape"):
             bound(qpos, qvel)

@@ -15,9 +15,7 @@ _PLANAR_ARMATURE = 0.02  # kg m^2
 _PLANAR_DAMPING = 0.1  # N m s/rad
 _PLANAR_VELOCITY_LIMIT = 2.5  # rad/s
 
-_IGNORED = (
-    mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
-)
+_IGNORED = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
 
 
 @dataclasses.dataclass(frozen=True)

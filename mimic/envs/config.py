@@ -80,9 +80,7 @@ class DemonstrationConfig:
 
     def __post_init__(self) -> None:
         if self.count < 1 or self.held_out < 1:
-            raise ValueError(
-                f"demonstrations: expected count and held_out of at least 1, got {self.count}, {self.held_out}"
-            )
+            raise ValueError(f"demonstrations: expected count and held_out of at least 1, got {self.count}, {self.held_out}")
 
 
 @dataclasses.dataclass(frozen=True)

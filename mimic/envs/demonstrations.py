@@ -46,6 +46,7 @@ class Demonstrations:
 
     @property
     def count(self) -> int:
+        """How many there are."""
         return self.qpos.shape[0]
 
     @property
@@ -82,13 +83,9 @@ class Demonstrations:
                 f"but the expert {arm.name!r} has {', '.join(arm.joint_names)}"
             )
         if abs(self.dt - dt) > 1e-9:
-            raise ValueError(
-                f"demonstrations: recorded with a time step of {self.dt} s, but the environment has {dt} s"
-            )
+            raise ValueError(f"demonstrations: recorded with a time step of {self.dt} s, but the environment has {dt} s")
         if self.horizon < horizon:
-            raise ValueError(
-                f"demonstrations: {self.horizon} steps long, but an episode of the environment has {horizon}"
-            )
+            raise ValueError(f"demonstrations: {self.horizon} steps long, but an episode of the environment has {horizon}")
 
 
 def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations:
@@ -203,9 +200,7 @@ def _record_one(
     raise ValueError(f"demonstrations: {_MAX_DRAWS} random goals of {arm.embodiment.name!r} all break its limits")
 
 
-def _simulate_pd(
-    arm: Arm, goal: np.ndarray, horizon: int, dt: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _simulate_pd(arm: Arm, goal: np.ndarray, horizon: int, dt: float, substeps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Trajectory [T+1, n] and torques [T, n] of the expert on its way to a goal, on C MuJoCo."""
     model, data = arm.model, mujoco.MjData(arm.model)
     model.opt.timestep = dt / substeps

@@ -17,9 +17,7 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations, recor
 from mimic.envs.physics import make_advance
 from mimic.kinematics import LinkStates, link_states
 
-_OFFERED_SPEED_FACTOR = (
-    2.0  # the largest torque takes a joint from rest to this multiple of its rated speed in one step
-)
+_OFFERED_SPEED_FACTOR = 2.0  # the largest torque takes a joint from rest to this multiple of its rated speed in one step
 
 
 @struct.dataclass

@@ -52,16 +52,12 @@ class LearningRate:
 
 def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
     """Policy and value network of a resolved config."""
-    return _network_factory(config)(
-        observation_size, action_size, preprocess_observations_fn=running_statistics.normalize
-    )
+    return _network_factory(config)(observation_size, action_size, preprocess_observations_fn=running_statistics.normalize)
 
 
 def _network_factory(config: PPOConfig) -> Callable[..., ppo_networks.PPONetworks]:
     hidden = tuple(config.hidden_layers or ())
-    return functools.partial(
-        ppo_networks.make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden
-    )
+    return functools.partial(ppo_networks.make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden)
 
 
 def params_template(config: PPOConfig, observation_size: int, action_size: int) -> Params:

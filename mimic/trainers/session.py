@@ -128,9 +128,7 @@ def _resumed_config(run_dir: Path, overrides: Sequence[str]) -> TrainConfig:
     changes = [override for override in overrides if not override.startswith("resume=")]
     refused = [change for change in changes if not change.startswith("trainer.")]
     if refused:
-        raise ValueError(
-            f"resume: only keys of the trainer can change, as in trainer.num_timesteps=N; got {refused[0]!r}"
-        )
+        raise ValueError(f"resume: only keys of the trainer can change, as in trainer.num_timesteps=N; got {refused[0]!r}")
     merged = OmegaConf.merge(schema(TrainConfig), to_dict(config), OmegaConf.from_dotlist(changes))
     return OmegaConf.to_object(merged)  # type: ignore[return-value]
 
@@ -146,9 +144,7 @@ def _restored(run_dir: Path, settings: PPOConfig, env: ImitationEnv) -> tuple[in
     return steps, params
 
 
-def _evaluation_program(
-    evaluator: Evaluator, settings: PPOConfig, env: ImitationEnv
-) -> Callable[[ppo.Params], Rollouts]:
+def _evaluation_program(evaluator: Evaluator, settings: PPOConfig, env: ImitationEnv) -> Callable[[ppo.Params], Rollouts]:
     controller = ppo.make_controller(settings, env.observation_size, env.action_size)
     program = jax.jit(lambda params: evaluator.rollout(controller(params)))
     # From the host: how brax or orbax spread the parameters over devices would each ask for a program of its own.
