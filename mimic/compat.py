@@ -45,6 +45,17 @@ def import_mjx() -> None:
         importlib.import_module("mujoco.mjx")
 
 
+def computed_once(scalars: list[Any]) -> list[Any]:
+    """The scalars, to be computed before they are stacked where XLA would else compute each of them from scratch.
+
+    On GPUs XLA may fuse a concatenation with all that leads to it, one copy of the chain for each row: small batches of a
+    7-link arm then take a minute to compile. On CPUs it does not, and the barrier would cost time.
+    """
+    import jax
+
+    return scalars if jax.default_backend() == "cpu" else jax.lax.optimization_barrier(scalars)
+
+
 def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """Copies of a pytree on all devices, along a new first axis.
 

@@ -143,17 +143,15 @@ def _pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> P
     zero = jnp.zeros((), a.position.dtype)  # of what candidate points lack
 
     def apart(x: Array | None, y: Array | None) -> Array:
-        if x is None or y is None:
-            return zero
-        return spatial.norm(spatial.subtract(spatial.vector(x), spatial.vector(y)))
+        lacking = x is None or y is None
+        return zero if lacking else spatial.norm(spatial.subtract(spatial.vector(x), spatial.vector(y)))
 
-    if a.direction is None or b.direction is None:
-        rotation = zero
-    else:
-        rotation = rotation_distance(a.direction, b.direction, measure)
+    def turned(x: Array | None, y: Array | None) -> Array:
+        return zero if x is None or y is None else rotation_distance(x, y, measure)
+
     return PairDistances(
         translation=apart(a.position, b.position),
-        rotation=rotation,
+        rotation=turned(a.direction, b.direction),
         linear_velocity=apart(a.linear_velocity, b.linear_velocity),
         angular_velocity=apart(a.angular_velocity, b.angular_velocity),
     )

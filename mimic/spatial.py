@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mimic import compat
+
 Scalar = Any  # a traced scalar, or a number
 Vector = tuple[Scalar, Scalar, Scalar]
 Rotation = tuple[Vector, Vector, Vector]  # rows
@@ -136,4 +138,4 @@ def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:
 def stack(vectors: Sequence[Sequence[Scalar]], dtype: Any) -> Float[Array, "n m"]:
     """Rows of scalars as one array."""
     scalars = [jnp.asarray(x, dtype) for row in vectors for x in row]
-    return jnp.stack(scalars).reshape(len(vectors), -1)
+    return jnp.stack(compat.computed_once(scalars)).reshape(len(vectors), -1)

@@ -3,6 +3,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 import random_arms
@@ -206,6 +207,11 @@ def test_float32_stays_float32_under_x64(x64, arm):
 def test_whole_numbers_are_angles_too(unchecked):
     arm = planar_arm([0.4, 0.6])
     assert link_states(arm, np.array([0, 1])).position.dtype == jnp.float32  # pyright: ignore[reportArgumentType]
+
+
+def test_annotated_shapes_are_checked_while_testing():
+    with pytest.raises(jaxtyping.TypeCheckError, match="qpos"):
+        link_states(planar_arm([0.4, 0.6]), np.zeros((5, 2), np.float32))
 
 
 @pytest.mark.parametrize("shape", [(), (6,), (8,), (7, 1), (5, 7)])

@@ -1,6 +1,7 @@
 """The imitation environment: a torque-controlled learner is rewarded for being like the expert."""
 
 import copy
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -177,8 +178,13 @@ def link_state_table(
     qvel: Float[Array, "demonstrations time joints"],
 ) -> LinkStates:
     """Link states of whole trajectories: each [demonstrations, time, links, 3]."""
+    return link_state_program(arm)(qpos, qvel)
+
+
+def link_state_program(arm: Embodiment) -> Callable[[Array, Array], LinkStates]:
+    """The compiled function behind `link_state_table`, for callers that use it more than once."""
     over_time = jax.vmap(lambda *motion: link_states(arm, *motion))
-    return jax.jit(jax.vmap(over_time))(qpos, qvel)
+    return jax.jit(jax.vmap(over_time))
 
 
 def _torque_scale(arm: Arm, config: EnvConfig) -> np.ndarray:

@@ -21,7 +21,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     # One GPU: as many environments as keep it busy; a batch is 8192 short stretches of motion.
     "gpu": {
-        "num_timesteps": 25_000_000,
+        "num_timesteps": 36_000_000,
         "num_envs": 4096,
         "unroll_length": 10,
         "batch_size": 512,

@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from mimic.envs.demonstrations import Demonstrations, concatenate
-from mimic.envs.imitation import ImitationEnv, link_state_table
+from mimic.envs.imitation import ImitationEnv, link_state_program
 from mimic.imitation import kinematic_bound
 
 Controller = Callable[[Array], Array]  # observation -> action
@@ -50,6 +50,7 @@ class Evaluator:
         self.training_env = env
         self._num_train = env.demonstrations.count
         self.env = env.with_demonstrations(concatenate(env.demonstrations, held_out))
+        self._learner_states = link_state_program(self.env.learner)
         self.lower_bound = np.asarray(_lower_bound(self.env))
         self.hold_distance = np.asarray(_hold_distance(self.env))
 
@@ -100,7 +101,7 @@ class Evaluator:
         """Mean angle [rad] of each learner link to the expert links that correspond to it, by their share in W."""
         env = self.env
         expert = np.asarray(env.expert_states.direction)[:, 1 : env.config.horizon + 1]
-        learner = np.asarray(link_state_table(env.learner, rollouts.qpos, jnp.zeros_like(rollouts.qpos)).direction)
+        learner = np.asarray(self._learner_states(rollouts.qpos, jnp.zeros_like(rollouts.qpos)).direction)
         cosine = np.einsum("dtix,dtjx->dtij", expert, learner)
         angle = np.arccos(np.clip(cosine, -1, 1)).mean(axis=1)
         return (angle * _shares(env)).sum(axis=1)

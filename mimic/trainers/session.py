@@ -146,7 +146,10 @@ def _restored(run_dir: Path, settings: PPOConfig, env: ImitationEnv) -> tuple[in
 
 def _evaluation_program(evaluator: Evaluator, settings: PPOConfig, env: ImitationEnv) -> Callable[[ppo.Params], Rollouts]:
     controller = ppo.make_controller(settings, env.observation_size, env.action_size)
-    program = jax.jit(lambda params: evaluator.rollout(controller(params)))
+    @jax.jit
+    def program(params: ppo.Params) -> Rollouts:
+        return evaluator.rollout(controller(params))
+
     # From the host: how brax or orbax spread the parameters over devices would each ask for a program of its own.
     return lambda params: program(jax.device_get(params))
 
