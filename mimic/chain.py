@@ -53,7 +53,9 @@ class Chain:
     links: tuple[Link, ...]
 
 
-def resolve_locked(locked: Locked, joint_names: tuple[str, ...], angles: Mapping[str, float] | None = None) -> dict[str, float]:
+def resolve_locked(
+    locked: Locked, joint_names: tuple[str, ...], angles: Mapping[str, float] | None = None
+) -> dict[str, float]:
     """Locked joints by name with their angles.
 
     Args:

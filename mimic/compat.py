@@ -18,8 +18,8 @@ _SLOW_CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
 def needs_cpu_flag(jaxlib_version: str | None = None) -> bool:
     """Whether XLA's CPU backend needs its fusion emitters turned off.
 
-    Before jaxlib 0.11 they make batched kinematics several hundred times slower; from 0.11 on the flag is unknown to XLA,
-    which aborts on it.
+    Before jaxlib 0.11 they make batched kinematics several hundred times slower; from 0.11 on the flag is unknown to
+    XLA, which aborts on it.
     """
     version = jaxlib_version or importlib.metadata.version("jaxlib")
     major, minor = (int(part) for part in version.split(".")[:2])
@@ -48,8 +48,8 @@ def import_mjx() -> None:
 def computed_once(scalars: list[Any]) -> list[Any]:
     """The scalars, to be computed before they are stacked where XLA would else compute each of them from scratch.
 
-    On GPUs XLA may fuse a concatenation with all that leads to it, one copy of the chain for each row: small batches of a
-    7-link arm then take a minute to compile. On CPUs it does not, and the barrier would cost time.
+    On GPUs XLA may fuse a concatenation with all that leads to it, one copy of the chain for each row: small batches of
+    a 7-link arm then take a minute to compile. On CPUs it does not, and the barrier would cost time.
     """
     import jax
 
@@ -59,9 +59,9 @@ def computed_once(scalars: list[Any]) -> list[Any]:
 def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """Copies of a pytree on all devices, along a new first axis.
 
-    JAX removed its function of this name in 0.10, and brax 0.14 still calls it. This one replicates through `jax.pmap`, with
-    brax's own name for the axis, so that the result is sharded just as what brax's training epoch returns: the epoch is then
-    compiled once and not twice.
+    JAX removed its function of this name in 0.10, and brax 0.14 still calls it. This one replicates through `jax.pmap`,
+    with brax's own name for the axis, so that the result is sharded just as what brax's training epoch returns: the
+    epoch is then compiled once and not twice.
     """
     import jax
 

@@ -3,7 +3,6 @@
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 
 def schema(config_class: type) -> DictConfig:
@@ -22,7 +21,7 @@ def _unfreeze(node: DictConfig) -> None:
             _unfreeze(child)
 
 
-def explain(error: OmegaConfBaseException) -> str:
+def explain(error: Exception) -> str:
     """One line for a config error: what is wrong with which key, and the valid keys."""
     message = " ".join(str(getattr(error, "msg", None) or error).splitlines()[0].split())
     key = getattr(error, "full_key", None) or getattr(error, "key", None)

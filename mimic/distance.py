@@ -47,7 +47,9 @@ class PairDistances:
 
 
 Weights = DistanceWeights | Callable[[PairDistances], DistanceWeights]
-Correspondence = Real[ArrayLike, "expert learner"] | Callable[[Float[Array, "expert learner"]], Float[Array, "expert learner"]]
+Correspondence = (
+    Real[ArrayLike, "expert learner"] | Callable[[Float[Array, "expert learner"]], Float[Array, "expert learner"]]
+)
 
 
 def adaptive_weights(distances: PairDistances) -> DistanceWeights:
@@ -132,7 +134,9 @@ def embodiment_distance(
     distances = link_distances(expert_states, learner_states, weights, rotation=rotation)
     matrix = jnp.asarray(correspondence(distances) if callable(correspondence) else correspondence, distances.dtype)
     if matrix.shape != distances.shape:
-        raise ValueError(f"correspondence: expected shape {distances.shape} (expert links, learner links), got {matrix.shape}")
+        raise ValueError(
+            f"correspondence: expected shape {distances.shape} (expert links, learner links), got {matrix.shape}"
+        )
     weighted = matrix * distances
     if reduction == "mean":
         return jnp.mean(weighted)
@@ -166,7 +170,8 @@ def _weight(part: str, value: Any, distances: Array) -> Any:
         return jnp.broadcast_to(weight, distances.shape)
     except ValueError:
         raise ValueError(
-            f"weights: expected {part} to broadcast to {distances.shape} (expert links, learner links), got shape {weight.shape}"
+            f"weights: expected {part} to broadcast to {distances.shape} (expert links, learner links), "
+            f"got shape {weight.shape}"
         ) from None
 
 

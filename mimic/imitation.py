@@ -1,5 +1,6 @@
 """The best that an arm can do: the motion of the learner that is nearest to a pose and velocity of the expert."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -116,7 +117,9 @@ def closest_motions(
         raise ValueError(f"starts, iterations: expected at least 1, got {starts} and {iterations}")
 
     def distance(states: LinkStates, learner_states: LinkStates) -> Array:
-        return embodiment_distance(states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction)
+        return embodiment_distance(
+            states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
+        )
 
     def descend(states: LinkStates, starts: _Motion, speed: Array, count: int, step: float) -> ClosestMotion:
         objective = lambda motion: distance(states, link_states(learner, motion[0], speed * motion[1]))  # noqa: E731
@@ -129,10 +132,10 @@ def closest_motions(
         states = jax.vmap(lambda *motion: link_states(expert, *motion))(qpos, qvel)
         speed = jnp.maximum(jnp.abs(qvel).max(axis=1), _LEAST_SPEED)  # a descent's unit of velocity
         first = jax.vmap(_starts(distance, expert, learner, starts, seed))(states, qpos, qvel)
-        search = jax.vmap(lambda *args: descend(*args, iterations, _SEARCH_STEP))
-        refine = jax.vmap(lambda *args: descend(*args, 2 * iterations, _POLISH_STEP))
-        found = search(states, first, speed)
-        return refine(states, (_with_neighbours(found.qpos), _with_neighbours(found.qvel)), speed)
+        search = functools.partial(descend, count=iterations, step=_SEARCH_STEP)
+        refine = functools.partial(descend, count=2 * iterations, step=_POLISH_STEP)
+        found = jax.vmap(search)(states, first, speed)
+        return jax.vmap(refine)(states, (_with_neighbours(found.qpos), _with_neighbours(found.qvel)), speed)
 
     return jax.jit(solve)(qpos, qvel)
 
@@ -177,7 +180,9 @@ def _descend(
         motion, mean, square, best = carry
         value, gradient = jax.value_and_grad(distance)(motion)
         better = value < best.distance
-        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), ClosestMotion(*motion, value), best)
+        best = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old), ClosestMotion(motion[0], motion[1], value), best
+        )
         mean = jax.tree.map(lambda m, g: _FAST * m + (1 - _FAST) * g, mean, gradient)
         square = jax.tree.map(lambda s, g: _SLOW * s + (1 - _SLOW) * g * g, square, gradient)
         size = 0.5 * first_step * (1 + jnp.cos(jnp.pi * count / iterations))

@@ -4,14 +4,13 @@ import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic import spatial
 from mimic.embodiment import Embodiment
-from mimic.spatial import Rotation, Scalar, Vector
+from mimic.spatial import Rotation, Vector
 
 
 @struct.dataclass
@@ -116,7 +115,9 @@ def candidate_points(states: LinkStates) -> LinkStates:
     return dataclasses.replace(states, direction=None, angular_velocity=None)
 
 
-def body_twists(arm: Embodiment, qpos: Float[ArrayLike, " joints"], qvel: Float[ArrayLike, " joints"]) -> Float[Array, "links 6"]:
+def body_twists(
+    arm: Embodiment, qpos: Float[ArrayLike, " joints"], qvel: Float[ArrayLike, " joints"]
+) -> Float[Array, "links 6"]:
     """Body twists [omega, v] of the link frames, by the recursion over adjoint maps (paper, eq. 7).
 
     Units: omega [rad/s] and v [m/s], both in the link's own frame.
@@ -180,11 +181,6 @@ def _link_point(arm: Embodiment, frames: list[_JointFrame], link: int, joint: in
     zero_lever = spatial.subtract(spatial.vector(arm.link_position[link]), zero_anchor)
     lever = spatial.rotate(frames[joint + 1].rotation, zero_lever)
     return spatial.add(frames[joint + 1].anchor, lever), lever
-
-
-def _chain_length(arm: Embodiment) -> Scalar:
-    length = arm.chain_length
-    return float(length) if isinstance(length, np.floating) else length
 
 
 def _prepare(arm: Embodiment, values: ArrayLike, what: str) -> Array:

@@ -15,7 +15,7 @@ CORE = ("chain", "mjcf", "embodiment", "kinematics", "distance", "correspondence
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    marks = config.getoption("markexpr")
+    marks = config.getoption("markexpr") or ""
     if "gpu" not in marks or "not gpu" in marks:
         jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_compilation_cache_dir", str(REPOSITORY / ".jax_cache"))

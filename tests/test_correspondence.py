@@ -46,7 +46,9 @@ def test_soft_is_a_softmax_over_rows_plus_one_over_columns(x64):
 def test_hard_is_the_limit_of_soft(x64, seed):
     distances = random_distances(seed)
     hard = hard_correspondence(distances)
-    errors = [float(abs(soft_correspondence(distances, xi=xi) - hard).max()) for xi in (-1.0, -10.0, -100.0, -1e4, -1e9)]
+    errors = [
+        float(abs(soft_correspondence(distances, xi=xi) - hard).max()) for xi in (-1.0, -10.0, -100.0, -1e4, -1e9)
+    ]
     assert errors == sorted(errors, reverse=True)
     assert errors[0] > 0.1
     assert errors[-1] == 0  # entries differ by more than 1e-4, and exp(-1e5) is 0

@@ -1,5 +1,6 @@
 """The kinematic bound is a global minimum: nothing that is tried goes below it, and known answers are met."""
 
+import dataclasses
 import functools
 
 import jax
@@ -107,14 +108,15 @@ def test_more_starts_change_nothing(name):
     expert, learner = ARMS[name]
     motion, correspondence, closest = solved(name)
     more = kinematic_bound(expert, learner, *motion, correspondence, PAPER_WEIGHTS, starts=32, seed=1)
-    np.testing.assert_allclose(closest.distance, more, rtol=0.005, atol=2e-5)  # at a match only the absolute error counts
+    # At a match only the absolute error counts.
+    np.testing.assert_allclose(closest.distance, more, rtol=0.005, atol=2e-5)
 
 
 def test_a_batch_is_a_loop():
     expert, learner = ARMS["planar 7->4"]
     qpos, qvel = (x[:, FEW] for x in demonstrations(7, 3))
     correspondence = overlap_correspondence(expert, learner)
-    bound = jax.jit(lambda *motion: kinematic_bound(expert, learner, *motion, correspondence, PAPER_WEIGHTS))
+    bound = jax.jit(lambda qpos, qvel: kinematic_bound(expert, learner, qpos, qvel, correspondence, PAPER_WEIGHTS))
     batch = jax.jit(jax.vmap(bound))(qpos, qvel)
     loop = jnp.stack([bound(*motion) for motion in zip(qpos, qvel, strict=True)])
     np.testing.assert_allclose(batch, loop, atol=BELOW)  # rounding decides which of two equal minima a descent ends in
@@ -125,7 +127,7 @@ def test_velocities_of_any_size_are_found():
     qpos, qvel = demonstration(2)
     weights = DistanceWeights(rotation=1.0, linear_velocity=0.1, angular_velocity=0.1)
     # Named otherwise, so that the expert's own motion is no start.
-    learner = arm.replace(joint_names=("a", "b"))
+    learner = dataclasses.replace(arm, joint_names=("a", "b"))
     speed = jnp.asarray([0.1, 1.0, 3.0, 10.0], qpos.dtype)
     motion = qpos, speed[:, None] * jnp.ones_like(qvel)
     bound = kinematic_bound(arm, learner, *motion, overlap_correspondence(arm, learner), weights)
@@ -163,7 +165,9 @@ def test_angles_stay_within_the_joint_range():
 def test_bad_input_is_named(unchecked):
     arm = planar_arm([0.5, 0.5])
     good = jnp.zeros((3, 2))
-    bound = functools.partial(kinematic_bound, arm, arm, correspondence=overlap_correspondence(arm, arm), weights=PAPER_WEIGHTS)
+    bound = functools.partial(
+        kinematic_bound, arm, arm, correspondence=overlap_correspondence(arm, arm), weights=PAPER_WEIGHTS
+    )
     for qpos, qvel in ((good[0], good[0]), (good[:, :1], good[:, :1]), (good, good[:2])):
         with pytest.raises(ValueError, match="qpos, qvel: expected shape"):
             bound(qpos, qvel)

@@ -165,7 +165,7 @@ def test_states_at_rest_and_unnormalized():
     qpos = motions(7)[0][0].astype(np.float32)
     rest, still = link_states(arm, qpos), link_states(arm, qpos, np.zeros(7, np.float32))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-7), rest, still)  # one rounding
-    assert not rest.linear_velocity.any() and not rest.angular_velocity.any()
+    assert not any(np.any(velocity) for velocity in (rest.linear_velocity, rest.angular_velocity))
     metres = link_states(arm, qpos, normalized=False)
     np.testing.assert_allclose(rest.position * arm.chain_length, metres.position, atol=1e-6)  # float32, 1 m
     points = candidate_points(rest)

@@ -35,7 +35,12 @@ REPORT_KEYS = {
 
 def command(module, *arguments, **more):
     return subprocess.run(
-        [sys.executable, "-m", f"mimic.{module}", *arguments], capture_output=True, text=True, timeout=280, check=False, **more
+        [sys.executable, "-m", f"mimic.{module}", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+        **more,
     )
 
 
@@ -158,7 +163,9 @@ def test_the_cpu_flag_speeds_up_kinematics(capsys):
     seconds = []
     for flag in ("false", "true"):
         environment = {**os.environ, "XLA_FLAGS": f"--xla_cpu_use_fusion_emitters={flag}", "JAX_PLATFORMS": "cpu"}
-        out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True).stdout
+        out = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
+        ).stdout
         seconds.append(float(out.splitlines()[-1]))
     logging.getLogger(__name__).info("speed-up by the flag: %.0f", seconds[1] / seconds[0])
     with capsys.disabled():

@@ -3,7 +3,7 @@
 import importlib.resources
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import compat
@@ -34,6 +34,7 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     if name not in environments():
         raise ValueError(f"unknown environment {name!r}; valid are {', '.join(environments())}")
     preset = OmegaConf.load(str(_PRESETS / f"{name}.yaml"))
+    assert isinstance(preset, DictConfig)
     del preset["defaults"]  # Hydra's; the schema is merged here
     try:
         merged = OmegaConf.merge(schema(EnvConfig), preset, overrides)
@@ -50,7 +51,7 @@ def make(name: str, **overrides: Any) -> "ImitationEnv":
       overrides: see `env_config`.
 
     Raises:
-      ValueError: an unknown name or field, a value of the wrong type or out of range, or demonstrations that do not fit.
+      ValueError: an unknown name or field, a value of the wrong type or out of range, demonstrations that do not fit.
     """
     compat.import_mjx()
     from mimic.envs.imitation import ImitationEnv  # brax and MJX, which take seconds to import

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -15,7 +15,9 @@ _PLANAR_ARMATURE = 0.02  # kg m^2
 _PLANAR_DAMPING = 0.1  # N m s/rad
 _PLANAR_VELOCITY_LIMIT = 2.5  # rad/s
 
-_IGNORED = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
+_IGNORED = (
+    mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Arm:
     model: mujoco.MjModel
 
 
-def build_arm(config: ArmConfig, limits: Limits = "none") -> Arm:
+def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
     """The arm that a config describes.
 
     Raises:
@@ -54,7 +56,9 @@ def build_arm(config: ArmConfig, limits: Limits = "none") -> Arm:
     if config.model == "planar":
         embodiment = planar_arm(config.link_lengths)
         source = _planar_model(embodiment)
-        embodiment, source, angles = load_arm(source, name=embodiment.name, locked=config.locked, limits=limits)
+        embodiment, source, angles = load_arm(
+            source, name=embodiment.name, locked=config.locked, limits=cast(Limits, limits)
+        )
         return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles))
     is_panda = config.model == "panda"
     embodiment, source, angles = load_arm(
@@ -63,7 +67,7 @@ def build_arm(config: ArmConfig, limits: Limits = "none") -> Arm:
         locked=config.locked,
         base=config.base,
         tip=config.tip,
-        limits=limits,
+        limits=cast(Limits, limits),
     )
     return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles))
 
@@ -71,9 +75,9 @@ def build_arm(config: ArmConfig, limits: Limits = "none") -> Arm:
 def simulation_model(
     source: mujoco.MjModel, joint_names: tuple[str, ...], locked: Mapping[str, float] | None = None
 ) -> mujoco.MjModel:
-    """The bodies, inertias and named joints of a model and nothing else: no geoms, actuators, constraints, contacts or gravity.
+    """The bodies, inertias and named joints of a model and nothing else.
 
-    Bodies that no remaining joint moves are fused into their parents.
+    No geoms, actuators, constraints, contacts or gravity. Bodies that no remaining joint moves are fused into their parents.
 
     Args:
       source: any model.

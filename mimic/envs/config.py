@@ -1,4 +1,4 @@
-"""What defines an environment. The presets in mimic/conf/env fill these in; `make` and the command line override them."""
+"""What defines an environment: filled in by the presets in mimic/conf/env, by `make`, and on the command line."""
 
 import dataclasses
 from collections.abc import Callable
@@ -49,7 +49,7 @@ class MetricConfig:
         """The weights as the metric takes them."""
         velocities = {"linear_velocity": self.linear_velocity, "angular_velocity": self.angular_velocity}
         if self.adaptive:
-            return lambda distances: adaptive_weights(distances).replace(**velocities)
+            return lambda distances: dataclasses.replace(adaptive_weights(distances), **velocities)
         return DistanceWeights(self.translation, self.rotation, **velocities)
 
     def make_correspondence(self, expert: Embodiment, learner: Embodiment) -> Correspondence:
@@ -80,7 +80,9 @@ class DemonstrationConfig:
 
     def __post_init__(self) -> None:
         if self.count < 1 or self.held_out < 1:
-            raise ValueError(f"demonstrations: expected count and held_out of at least 1, got {self.count}, {self.held_out}")
+            raise ValueError(
+                f"demonstrations: expected count and held_out of at least 1, got {self.count}, {self.held_out}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +99,7 @@ class EnvConfig:
       control_dt: time that a torque is held [s].
       substeps: physics steps in a control step.
       preview: expert steps that the learner sees beyond the present one; 0 is the paper.
-      action_scale: of the torque range; 1 is twice the torque that takes a joint to its rated speed in one control step.
+      action_scale: of the torque range; 1 is twice the torque that takes a joint to its rated speed in one step.
       speed_bound: joint speed [rad/s] at which an episode ends as a runaway.
     """
 

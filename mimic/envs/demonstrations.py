@@ -15,8 +15,8 @@ from mimic.envs.arms import Arm
 FORMAT = "mimic-demonstrations-1"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
 
-# The expert's joint-space PD control: critically damped, at 2 rad/s. A goal a quarter turn away asks for a peak speed of
-# 1.2 rad/s (omega * distance / e), within every joint's rating, and is reached to within 1 % in 3.3 s of the 5 s.
+# The expert's joint-space PD control: critically damped, at 2 rad/s. A goal a quarter turn away asks for a peak speed
+# of 1.2 rad/s (omega * distance / e), within every joint's rating, and is reached to within 1 % in 3.3 s of the 5 s.
 PD_FREQUENCY = 2.0  # rad/s
 GOAL_SHARE = 0.5  # goals lie within this share of the way from home to the joint limits
 _MAX_DRAWS = 100
@@ -76,16 +76,20 @@ class Demonstrations:
         os.replace(partial, path)
 
     def check_fits(self, arm: Embodiment, dt: float, horizon: int) -> None:
-        """Raises a ValueError unless these can be the demonstrations of an environment with this expert and time step."""
+        """Raises a ValueError unless an environment with this expert and time step can use these."""
         if self.joint_names != arm.joint_names:
             raise ValueError(
                 f"demonstrations: recorded with the joints {', '.join(self.joint_names)} of {self.arm!r}, "
                 f"but the expert {arm.name!r} has {', '.join(arm.joint_names)}"
             )
         if abs(self.dt - dt) > 1e-9:
-            raise ValueError(f"demonstrations: recorded with a time step of {self.dt} s, but the environment has {dt} s")
+            raise ValueError(
+                f"demonstrations: recorded with a time step of {self.dt} s, but the environment has {dt} s"
+            )
         if self.horizon < horizon:
-            raise ValueError(f"demonstrations: {self.horizon} steps long, but an episode of the environment has {horizon}")
+            raise ValueError(
+                f"demonstrations: {self.horizon} steps long, but an episode of the environment has {horizon}"
+            )
 
 
 def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations:
@@ -98,8 +102,8 @@ def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
     """Reads and validates a file that `Demonstrations.save` wrote, or one made like it.
 
     Raises:
-      ValueError: the file is missing, truncated, no npz, holds pickled objects, lacks an array, or holds wrong shapes or
-        values that are not finite.
+      ValueError: the file is missing, truncated, no npz, holds pickled objects, lacks an array, or holds wrong shapes
+        or values that are not finite.
     """
     name = os.fspath(path)
     if not os.path.isfile(path):
@@ -157,8 +161,8 @@ def record_demonstrations(
 ) -> Demonstrations:
     """Records the expert under joint-space PD control to random goals (paper, "Dynamic Motion Imitation").
 
-    Every trajectory starts at rest in the home pose. As for the learner, the torque is held within a step, so that an equal
-    learner can do exactly the same. Goals that would take the arm beyond a torque, speed or joint limit are drawn anew.
+    Every trajectory starts at rest in the home pose. As for the learner, the torque is held within a step, so that an
+    equal learner can do exactly the same. Goals that would take the arm beyond a torque, speed or joint limit are drawn anew.
 
     Args:
       arm: the expert.
@@ -200,7 +204,9 @@ def _record_one(
     raise ValueError(f"demonstrations: {_MAX_DRAWS} random goals of {arm.embodiment.name!r} all break its limits")
 
 
-def _simulate_pd(arm: Arm, goal: np.ndarray, horizon: int, dt: float, substeps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _simulate_pd(
+    arm: Arm, goal: np.ndarray, horizon: int, dt: float, substeps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Trajectory [T+1, n] and torques [T, n] of the expert on its way to a goal, on C MuJoCo."""
     model, data = arm.model, mujoco.MjData(arm.model)
     model.opt.timestep = dt / substeps

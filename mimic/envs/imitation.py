@@ -1,6 +1,7 @@
 """The imitation environment: a torque-controlled learner is rewarded for being like the expert."""
 
 import copy
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -18,7 +19,9 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations, recor
 from mimic.envs.physics import make_advance
 from mimic.kinematics import LinkStates, link_states
 
-_OFFERED_SPEED_FACTOR = 2.0  # the largest torque takes a joint from rest to this multiple of its rated speed in one step
+_OFFERED_SPEED_FACTOR = (
+    2.0  # the largest torque takes a joint from rest to this multiple of its rated speed in one step
+)
 
 
 @struct.dataclass
@@ -44,8 +47,8 @@ class ImitationEnv(Env):
     """One learner imitating one of the demonstrations; a brax environment over MJX.
 
     Reward: minus the embodiment distance to the expert at the new step. Observation: link states of the learner, of the
-    expert, and of the expert `preview` steps ahead, as one vector. Action: a torque for each joint in [-1, 1], scaled by
-    `torque_scale`. The episode ends at the horizon, a true end: there is nothing to imitate after it.
+    expert, and of the expert `preview` steps ahead, as one vector. Action: a torque for each joint in [-1, 1], scaled
+    by `torque_scale`. The episode ends at the horizon, a true end: there is nothing to imitate after it.
 
     Args:
       config: see `EnvConfig`.
@@ -113,7 +116,7 @@ class ImitationEnv(Env):
         distance = jnp.where(runaway, self._worst_distance, self.distance(qpos, qvel, before.demonstration, step))
         penalty = jnp.where(runaway, 1.0 + remaining, 1.0)  # as if it stayed this bad: ending early never pays
         done = (runaway | (step >= self.config.horizon)).astype(jnp.float32)
-        after = before.replace(qpos=qpos, qvel=qvel, step=step)
+        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=step)
         metrics = {
             **state.metrics,
             "distance": distance,

@@ -1,5 +1,7 @@
 """Training wrappers: brax's own, with a fresh demonstration for every episode."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
@@ -26,7 +28,7 @@ class FreshEpisodeWrapper(Wrapper):
         arm_state: ArmState = state.pipeline_state  # type: ignore[assignment]
         keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(arm_state.key, 0)
         steps = jax.vmap(lambda key: jax.random.randint(key, (), 0, self._imitation.config.horizon))(keys)
-        arm_state = arm_state.replace(step=steps)
+        arm_state = dataclasses.replace(arm_state, step=steps)
         return state.replace(pipeline_state=arm_state, obs=jax.vmap(self._imitation.observe)(arm_state))
 
     def step(self, state: State, action: jax.Array) -> State:

@@ -15,20 +15,24 @@ PRESETS: dict[str, dict[str, Any]] = {
         "num_minibatches": 32,
         "num_updates_per_batch": 8,
         "learning_rate": 1e-3,
+        "final_learning_rate": 0.05,
         "discounting": 0.8,
+        "entropy_cost": 1e-3,
         "hidden_layers": [128, 128],
         "evaluations": 10,
     },
     # One GPU: as many environments as keep it busy; a batch is 8192 short stretches of motion.
     "gpu": {
-        "num_timesteps": 36_000_000,
+        "num_timesteps": 30_000_000,
         "num_envs": 4096,
         "unroll_length": 10,
         "batch_size": 512,
         "num_minibatches": 32,
         "num_updates_per_batch": 8,
         "learning_rate": 1e-3,
+        "final_learning_rate": 0.01,
         "discounting": 0.9,
+        "entropy_cost": 0.06,
         "hidden_layers": [256, 256],
         "evaluations": 8,
     },
@@ -69,10 +73,10 @@ class PPOConfig:
     num_minibatches: int | None = None
     num_updates_per_batch: int | None = None
     learning_rate: float | None = None
-    final_learning_rate: float = 0.05
+    final_learning_rate: float | None = None
     discounting: float | None = None
     gae_lambda: float = 0.9
-    entropy_cost: float = 1e-3
+    entropy_cost: float | None = None
     clipping_epsilon: float = 0.2
     max_grad_norm: float = 1.0
     reward_scaling: float = 10.0
@@ -114,8 +118,8 @@ class PPOConfig:
         unrolls = self.batch_size * self.num_minibatches  # type: ignore[operator]
         if unrolls % self.num_envs:  # type: ignore[operator]
             raise ValueError(
-                f"trainer: batch_size * num_minibatches = {self.batch_size} * {self.num_minibatches} = {unrolls} must be a "
-                f"multiple of num_envs = {self.num_envs}"
+                f"trainer: batch_size * num_minibatches = {self.batch_size} * {self.num_minibatches} = {unrolls} must be "
+                f"a multiple of num_envs = {self.num_envs}"
             )
 
     @property

@@ -55,7 +55,7 @@ class Evaluator:
         self.hold_distance = np.asarray(_hold_distance(self.env))
 
     def rollout(self, controller: Controller) -> Rollouts:
-        """Runs a controller on every demonstration; to be jitted by the caller, with the controller's parameters inside."""
+        """Runs a controller on every demonstration; the caller jits this, with the parameters inside."""
         env = self.env
 
         def one(demonstration: Array) -> Rollouts:
@@ -77,7 +77,7 @@ class Evaluator:
         return {"train": slice(0, self._num_train), "held_out": slice(self._num_train, None)}
 
     def summary(self, rollouts: Rollouts) -> dict[str, Any]:
-        """The quality figures of a controller, each for the training and the held-out demonstrations where it has two."""
+        """The quality figures of a controller, for the training and the held-out demonstrations."""
         distance = np.asarray(rollouts.distance)
         parts = self.parts
 

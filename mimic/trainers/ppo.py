@@ -52,12 +52,16 @@ class LearningRate:
 
 def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
     """Policy and value network of a resolved config."""
-    return _network_factory(config)(observation_size, action_size, preprocess_observations_fn=running_statistics.normalize)
+    return _network_factory(config)(
+        observation_size, action_size, preprocess_observations_fn=running_statistics.normalize
+    )
 
 
 def _network_factory(config: PPOConfig) -> Callable[..., ppo_networks.PPONetworks]:
     hidden = tuple(config.hidden_layers or ())
-    return functools.partial(ppo_networks.make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden)
+    return functools.partial(
+        ppo_networks.make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden
+    )
 
 
 def params_template(config: PPOConfig, observation_size: int, action_size: int) -> Params:
@@ -139,13 +143,14 @@ def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> di
     updates = config.num_timesteps // config.steps_per_batch * updates_per_batch  # type: ignore[operator]
     done_updates = done_steps // config.steps_per_batch * updates_per_batch
     rate: float = config.learning_rate  # type: ignore[assignment]
+    final_share: float = config.final_learning_rate  # type: ignore[assignment]
     return {
         "environment": env,
         "num_timesteps": max(config.num_timesteps - done_steps, 1),  # type: ignore[operator]
         "num_envs": config.num_envs,
         "episode_length": env.config.horizon + 1,  # the environment ends first
         "wrap_env_fn": wrap_for_training,
-        "learning_rate": LearningRate(rate, rate * config.final_learning_rate, updates, done_updates),
+        "learning_rate": LearningRate(rate, rate * final_share, updates, done_updates),
         "entropy_cost": config.entropy_cost,
         "discounting": config.discounting,
         "unroll_length": config.unroll_length,

@@ -10,7 +10,7 @@ from rich.table import Table
 
 
 class TrainingProgress:
-    """A progress bar with distance, optimality gap, steps/s and time left; one line for each evaluation without a terminal."""
+    """A bar with distance, optimality gap, steps/s and time left; without a terminal, a line for each evaluation."""
 
     def __init__(self, console: Console, total_steps: int, done_steps: int = 0):
         self._console = console

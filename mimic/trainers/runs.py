@@ -137,9 +137,9 @@ class Stopwatch:
         self.seconds: dict[str, float] = {"import": time.perf_counter() - started, "compile": 0.0}
         jax.monitoring.register_event_duration_secs_listener(self._count)
 
-    def _count(self, event: str, duration: float, **_: Any) -> None:
+    def _count(self, event: str, duration_secs: float, **_: Any) -> None:
         if event.startswith(self._COMPILE_EVENTS):
-            self._compiling += duration
+            self._compiling += duration_secs
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[None]:

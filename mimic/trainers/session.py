@@ -128,7 +128,9 @@ def _resumed_config(run_dir: Path, overrides: Sequence[str]) -> TrainConfig:
     changes = [override for override in overrides if not override.startswith("resume=")]
     refused = [change for change in changes if not change.startswith("trainer.")]
     if refused:
-        raise ValueError(f"resume: only keys of the trainer can change, as in trainer.num_timesteps=N; got {refused[0]!r}")
+        raise ValueError(
+            f"resume: only keys of the trainer can change, as in trainer.num_timesteps=N; got {refused[0]!r}"
+        )
     merged = OmegaConf.merge(schema(TrainConfig), to_dict(config), OmegaConf.from_dotlist(changes))
     return OmegaConf.to_object(merged)  # type: ignore[return-value]
 
@@ -144,8 +146,11 @@ def _restored(run_dir: Path, settings: PPOConfig, env: ImitationEnv) -> tuple[in
     return steps, params
 
 
-def _evaluation_program(evaluator: Evaluator, settings: PPOConfig, env: ImitationEnv) -> Callable[[ppo.Params], Rollouts]:
+def _evaluation_program(
+    evaluator: Evaluator, settings: PPOConfig, env: ImitationEnv
+) -> Callable[[ppo.Params], Rollouts]:
     controller = ppo.make_controller(settings, env.observation_size, env.action_size)
+
     @jax.jit
     def program(params: ppo.Params) -> Rollouts:
         return evaluator.rollout(controller(params))
