@@ -21,7 +21,9 @@ from mimic.distance import (  # noqa: E402
 )
 from mimic.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
 from mimic.envs import env_config, environments, make  # noqa: E402
-from mimic.envs.demonstrations import Demonstrations, load_demonstrations, record_demonstrations  # noqa: E402
+from mimic.envs.arms import ArmConfig, build_arm  # noqa: E402
+from mimic.envs.demonstrations import Demonstrations, load_demonstrations  # noqa: E402
+from mimic.envs.recording import record_demonstrations  # noqa: E402
 from mimic.imitation import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
 from mimic.kinematics import (  # noqa: E402
     Frames,
@@ -39,6 +41,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "PAPER_WEIGHTS",
+    "ArmConfig",
     "ClosestMotion",
     "Demonstrations",
     "DistanceWeights",
@@ -49,6 +52,7 @@ __all__ = [
     "PairDistances",
     "adaptive_weights",
     "body_twists",
+    "build_arm",
     "candidate_points",
     "closest_motion",
     "embodiment_distance",

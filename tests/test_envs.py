@@ -120,6 +120,18 @@ def test_demonstrations_are_reproducible_and_within_limits():
     assert np.all(more.qvel[:, 0] == 0)
 
 
+@pytest.mark.parametrize("limits", ["none", "hardware"])
+def test_reaches_end_where_they_should_and_within_limits(limits):
+    arm = build_arm(ArmConfig(), limits)
+    reaches = mimic.record_demonstrations(arm, 4, kind="reach", seed=1)
+    embodiment = arm.embodiment
+    assert np.all(np.abs(reaches.qvel) <= embodiment.velocity_limit)
+    hand = jax.vmap(lambda qpos: mimic.forward_kinematics(embodiment, qpos).position[-1])
+    np.testing.assert_allclose(hand(reaches.qpos[:, -1]), hand(reaches.goals), atol=5e-3)  # 5 mm: feedback, not fit
+    other = mimic.record_demonstrations(arm, 4, kind="pd", seed=1)
+    assert not np.allclose(other.qpos, reaches.qpos, atol=0.1)
+
+
 def test_training_and_held_out_are_apart():
     training, held_out = training_and_held_out(mimic.env_config("planar4dof", demonstrations=FEW))
     assert (training.count, held_out.count) == (6, 2)
@@ -185,6 +197,7 @@ def test_demonstrations_of_another_arm_or_time_step_are_refused(saved):
         ({"preview": "x"}, "could not be converted to Integer"),
         ({"demonstrations": {"cont": 1}}, "unknown key 'demonstrations.cont'"),
         ({"limits": "soft"}, "expected one of none, hardware"),
+        ({"demonstrations": {"kind": "dance"}}, "expected one of pd, reach"),
         ({"metric": {"xi": 1.0}}, "below 0"),
         ({"learner": {"locked": [1, 2, 3, 4, 5, 6, 7]}}, "all 7 joints are locked"),
         ({"learner": {"locked": [9]}}, "unknown joint 9"),

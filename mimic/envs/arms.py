@@ -77,7 +77,8 @@ def simulation_model(
 ) -> mujoco.MjModel:
     """The bodies, inertias and named joints of a model and nothing else.
 
-    No geoms, actuators, constraints, contacts or gravity. Bodies that no remaining joint moves are fused into their parents.
+    No geoms, actuators, constraints, contacts or gravity. Bodies that no remaining joint moves are fused into their
+    parents.
 
     Args:
       source: any model.

@@ -8,6 +8,7 @@ from mimic.correspondence import hard_correspondence, overlap_correspondence, so
 from mimic.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
 from mimic.embodiment import LIMITS, Embodiment
 from mimic.envs.arms import ArmConfig
+from mimic.envs.recording import KINDS
 
 CORRESPONDENCES = ("overlap", "hard", "soft")
 
@@ -68,17 +69,20 @@ class DemonstrationConfig:
 
     Attributes:
       path: a file of demonstrations; they are recorded where it is empty.
+      kind: of the recorded ones: "pd" or "reach", see `record_demonstrations`.
       count: demonstrations to train on.
       held_out: demonstrations to test on, never trained on.
       seed: of the recorded goals.
     """
 
     path: str = ""
+    kind: str = "pd"
     count: int = 124
     held_out: int = 32
     seed: int = 0
 
     def __post_init__(self) -> None:
+        _check_choice("demonstrations.kind", self.kind, KINDS)
         if self.count < 1 or self.held_out < 1:
             raise ValueError(
                 f"demonstrations: expected count and held_out of at least 1, got {self.count}, {self.held_out}"

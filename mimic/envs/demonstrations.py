@@ -1,25 +1,17 @@
-"""Demonstrations: what the expert did, recorded in simulation or brought by the user, in one file without pickle."""
+"""Demonstrations: what the expert did, in one file without pickle. Recorded by `mimic.envs.recording`, or brought."""
 
 import dataclasses
 import os
 import zipfile
 from collections.abc import Sequence
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from mimic.embodiment import Embodiment
-from mimic.envs.arms import Arm
 
 FORMAT = "mimic-demonstrations-1"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
-
-# The expert's joint-space PD control: critically damped, at 2 rad/s. A goal a quarter turn away asks for a peak speed
-# of 1.2 rad/s (omega * distance / e), within every joint's rating, and is reached to within 1 % in 3.3 s of the 5 s.
-PD_FREQUENCY = 2.0  # rad/s
-GOAL_SHARE = 0.5  # goals lie within this share of the way from home to the joint limits
-_MAX_DRAWS = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,72 +146,3 @@ def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
         joint_names=joint_names,
         seed=int(content["seed"]),
     )
-
-
-def record_demonstrations(
-    arm: Arm, count: int, *, seed: int = 0, horizon: int = 50, dt: float = 0.1, substeps: int = 5
-) -> Demonstrations:
-    """Records the expert under joint-space PD control to random goals (paper, "Dynamic Motion Imitation").
-
-    Every trajectory starts at rest in the home pose. As for the learner, the torque is held within a step, so that an
-    equal learner can do exactly the same. Goals that would take the arm beyond a torque, speed or joint limit are drawn anew.
-
-    Args:
-      arm: the expert.
-      count: number of demonstrations.
-      seed: demonstration i of a seed is the same whatever the count.
-      horizon: steps T of a demonstration.
-      dt: control step [s].
-      substeps: physics steps in a control step.
-
-    Raises:
-      ValueError: a count, horizon or time below its least value, or an arm whose limits leave no goal.
-    """
-    for name, value, least in (("count", count, 1), ("horizon", horizon, 1), ("substeps", substeps, 1)):
-        if value < least:
-            raise ValueError(f"{name}: expected at least {least}, got {value}")
-    if not dt > 0:
-        raise ValueError(f"dt: expected a time above 0 s, got {dt}")
-    recordings = [_record_one(arm, np.random.default_rng([seed, i]), horizon, dt, substeps) for i in range(count)]
-    qpos, qvel, goals = (np.stack(column) for column in zip(*recordings, strict=True))
-    embodiment = arm.embodiment
-    return Demonstrations(qpos, qvel, goals, float(dt), embodiment.name, embodiment.joint_names, seed)
-
-
-def _record_one(
-    arm: Arm, rng: np.random.Generator, horizon: int, dt: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    home = np.asarray(arm.embodiment.home)
-    lower, upper = np.asarray(arm.embodiment.joint_range).T
-    for _ in range(_MAX_DRAWS):
-        goal = home + GOAL_SHARE * (rng.uniform(lower, upper) - home)
-        qpos, qvel, torque = _simulate_pd(arm, goal, horizon, dt, substeps)
-        within = (
-            np.all(np.abs(torque) <= arm.embodiment.torque_limit)
-            and np.all(np.abs(qvel) <= arm.embodiment.velocity_limit)
-            and np.all((qpos >= lower) & (qpos <= upper))
-        )
-        if within:
-            return qpos, qvel, goal
-    raise ValueError(f"demonstrations: {_MAX_DRAWS} random goals of {arm.embodiment.name!r} all break its limits")
-
-
-def _simulate_pd(
-    arm: Arm, goal: np.ndarray, horizon: int, dt: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Trajectory [T+1, n] and torques [T, n] of the expert on its way to a goal, on C MuJoCo."""
-    model, data = arm.model, mujoco.MjData(arm.model)
-    model.opt.timestep = dt / substeps
-    data.qpos[:] = arm.embodiment.home
-    inertial = np.zeros(model.nv)
-    qpos, qvel, torques = [data.qpos.copy()], [data.qvel.copy()], []
-    for _ in range(horizon):
-        mujoco.mj_forward(model, data)
-        qacc = PD_FREQUENCY**2 * (goal - data.qpos) - 2 * PD_FREQUENCY * data.qvel
-        mujoco.mj_mulM(model, data, inertial, qacc)
-        data.qfrc_applied[:] = inertial + data.qfrc_bias - data.qfrc_passive
-        torques.append(data.qfrc_applied.copy())
-        mujoco.mj_step(model, data, substeps)
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
-    return np.stack(qpos), np.stack(qvel), np.stack(torques)

@@ -15,8 +15,9 @@ from mimic.distance import embodiment_distance
 from mimic.embodiment import Embodiment
 from mimic.envs.arms import Arm, build_arm, effective_inertia
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, load_demonstrations, record_demonstrations
+from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.physics import make_advance
+from mimic.envs.recording import record_demonstrations
 from mimic.kinematics import LinkStates, link_states
 
 _OFFERED_SPEED_FACTOR = (
@@ -222,6 +223,7 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
         loaded = record_demonstrations(
             expert,
             wanted.count + wanted.held_out,
+            kind=wanted.kind,
             seed=wanted.seed,
             horizon=config.horizon,
             dt=config.control_dt,

@@ -118,8 +118,8 @@ class PPOConfig:
         unrolls = self.batch_size * self.num_minibatches  # type: ignore[operator]
         if unrolls % self.num_envs:  # type: ignore[operator]
             raise ValueError(
-                f"trainer: batch_size * num_minibatches = {self.batch_size} * {self.num_minibatches} = {unrolls} must be "
-                f"a multiple of num_envs = {self.num_envs}"
+                f"trainer: batch_size * num_minibatches = {self.batch_size} * {self.num_minibatches} = {unrolls} "
+                f"must be a multiple of num_envs = {self.num_envs}"
             )
 
     @property
