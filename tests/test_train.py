@@ -96,6 +96,14 @@ def test_resume_goes_on_from_the_last_checkpoint(finished):
     assert again.returncode == 2 and "larger trainer.num_timesteps" in again.stderr
 
 
+def test_training_ends_at_the_target_gap(tmp_path):
+    run_dir = tmp_path / "early"
+    result = command("train", *TINY, f"run_dir={run_dir}", "trainer.target_gap=100")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 1
+    assert json.loads((run_dir / "report.json").read_text())["env_steps"] < 5000
+
+
 def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(tmp_path):
     run_dir = tmp_path / "stopped"
     arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]

@@ -23,7 +23,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     # One GPU: as many environments as keep it busy; a batch is 8192 short stretches of motion.
     "gpu": {
-        "num_timesteps": 30_000_000,
+        "num_timesteps": 32_000_000,
         "num_envs": 4096,
         "unroll_length": 10,
         "batch_size": 512,
@@ -33,7 +33,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "final_learning_rate": 0.01,
         "discounting": 0.9,
         "entropy_cost": 0.06,
-        "hidden_layers": [256, 256],
+        "hidden_layers": [512, 256],
         "evaluations": 8,
     },
 }
@@ -61,6 +61,7 @@ class PPOConfig:
       max_grad_norm: gradients are clipped to it.
       reward_scaling: of the reward inside PPO.
       hidden_layers: widths of policy and value network.
+      target_gap: training ends early once the optimality gap on the training demonstrations is no larger; 0 never.
       evaluations: how often the policy is evaluated and saved.
     """
 
@@ -81,6 +82,7 @@ class PPOConfig:
     max_grad_norm: float = 1.0
     reward_scaling: float = 10.0
     hidden_layers: list[int] | None = None
+    target_gap: float = 0.0
     evaluations: int | None = None
 
     def __post_init__(self) -> None:
@@ -112,6 +114,8 @@ class PPOConfig:
         for key in ("discounting", "gae_lambda", "final_learning_rate"):
             if not 0 <= getattr(self, key) <= 1:
                 raise ValueError(f"trainer.{key}: expected a number in [0, 1], got {getattr(self, key)}")
+        if not self.target_gap >= 0:
+            raise ValueError(f"trainer.target_gap: expected at least 0, got {self.target_gap}")
         layers = self.hidden_layers or []
         if not layers or min(layers) < 1:
             raise ValueError(f"trainer.hidden_layers: expected one or more widths above 0, got {layers}")

@@ -1,5 +1,6 @@
 """Brax PPO on an imitation environment: called as the library that it is, watched from its callback."""
 
+import contextlib
 import functools
 import signal
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from mimic.trainers.config import PPOConfig
 from mimic.trainers.evaluation import Controller
 
 Params = Any  # observation statistics, policy parameters, value parameters
-OnEvaluation = Callable[[int, Params, dict[str, float]], None]
+OnEvaluation = Callable[[int, Params, dict[str, float]], bool]  # whether that is good enough to stop
 
 
 class Interrupted(Exception):
@@ -31,6 +32,10 @@ class Interrupted(Exception):
     def __init__(self, signal_number: int):
         super().__init__(signal.Signals(signal_number).name)
         self.signal_number = signal_number
+
+
+class _GoodEnough(Exception):  # noqa: N818 - not an error: brax has no other way to be stopped
+    """Training has reached what was asked for."""
 
 
 class LearningRate:
@@ -100,7 +105,8 @@ def train(
       config: resolved.
       run_dir: where checkpoints go.
       seed: of networks, exploration and resets.
-      on_evaluation: called with the environment steps so far, the parameters and brax's training metrics.
+      on_evaluation: called with the environment steps so far, the parameters and brax's training metrics; training
+        ends where it returns True.
       restore: steps and parameters to go on from. Networks and observation statistics are kept; the moments of the
         optimiser and the states of the environments start anew.
 
@@ -110,12 +116,12 @@ def train(
     compat.mend_brax()
     done_steps, params = restore or (0, None)
     caught: list[int] = []
-    unwritten: dict[str, Any] = {}
+    latest: dict[str, Any] = {}
 
     def on_params(step: int, _: Any, params: Params) -> None:
         step += done_steps
         save_checkpoint(run_dir, step, params)
-        unwritten.update(step=step, params=params)
+        latest.update(step=step, params=params)
         if step == done_steps:
             on_evaluation(step, params, {})
         if caught:
@@ -123,19 +129,21 @@ def train(
 
     def on_metrics(_: int, metrics: dict[str, Any]) -> None:
         named = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
-        on_evaluation(unwritten["step"], unwritten["params"], named)
+        enough = on_evaluation(latest["step"], latest["params"], named)
         if caught:
             raise Interrupted(caught[0])
+        if enough:
+            raise _GoodEnough
 
-    with _signals_caught(caught):
-        _, final, _ = brax_ppo.train(
+    with _signals_caught(caught), contextlib.suppress(_GoodEnough):
+        brax_ppo.train(
             progress_fn=on_metrics,
             policy_params_fn=on_params,
             **_brax_arguments(env, config, done_steps),
             restore_params=params,
             seed=seed + done_steps,
         )
-    return final
+    return latest["params"]
 
 
 def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> dict[str, Any]:

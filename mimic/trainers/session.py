@@ -175,7 +175,7 @@ def _train(
     total: int = settings.num_timesteps  # type: ignore[assignment]
     with TrainingProgress(console, total, reached["step"]) as progress, stopwatch.stage("train"):
 
-        def on_evaluation(step: int, params: ppo.Params, metrics: Mapping[str, float]) -> None:
+        def on_evaluation(step: int, params: ppo.Params, metrics: Mapping[str, float]) -> bool:
             with stopwatch.stage("evaluate"):
                 quality = evaluator.summary(evaluate_params(params))
                 if metrics:
@@ -184,6 +184,7 @@ def _train(
                     log.write(step, {**row, "wall_time_s": time.perf_counter() - stopwatch.started})
                 progress.update(step, quality, metrics.get("sps"))
                 reached["step"] = step
+            return quality["optimality_gap"]["train"] <= settings.target_gap
 
         params = ppo.train(
             evaluator.training_env,
