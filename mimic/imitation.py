@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
@@ -39,8 +40,8 @@ class ClosestMotion(NamedTuple):
 def kinematic_bound(
     expert: Embodiment,
     learner: Embodiment,
-    qpos: Float[Array, "time expert_joints"],
-    qvel: Float[Array, "time expert_joints"],
+    qpos: Float[ArrayLike, "time expert_joints"],
+    qvel: Float[ArrayLike, "time expert_joints"],
     correspondence: Correspondence,
     weights: Weights,
     *,
@@ -69,8 +70,8 @@ def kinematic_bound(
 def closest_motions(
     expert: Embodiment,
     learner: Embodiment,
-    qpos: Float[Array, "time expert_joints"],
-    qvel: Float[Array, "time expert_joints"],
+    qpos: Float[ArrayLike, "time expert_joints"],
+    qvel: Float[ArrayLike, "time expert_joints"],
     correspondence: Correspondence,
     weights: Weights,
     *,

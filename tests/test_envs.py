@@ -70,8 +70,10 @@ def test_simulation_model_keeps_only_what_moves():
 
 
 def test_every_environment_resets_and_steps():
-    for name in mimic.environments():
-        env = mimic.make(name, demonstrations=FEW)
+    limited = {"demonstrations": FEW, "limits": "hardware"}
+    settings = [(name, {"demonstrations": FEW}) for name in mimic.environments()]
+    for name, overrides in [*settings, ("panda4dof", limited)]:
+        env = mimic.make(name, **overrides)
         state = env.reset(jax.random.PRNGKey(0))
         assert state.obs.shape == (env.observation_size,)
         after = jax.jit(env.step)(state, jnp.zeros(env.action_size))

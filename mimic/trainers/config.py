@@ -8,7 +8,7 @@ from mimic.envs.config import EnvConfig
 PRESETS: dict[str, dict[str, Any]] = {
     # Two cores: few environments, many gradient steps on each sample, since the physics is what costs.
     "cpu": {
-        "num_timesteps": 2_200_000,
+        "num_timesteps": 1_600_000,
         "num_envs": 512,
         "unroll_length": 10,
         "batch_size": 128,
@@ -17,13 +17,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         "learning_rate": 1e-3,
         "final_learning_rate": 0.05,
         "discounting": 0.8,
-        "entropy_cost": 1e-3,
+        "entropy_cost": 0.01,
         "hidden_layers": [128, 128],
         "evaluations": 10,
     },
     # One GPU: as many environments as keep it busy; a batch is 8192 short stretches of motion.
     "gpu": {
-        "num_timesteps": 32_000_000,
+        "num_timesteps": 40_000_000,
         "num_envs": 4096,
         "unroll_length": 10,
         "batch_size": 512,
@@ -32,7 +32,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "learning_rate": 1e-3,
         "final_learning_rate": 0.01,
         "discounting": 0.9,
-        "entropy_cost": 0.06,
+        "entropy_cost": 0.1,
         "hidden_layers": [512, 256],
         "evaluations": 8,
     },
