@@ -1,0 +1,357 @@
+"""Static pose imitation: the learner's pose that is nearest to a pose of the expert."""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
+from mimic.embodiment import Embodiment
+from mimic.kinematics import LinkStates, link_states
+
+Method = Literal["newton", "gradient_descent"]
+METHODS = ("newton", "gradient_descent")
+
+_ITERATIONS = {"newton": 16, "gradient_descent": 200}
+_TRACKING_ITERATIONS = 6  # Newton steps from the pose of the neighbouring time
+_ROUGH_SHARE, _POLISHED = 0.35, 2  # all starts descend for this share of the iterations, then the best of them
+_POSES = 256  # random poses that are compared, without a descent, to find the starts
+_LARGEST_STEP = 1.0  # rad, of a joint in one Newton step
+_FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: at the start, after a success, after a failure
+_GRADIENT_STEP = 0.5  # rad per unit of gradient, of plain descent; times joints and links, since the metric is a mean
+_FLAT = 1e-3  # gradient [1/rad] of a pose that counts as converged, as a share of the mean distance of random poses
+_ANCHORS = 3  # times of a trajectory at which minima are searched; all others are tracked
+
+_Objective = Callable[[Array], Array]
+
+
+class PoseImitation(NamedTuple):
+    """The learner's nearest poses.
+
+    Attributes:
+      qpos: [*batch, learner_joints] [rad].
+      distance: [*batch] embodiment distance that is left.
+      converged: [*batch] whether the gradient vanishes there, but for joints that are held at a limit.
+    """
+
+    qpos: Float[Array, "*batch learner_joints"]
+    distance: Float[Array, "*batch"]
+    converged: Bool[Array, "*batch"]
+
+
+def imitate_pose(
+    expert: Embodiment,
+    learner: Embodiment,
+    qpos: Float[ArrayLike, "*batch expert_joints"],
+    correspondence: Correspondence,
+    weights: Weights,
+    *,
+    starts: int = 12,
+    key: Array | None = None,
+    warm_start: Float[ArrayLike, "*batch learner_joints"] | None = None,
+    method: Method = "newton",
+    iterations: int | None = None,
+    rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
+) -> PoseImitation:
+    """The learner's pose of least embodiment distance, argmin d(s(q), s_hat(q_hat)) (paper, eq. 22).
+
+    The distance has local minima, so several descents are made for each pose: from the expert's own angles in the
+    joints that both arms have by name, and from the nearest of each of `starts` sets of random poses. The best end
+    is returned. "newton" is a damped Newton method on the exact second derivative, with concave directions turned
+    round; "gradient_descent" is the paper's plain descent with a constant step.
+
+    Jit what calls this if it is called more than once; each call of its own is compiled anew.
+
+    Args:
+      expert: n joints.
+      learner: its n_hat joints are optimised, within their range; a joint that can do a full turn ends in [-pi, pi].
+      qpos: [n] or [..., n] the expert's poses [rad].
+      correspondence: see `embodiment_distance`.
+      weights: see `embodiment_distance`; velocities are zero.
+      starts: descents from random poses; 0 leaves the expert's own angles.
+      key: of the random poses; `jax.random.key(0)` where None.
+      warm_start: [..., n_hat] the only start, where it is given.
+      method: "newton" or "gradient_descent".
+      iterations: of each descent; 16 for Newton's method, 200 for gradient descent where None.
+      rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
+
+    Raises:
+      ValueError: poses of the wrong shape or not finite, an unknown method, or counts below their least value.
+    """
+    poses = _checked_poses(expert, qpos, "qpos")
+    if method not in METHODS:
+        raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    count = _ITERATIONS[method] if iterations is None else iterations
+    if starts < 0 or count < 2:
+        raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {count}")
+    rough = max(int(_ROUGH_SHARE * count), 1)
+    key = jax.random.key(0) if key is None else key
+    batch = poses.shape[:-1]
+    distance = _pose_distance(learner, correspondence, weights, rotation, reduction)
+    limits = pose_limits(learner, poses.dtype)
+    descend = _newton if method == "newton" else _gradient_descent
+
+    def solve(poses: Array, warm: Array | None) -> PoseImitation:
+        random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
+        scale = _typical_distance(distance, expert, learner, poses, random_poses)
+
+        def one(pose: Array, warm: Array | None) -> PoseImitation:
+            states = link_states(expert, pose)
+            first = _starts(distance, expert, learner, states, pose, random_poses if starts else None)
+            first = first if warm is None else warm[None]
+            objective = lambda q: distance(states, q)  # noqa: E731
+            ends = jax.vmap(lambda start: descend(objective, start, limits, rough))(first)
+            chosen = jax.lax.top_k(-ends[1], min(_POLISHED, len(first)))[1]
+            ends = jax.vmap(lambda start: descend(objective, start, limits, count - rough))(ends[0][chosen])
+            found, value, slope = jax.tree.map(lambda x: x[jnp.argmin(ends[1])], ends)
+            return PoseImitation(_wrapped(found, limits), value, slope <= _FLAT * scale)
+
+        in_axes = (0, None if warm is None else 0)
+        return jax.vmap(one, in_axes)(poses, warm)
+
+    flat_warm = None
+    if warm_start is not None:
+        flat_warm = _checked_poses(learner, warm_start, "warm_start").reshape(-1, learner.num_joints)
+        flat_warm = jnp.broadcast_to(flat_warm, (int(np.prod(batch)), learner.num_joints))
+    found = jax.jit(solve)(poses.reshape(-1, expert.num_joints), flat_warm)
+    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), found)
+
+
+def imitate_trajectory(
+    expert: Embodiment,
+    learner: Embodiment,
+    qpos: Float[ArrayLike, "time expert_joints"],
+    correspondence: Correspondence,
+    weights: Weights,
+    *,
+    largest_jump: Float[ArrayLike, " learner_joints"] | float = 0.3,
+    starts: int = 12,
+    key: Array | None = None,
+    rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
+) -> PoseImitation:
+    """Nearest poses that form one continuous motion: each time starts from its neighbour's pose.
+
+    Minima are searched at three times, the first, middle and last; each minimum is tracked over the whole motion, and
+    the track of the least mean distance is returned. Where a minimum vanishes, the joints move on to another at their
+    largest jump. Angles are not wrapped: a joint without a limit may pass pi.
+
+    Args:
+      expert: n joints.
+      learner: n_hat joints.
+      qpos: [T, n] the expert's motion [rad].
+      correspondence: see `embodiment_distance`.
+      weights: see `embodiment_distance`; velocities are zero.
+      largest_jump: bound on the change of a joint between two times [rad], one number or one for each joint.
+      starts: see `imitate_pose`.
+      key: see `imitate_pose`.
+      rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
+
+    Raises:
+      ValueError: what `imitate_pose` refuses, or a jump that is not above 0.
+    """
+    poses = _checked_poses(expert, qpos, "qpos")
+    if poses.ndim != 2:
+        raise ValueError(f"qpos: expected shape [time, {expert.num_joints}], got {poses.shape}")
+    if not np.all(np.asarray(largest_jump) > 0):
+        raise ValueError(f"largest_jump: expected angles above 0 rad, got {largest_jump}")
+    if starts < 0:
+        raise ValueError(f"starts: expected at least 0, got {starts}")
+    key = jax.random.key(0) if key is None else key
+    distance = _pose_distance(learner, correspondence, weights, rotation, reduction)
+    lower, upper = pose_limits(learner, poses.dtype)
+    jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
+    last = poses.shape[0] - 1
+    anchors = np.unique(np.linspace(0, last, _ANCHORS).round().astype(int))
+
+    def solve(poses: Array) -> PoseImitation:
+        random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
+        scale = _typical_distance(distance, expert, learner, poses, random_poses)
+        states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
+
+        def at(time: Array) -> LinkStates:
+            return jax.tree.map(lambda x: x[time], states)
+
+        def track(anchor: Array, start: Array) -> tuple[Array, Array, Array]:
+            begin = _newton(lambda q: distance(at(anchor), q), start, (lower, upper), _ITERATIONS["newton"])[0]
+
+            def follow(pose: Array, time: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+                reach = jnp.maximum(lower, pose - jump), jnp.minimum(upper, pose + jump)
+                end = _newton(lambda q: distance(at(time), q), pose, reach, _TRACKING_ITERATIONS)
+                return end[0], end
+
+            # Forth from the anchor to the end, then back over all: what lies before the anchor is reached that way too.
+            forth = jnp.maximum(jnp.arange(last + 1), anchor)
+            turned, _ = jax.lax.scan(follow, begin, forth)
+            return jax.lax.scan(follow, turned, jnp.arange(last + 1), reverse=True)[1]
+
+        def from_anchor(anchor: Array) -> tuple[Array, Array, Array]:
+            expert_pose = poses[anchor]
+            first = _starts(distance, expert, learner, at(anchor), expert_pose, random_poses if starts else None)
+            return jax.vmap(lambda start: track(anchor, start))(first)
+
+        tracks = jax.vmap(from_anchor)(jnp.asarray(anchors))
+        tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
+        best = jnp.argmin(tracks[1].mean(axis=1))
+        found, value, slope = jax.tree.map(lambda x: x[best], tracks)
+        return PoseImitation(found, value, slope <= _FLAT * scale)
+
+    return jax.jit(solve)(poses)
+
+
+def pose_limits(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Joint ranges, lower and upper; infinite for a joint that can do a full turn."""
+    lower, upper = np.asarray(arm.joint_range).T
+    full = upper - lower >= 2 * np.pi - 1e-4  # a model's text rounds pi
+    return np.where(full, -np.inf, lower).astype(dtype), np.where(full, np.inf, upper).astype(dtype)
+
+
+def _pose_distance(
+    learner: Embodiment,
+    correspondence: Correspondence,
+    weights: Weights,
+    rotation: RotationMeasure,
+    reduction: Reduction,
+) -> Callable[[LinkStates, Array], Array]:
+    def distance(states: LinkStates, qpos: Array) -> Array:
+        learner_states = link_states(learner, qpos)
+        return embodiment_distance(
+            states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
+        )
+
+    return distance
+
+
+def _checked_poses(arm: Embodiment, values: ArrayLike, name: str) -> Array:
+    poses = jnp.asarray(values)
+    if poses.ndim < 1 or poses.shape[-1] != arm.num_joints:
+        raise ValueError(f"{name}: expected shape [..., {arm.num_joints}] for {arm.name}, got {poses.shape}")
+    poses = poses if jnp.issubdtype(poses.dtype, jnp.floating) else poses.astype(float)
+    if not isinstance(poses, Tracer) and not np.all(np.isfinite(np.asarray(poses))):
+        raise ValueError(f"{name}: expected finite angles [rad], got some that are not")
+    return poses
+
+
+def _random_poses(arm: Embodiment, key: Array, sets: int, dtype: Any) -> Float[Array, "sets poses joints"]:
+    lower, upper = jnp.asarray(arm.joint_range, dtype).T
+    shape = (sets, -(-_POSES // sets), arm.num_joints)
+    return jax.random.uniform(key, shape, dtype, minval=lower, maxval=upper)
+
+
+def _typical_distance(
+    distance: Callable[[LinkStates, Array], Array],
+    expert: Embodiment,
+    learner: Embodiment,
+    poses: Array,
+    random_poses: Array,
+) -> Float[Array, ""]:
+    """Mean distance of random poses to one of the expert's: the scale of the metric."""
+    states = link_states(expert, poses.reshape(-1, expert.num_joints)[0])
+    return jax.vmap(lambda q: distance(states, q))(random_poses.reshape(-1, learner.num_joints)).mean()
+
+
+def _starts(
+    distance: Callable[[LinkStates, Array], Array],
+    expert: Embodiment,
+    learner: Embodiment,
+    states: LinkStates,
+    expert_qpos: Array,
+    random_poses: Float[Array, "sets poses joints"] | None,
+) -> Float[Array, "starts joints"]:
+    """The expert's angles in the joints that both arms have by name, then the nearest of each set of random poses."""
+    index = [expert.joint_names.index(name) if name in expert.joint_names else -1 for name in learner.joint_names]
+    own = jnp.where(np.array(index) >= 0, expert_qpos[np.array(index)], 0)
+    if random_poses is None:
+        return own[None]
+    tried = jax.vmap(jax.vmap(lambda q: distance(states, q)))(random_poses)
+    nearest = jnp.take_along_axis(random_poses, jnp.argmin(tried, axis=1)[:, None, None], axis=1)[:, 0]
+    return jnp.concatenate([own[None], nearest])
+
+
+def _wrapped(qpos: Array, limits: tuple[np.ndarray, np.ndarray]) -> Array:
+    """Joints that can do a full turn, in [-pi, pi]."""
+    return jnp.where(np.isinf(limits[0]), qpos - 2 * jnp.pi * jnp.round(qpos / (2 * jnp.pi)), qpos)
+
+
+def _free(qpos: Array, gradient: Array, lower: Any, upper: Any) -> Array:
+    """1 for the joints that may move, 0 for those that a limit holds against the descent."""
+    held = ((qpos <= lower) & (gradient > 0)) | ((qpos >= upper) & (gradient < 0))
+    return jnp.where(held, 0, 1).astype(qpos.dtype)
+
+
+def _newton(
+    objective: _Objective, start: Array, limits: tuple[Any, Any], iterations: int
+) -> tuple[Array, Array, Array]:
+    """Damped Newton descent within limits: the pose, its distance, and the largest slope of a joint that is free."""
+    lower, upper = limits
+
+    def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
+        value, gradient = jax.value_and_grad(objective)(qpos)
+        return gradient, (value, gradient)
+
+    def derivatives(qpos: Array) -> tuple[Array, Array, Array]:
+        hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(qpos)
+        return value, gradient, hessian
+
+    def iterate(carry: Any, _: None) -> tuple[Any, None]:
+        qpos, (value, gradient, hessian), damping = carry
+        free = _free(qpos, gradient, lower, upper)
+        step = _descent_step(hessian, gradient, free, damping)
+        step = step / jnp.maximum(jnp.abs(step).max() / _LARGEST_STEP, 1.0)
+        tried = jnp.clip(qpos + step, lower, upper)
+        there = derivatives(tried)
+        better = there[0] < value
+        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (tried, there), (qpos, carry[1]))
+        return (*kept, damping * jnp.where(better, _LESS, _MORE)), None
+
+    start = jnp.clip(start, lower, upper)
+    # Nothing is known at the start: the first step is none, and what it finds is better than infinity.
+    unknown = jnp.full_like(start[0], jnp.inf), jnp.zeros_like(start), jnp.zeros_like(start, shape=2 * start.shape)
+    first = start, unknown, jnp.asarray(_FIRST_DAMPING / _LESS, start.dtype)
+    (qpos, (value, gradient, _), _), _ = jax.lax.scan(iterate, first, None, length=iterations + 1)
+    return qpos, value, jnp.abs(_free(qpos, gradient, lower, upper) * gradient).max()
+
+
+def _descent_step(hessian: Array, gradient: Array, free: Array, damping: Array) -> Array:
+    """-(L |D| L^T)^-1 g for the damped Hessian L D L^T of the free joints: downhill, whatever the curvature."""
+    joints = gradient.shape[0]
+    scale = jnp.abs(jnp.diagonal(hessian)).max() + jnp.finfo(gradient.dtype).tiny
+    matrix = hessian * free[:, None] * free[None, :] / scale
+    matrix = matrix + jnp.diag(damping + (1 - free))
+    least = jnp.finfo(gradient.dtype).eps
+    right, pivots, factors = -gradient * free / scale, [], []
+    for k in range(joints):
+        pivot = matrix[k, k]
+        pivot = jnp.where(jnp.abs(pivot) < least, least, pivot)
+        factor = jnp.where(jnp.arange(joints) > k, matrix[:, k] / pivot, 0)
+        matrix = matrix - factor[:, None] * matrix[k][None, :]
+        right = right - factor * right[k]
+        pivots.append(jnp.abs(pivot))
+        factors.append(factor)
+    step = right / jnp.stack(pivots)
+    for k in reversed(range(joints)):
+        step = step - jnp.where(jnp.arange(joints) == k, jnp.sum(factors[k] * step), 0)
+    return step
+
+
+def _gradient_descent(
+    objective: _Objective, start: Array, limits: tuple[Any, Any], iterations: int
+) -> tuple[Array, Array, Array]:
+    """Steps of constant length per slope (paper): the pose, its distance, and the largest slope of a free joint."""
+    lower, upper = limits
+
+    def iterate(qpos: Array, _: None) -> tuple[Array, None]:
+        slope = jax.grad(objective)(qpos)
+        return jnp.clip(qpos - _GRADIENT_STEP * start.shape[0] * slope, lower, upper), None
+
+    qpos, _ = jax.lax.scan(iterate, jnp.clip(start, lower, upper), None, length=iterations)
+    value, gradient = jax.value_and_grad(objective)(qpos)
+    return qpos, value, jnp.abs(_free(qpos, gradient, lower, upper) * gradient).max()
