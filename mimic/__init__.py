@@ -33,6 +33,7 @@ from mimic.kinematics import (  # noqa: E402
     forward_kinematics,
     link_states,
 )
+from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
@@ -50,6 +51,7 @@ __all__ = [
     "ImitationEnv",
     "LinkStates",
     "PairDistances",
+    "PoseImitation",
     "adaptive_weights",
     "body_twists",
     "build_arm",
@@ -60,6 +62,8 @@ __all__ = [
     "environments",
     "forward_kinematics",
     "hard_correspondence",
+    "imitate_pose",
+    "imitate_trajectory",
     "kinematic_bound",
     "link_distances",
     "link_states",

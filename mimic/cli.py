@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic.config import explain, schema
-from mimic.envs.config import EnvConfig
+from mimic.envs.config import EnvConfig, RetargetConfig
 from mimic.trainers.config import EvaluateConfig, PPOConfig, TrainConfig
 
 BAD_INPUT = 2
@@ -52,6 +52,7 @@ def _register_schemas() -> None:
     store = ConfigStore.instance()
     store.store(name="train_schema", node=schema(TrainConfig))
     store.store(name="evaluate_schema", node=schema(EvaluateConfig))
+    store.store(name="retarget_schema", node=schema(RetargetConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
     store.store(group="trainer", name="schema", node=schema(PPOConfig))
 

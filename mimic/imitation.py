@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
 from mimic.embodiment import Embodiment
 from mimic.kinematics import LinkStates, link_states
+from mimic.pose import pose_limits, shared_joints
 
 _POSES = 256  # random poses that are tried, without a descent, to find the starts
 _SEARCH_STEP, _POLISH_STEP = 0.1, 0.03  # first step of a descent [rad, and times the expert's speed]
@@ -154,7 +155,7 @@ def _starts(
         pose_states = jax.vmap(lambda pose: link_states(learner, pose))(poses)
         tried = jax.vmap(lambda pose: distance(states, pose))(pose_states).reshape(starts, -1)
         chosen = poses.reshape(starts, -1, learner.num_joints)[jnp.arange(starts), jnp.argmin(tried, axis=1)]
-        own_qpos, own_qvel = _shared_joints(expert, learner, expert_qpos, expert_qvel)
+        own_qpos, own_qvel = (shared_joints(expert, learner, values) for values in (expert_qpos, expert_qvel))
         start_qpos = jnp.concatenate([own_qpos[None], chosen])
         return start_qpos, jnp.broadcast_to(own_qvel, start_qpos.shape)
 
@@ -175,7 +176,7 @@ def _descend(
     first_step: float,
 ) -> ClosestMotion:
     """Adam with a step that shrinks to zero along a cosine, keeping the best point."""
-    lower, upper = _pose_limits(learner, start[0].dtype)
+    lower, upper = pose_limits(learner, start[0].dtype)
 
     def iterate(carry: Any, count: Array) -> tuple[Any, None]:
         motion, mean, square, best = carry
@@ -200,22 +201,6 @@ def _descend(
     return jax.lax.scan(iterate, (start, zero, zero, best), counts)[0][3]
 
 
-def _pose_limits(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Joint ranges; infinite for a joint that can do a full turn."""
-    lower, upper = np.asarray(arm.joint_range).T
-    full = upper - lower >= 2 * np.pi - 1e-4  # a model's text rounds pi
-    return np.where(full, -np.inf, lower).astype(dtype), np.where(full, np.inf, upper).astype(dtype)
-
-
 def _random_poses(arm: Embodiment, count: int, seed: int, dtype: Any) -> Float[Array, "count joints"]:
     lower, upper = np.asarray(arm.joint_range).T
     return jnp.asarray(np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)), dtype)
-
-
-def _shared_joints(
-    expert: Embodiment, learner: Embodiment, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]
-) -> tuple[Array, Array]:
-    """The expert's angles and velocities in the joints that both arms have by name, zero in the others."""
-    index = [expert.joint_names.index(name) if name in expert.joint_names else -1 for name in learner.joint_names]
-    shared = np.array(index) >= 0
-    return jnp.where(shared, qpos[np.array(index)], 0), jnp.where(shared, qvel[np.array(index)], 0)

@@ -141,7 +141,7 @@ def imitate_trajectory(
 
     Minima are searched at three times, the first, middle and last; each minimum is tracked over the whole motion, and
     the track of the least mean distance is returned. Where a minimum vanishes, the joints move on to another at their
-    largest jump. Angles are not wrapped: a joint without a limit may pass pi.
+    largest jump. The first pose lies in [-pi, pi]; then a joint that can do a full turn may pass pi.
 
     Args:
       expert: n joints.
@@ -167,7 +167,7 @@ def imitate_trajectory(
         raise ValueError(f"starts: expected at least 0, got {starts}")
     key = jax.random.key(0) if key is None else key
     distance = _pose_distance(learner, correspondence, weights, rotation, reduction)
-    lower, upper = pose_limits(learner, poses.dtype)
+    limits = lower, upper = pose_limits(learner, poses.dtype)
     jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
     last = poses.shape[0] - 1
     anchors = np.unique(np.linspace(0, last, _ANCHORS).round().astype(int))
@@ -202,7 +202,7 @@ def imitate_trajectory(
         tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
         best = jnp.argmin(tracks[1].mean(axis=1))
         found, value, slope = jax.tree.map(lambda x: x[best], tracks)
-        return PoseImitation(found, value, slope <= _FLAT * scale)
+        return PoseImitation(found + _wrapped(found[0], limits) - found[0], value, slope <= _FLAT * scale)
 
     return jax.jit(solve)(poses)
 
@@ -212,6 +212,14 @@ def pose_limits(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
     lower, upper = np.asarray(arm.joint_range).T
     full = upper - lower >= 2 * np.pi - 1e-4  # a model's text rounds pi
     return np.where(full, -np.inf, lower).astype(dtype), np.where(full, np.inf, upper).astype(dtype)
+
+
+def shared_joints(
+    expert: Embodiment, learner: Embodiment, values: Float[Array, " expert_joints"]
+) -> Float[Array, " learner_joints"]:
+    """The expert's values in the joints that both arms have by name, zero in the learner's others."""
+    index = [expert.joint_names.index(name) if name in expert.joint_names else -1 for name in learner.joint_names]
+    return jnp.where(np.array(index) >= 0, values[np.array(index)], 0)
 
 
 def _pose_distance(
@@ -267,8 +275,7 @@ def _starts(
     random_poses: Float[Array, "sets poses joints"] | None,
 ) -> Float[Array, "starts joints"]:
     """The expert's angles in the joints that both arms have by name, then the nearest of each set of random poses."""
-    index = [expert.joint_names.index(name) if name in expert.joint_names else -1 for name in learner.joint_names]
-    own = jnp.where(np.array(index) >= 0, expert_qpos[np.array(index)], 0)
+    own = shared_joints(expert, learner, expert_qpos)
     if random_poses is None:
         return own[None]
     tried = jax.vmap(jax.vmap(lambda q: distance(states, q)))(random_poses)

@@ -128,9 +128,8 @@ def test_trajectories_do_not_jump(limits):
     motion = imitate_trajectory(expert, learner, qpos, correspondence, PAPER_WEIGHTS, largest_jump=0.2)
     assert np.abs(np.diff(motion.qpos, axis=0)).max() <= 0.2 + 1e-6
     best = imitate_pose(expert, learner, qpos, correspondence, PAPER_WEIGHTS)
-    hold = imitate_pose(expert, learner, qpos, correspondence, PAPER_WEIGHTS, starts=0, iterations=2)
     assert np.all(motion.distance > best.distance - 1e-5)
-    assert motion.distance.mean() < 0.5 * (best.distance.mean() + hold.distance.mean()) + 0.02
+    assert motion.distance.mean() < 1.3 * best.distance.mean()  # six such motions: at most 1.24 times
     lower, upper = learner.joint_range.T
     if limits == "hardware":
         assert np.all((motion.qpos >= lower - 1e-6) & (motion.qpos <= upper + 1e-6))

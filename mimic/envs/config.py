@@ -130,6 +130,25 @@ class EnvConfig:
                 raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
 
 
+@dataclasses.dataclass(frozen=True)
+class RetargetConfig:
+    """A retargeting of demonstrations.
+
+    Attributes:
+      demonstrations: file of the expert's.
+      learner: name of the environment whose arms and metric count.
+      limits: see `EnvConfig`.
+      out: file of the learner's; must not exist.
+      seed: of the random poses that minima are searched from.
+    """
+
+    demonstrations: str = ""
+    learner: str = "panda4dof"
+    limits: str = "none"
+    out: str = ""
+    seed: int = 0
+
+
 def _check_choice(name: str, value: str, valid: tuple[str, ...]) -> None:
     if value not in valid:
         raise ValueError(f"{name}: expected one of {', '.join(valid)}, got {value!r}")

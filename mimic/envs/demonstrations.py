@@ -69,7 +69,7 @@ class Demonstrations:
 
     def check_fits(self, arm: Embodiment, dt: float, horizon: int) -> None:
         """Raises a ValueError unless an environment with this expert and time step can use these."""
-        if self.joint_names != arm.joint_names:
+        if (self.arm, self.joint_names) != (arm.name, arm.joint_names):  # joint1, joint2, … are names of many arms
             raise ValueError(
                 f"demonstrations: recorded with the joints {', '.join(self.joint_names)} of {self.arm!r}, "
                 f"but the expert {arm.name!r} has {', '.join(arm.joint_names)}"
