@@ -27,7 +27,7 @@ def explain(error: Exception) -> str:
     key = getattr(error, "full_key", None) or getattr(error, "key", None)
     parent = getattr(error, "parent_node", None)
     if " not in " in message and isinstance(parent, DictConfig):
-        return f"unknown key {str(key)!r}; valid are {', '.join(map(str, parent))}"
+        return f"unknown key {str(key)!r}; valid are {', '.join(str(name) for name in parent if name != 'hydra')}"
     return f"{key}: {message}" if key and str(key) not in message else message
 
 

@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from mimic.descent import End, gradient_descent, newton
 from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
 from mimic.embodiment import Embodiment
 from mimic.kinematics import LinkStates, link_states
@@ -21,13 +22,8 @@ _ITERATIONS = {"newton": 16, "gradient_descent": 200}
 _TRACKING_ITERATIONS = 6  # Newton steps from the pose of the neighbouring time
 _ROUGH_SHARE, _POLISHED = 0.35, 2  # all starts descend for this share of the iterations, then the best of them
 _POSES = 256  # random poses that are compared, without a descent, to find the starts
-_LARGEST_STEP = 1.0  # rad, of a joint in one Newton step
-_FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: at the start, after a success, after a failure
-_GRADIENT_STEP = 0.5  # rad per unit of gradient, of plain descent; times joints and links, since the metric is a mean
 _FLAT = 1e-3  # gradient [1/rad] of a pose that counts as converged, as a share of the mean distance of random poses
 _ANCHORS = 3  # times of a trajectory at which minima are searched; all others are tracked
-
-_Objective = Callable[[Array], Array]
 
 
 class PoseImitation(NamedTuple):
@@ -96,7 +92,7 @@ def imitate_pose(
     batch = poses.shape[:-1]
     distance = _pose_distance(learner, correspondence, weights, rotation, reduction)
     limits = pose_limits(learner, poses.dtype)
-    descend = _newton if method == "newton" else _gradient_descent
+    descend = newton if method == "newton" else gradient_descent
 
     def solve(poses: Array, warm: Array | None) -> PoseImitation:
         random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
@@ -108,10 +104,10 @@ def imitate_pose(
             first = first if warm is None else warm[None]
             objective = lambda q: distance(states, q)  # noqa: E731
             ends = jax.vmap(lambda start: descend(objective, start, limits, rough))(first)
-            chosen = jax.lax.top_k(-ends[1], min(_POLISHED, len(first)))[1]
-            ends = jax.vmap(lambda start: descend(objective, start, limits, count - rough))(ends[0][chosen])
-            found, value, slope = jax.tree.map(lambda x: x[jnp.argmin(ends[1])], ends)
-            return PoseImitation(_wrapped(found, limits), value, slope <= _FLAT * scale)
+            chosen = jax.lax.top_k(-ends.value, min(_POLISHED, len(first)))[1]
+            ends = jax.vmap(lambda start: descend(objective, start, limits, count - rough))(ends.qpos[chosen])
+            end: End = jax.tree.map(lambda x: x[jnp.argmin(ends.value)], ends)
+            return PoseImitation(_wrapped(end.qpos, limits), end.value, end.slope <= _FLAT * scale)
 
         in_axes = (0, None if warm is None else 0)
         return jax.vmap(one, in_axes)(poses, warm)
@@ -180,29 +176,30 @@ def imitate_trajectory(
         def at(time: Array) -> LinkStates:
             return jax.tree.map(lambda x: x[time], states)
 
-        def track(anchor: Array, start: Array) -> tuple[Array, Array, Array]:
-            begin = _newton(lambda q: distance(at(anchor), q), start, (lower, upper), _ITERATIONS["newton"])[0]
+        def track(anchor: Array, start: Array) -> End:
+            begin = newton(lambda q: distance(at(anchor), q), start, (lower, upper), _ITERATIONS["newton"]).qpos
 
-            def follow(pose: Array, time: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+            def follow(pose: Array, time: Array) -> tuple[Array, End]:
                 reach = jnp.maximum(lower, pose - jump), jnp.minimum(upper, pose + jump)
-                end = _newton(lambda q: distance(at(time), q), pose, reach, _TRACKING_ITERATIONS)
-                return end[0], end
+                end = newton(lambda q: distance(at(time), q), pose, reach, _TRACKING_ITERATIONS)
+                return end.qpos, end
 
             # Forth from the anchor to the end, then back over all: what lies before the anchor is reached that way too.
             forth = jnp.maximum(jnp.arange(last + 1), anchor)
             turned, _ = jax.lax.scan(follow, begin, forth)
             return jax.lax.scan(follow, turned, jnp.arange(last + 1), reverse=True)[1]
 
-        def from_anchor(anchor: Array) -> tuple[Array, Array, Array]:
+        def from_anchor(anchor: Array) -> End:
             expert_pose = poses[anchor]
             first = _starts(distance, expert, learner, at(anchor), expert_pose, random_poses if starts else None)
             return jax.vmap(lambda start: track(anchor, start))(first)
 
         tracks = jax.vmap(from_anchor)(jnp.asarray(anchors))
         tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
-        best = jnp.argmin(tracks[1].mean(axis=1))
-        found, value, slope = jax.tree.map(lambda x: x[best], tracks)
-        return PoseImitation(found + _wrapped(found[0], limits) - found[0], value, slope <= _FLAT * scale)
+        best = jnp.argmin(tracks.value.mean(axis=1))
+        found: End = jax.tree.map(lambda x: x[best], tracks)
+        shift = _wrapped(found.qpos[0], limits) - found.qpos[0]
+        return PoseImitation(found.qpos + shift, found.value, found.slope <= _FLAT * scale)
 
     return jax.jit(solve)(poses)
 
@@ -286,79 +283,3 @@ def _starts(
 def _wrapped(qpos: Array, limits: tuple[np.ndarray, np.ndarray]) -> Array:
     """Joints that can do a full turn, in [-pi, pi]."""
     return jnp.where(np.isinf(limits[0]), qpos - 2 * jnp.pi * jnp.round(qpos / (2 * jnp.pi)), qpos)
-
-
-def _free(qpos: Array, gradient: Array, lower: Any, upper: Any) -> Array:
-    """1 for the joints that may move, 0 for those that a limit holds against the descent."""
-    held = ((qpos <= lower) & (gradient > 0)) | ((qpos >= upper) & (gradient < 0))
-    return jnp.where(held, 0, 1).astype(qpos.dtype)
-
-
-def _newton(
-    objective: _Objective, start: Array, limits: tuple[Any, Any], iterations: int
-) -> tuple[Array, Array, Array]:
-    """Damped Newton descent within limits: the pose, its distance, and the largest slope of a joint that is free."""
-    lower, upper = limits
-
-    def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
-        value, gradient = jax.value_and_grad(objective)(qpos)
-        return gradient, (value, gradient)
-
-    def derivatives(qpos: Array) -> tuple[Array, Array, Array]:
-        hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(qpos)
-        return value, gradient, hessian
-
-    def iterate(carry: Any, _: None) -> tuple[Any, None]:
-        qpos, (value, gradient, hessian), damping = carry
-        free = _free(qpos, gradient, lower, upper)
-        step = _descent_step(hessian, gradient, free, damping)
-        step = step / jnp.maximum(jnp.abs(step).max() / _LARGEST_STEP, 1.0)
-        tried = jnp.clip(qpos + step, lower, upper)
-        there = derivatives(tried)
-        better = there[0] < value
-        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (tried, there), (qpos, carry[1]))
-        return (*kept, damping * jnp.where(better, _LESS, _MORE)), None
-
-    start = jnp.clip(start, lower, upper)
-    # Nothing is known at the start: the first step is none, and what it finds is better than infinity.
-    unknown = jnp.full_like(start[0], jnp.inf), jnp.zeros_like(start), jnp.zeros_like(start, shape=2 * start.shape)
-    first = start, unknown, jnp.asarray(_FIRST_DAMPING / _LESS, start.dtype)
-    (qpos, (value, gradient, _), _), _ = jax.lax.scan(iterate, first, None, length=iterations + 1)
-    return qpos, value, jnp.abs(_free(qpos, gradient, lower, upper) * gradient).max()
-
-
-def _descent_step(hessian: Array, gradient: Array, free: Array, damping: Array) -> Array:
-    """-(L |D| L^T)^-1 g for the damped Hessian L D L^T of the free joints: downhill, whatever the curvature."""
-    joints = gradient.shape[0]
-    scale = jnp.abs(jnp.diagonal(hessian)).max() + jnp.finfo(gradient.dtype).tiny
-    matrix = hessian * free[:, None] * free[None, :] / scale
-    matrix = matrix + jnp.diag(damping + (1 - free))
-    least = jnp.finfo(gradient.dtype).eps
-    right, pivots, factors = -gradient * free / scale, [], []
-    for k in range(joints):
-        pivot = matrix[k, k]
-        pivot = jnp.where(jnp.abs(pivot) < least, least, pivot)
-        factor = jnp.where(jnp.arange(joints) > k, matrix[:, k] / pivot, 0)
-        matrix = matrix - factor[:, None] * matrix[k][None, :]
-        right = right - factor * right[k]
-        pivots.append(jnp.abs(pivot))
-        factors.append(factor)
-    step = right / jnp.stack(pivots)
-    for k in reversed(range(joints)):
-        step = step - jnp.where(jnp.arange(joints) == k, jnp.sum(factors[k] * step), 0)
-    return step
-
-
-def _gradient_descent(
-    objective: _Objective, start: Array, limits: tuple[Any, Any], iterations: int
-) -> tuple[Array, Array, Array]:
-    """Steps of constant length per slope (paper): the pose, its distance, and the largest slope of a free joint."""
-    lower, upper = limits
-
-    def iterate(qpos: Array, _: None) -> tuple[Array, None]:
-        slope = jax.grad(objective)(qpos)
-        return jnp.clip(qpos - _GRADIENT_STEP * start.shape[0] * slope, lower, upper), None
-
-    qpos, _ = jax.lax.scan(iterate, jnp.clip(start, lower, upper), None, length=iterations)
-    value, gradient = jax.value_and_grad(objective)(qpos)
-    return qpos, value, jnp.abs(_free(qpos, gradient, lower, upper) * gradient).max()
