@@ -33,6 +33,7 @@ from mimic.kinematics import (  # noqa: E402
     forward_kinematics,
     link_states,
 )
+from mimic.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ __all__ = [
     "build_arm",
     "candidate_points",
     "closest_motion",
+    "distance_landscape",
     "embodiment_distance",
     "env_config",
     "environments",
@@ -69,6 +71,7 @@ __all__ = [
     "link_states",
     "load_demonstrations",
     "load_mjcf",
+    "local_minima",
     "make",
     "overlap_correspondence",
     "panda",
