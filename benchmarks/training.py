@@ -100,11 +100,12 @@ def main() -> None:
         for seed in options.seeds:
             results.append({"case": name, **run_once([*CASES[name], f"seed={seed}"])})
             if options.out:
-                write(options.out, results, options.commit or _commit())
+                write(options.out, results, options.commit or commit_id())
     Console().print(_table(results))
 
 
-def _commit() -> str:
+def commit_id() -> str:
+    """What is checked out, where this is a git checkout."""
     found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
     return found.stdout.strip() if found.returncode == 0 else "unknown"
 
