@@ -9,7 +9,9 @@ from jaxtyping import Array, Float
 
 _LARGEST_STEP = 1.0  # rad, of a joint in one Newton step
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: at the start, after a success, after a failure
-_GRADIENT_STEP = 0.5  # rad per unit of gradient, of plain descent; times joints and links, since the metric is a mean
+# rad per unit of gradient, of plain descent: stable for the static rotational measure (2 over its largest curvature is
+# 0.46 for planar arms of 4 and 7 links, 0.64 for two Pandas).
+_GRADIENT_STEP = 0.4
 
 Objective = Callable[[Array], Array]
 Limits = tuple[Any, Any]  # lower, upper [rad]
@@ -66,7 +68,7 @@ def gradient_descent(objective: Objective, start: Array, limits: Limits, iterati
 
     def iterate(qpos: Array, _: None) -> tuple[Array, None]:
         slope = jax.grad(objective)(qpos)
-        return jnp.clip(qpos - _GRADIENT_STEP * start.shape[0] * slope, lower, upper), None
+        return jnp.clip(qpos - _GRADIENT_STEP * slope, lower, upper), None
 
     qpos, _ = jax.lax.scan(iterate, jnp.clip(start, lower, upper), None, length=iterations)
     value, gradient = jax.value_and_grad(objective)(qpos)

@@ -18,7 +18,7 @@ from mimic.kinematics import LinkStates, link_states
 Method = Literal["newton", "gradient_descent"]
 METHODS = ("newton", "gradient_descent")
 
-_ITERATIONS = {"newton": 16, "gradient_descent": 200}
+_ITERATIONS = {"newton": 16, "gradient_descent": 1000}
 _TRACKING_ITERATIONS = 6  # Newton steps from the pose of the neighbouring time
 _ROUGH_SHARE, _POLISHED = 0.35, 2  # all starts descend for this share of the iterations, then the best of them
 _POSES = 256  # random poses that are compared, without a descent, to find the starts
@@ -74,7 +74,7 @@ def imitate_pose(
       key: of the random poses; `jax.random.key(0)` where None.
       warm_start: [..., n_hat] the only start, where it is given.
       method: "newton" or "gradient_descent".
-      iterations: of each descent; 16 for Newton's method, 200 for gradient descent where None.
+      iterations: of each descent; 16 for Newton's method, 1000 for gradient descent where None.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
 
