@@ -4,6 +4,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import FrozenInstanceError
 from typing import Any, NoReturn
 
 import hydra
@@ -18,6 +19,8 @@ from mimic.envs.config import EnvConfig, RetargetConfig
 from mimic.trainers.config import EvaluateConfig, PPOConfig, TrainConfig
 
 BAD_INPUT = 2
+# FrozenInstanceError: a key that was added with "+".
+_REFUSED = (ValueError, OSError, FrozenInstanceError, HydraException, OmegaConfBaseException)
 
 
 def run(main: Callable[[Any], None], config_name: str) -> None:
@@ -29,12 +32,12 @@ def run(main: Callable[[Any], None], config_name: str) -> None:
     def command(config: DictConfig) -> None:
         try:
             main(OmegaConf.to_object(config))
-        except (ValueError, OmegaConfBaseException) as error:
+        except _REFUSED as error:
             _refuse(error)
 
     try:
         command()
-    except (ValueError, HydraException, OmegaConfBaseException) as error:
+    except _REFUSED as error:
         _refuse(error)
 
 
@@ -65,6 +68,8 @@ def _one_line(error: BaseException) -> str:
     typed = [cause for cause in causes if isinstance(cause, OmegaConfBaseException)]
     if typed:
         return explain(typed[-1])
+    if isinstance(error, FrozenInstanceError):
+        return f"a key that does not exist cannot be added: {error}"
     message = str(error)
     choice = re.search(r"Could not find '(\w+)/([^']*)'\s+Available options in '\w+':((?:\n\t\S+)*)", message)
     if choice:

@@ -10,7 +10,7 @@ from mimic.kinematics import forward_kinematics, link_states
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
 
-# Craig's DH table from the maker's manual, and the segments that the metric compares, at the zero pose (DESIGN, 4).
+# Craig's DH table from the maker's manual, and the segments that the metric compares, at the zero pose .
 DH = [  # a_{i-1} [m], d_i [m], alpha_{i-1} [rad]
     (0, 0.333, 0),
     (0, 0, -np.pi / 2),

@@ -156,6 +156,11 @@ def test_demonstrations_survive_a_file(saved):
     assert (loaded.joint_names, loaded.dt, loaded.seed) == (demonstrations.joint_names, 0.1, 0)
 
 
+def _with_array(path):
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
 def _rewritten(path, **changes):
     with np.load(path) as archive:
         content = {key: archive[key] for key in archive.files}
@@ -168,6 +173,9 @@ def _rewritten(path, **changes):
         (lambda path: path.unlink(), "no file"),
         (lambda path: path.write_bytes(path.read_bytes()[:300]), "not a whole npz"),
         (lambda path: path.write_text("hello"), "not a whole npz"),
+        (lambda path: _with_array(path), "it holds a single array"),
+        (lambda path: _rewritten(path, seed=np.arange(2)), "seed"),
+        (lambda path: _rewritten(path, arm=np.array(["a", "b"])), "arm"),
         (lambda path: _rewritten(path, goals=np.array([{}, None], dtype=object)), "pickled objects"),
         (lambda path: _rewritten(path, qpos=np.full((2, 6, 2), np.nan)), "not finite"),
         (lambda path: _rewritten(path, qpos=np.zeros((2, 6, 3))), "qpos"),
@@ -201,6 +209,7 @@ def test_demonstrations_of_another_arm_or_time_step_are_refused(saved):
         ({"limits": "soft"}, "expected one of none, hardware"),
         ({"demonstrations": {"kind": "dance"}}, "expected one of pd, reach"),
         ({"metric": {"xi": 1.0}}, "below 0"),
+        ({"metric": {"xi": float("-inf")}}, "finite number below 0"),
         ({"learner": {"locked": [1, 2, 3, 4, 5, 6, 7]}}, "all 7 joints are locked"),
         ({"learner": {"locked": [9]}}, "unknown joint 9"),
     ],

@@ -131,6 +131,11 @@ def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(tmp_path):
         (["trainer.num_envs=500"], "must be a multiple of num_envs = 500"),
         (["env.demonstrations.path=missing.npz"], "no file"),
         (["resume=missing"], "not a run directory"),
+        (["+foo=1"], "foo"),
+        (["env.learner.locked=[3,joint3]"], "named twice"),
+        (["env.learner.locked=[1,2,3,4,5,6,7]"], "all 7 joints are locked"),
+        (["env.metric.correspondence=soft", "env.metric.xi=1"], "below 0"),
+        (["env=planar4dof", "env.learner.link_lengths=[0.5,0]"], "above 0 [m]"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tmp_path):
@@ -144,7 +149,9 @@ def test_existing_run_dir_and_missing_checkpoint_are_refused(tmp_path):
     existing = command("train", f"run_dir={tmp_path}")
     assert existing.returncode == 2 and "exists" in existing.stderr
     (tmp_path / "config.yaml").write_text("seed: 0\n")
-    assert "no checkpoint" in command("train", f"resume={tmp_path}").stderr
+    for module, key in (("train", "resume"), ("evaluate", "run")):
+        refused = command(module, f"{key}={tmp_path}")
+        assert refused.returncode == 2 and refused.stderr.count("\n") == 1 and "no checkpoint" in refused.stderr
 
 
 def test_help_names_the_environments():

@@ -69,7 +69,10 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
         tip=config.tip,
         limits=cast(Limits, limits),
     )
-    return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles))
+    model = simulation_model(source, embodiment.joint_names, angles)
+    if model.nq != embodiment.num_joints:
+        raise ValueError(f"model: the hinges of {config.model!r} need names to be simulated; some have none")
+    return Arm(embodiment, model)
 
 
 def simulation_model(

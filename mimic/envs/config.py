@@ -1,6 +1,7 @@
 """What defines an environment: filled in by the presets in mimic/conf/env, by `make`, and on the command line."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -40,8 +41,8 @@ class MetricConfig:
         _check_choice("correspondence", self.correspondence, CORRESPONDENCES)
         _check_choice("rotation_measure", self.rotation_measure, ("cosine", "angle"))
         _check_choice("reduction", self.reduction, ("mean", "frobenius"))
-        if not self.xi < 0:
-            raise ValueError(f"xi: expected a number below 0 (soft minimum), got {self.xi}")
+        if not -math.inf < self.xi < 0:
+            raise ValueError(f"xi: expected a finite number below 0 (soft minimum), got {self.xi}")
         for name in ("translation", "rotation", "linear_velocity", "angular_velocity"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: expected a weight of at least 0, got {getattr(self, name)}")

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import zipfile
+import zlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -101,14 +102,15 @@ def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
     if not os.path.isfile(path):
         raise ValueError(f"demonstrations: no file at {name!r}")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("it holds a single array")
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("it holds a single array")
+        with archive:
             missing = [key for key in _ARRAYS if key not in archive.files]
             if missing:
                 raise ValueError(f"it lacks {', '.join(missing)}; expected are {', '.join(_ARRAYS)}")
             content = {key: archive[key] for key in _ARRAYS}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zipfile.error) as error:
+    except (ValueError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         reason = "it holds pickled objects" if "allow_pickle" in str(error) else str(error)
         raise ValueError(f"demonstrations: {name!r} is not a whole npz file of demonstrations: {reason}") from error
     if str(content["format"]) != FORMAT:
@@ -135,7 +137,12 @@ def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
             f"demonstrations: qvel and goals in {name!r} must be {list(qpos.shape)} and "
             f"{[qpos.shape[0], qpos.shape[2]]}, got {list(qvel.shape)} and {list(goals.shape)}"
         )
-    if content["dt"].shape != () or content["dt"] <= 0:
+    for key in ("dt", "seed", "arm"):
+        if content[key].shape != ():
+            raise ValueError(f"demonstrations: {key} in {name!r} must be one value, got shape {content[key].shape}")
+    if not np.issubdtype(content["seed"].dtype, np.integer):
+        raise ValueError(f"demonstrations: seed in {name!r} must be an integer, got {content['seed'].dtype}")
+    if content["dt"] <= 0:
         raise ValueError(f"demonstrations: dt in {name!r} must be one number above 0, got {content['dt']}")
     return Demonstrations(
         qpos=qpos,

@@ -147,7 +147,8 @@ class ImitationEnv(Env):
         """What a runaway costs a step: all corresponding links opposite, at the opposite ends of the workspace."""
         metric, n, n_hat = self.config.metric, self.expert.num_links, self.learner.num_links
         per_pair = np.pi * metric.rotation + 2 * metric.translation + 4 * metric.adaptive
-        return float(per_pair * (n + n_hat) / (n * n_hat))
+        # The entries of W sum up to n + n_hat, and no Frobenius norm is above the sum.
+        return float(per_pair * (n + n_hat) / (n * n_hat if metric.reduction == "mean" else 1))
 
     def expert_at(self, demonstration: Array, step: Array) -> LinkStates:
         """The expert's link states at a step of a demonstration."""

@@ -23,6 +23,21 @@ def checkpoint_steps(run_dir: Path) -> list[int]:
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdigit()) if folder.is_dir() else []
 
 
+def check_checkpoint(run_dir: Path, step: int | None = None) -> int:
+    """Environment steps of a checkpoint of a run, of the last one where None.
+
+    Raises:
+      ValueError: the run has no such checkpoint.
+    """
+    steps = checkpoint_steps(run_dir)
+    if not steps:
+        raise ValueError(f"{str(run_dir)!r} has no checkpoint")
+    step = steps[-1] if step is None else step
+    if step not in steps:
+        raise ValueError(f"{str(run_dir)!r} has no checkpoint {step}; it has {', '.join(map(str, steps))}")
+    return step
+
+
 def load_checkpoint(run_dir: Path, template: Any, step: int | None = None) -> tuple[int, Any]:
     """Reads a checkpoint of a run: its step, and a pytree like the template.
 
@@ -34,12 +49,7 @@ def load_checkpoint(run_dir: Path, template: Any, step: int | None = None) -> tu
     Raises:
       ValueError: no such checkpoint, or one of another structure.
     """
-    steps = checkpoint_steps(run_dir)
-    if not steps:
-        raise ValueError(f"{str(run_dir)!r} has no checkpoint")
-    step = steps[-1] if step is None else step
-    if step not in steps:
-        raise ValueError(f"{str(run_dir)!r} has no checkpoint {step}; it has {', '.join(map(str, steps))}")
+    step = check_checkpoint(run_dir, step)
     path = (run_dir / FOLDER / f"{step:012d}").absolute()
     abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, template)
     try:

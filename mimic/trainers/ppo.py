@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
@@ -124,13 +125,13 @@ def train(
         latest.update(step=step, params=params)
         if step == done_steps:
             on_evaluation(step, params, {})
-        if caught:
-            raise Interrupted(caught[0])
+            if caught:
+                raise Interrupted(caught[0])
 
     def on_metrics(_: int, metrics: dict[str, Any]) -> None:
         named = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
         enough = on_evaluation(latest["step"], latest["params"], named)
-        if caught:
+        if caught and latest["step"] < config.num_timesteps:  # else all is done, and there is nothing to resume
             raise Interrupted(caught[0])
         if enough:
             raise _GoodEnough
@@ -189,6 +190,7 @@ class _signals_caught:  # noqa: N801 - reads as the statement that it is
 
     def _note(self, number: int, _: FrameType | None) -> None:
         self._caught.append(number)
+        print("stopping after this stretch of training; again to stop at once", file=sys.stderr, flush=True)
         signal.signal(number, self._previous[number] or signal.SIG_DFL)
 
     def __exit__(self, *_: Any) -> None:

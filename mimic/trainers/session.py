@@ -16,7 +16,7 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.trainers import ppo, runs
-from mimic.trainers.checkpoints import checkpoint_steps, load_checkpoint
+from mimic.trainers.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import EvaluateConfig, PPOConfig, TrainConfig
 from mimic.trainers.evaluation import Evaluator, Rollouts
 from mimic.trainers.plots import plot_quality, plot_training
@@ -88,6 +88,10 @@ def evaluate(config: EvaluateConfig, started: float) -> dict[str, Any]:
         raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
     trained = runs.load_config(run_dir)
+    check_checkpoint(run_dir, config.checkpoint or None)
+    out = Path(config.out).expanduser() if config.out else None
+    if out and not out.parent.is_dir():
+        raise ValueError(f"out: there is no folder {str(out.parent)!r}")
     with stopwatch.stage("build"):
         settings = trained.trainer.resolve(jax.default_backend())  # saved resolved: the machine does not matter
         env, held_out = _environment(trained.env, run_dir)
@@ -98,8 +102,8 @@ def evaluate(config: EvaluateConfig, started: float) -> dict[str, Any]:
         rollouts = _evaluation_program(evaluator, settings, env)(params)
     report = _report(trained, evaluator, rollouts, stopwatch, steps, 0)
     console.print(report_table(report))
-    if config.out:
-        runs.write_atomically(Path(config.out).expanduser(), json.dumps(report, indent=2) + "\n")
+    if out:
+        runs.write_atomically(out, json.dumps(report, indent=2) + "\n")
         console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
     return report
 
@@ -123,8 +127,7 @@ def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv,
 
 def _resumed_config(run_dir: Path, overrides: Sequence[str]) -> TrainConfig:
     config = runs.load_config(run_dir)
-    if not checkpoint_steps(run_dir):
-        raise ValueError(f"resume: {str(run_dir)!r} has no checkpoint")
+    check_checkpoint(run_dir)
     changes = [override for override in overrides if not override.startswith("resume=")]
     refused = [change for change in changes if not change.startswith("trainer.")]
     if refused:
