@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
@@ -16,29 +17,43 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, RetargetConfig
-from mimic.trainers.config import EvaluateConfig, PPOConfig, TrainConfig
+from mimic.trainers.config import TRAINERS, EvaluateConfig, TrainConfig
+from mimic.trainers.signals import STOPPED_BY_SIGNAL
 
 BAD_INPUT = 2
-# FrozenInstanceError: a key that was added with "+".
-_REFUSED = (ValueError, OSError, FrozenInstanceError, HydraException, OmegaConfBaseException)
+_CONFIG_ERRORS = (FrozenInstanceError, HydraException, OmegaConfBaseException)  # the first: a key added with "+"
+
+Work = Callable[[], int | None]  # returns the exit code, 0 for None
 
 
-def run(main: Callable[[Any], None], config_name: str) -> None:
-    """Runs a command on its typed config; exits with 2 and one line for input that it cannot take."""
+def run(prepare: Callable[[Any], Work], config_name: str) -> None:
+    """Runs a command; exits with 2 and one line for input that it cannot take.
+
+    Args:
+      prepare: takes the typed config and returns the work. What it raises is the user's to mend, and is shown as one
+        line; what the work raises is ours, and is shown whole.
+      config_name: in mimic/conf.
+    """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises, and the line below is all that is shown
     _register_schemas()
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
     def command(config: DictConfig) -> None:
         try:
-            main(OmegaConf.to_object(config))
-        except _REFUSED as error:
+            work = prepare(OmegaConf.to_object(config))
+        except (ValueError, OSError, *_CONFIG_ERRORS) as error:
             _refuse(error)
+        exit_code = work()
+        if exit_code:
+            sys.exit(exit_code)
 
     try:
         command()
-    except _REFUSED as error:
+    except _CONFIG_ERRORS as error:
         _refuse(error)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(STOPPED_BY_SIGNAL + signal.SIGINT)
 
 
 def _refuse(error: BaseException) -> NoReturn:
@@ -57,7 +72,8 @@ def _register_schemas() -> None:
     store.store(name="evaluate_schema", node=schema(EvaluateConfig))
     store.store(name="retarget_schema", node=schema(RetargetConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
-    store.store(group="trainer", name="schema", node=schema(PPOConfig))
+    for name, config_class in TRAINERS.items():
+        store.store(group="trainer", name=f"{name}_schema", node=schema(config_class))
 
 
 def _one_line(error: BaseException) -> str:
@@ -74,6 +90,6 @@ def _one_line(error: BaseException) -> str:
     choice = re.search(r"Could not find '(\w+)/([^']*)'\s+Available options in '\w+':((?:\n\t\S+)*)", message)
     if choice:
         group, name, options = choice.groups()
-        valid = ", ".join(sorted(set(options.split()) - {"schema"}))
+        valid = ", ".join(sorted(option for option in set(options.split()) if not option.endswith("schema")))
         return f"unknown {group} {name!r}; valid are {valid}"
     return " ".join(message.split())

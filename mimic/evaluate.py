@@ -4,17 +4,16 @@ import time
 
 _STARTED = time.perf_counter()
 
-from mimic import cli, compat  # noqa: E402
+from mimic import cli  # noqa: E402
 from mimic.trainers.config import EvaluateConfig  # noqa: E402
 
 
-def main(config: EvaluateConfig) -> None:
-    """Runs what the config says."""
-    compat.import_mjx()
-    from mimic.trainers import session  # brax and MJX: not needed for --help
+def prepare(config: EvaluateConfig) -> cli.Work:
+    """The evaluation that the config describes."""
+    from mimic.trainers import session  # not needed for --help
 
-    session.evaluate(config, _STARTED)
+    return session.prepare_evaluation(config, _STARTED)
 
 
 if __name__ == "__main__":
-    cli.run(main, "evaluate")
+    cli.run(prepare, "evaluate")

@@ -52,8 +52,8 @@ def kinematic_bound(
     iterations: int = 40,
     seed: int = 0,
 ) -> Float[Array, " time"]:
-    """What no controller can go below at each step: the distance of the `closest_motions`; same arguments."""
-    return closest_motions(
+    """What no controller can go below at each step: the distance of the `closest_motion`; same arguments."""
+    return closest_motion(
         expert,
         learner,
         qpos,
@@ -68,7 +68,7 @@ def kinematic_bound(
     ).distance
 
 
-def closest_motions(
+def closest_motion(
     expert: Embodiment,
     learner: Embodiment,
     qpos: Float[ArrayLike, "time expert_joints"],
@@ -140,9 +140,6 @@ def closest_motions(
         return jax.vmap(refine)(states, (_with_neighbours(found.qpos), _with_neighbours(found.qvel)), speed)
 
     return jax.jit(solve)(qpos, qvel)
-
-
-closest_motion = closest_motions  # the name that `mimic` exports
 
 
 def _starts(

@@ -4,12 +4,12 @@ from mimic import cli
 from mimic.envs.config import RetargetConfig
 
 
-def main(config: RetargetConfig) -> None:
-    """Runs what the config says."""
+def prepare(config: RetargetConfig) -> cli.Work:
+    """The retargeting that the config describes."""
     from mimic.envs import retargeting  # not needed for --help
 
-    retargeting.retarget_file(config)
+    return retargeting.prepare_retargeting(config)
 
 
 if __name__ == "__main__":
-    cli.run(main, "retarget")
+    cli.run(prepare, "retarget")

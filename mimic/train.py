@@ -2,23 +2,20 @@
 
 import time
 
-_STARTED = time.perf_counter()
+_process_started = [time.perf_counter()]  # for the first job; those that follow in a sweep start when they start
 
-import sys  # noqa: E402
-
-from mimic import cli, compat  # noqa: E402
+from mimic import cli  # noqa: E402
 from mimic.trainers.config import TrainConfig  # noqa: E402
 
 
-def main(config: TrainConfig) -> None:
-    """Runs what the config says."""
-    compat.import_mjx()
-    from mimic.trainers import session  # brax and MJX: not needed for --help
+def prepare(config: TrainConfig) -> cli.Work:
+    """The run that the config describes."""
+    began = time.perf_counter()
+    from mimic.trainers import session  # not needed for --help
 
-    exit_code = session.train(config, _STARTED, cli.overrides())
-    if exit_code:
-        sys.exit(exit_code)
+    started = _process_started.pop() if _process_started else began
+    return session.prepare_training(config, started, cli.overrides())
 
 
 if __name__ == "__main__":
-    cli.run(main, "train")
+    cli.run(prepare, "train")

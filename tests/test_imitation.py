@@ -11,7 +11,7 @@ import pytest
 from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
 from mimic.distance import PAPER_WEIGHTS, DistanceWeights, adaptive_weights, embodiment_distance
 from mimic.embodiment import panda, planar_arm
-from mimic.imitation import closest_motions, kinematic_bound
+from mimic.imitation import closest_motion, kinematic_bound
 from mimic.kinematics import link_states
 
 BELOW = 1e-4  # what a controller may gain on the bound: 0.1 % of a typical one
@@ -59,7 +59,7 @@ def solved(name):
     expert, learner = ARMS[name]
     correspondence = overlap_correspondence(expert, learner)
     motion = demonstration(expert.num_joints)
-    return motion, correspondence, closest_motions(expert, learner, *motion, correspondence, PAPER_WEIGHTS)
+    return motion, correspondence, closest_motion(expert, learner, *motion, correspondence, PAPER_WEIGHTS)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -146,7 +146,7 @@ def test_velocities_of_any_size_are_found():
 def test_correspondence_and_weights_may_depend_on_the_distances(correspondence, weights, options):
     expert, learner = ARMS["panda 7->4"]
     qpos, qvel = demonstration(7)
-    closest = closest_motions(expert, learner, qpos, qvel, correspondence, weights, **options)
+    closest = closest_motion(expert, learner, qpos, qvel, correspondence, weights, **options)
     shared = np.array([0, 1, 3, 4])
     copied = qpos[:, None, shared], qvel[:, None, shared]
     for candidates in (copied, random_motions(learner, 10_000)):
@@ -157,7 +157,7 @@ def test_correspondence_and_weights_may_depend_on_the_distances(correspondence, 
 def test_angles_stay_within_the_joint_range():
     expert, learner = panda(), panda(locked=(3, 6, 7), limits="hardware")
     motion = demonstration(7)  # joint 4 turns the way that the real arm cannot
-    closest = closest_motions(expert, learner, *motion, overlap_correspondence(expert, learner), PAPER_WEIGHTS)
+    closest = closest_motion(expert, learner, *motion, overlap_correspondence(expert, learner), PAPER_WEIGHTS)
     lower, upper = learner.joint_range.T.astype(np.float32)
     assert np.all((closest.qpos >= lower) & (closest.qpos <= upper))
 

@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -68,13 +69,15 @@ def test_a_run_directory_holds_everything(finished):
 
 
 def test_brax_compiles_its_training_epoch_once(finished):
-    """A sharding that differs from pmap's would show as a second long program `_fun`; resets are short."""
+    """A sharding that differs from pmap's shows as a second program of the same name on the same shapes."""
     _, result = finished
-    finished_lines = [line for line in result.stderr.splitlines() if "Finished XLA compilation of jit(_fun)" in line]
-    seconds = sorted((float(line.split(" in ")[-1].split()[0]) for line in finished_lines), reverse=True)
-    assert seconds[0] > 4 * seconds[1], seconds
-    evaluations = [line for line in result.stderr.splitlines() if "Finished XLA compilation of jit(program)" in line]
-    assert 1 <= len(evaluations) <= 2
+    programs = re.findall(
+        r"Compiling jit\((\w+)\) with global shapes and types (.*?)\. Argument mapping", result.stderr
+    )
+    shapes = {name: [arguments for other, arguments in programs if other == name] for name, _ in programs}
+    assert len(shapes["_fun"]) >= 2  # the resets and the training epoch
+    assert len(set(shapes["_fun"])) == len(shapes["_fun"])
+    assert 1 <= len(shapes["program"]) <= 2  # evaluations
 
 
 def test_evaluate_repeats_the_report(finished, tmp_path):
@@ -104,59 +107,35 @@ def test_training_ends_at_the_target_gap(tmp_path):
     assert json.loads((run_dir / "report.json").read_text())["env_steps"] < 5000
 
 
-def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
     run_dir = tmp_path / "stopped"
     arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
     process = subprocess.Popen(
         [sys.executable, "-m", "mimic.train", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
+    # SIGINT as soon as there is something to lose, SIGTERM in the midst of training.
+    awaited = "config.yaml" if number == signal.SIGINT else "checkpoints/0*[1-9]*"
     until = time.monotonic() + 200
-    while time.monotonic() < until and len(list((run_dir / "checkpoints").glob("0*[1-9]*"))) < 1:
+    while time.monotonic() < until and not list(run_dir.glob(awaited)):
         assert process.poll() is None, process.communicate()[1][-2000:]
         time.sleep(0.2)
-    process.send_signal(signal.SIGTERM)
-    out, _ = process.communicate(timeout=60)
-    assert process.returncode == 128 + signal.SIGTERM
-    assert f"resume={run_dir}" in out.replace("\n", "")
+    process.send_signal(number)
+    out, error = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, error[-2000:]
+    assert f"resume={run_dir}" in out.replace("\n", "") and "stopping at the next checkpoint" in error
+    assert list((run_dir / "checkpoints").iterdir())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["env=panda5dof"], "unknown env 'panda5dof'; valid are panda3dof, panda4dof, panda7dof, planar4dof"),
-        (["trainer=sac"], "unknown trainer 'sac'; valid are ppo"),
-        (["env.previw=1"], "unknown key 'env.previw'; valid are"),
-        (["seed=one"], "could not be converted to Integer"),
-        (["env.learner.locked=[joint9]"], "unknown joint 'joint9'"),
-        (["trainer.num_envs=500"], "must be a multiple of num_envs = 500"),
-        (["env.demonstrations.path=missing.npz"], "no file"),
-        (["resume=missing"], "not a run directory"),
-        (["+foo=1"], "foo"),
-        (["env.learner.locked=[3,joint3]"], "named twice"),
-        (["env.learner.locked=[1,2,3,4,5,6,7]"], "all 7 joints are locked"),
-        (["env.metric.correspondence=soft", "env.metric.xi=1"], "below 0"),
-        (["env=planar4dof", "env.learner.link_lengths=[0.5,0]"], "above 0 [m]"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(arguments, message, tmp_path):
-    result = command("train", *arguments, cwd=tmp_path)
-    assert result.returncode == 2
-    assert result.stderr.count("\n") == 1 and message in result.stderr
-    assert not list(tmp_path.iterdir())
-
-
-def test_existing_run_dir_and_missing_checkpoint_are_refused(tmp_path):
-    existing = command("train", f"run_dir={tmp_path}")
-    assert existing.returncode == 2 and "exists" in existing.stderr
-    (tmp_path / "config.yaml").write_text("seed: 0\n")
-    for module, key in (("train", "resume"), ("evaluate", "run")):
-        refused = command(module, f"{key}={tmp_path}")
-        assert refused.returncode == 2 and refused.stderr.count("\n") == 1 and "no checkpoint" in refused.stderr
-
-
-def test_help_names_the_environments():
-    result = command("train", "--help")
-    assert result.returncode == 0 and "panda4dof" in result.stdout and "resume=DIR" in result.stdout
+@pytest.mark.slow
+def test_a_sweep_trains_each_of_its_runs(tmp_path):
+    result = command(
+        "train", "-m", *TINY, "seed=0,1", "trainer.num_timesteps=2000", "trainer.evaluations=1", cwd=tmp_path
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
+    reports = [json.loads(path.read_text()) for path in tmp_path.glob("runs/*/report.json")]
+    assert sorted(report["seed"] for report in reports) == [0, 1]
+    assert max(report["wall_time_s"]["import"] for report in reports[1:]) < 60
 
 
 @pytest.mark.parametrize(("version", "needed"), [("0.10.2", True), ("0.11.0", False), ("0.12.0.1", False)])

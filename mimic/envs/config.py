@@ -44,8 +44,8 @@ class MetricConfig:
         if not -math.inf < self.xi < 0:
             raise ValueError(f"xi: expected a finite number below 0 (soft minimum), got {self.xi}")
         for name in ("translation", "rotation", "linear_velocity", "angular_velocity"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected a weight of at least 0, got {getattr(self, name)}")
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite weight of at least 0, got {getattr(self, name)}")
 
     def make_weights(self) -> Weights:
         """The weights as the metric takes them."""
@@ -127,7 +127,7 @@ class EnvConfig:
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
         for name in ("control_dt", "action_scale", "speed_bound"):
-            if not getattr(self, name) > 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
 
 

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -144,7 +145,7 @@ class ImitationEnv(Env):
 
     @property
     def _worst_distance(self) -> float:
-        """What a runaway costs a step: all corresponding links opposite, at the opposite ends of the workspace."""
+        """What a runaway costs a step: all corresponding links opposite, at opposite ends of the workspace, at rest."""
         metric, n, n_hat = self.config.metric, self.expert.num_links, self.learner.num_links
         per_pair = np.pi * metric.rotation + 2 * metric.translation + 4 * metric.adaptive
         # The entries of W sum up to n + n_hat, and no Frobenius norm is above the sum.
@@ -213,7 +214,7 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
     expert = expert or build_arm(config.expert, config.limits)
     wanted = config.demonstrations
     if wanted.path:
-        loaded = load_demonstrations(wanted.path)
+        loaded = load_demonstrations(Path(wanted.path).expanduser())
         loaded.check_fits(expert.embodiment, config.control_dt, config.horizon)
         if loaded.count < wanted.count + wanted.held_out:
             raise ValueError(

@@ -1,6 +1,6 @@
 """Retargeting: demonstrations of one arm as motions of another, pose by pose."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,7 @@ def retarget(
     Raises:
       ValueError: demonstrations of another arm, or poses outside its range.
     """
-    demonstrations.check_fits(expert, demonstrations.dt, demonstrations.horizon)
-    _check_range(demonstrations, expert)
+    _check(demonstrations, expert)
     correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
     rated = np.where(np.isfinite(learner.velocity_limit), learner.velocity_limit, np.pi)
 
@@ -77,8 +76,8 @@ def retarget(
     return motions, report
 
 
-def retarget_file(config: RetargetConfig) -> None:
-    """Retargets a file of demonstrations, says how well it went, and writes the result.
+def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
+    """What retargets a file of demonstrations, says how well it went, and writes the result.
 
     Raises:
       ValueError: a name that is missing, an `out` that exists, a file or an environment that does not fit.
@@ -93,15 +92,22 @@ def retarget_file(config: RetargetConfig) -> None:
     env = env_config(config.learner, limits=config.limits)
     expert, learner = (build_arm(arm, env.limits).embodiment for arm in (env.expert, env.learner))
     loaded = load_demonstrations(Path(config.demonstrations).expanduser())
-    console = Console()
-    with console.status(f"retargeting {loaded.count} motions from {expert.name} to {learner.name}"):
-        motions, report = retarget(loaded, expert, learner, env.metric, seed=config.seed)
-    motions.save(out)
-    console.print(_table(motions, report))
-    console.print(f"results: {out}", soft_wrap=True, highlight=False)
+    _check(loaded, expert)
+
+    def run() -> None:
+        console = Console()
+        with console.status(f"retargeting {loaded.count} motions from {expert.name} to {learner.name}"):
+            motions, report = retarget(loaded, expert, learner, env.metric, seed=config.seed)
+        motions.save(out)
+        console.print(_table(motions, report))
+        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+
+    return run
 
 
-def _check_range(demonstrations: Demonstrations, arm: Embodiment) -> None:
+def _check(demonstrations: Demonstrations, arm: Embodiment) -> None:
+    """Refuses demonstrations of another arm, and poses outside of its range."""
+    demonstrations.check_fits(arm, demonstrations.dt, demonstrations.horizon)
     lower, upper = np.asarray(arm.joint_range).T
     outside = (demonstrations.qpos < lower - 1e-6) | (demonstrations.qpos > upper + 1e-6)
     if outside.any():

@@ -1,7 +1,10 @@
 """What defines a training run. `python -m mimic.train` fills these in from mimic/conf and the command line."""
 
 import dataclasses
-from typing import Any
+import math
+from typing import Any, ClassVar
+
+from omegaconf import MISSING
 
 from mimic.envs.config import EnvConfig
 
@@ -40,7 +43,22 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class PPOConfig:
+class TrainerConfig:
+    """What all trainers have.
+
+    Attributes:
+      name: of the trainer.
+      preset: where fields that are None take their values from.
+    """
+
+    length_key: ClassVar[str]  # the field that says how long to train
+
+    name: str = MISSING
+    preset: str = MISSING
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig(TrainerConfig):
     """Brax PPO. A field that is None takes its value from the preset.
 
     Attributes:
@@ -64,6 +82,8 @@ class PPOConfig:
       target_gap: training ends early once the optimality gap on the training demonstrations is no larger; 0 never.
       evaluations: how often the policy is evaluated and saved.
     """
+
+    length_key: ClassVar[str] = "num_timesteps"
 
     name: str = "ppo"
     preset: str = "auto"
@@ -91,8 +111,12 @@ class PPOConfig:
         if self.name != "ppo":
             raise ValueError(f"trainer.name: expected 'ppo', got {self.name!r}")
 
-    def resolve(self, backend: str) -> "PPOConfig":
+    def resolve(self, backend: str, devices: int = 1) -> "PPOConfig":
         """The same with every field filled in, and the preset's name.
+
+        Args:
+          backend: of JAX.
+          devices: that brax spreads environments and batches over.
 
         Raises:
           ValueError: numbers out of range, or batch sizes that PPO cannot divide.
@@ -100,16 +124,16 @@ class PPOConfig:
         name = self.preset if self.preset != "auto" else "cpu" if backend == "cpu" else "gpu"
         open_fields = {key: value for key, value in PRESETS[name].items() if getattr(self, key) is None}
         resolved = dataclasses.replace(self, preset=name, **open_fields)
-        resolved._check()
+        resolved._check(devices)
         return resolved
 
-    def _check(self) -> None:
+    def _check(self, devices: int) -> None:
         whole = ("num_timesteps", "num_envs", "unroll_length", "batch_size", "num_minibatches", "num_updates_per_batch")
         for key in (*whole, "evaluations"):
             if getattr(self, key) < 1:
                 raise ValueError(f"trainer.{key}: expected at least 1, got {getattr(self, key)}")
         for key in ("learning_rate", "max_grad_norm", "reward_scaling", "clipping_epsilon"):
-            if not getattr(self, key) > 0:
+            if not 0 < getattr(self, key) < math.inf:
                 raise ValueError(f"trainer.{key}: expected a number above 0, got {getattr(self, key)}")
         for key in ("discounting", "gae_lambda", "final_learning_rate"):
             if not 0 <= getattr(self, key) <= 1:
@@ -125,11 +149,19 @@ class PPOConfig:
                 f"trainer: batch_size * num_minibatches = {self.batch_size} * {self.num_minibatches} = {unrolls} "
                 f"must be a multiple of num_envs = {self.num_envs}"
             )
+        for key in ("num_envs", "batch_size"):
+            if getattr(self, key) % devices:
+                raise ValueError(
+                    f"trainer.{key}: expected a multiple of the {devices} devices, got {getattr(self, key)}"
+                )
 
     @property
     def steps_per_batch(self) -> int:
         """Environment steps between two updates of the policy that collects them."""
         return self.batch_size * self.num_minibatches * self.unroll_length  # type: ignore[operator]
+
+
+TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +170,7 @@ class TrainConfig:
 
     Attributes:
       env: see `EnvConfig`.
-      trainer: see `PPOConfig`.
+      trainer: one of `TRAINERS`.
       seed: of networks, exploration and resets.
       run_dir: where everything is written; runs/ENV-TRAINER-seedSEED-TIME where empty.
       resume: a run directory to go on from.
@@ -146,7 +178,7 @@ class TrainConfig:
     """
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
-    trainer: PPOConfig = dataclasses.field(default_factory=PPOConfig)
+    trainer: TrainerConfig = dataclasses.field(default_factory=TrainerConfig)
     seed: int = 0
     run_dir: str = ""
     resume: str = ""
@@ -159,12 +191,12 @@ class EvaluateConfig:
 
     Attributes:
       run: the run directory.
-      checkpoint: environment steps of the checkpoint; the last one where 0.
+      checkpoint: environment steps of the checkpoint; the last one where None.
       out: file that the report is written to; printed only where empty.
       compilation_cache: see `TrainConfig`.
     """
 
     run: str = ""
-    checkpoint: int = 0
+    checkpoint: int | None = None
     out: str = ""
     compilation_cache: str = "~/.cache/mimic/jax"

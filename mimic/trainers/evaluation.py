@@ -1,5 +1,6 @@
 """How good a controller is: every demonstration once, against the kinematic bound and against holding still."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -43,7 +44,6 @@ class Evaluator:
     Attributes:
       training_env: the environment that was given.
       env: the same environment on all demonstrations, training first.
-      lower_bound, hold_distance: [demonstrations, T].
     """
 
     def __init__(self, env: ImitationEnv, held_out: Demonstrations):
@@ -51,8 +51,16 @@ class Evaluator:
         self._num_train = env.demonstrations.count
         self.env = env.with_demonstrations(concatenate(env.demonstrations, held_out))
         self._learner_states = link_state_program(self.env.learner)
-        self.lower_bound = np.asarray(_lower_bound(self.env))
-        self.hold_distance = np.asarray(_hold_distance(self.env))
+
+    @functools.cached_property
+    def lower_bound(self) -> Float[np.ndarray, "demonstrations time"]:
+        """The kinematic bound; computed when it is first asked for."""
+        return np.asarray(_lower_bound(self.env))
+
+    @functools.cached_property
+    def hold_distance(self) -> Float[np.ndarray, "demonstrations time"]:
+        """Distance of the learner at rest in its home pose."""
+        return np.asarray(_hold_distance(self.env))
 
     def rollout(self, controller: Controller) -> Rollouts:
         """Runs a controller on every demonstration; the caller jits this, with the parameters inside."""

@@ -17,16 +17,16 @@ _COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
 _LABELS = {"train": "training demonstrations", "held_out": "held-out demonstrations"}
 
 
-def plot_training(metrics: Path, out: Path, *, title: str) -> None:
-    """Optimality gap over environment steps, from the metrics of a run."""
+def plot_training(metrics: Path, out: Path, figure_name: str, label: str, *, title: str) -> None:
+    """A figure in percent over the steps, on training and held-out data, from the metrics of a run."""
     with metrics.open(newline="") as file:
         rows = list(csv.DictReader(file))
     steps = [int(row["step"]) for row in rows]
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
     for split, colour in _COLOURS.items():
-        gap = [100 * float(row[f"quality/optimality_gap.{split}"]) for row in rows]
+        gap = [100 * float(row[f"quality/{figure_name}.{split}"]) for row in rows]
         axes.plot(steps, gap, "o-", markersize=3, color=colour, label=_LABELS[split])
-    axes.set(xlabel="environment steps", ylabel="optimality gap [%]", title=title, yscale="log")
+    axes.set(xlabel="steps", ylabel=label, title=title, yscale="log")
     axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     axes.yaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     axes.grid(alpha=0.3, which="both")

@@ -2,11 +2,8 @@
 
 import contextlib
 import functools
-import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import jax
@@ -22,17 +19,10 @@ from mimic.envs.wrappers import wrap_for_training
 from mimic.trainers.checkpoints import save_checkpoint
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.evaluation import Controller
+from mimic.trainers.signals import Signals
 
 Params = Any  # observation statistics, policy parameters, value parameters
 OnEvaluation = Callable[[int, Params, dict[str, float]], bool]  # whether that is good enough to stop
-
-
-class Interrupted(Exception):
-    """Training was stopped by a signal after a checkpoint was written."""
-
-    def __init__(self, signal_number: int):
-        super().__init__(signal.Signals(signal_number).name)
-        self.signal_number = signal_number
 
 
 class _GoodEnough(Exception):  # noqa: N818 - not an error: brax has no other way to be stopped
@@ -97,6 +87,7 @@ def train(
     *,
     seed: int,
     on_evaluation: OnEvaluation,
+    signals: Signals,
     restore: tuple[int, Params] | None = None,
 ) -> Params:
     """Trains a policy; saves a checkpoint before each call of `on_evaluation`.
@@ -108,15 +99,15 @@ def train(
       seed: of networks, exploration and resets.
       on_evaluation: called with the environment steps so far, the parameters and brax's training metrics; training
         ends where it returns True.
+      signals: training ends after the next checkpoint if one came.
       restore: steps and parameters to go on from. Networks and observation statistics are kept; the moments of the
         optimiser and the states of the environments start anew.
 
     Raises:
-      Interrupted: on SIGINT or SIGTERM, after the next checkpoint.
+      Interrupted: a signal came; a checkpoint is written.
     """
     compat.mend_brax()
     done_steps, params = restore or (0, None)
-    caught: list[int] = []
     latest: dict[str, Any] = {}
 
     def on_params(step: int, _: Any, params: Params) -> None:
@@ -125,18 +116,17 @@ def train(
         latest.update(step=step, params=params)
         if step == done_steps:
             on_evaluation(step, params, {})
-            if caught:
-                raise Interrupted(caught[0])
+            signals.check()
 
     def on_metrics(_: int, metrics: dict[str, Any]) -> None:
         named = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
         enough = on_evaluation(latest["step"], latest["params"], named)
-        if caught and latest["step"] < config.num_timesteps:  # else all is done, and there is nothing to resume
-            raise Interrupted(caught[0])
+        if latest["step"] < config.num_timesteps:  # else all is done, and there is nothing to resume
+            signals.check()
         if enough:
             raise _GoodEnough
 
-    with _signals_caught(caught), contextlib.suppress(_GoodEnough):
+    with contextlib.suppress(_GoodEnough):
         brax_ppo.train(
             progress_fn=on_metrics,
             policy_params_fn=on_params,
@@ -151,11 +141,13 @@ def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> di
     updates_per_batch = config.num_minibatches * config.num_updates_per_batch  # type: ignore[operator]
     updates = config.num_timesteps // config.steps_per_batch * updates_per_batch  # type: ignore[operator]
     done_updates = done_steps // config.steps_per_batch * updates_per_batch
+    left = max(config.num_timesteps - done_steps, 1)  # type: ignore[operator]
+    evaluations = max(round(config.evaluations * left / config.num_timesteps), 1)  # type: ignore[operator]
     rate: float = config.learning_rate  # type: ignore[assignment]
     final_share: float = config.final_learning_rate  # type: ignore[assignment]
     return {
         "environment": env,
-        "num_timesteps": max(config.num_timesteps - done_steps, 1),  # type: ignore[operator]
+        "num_timesteps": left,
         "num_envs": config.num_envs,
         "episode_length": env.config.horizon + 1,  # the environment ends first
         "wrap_env_fn": wrap_for_training,
@@ -172,27 +164,6 @@ def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> di
         "gae_lambda": config.gae_lambda,
         "max_grad_norm": config.max_grad_norm,
         "network_factory": _network_factory(config),
-        "num_evals": config.evaluations + 1,  # type: ignore[operator]
+        "num_evals": evaluations + 1,
         "run_evals": False,  # our evaluator's program is smaller, and it knows the held-out demonstrations
     }
-
-
-class _signals_caught:  # noqa: N801 - reads as the statement that it is
-    """Notes SIGINT and SIGTERM for the next checkpoint; a second one of a kind acts at once."""
-
-    def __init__(self, caught: list[int]):
-        self._caught = caught
-        self._previous: dict[int, Any] = {}
-
-    def __enter__(self) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._note)
-
-    def _note(self, number: int, _: FrameType | None) -> None:
-        self._caught.append(number)
-        print("stopping after this stretch of training; again to stop at once", file=sys.stderr, flush=True)
-        signal.signal(number, self._previous[number] or signal.SIG_DFL)
-
-    def __exit__(self, *_: Any) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler or signal.SIG_DFL)

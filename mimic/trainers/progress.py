@@ -8,9 +8,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from mimic.trainers.job import Job
+
 
 class TrainingProgress:
-    """A bar with distance, optimality gap, steps/s and time left; without a terminal, a line for each evaluation."""
+    """A bar with quality figures, steps/s and time left; without a terminal, a line for each evaluation."""
 
     def __init__(self, console: Console, total_steps: int, done_steps: int = 0):
         self._console = console
@@ -33,10 +35,8 @@ class TrainingProgress:
     def __exit__(self, *_: Any) -> None:
         self._bar.stop()
 
-    def update(self, step: int, quality: Mapping[str, Any], steps_per_second: float | None) -> None:
+    def update(self, step: int, status: str, steps_per_second: float | None) -> None:
         """Shows the state after an evaluation."""
-        gap, distance = quality["optimality_gap"], quality["mean_distance"]["train"]
-        status = f"distance {distance:.4f}  gap {gap['train']:.1%}, held out {gap['held_out']:.1%}"
         if steps_per_second:
             left = max(self._total - step, 0) / steps_per_second
             status += f"  {steps_per_second:,.0f} steps/s  {_duration(left)} left"
@@ -49,23 +49,17 @@ def _duration(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
 
 
-def report_table(report: Mapping[str, Any]) -> Table:
-    """The figures of a report, training next to held-out demonstrations."""
+def report_table(report: Mapping[str, Any], job: Job) -> Table:
+    """The figures of a report, training next to held-out data."""
     table = Table(title=f"{report['env']}  {report['trainer']}  seed {report['seed']}", title_justify="left")
     table.add_column("")
     table.add_column("training", justify="right")
     table.add_column("held out", justify="right")
-    for label, key, form in (
-        ("optimality gap (0 best, 1 holding still)", "optimality_gap", "{:.2%}"),
-        ("mean distance", "mean_distance", "{:.4f}"),
-        ("  lower bound of this arm", "lower_bound", "{:.4f}"),
-        ("  holding the start pose", "hold_distance", "{:.4f}"),
-    ):
-        table.add_row(label, form.format(report[key]["train"]), form.format(report[key]["held_out"]))
-    table.add_row("angle to the expert's links", f"{report['link_angle_error_deg']:.1f} deg", "")
-    table.add_row("steps with a torque at its limit", f"{report['torque_saturation']:.1%}", "")
+    for row in job.rows(dict(report)):
+        table.add_row(*row)
     table.add_section()
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in report["wall_time_s"].items())
-    table.add_row("environment steps", f"{report['env_steps']:,}", f"{report['steps_per_second']:,.0f} /s")
+    speed = f"{report['steps_per_second']:,.0f} /s" if report["steps_per_second"] else ""
+    table.add_row(job.unit.replace("_", " "), f"{report[job.unit]:,}", speed)
     table.caption, table.caption_justify = f"seconds: {seconds}", "left"
     return table

@@ -13,10 +13,10 @@ from typing import Any
 
 import jax
 import tensorboardX
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from mimic.config import explain, schema, to_dict
-from mimic.trainers.config import TrainConfig
+from mimic.trainers.config import TRAINERS, TrainConfig
 
 CONFIG, REPORT, METRICS, DEMONSTRATIONS = "config.yaml", "report.json", "metrics.csv", "demonstrations.npz"
 _PACKAGES = ("mimic-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -45,6 +45,11 @@ def save_config(run_dir: Path, config: TrainConfig) -> None:
     write_atomically(run_dir / CONFIG, OmegaConf.to_yaml(OmegaConf.create(to_dict(config))))
 
 
+def run_schema(trainer: str) -> DictConfig:
+    """The typed node of a run with a trainer."""
+    return OmegaConf.merge(schema(TrainConfig), {"trainer": schema(TRAINERS[trainer])})  # type: ignore[return-value]
+
+
 def load_config(run_dir: Path) -> TrainConfig:
     """The config of a run.
 
@@ -54,7 +59,11 @@ def load_config(run_dir: Path) -> TrainConfig:
     if not (run_dir / CONFIG).is_file():
         raise ValueError(f"{str(run_dir)!r} is not a run directory: it has no {CONFIG}")
     try:
-        merged = OmegaConf.merge(schema(TrainConfig), OmegaConf.load(run_dir / CONFIG))
+        content = OmegaConf.load(run_dir / CONFIG)
+        name = OmegaConf.select(content, "trainer.name")
+        if name not in TRAINERS:
+            raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
+        merged = OmegaConf.merge(run_schema(name), content)
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own kinds
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error

@@ -11,22 +11,18 @@ import jax
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from mimic.config import schema, to_dict
-from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, concatenate
-from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.trainers import ppo, runs
+from mimic import compat
+from mimic.config import to_dict
+from mimic.trainers import runs
 from mimic.trainers.checkpoints import check_checkpoint, load_checkpoint
-from mimic.trainers.config import EvaluateConfig, PPOConfig, TrainConfig
-from mimic.trainers.evaluation import Evaluator, Rollouts
-from mimic.trainers.plots import plot_quality, plot_training
+from mimic.trainers.config import EvaluateConfig, TrainConfig
+from mimic.trainers.job import Job, Params
 from mimic.trainers.progress import TrainingProgress, report_table
+from mimic.trainers.signals import Interrupted, Signals, noted_signals
 
-_STOPPED_BY_SIGNAL = 128  # plus the signal's number: the exit code by convention
 
-
-def train(config: TrainConfig, started: float, overrides: Sequence[str] = ()) -> int:
-    """Trains a new run, or goes on with one.
+def prepare_training(config: TrainConfig, started: float, overrides: Sequence[str] = ()) -> Callable[[], int]:
+    """A new run, or one to go on with, ready to start; nothing is written yet.
 
     Args:
       config: of the run; with `resume`, what the run directory says counts, but for the overrides.
@@ -34,78 +30,68 @@ def train(config: TrainConfig, started: float, overrides: Sequence[str] = ()) ->
       overrides: of the command line, applied to the config of a resumed run.
 
     Returns:
-      The exit code: 0, or 128 plus the number of the signal that stopped it.
+      What trains, evaluates and reports; it returns the exit code: 0, or 128 plus the number of the signal that
+      stopped it.
 
     Raises:
-      ValueError: input that cannot be trained; nothing is trained or written then.
+      ValueError: input that cannot be trained.
     """
-    console, stopwatch = Console(), runs.Stopwatch(started)
+    stopwatch = runs.Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
     resumed = Path(config.resume).expanduser() if config.resume else None
     if resumed:
-        config = _resumed_config(resumed, overrides)
+        config = _resumed_config(resumed, config, overrides)
     run_dir = resumed or runs.new_run_dir(config)
     with stopwatch.stage("build"):
-        settings = config.trainer.resolve(jax.default_backend())
-        env, held_out = _environment(config.env, run_dir if resumed else None)
-        restore = _restored(run_dir, settings, env) if resumed else None
-        run_dir.mkdir(parents=True, exist_ok=bool(resumed))
-        runs.save_config(run_dir, dataclasses.replace(config, trainer=settings))
-        concatenate(env.demonstrations, held_out).save(run_dir / runs.DEMONSTRATIONS)
-        console.print(
-            f"{config.env.name}: {env.demonstrations.count} demonstrations, {settings.num_envs} arms at once on "
-            f"{runs.hardware()['device']} (preset {settings.preset})\nrun directory: {run_dir}",
-            highlight=False,
-            soft_wrap=True,
-        )
-        evaluator = Evaluator(env, held_out)
-    evaluate_params = _evaluation_program(evaluator, settings, env)
-    try:
-        params, steps = _train(config, settings, run_dir, evaluator, evaluate_params, restore, stopwatch, console)
-    except ppo.Interrupted as stop:
-        console.print(f"stopped by {stop}; go on with: python -m mimic.train resume={run_dir}", soft_wrap=True)
-        return _STOPPED_BY_SIGNAL + stop.signal_number
-    with stopwatch.stage("evaluate"):
-        rollouts = evaluate_params(params)
-    report = _report(config, evaluator, rollouts, stopwatch, steps, steps - (restore[0] if restore else 0))
-    runs.write_report(run_dir, report)
-    plot_training(run_dir / runs.METRICS, run_dir / "training.png", title=config.env.name)
-    plot_quality(evaluator, rollouts, run_dir / "quality.png", title=config.env.name)
-    console.print(report_table(report))
-    console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
-    return 0
+        job = make_job(config, resumed)
+        restore = load_checkpoint(resumed, job.params_template()) if resumed else None
+    config = dataclasses.replace(config, trainer=job.settings)
+    return lambda: _train(config, job, run_dir, restore, stopwatch)
 
 
-def evaluate(config: EvaluateConfig, started: float) -> dict[str, Any]:
-    """Repeats the report of a run from a checkpoint alone.
+def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
+    """An evaluation of a run from a checkpoint alone, ready to start.
 
     Raises:
       ValueError: no run directory, or no such checkpoint.
     """
-    console, stopwatch = Console(), runs.Stopwatch(started)
+    stopwatch = runs.Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
     if not config.run:
         raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
-    trained = runs.load_config(run_dir)
-    check_checkpoint(run_dir, config.checkpoint or None)
+    trained = runs.load_config(run_dir)  # saved resolved: the machine does not matter
+    check_checkpoint(run_dir, config.checkpoint)
     out = Path(config.out).expanduser() if config.out else None
     if out and not out.parent.is_dir():
         raise ValueError(f"out: there is no folder {str(out.parent)!r}")
     with stopwatch.stage("build"):
-        settings = trained.trainer.resolve(jax.default_backend())  # saved resolved: the machine does not matter
-        env, held_out = _environment(trained.env, run_dir)
-        template = ppo.params_template(settings, env.observation_size, env.action_size)
-        steps, params = load_checkpoint(run_dir, template, config.checkpoint or None)
-        evaluator = Evaluator(env, held_out)
-    with stopwatch.stage("evaluate"):
-        rollouts = _evaluation_program(evaluator, settings, env)(params)
-    report = _report(trained, evaluator, rollouts, stopwatch, steps, 0)
-    console.print(report_table(report))
-    if out:
-        runs.write_atomically(out, json.dumps(report, indent=2) + "\n")
-        console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
-    return report
+        job = make_job(trained, run_dir)
+        steps, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
+
+    def run() -> None:
+        console = Console()
+        with stopwatch.stage("evaluate"):
+            outcome = job.evaluate(params)
+        report = _report(trained, job, job.figures(outcome), stopwatch, steps, 0)
+        console.print(report_table(report, job))
+        if out:
+            runs.write_atomically(out, json.dumps(report, indent=2) + "\n")
+            console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
+
+    return run
+
+
+def make_job(config: TrainConfig, run_dir: Path | None) -> Job:
+    """What the trainer of a config does; with the inputs of a run directory where there is one.
+
+    Raises:
+      ValueError: a config that cannot be trained.
+    """
+    compat.import_mjx()
+    from mimic.trainers.ppo_job import PPOJob  # brax and MJX, which take seconds to import
+
+    return PPOJob(config, run_dir)
 
 
 def use_compilation_cache(folder: str) -> None:
@@ -115,96 +101,92 @@ def use_compilation_cache(folder: str) -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
-    """The environment on its training demonstrations, and the held-out ones; those of a run where there is one."""
-    if run_dir is not None:
-        path = str(run_dir / runs.DEMONSTRATIONS)
-        stored = dataclasses.replace(config.demonstrations, path=path)
-        config = dataclasses.replace(config, demonstrations=stored)
-    training, held_out = training_and_held_out(config)
-    return ImitationEnv(config, training), held_out
-
-
-def _resumed_config(run_dir: Path, overrides: Sequence[str]) -> TrainConfig:
+def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
     config = runs.load_config(run_dir)
-    check_checkpoint(run_dir)
-    changes = [override for override in overrides if not override.startswith("resume=")]
-    refused = [change for change in changes if not change.startswith("trainer.")]
+    steps = check_checkpoint(run_dir)
+    of_the_process = ("resume=", "compilation_cache=")
+    changes = [override for override in overrides if not override.startswith(of_the_process)]
+    refused = [c for c in changes if not c.startswith("trainer.") or c.startswith(("trainer.preset=", "trainer.name="))]
     if refused:
         raise ValueError(
-            f"resume: only keys of the trainer can change, as in trainer.num_timesteps=N; got {refused[0]!r}"
+            f"resume: only settings of the trainer can change, as in trainer.{config.trainer.length_key}=N; "
+            f"got {refused[0]!r}"
         )
-    merged = OmegaConf.merge(schema(TrainConfig), to_dict(config), OmegaConf.from_dotlist(changes))
-    return OmegaConf.to_object(merged)  # type: ignore[return-value]
-
-
-def _restored(run_dir: Path, settings: PPOConfig, env: ImitationEnv) -> tuple[int, ppo.Params]:
-    template = ppo.params_template(settings, env.observation_size, env.action_size)
-    steps, params = load_checkpoint(run_dir, template)
-    if steps >= settings.num_timesteps:  # type: ignore[operator]
+    merged = OmegaConf.merge(runs.run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
+    config: TrainConfig = OmegaConf.to_object(merged)  # type: ignore[assignment]
+    length = getattr(config.trainer, config.trainer.length_key)
+    if steps >= length:
         raise ValueError(
-            f"resume: {str(run_dir)!r} is trained for {steps} of {settings.num_timesteps} steps; "
-            "give a larger trainer.num_timesteps"
+            f"resume: {str(run_dir)!r} is trained for {steps} of {length} steps; "
+            f"give a larger trainer.{config.trainer.length_key}"
         )
-    return steps, params
-
-
-def _evaluation_program(
-    evaluator: Evaluator, settings: PPOConfig, env: ImitationEnv
-) -> Callable[[ppo.Params], Rollouts]:
-    controller = ppo.make_controller(settings, env.observation_size, env.action_size)
-
-    @jax.jit
-    def program(params: ppo.Params) -> Rollouts:
-        return evaluator.rollout(controller(params))
-
-    # From the host: how brax or orbax spread the parameters over devices would each ask for a program of its own.
-    return lambda params: program(jax.device_get(params))
+    return dataclasses.replace(config, compilation_cache=given.compilation_cache)
 
 
 def _train(
-    config: TrainConfig,
-    settings: PPOConfig,
+    config: TrainConfig, job: Job, run_dir: Path, restore: tuple[int, Params] | None, stopwatch: runs.Stopwatch
+) -> int:
+    console = Console()
+    run_dir.mkdir(parents=True, exist_ok=restore is not None)
+    runs.save_config(run_dir, config)
+    job.save_inputs(run_dir)
+    device = runs.hardware()["device"]
+    console.print(
+        f"{job.headline} on {device} (preset {job.settings.preset})\nrun directory: {run_dir}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    with noted_signals() as signals:  # also while the report is made: all is done then, and a signal changes nothing
+        try:
+            params, steps = _train_and_log(job, run_dir, signals, restore, stopwatch, console)
+        except Interrupted as stop:
+            console.print(f"stopped by {stop}; go on with: python -m mimic.train resume={run_dir}", soft_wrap=True)
+            return stop.exit_code
+        with stopwatch.stage("evaluate"):
+            outcome = job.evaluate(params)
+        done_before = restore[0] if restore else 0
+        report = _report(config, job, job.figures(outcome), stopwatch, steps, steps - done_before)
+        runs.write_report(run_dir, report)
+        job.plot(run_dir, outcome)
+    console.print(report_table(report, job))
+    console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
+    return 0
+
+
+def _train_and_log(
+    job: Job,
     run_dir: Path,
-    evaluator: Evaluator,
-    evaluate_params: Callable[[ppo.Params], Rollouts],
-    restore: tuple[int, ppo.Params] | None,
+    signals: Signals,
+    restore: tuple[int, Params] | None,
     stopwatch: runs.Stopwatch,
     console: Console,
-) -> tuple[ppo.Params, int]:
-    """Trains; evaluates, logs and shows the policy after each stretch. Parameters and steps at the end."""
+) -> tuple[Params, int]:
+    """Trains; evaluates, logs and shows the result after each stretch. Parameters and steps at the end."""
     log = runs.MetricsLog(run_dir)
-    reached = {"step": restore[0] if restore else 0}
-    total: int = settings.num_timesteps  # type: ignore[assignment]
-    with TrainingProgress(console, total, reached["step"]) as progress, stopwatch.stage("train"):
+    reached = restore[0] if restore else 0
+    with TrainingProgress(console, job.total_steps, reached) as progress, stopwatch.stage("train"):
 
-        def on_evaluation(step: int, params: ppo.Params, metrics: Mapping[str, float]) -> bool:
+        def on_evaluation(step: int, params: Params, metrics: Mapping[str, float]) -> bool:
+            nonlocal reached
             with stopwatch.stage("evaluate"):
-                quality = evaluator.summary(evaluate_params(params))
+                figures = job.figures(job.evaluate(params))
                 if metrics:
-                    row = {f"quality/{key}": value for key, value in _flat(quality).items()}
+                    row = {f"quality/{key}": value for key, value in _flat(figures).items()}
                     row |= {f"training/{key}": value for key, value in metrics.items()}
                     log.write(step, {**row, "wall_time_s": time.perf_counter() - stopwatch.started})
-                progress.update(step, quality, metrics.get("sps"))
-                reached["step"] = step
-            return quality["optimality_gap"]["train"] <= settings.target_gap
+                progress.update(step, job.status(figures), metrics.get("sps"))
+                reached = step
+            return job.good_enough(figures)
 
-        params = ppo.train(
-            evaluator.training_env,
-            settings,
-            run_dir,
-            seed=config.seed,
-            on_evaluation=on_evaluation,
-            restore=restore,
-        )
+        params = job.train(run_dir, on_evaluation, signals, restore)
     log.close()
-    return params, reached["step"]
+    return params, reached
 
 
-def _flat(quality: Mapping[str, Any]) -> dict[str, float]:
+def _flat(figures: Mapping[str, Any]) -> dict[str, float]:
     """Nested figures as one level, split names behind a dot."""
     flat: dict[str, float] = {}
-    for key, value in quality.items():
+    for key, value in figures.items():
         if isinstance(value, Mapping):
             flat |= {f"{key}.{name}": number for name, number in value.items()}
         else:
@@ -213,16 +195,16 @@ def _flat(quality: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _report(
-    config: TrainConfig, evaluator: Evaluator, rollouts: Rollouts, stopwatch: runs.Stopwatch, steps: int, trained: int
+    config: TrainConfig, job: Job, figures: Mapping[str, Any], stopwatch: runs.Stopwatch, steps: int, trained: int
 ) -> dict[str, Any]:
     wall_time = stopwatch.report()
     return {
         "env": config.env.name,
         "trainer": config.trainer.name,
         "seed": config.seed,
-        **evaluator.summary(rollouts),
+        **figures,
         "wall_time_s": wall_time,
-        "env_steps": steps,
+        job.unit: steps,
         "steps_per_second": trained / wall_time["train"] if wall_time["train"] else 0.0,
         "hardware": runs.hardware(),
         "versions": runs.versions(),

@@ -1,0 +1,78 @@
+"""What a trainer brings to a run: its inputs, its training, and how good the result is. The session does the rest."""
+
+import abc
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from mimic.trainers.config import TrainerConfig
+from mimic.trainers.signals import Signals
+
+Params = Any  # pytree
+Figures = dict[str, Any]  # quality figures of a report, some by split
+OnEvaluation = Callable[[int, Params, Mapping[str, float]], bool]  # steps, metrics of the training; whether to stop
+Row = tuple[str, str, str]  # of the final table: label, on training data, on held-out data
+
+
+class Job(abc.ABC):
+    """A run as its trainer sees it.
+
+    Attributes:
+      settings: the trainer's config, resolved.
+      headline: what is trained on what, for people.
+      total_steps: how long training goes on.
+      unit: what a step is; its key in the report.
+    """
+
+    settings: TrainerConfig
+    headline: str
+    total_steps: int
+    unit: str
+
+    @abc.abstractmethod
+    def save_inputs(self, run_dir: Path) -> None:
+        """Writes what the run needs to be repeated, beside its config."""
+
+    @abc.abstractmethod
+    def params_template(self) -> Params:
+        """Parameters of the right structure, to restore a checkpoint into."""
+
+    @abc.abstractmethod
+    def train(
+        self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
+    ) -> Params:
+        """Trains; saves a checkpoint before each call of `on_evaluation`.
+
+        Args:
+          run_dir: where checkpoints go.
+          on_evaluation: training ends where it returns True.
+          signals: training ends after the next checkpoint if one came.
+          restore: steps and parameters to go on from.
+
+        Raises:
+          Interrupted: a signal came; a checkpoint is written.
+        """
+
+    @abc.abstractmethod
+    def evaluate(self, params: Params) -> Any:
+        """What `figures` and `plot` are made of."""
+
+    @abc.abstractmethod
+    def figures(self, outcome: Any) -> Figures:
+        """Quality figures of an evaluation."""
+
+    @abc.abstractmethod
+    def status(self, figures: Figures) -> str:
+        """The figures that a person watches while it trains, in a few words."""
+
+    @abc.abstractmethod
+    def good_enough(self, figures: Figures) -> bool:
+        """Whether training may end."""
+
+    @abc.abstractmethod
+    def rows(self, figures: Figures) -> list[Row]:
+        """The figures as rows of the final table."""
+
+    @abc.abstractmethod
+    def plot(self, run_dir: Path, outcome: Any) -> None:
+        """Writes the plots of a finished run."""

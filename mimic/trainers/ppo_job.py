@@ -1,0 +1,120 @@
+"""`trainer=ppo`: a policy that moves the learner like the expert, by torques."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+
+from mimic.envs.config import EnvConfig
+from mimic.envs.demonstrations import Demonstrations, concatenate
+from mimic.envs.imitation import ImitationEnv, training_and_held_out
+from mimic.trainers import plots, ppo, runs
+from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.trainers.evaluation import Evaluator, Rollouts
+from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
+from mimic.trainers.signals import Signals
+
+
+class PPOJob(Job):
+    """Trains a policy on training demonstrations; tells how good it is on these and on held-out ones.
+
+    Args:
+      config: of the run.
+      run_dir: of a run that exists, whose demonstrations count.
+
+    Raises:
+      ValueError: settings, arms or demonstrations that do not fit each other.
+    """
+
+    unit = "env_steps"
+
+    def __init__(self, config: TrainConfig, run_dir: Path | None):
+        assert isinstance(config.trainer, PPOConfig)
+        self._name, self._seed = config.env.name, config.seed
+        self.settings: PPOConfig = config.trainer.resolve(jax.default_backend(), jax.device_count())
+        self.total_steps: int = self.settings.num_timesteps  # type: ignore[assignment]
+        self._env, held_out = _environment(config.env, run_dir)
+        self._evaluator = Evaluator(self._env, held_out)
+        self._demonstrations = concatenate(self._env.demonstrations, held_out)
+        self.headline = (
+            f"{config.env.name}: {self._env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once"
+        )
+        controller = ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)
+
+        @jax.jit
+        def program(params: Params) -> Rollouts:
+            return self._evaluator.rollout(controller(params))
+
+        self._program = program
+
+    def save_inputs(self, run_dir: Path) -> None:
+        """The demonstrations."""
+        self._demonstrations.save(run_dir / runs.DEMONSTRATIONS)
+
+    def params_template(self) -> Params:
+        """Observation statistics, policy and value network."""
+        return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
+
+    def train(
+        self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
+    ) -> Params:
+        """By brax."""
+        return ppo.train(
+            self._env,
+            self.settings,
+            run_dir,
+            seed=self._seed,
+            on_evaluation=on_evaluation,
+            signals=signals,
+            restore=restore,
+        )
+
+    def evaluate(self, params: Params) -> Rollouts:
+        """Each demonstration once, without exploration."""
+        # From the host: how brax or orbax spread the parameters over devices would each ask for a program of its own.
+        return self._program(jax.device_get(params))
+
+    def figures(self, outcome: Rollouts) -> Figures:
+        """See `Evaluator.summary`."""
+        return self._evaluator.summary(outcome)
+
+    def status(self, figures: Figures) -> str:
+        """Distance and optimality gap."""
+        gap, distance = figures["optimality_gap"], figures["mean_distance"]["train"]
+        return f"distance {distance:.4f}  gap {gap['train']:.1%}, held out {gap['held_out']:.1%}"
+
+    def good_enough(self, figures: Figures) -> bool:
+        """At the target gap."""
+        return figures["optimality_gap"]["train"] <= self.settings.target_gap
+
+    def rows(self, figures: Figures) -> list[Row]:
+        """The gap and what it is made of."""
+        by_split = (
+            ("optimality gap (0 best, 1 holding still)", "optimality_gap", "{:.2%}"),
+            ("mean distance", "mean_distance", "{:.4f}"),
+            ("  lower bound of this arm", "lower_bound", "{:.4f}"),
+            ("  holding the start pose", "hold_distance", "{:.4f}"),
+        )
+        return [
+            *((label, form.format(figures[key]["train"]), form.format(figures[key]["held_out"]))
+              for label, key, form in by_split),
+            ("angle to the expert's links", f"{figures['link_angle_error_deg']:.1f} deg", ""),
+            ("steps with a torque at its limit", f"{figures['torque_saturation']:.1%}", ""),
+        ]  # fmt: skip
+
+    def plot(self, run_dir: Path, outcome: Rollouts) -> None:
+        """How it learned, and the distance over an episode."""
+        plots.plot_training(
+            run_dir / runs.METRICS, run_dir / "training.png", "optimality_gap", "optimality gap [%]", title=self._name
+        )
+        plots.plot_quality(self._evaluator, outcome, run_dir / "quality.png", title=self._name)
+
+
+def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
+    """The environment on its training demonstrations, and the held-out ones; those of a run where there is one."""
+    if run_dir is not None:
+        path = str(run_dir / runs.DEMONSTRATIONS)
+        stored = dataclasses.replace(config.demonstrations, path=path)
+        config = dataclasses.replace(config, demonstrations=stored)
+    training, held_out = training_and_held_out(config)
+    return ImitationEnv(config, training), held_out
