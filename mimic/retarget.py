@@ -6,7 +6,7 @@ from mimic.envs.config import RetargetConfig
 
 def prepare(config: RetargetConfig) -> cli.Work:
     """The retargeting that the config describes."""
-    from mimic.envs import retargeting  # not needed for --help
+    from mimic.trainers import retargeting  # not needed for --help
 
     return retargeting.prepare_retargeting(config)
 

@@ -5,6 +5,9 @@ import math
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
+from jaxtyping import Float
+
 from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
 from mimic.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
 from mimic.embodiment import LIMITS, Embodiment
@@ -62,6 +65,13 @@ class MetricConfig:
             "soft": lambda: partial(soft_correspondence, xi=self.xi),
         }
         return made[self.correspondence]()
+
+    def shares(self, expert: Embodiment, learner: Embodiment) -> Float[np.ndarray, "expert learner"]:
+        """How much each expert link counts for a learner link: columns sum to 1; alike where W depends on the state."""
+        correspondence = self.make_correspondence(expert, learner)
+        shape = expert.num_links, learner.num_links
+        matrix = np.ones(shape) if callable(correspondence) else np.asarray(correspondence)
+        return matrix / matrix.sum(axis=0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Policies on disk: orbax checkpoints, one folder for each evaluation, named by its environment steps."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,11 @@ def save_checkpoint(run_dir: Path, step: int, params: Any) -> Path:
     with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save(path, params, force=True)
     return path
+
+
+def delete_checkpoint(run_dir: Path, step: int) -> None:
+    """Removes a checkpoint."""
+    shutil.rmtree(run_dir / FOLDER / f"{step:012d}")
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from omegaconf import MISSING
@@ -56,6 +57,11 @@ class TrainerConfig:
     name: str = MISSING
     preset: str = MISSING
 
+    @property
+    def total_steps(self) -> int:
+        """How long a resolved config trains."""
+        raise NotImplementedError
+
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig(TrainerConfig):
@@ -106,10 +112,8 @@ class PPOConfig(TrainerConfig):
     evaluations: int | None = None
 
     def __post_init__(self) -> None:
-        if self.preset not in ("auto", *PRESETS):
-            raise ValueError(f"trainer.preset: expected one of auto, {', '.join(PRESETS)}, got {self.preset!r}")
-        if self.name != "ppo":
-            raise ValueError(f"trainer.name: expected 'ppo', got {self.name!r}")
+        _check_choice("trainer.preset", self.preset, ("auto", *PRESETS))
+        _check_choice("trainer.name", self.name, ("ppo",))
 
     def resolve(self, backend: str, devices: int = 1) -> "PPOConfig":
         """The same with every field filled in, and the preset's name.
@@ -129,9 +133,7 @@ class PPOConfig(TrainerConfig):
 
     def _check(self, devices: int) -> None:
         whole = ("num_timesteps", "num_envs", "unroll_length", "batch_size", "num_minibatches", "num_updates_per_batch")
-        for key in (*whole, "evaluations"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"trainer.{key}: expected at least 1, got {getattr(self, key)}")
+        _check_whole(self, *whole, "evaluations")
         for key in ("learning_rate", "max_grad_norm", "reward_scaling", "clipping_epsilon"):
             if not 0 < getattr(self, key) < math.inf:
                 raise ValueError(f"trainer.{key}: expected a number above 0, got {getattr(self, key)}")
@@ -140,9 +142,7 @@ class PPOConfig(TrainerConfig):
                 raise ValueError(f"trainer.{key}: expected a number in [0, 1], got {getattr(self, key)}")
         if not self.target_gap >= 0:
             raise ValueError(f"trainer.target_gap: expected at least 0, got {self.target_gap}")
-        layers = self.hidden_layers or []
-        if not layers or min(layers) < 1:
-            raise ValueError(f"trainer.hidden_layers: expected one or more widths above 0, got {layers}")
+        _check_layers(self.hidden_layers)
         unrolls = self.batch_size * self.num_minibatches  # type: ignore[operator]
         if unrolls % self.num_envs:  # type: ignore[operator]
             raise ValueError(
@@ -156,12 +156,162 @@ class PPOConfig(TrainerConfig):
                 )
 
     @property
+    def total_steps(self) -> int:
+        """Environment steps."""
+        return self.num_timesteps  # type: ignore[return-value]
+
+    @property
     def steps_per_batch(self) -> int:
         """Environment steps between two updates of the policy that collects them."""
         return self.batch_size * self.num_minibatches * self.unroll_length  # type: ignore[operator]
 
 
-TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig}
+MAPPER_PRESETS: dict[str, dict[str, Any]] = {
+    # Of the paper: network, training set and minibatches. What it leaves open: Adam, rate, epochs, patience.
+    "paper": {
+        "inputs": "angles",
+        "outputs": "tanh",
+        "heads": 1,
+        "hidden_layers": [32, 32, 32],
+        "activation": "leaky_relu",
+        "samples": 1024,
+        "batch_size": 32,
+        "fresh": False,
+        "epochs": 2000,
+        "learning_rate": 1e-3,
+        "final_learning_rate": 1.0,
+        "patience": 10,
+        "evaluations": 100,
+    },
+    # By measurement, on a GPU and on two cores alike.
+    "large": {
+        "inputs": "link_states",
+        "outputs": "circle",
+        "heads": 4,
+        "hidden_layers": [128, 128, 128],
+        "activation": "gelu",
+        "samples": 65_536,
+        "batch_size": 512,
+        "fresh": True,
+        "epochs": 30,
+        "learning_rate": 2e-3,
+        "final_learning_rate": 1e-3,
+        "patience": 0,
+        "evaluations": 10,
+    },
+}
+MAPPER_INPUTS, MAPPER_OUTPUTS, ACTIVATIONS = ("angles", "link_states"), ("tanh", "circle"), ("leaky_relu", "gelu")
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseMapperConfig(TrainerConfig):
+    """The neural pose mapper. A field that is None takes its value from the preset.
+
+    Attributes:
+      name: "pose_mapper".
+      preset: "large", or "paper".
+      inputs: "angles" (paper) or "link_states" of the expert: positions and directions.
+      outputs: "tanh" of an angle within the joint's range (paper), or a point on the "circle" for joints that can do a
+        full turn.
+      heads: poses that the network proposes; the nearest is taken.
+      hidden_layers: widths.
+      activation: "leaky_relu" (paper) or "gelu".
+      samples: poses in an epoch.
+      batch_size: poses in a minibatch; divides samples.
+      fresh: whether each epoch has new random poses; else it has the same ones, shuffled.
+      epochs: how long to train.
+      learning_rate: of Adam, after a warm-up.
+      final_learning_rate: as a share of it at the end; the decay is a cosine. 1 is a constant rate without warm-up.
+      patience: evaluations without a better distance on the validation poses after which training stops; 0 never.
+      target_quality: training ends early once the quality on validation poses is no larger; 0 never.
+      evaluations: how often the mapper is evaluated and saved.
+      validation_poses: that early stopping looks at.
+      held_out_poses: that the report is made on.
+    """
+
+    length_key: ClassVar[str] = "epochs"
+
+    name: str = "pose_mapper"
+    preset: str = "large"
+    inputs: str | None = None
+    outputs: str | None = None
+    heads: int | None = None
+    hidden_layers: list[int] | None = None
+    activation: str | None = None
+    samples: int | None = None
+    batch_size: int | None = None
+    fresh: bool | None = None
+    epochs: int | None = None
+    learning_rate: float | None = None
+    final_learning_rate: float | None = None
+    patience: int | None = None
+    target_quality: float = 0.0
+    evaluations: int | None = None
+    validation_poses: int = 1024
+    held_out_poses: int = 10_000
+
+    def __post_init__(self) -> None:
+        _check_choice("trainer.preset", self.preset, tuple(MAPPER_PRESETS))
+        _check_choice("trainer.name", self.name, ("pose_mapper",))
+
+    def resolve(self) -> "PoseMapperConfig":
+        """The same with every field filled in.
+
+        Raises:
+          ValueError: numbers out of range, or a batch size that does not divide the samples.
+        """
+        preset = MAPPER_PRESETS[self.preset]
+        resolved = dataclasses.replace(self, **{key: preset[key] for key in preset if getattr(self, key) is None})
+        resolved._check()
+        return resolved
+
+    def _check(self) -> None:
+        _check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
+        _check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
+        _check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
+        _check_whole(
+            self, "heads", "samples", "batch_size", "epochs", "evaluations", "validation_poses", "held_out_poses"
+        )
+        _check_layers(self.hidden_layers)
+        if not 0 < self.learning_rate < math.inf:  # type: ignore[operator]
+            raise ValueError(f"trainer.learning_rate: expected a number above 0, got {self.learning_rate}")
+        if not 0 <= self.final_learning_rate <= 1:  # type: ignore[operator]
+            raise ValueError(
+                f"trainer.final_learning_rate: expected a number in [0, 1], got {self.final_learning_rate}"
+            )
+        if self.patience < 0 or not self.target_quality >= 0:  # type: ignore[operator]
+            raise ValueError(
+                f"trainer: expected patience and target_quality of at least 0, got {self.patience}, "
+                f"{self.target_quality}"
+            )
+        if self.samples % self.batch_size:  # type: ignore[operator]
+            raise ValueError(
+                f"trainer.batch_size: expected a divisor of samples = {self.samples}, got {self.batch_size}"
+            )
+
+    @property
+    def total_steps(self) -> int:
+        """Poses to train on, each time anew."""
+        return self.samples * self.epochs  # type: ignore[operator]
+
+
+TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig, "pose_mapper": PoseMapperConfig}
+
+
+def _check_choice(what: str, value: str, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise ValueError(f"{what}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def _check_whole(config: TrainerConfig, *keys: str) -> None:
+    for key in keys:
+        if getattr(config, key) < 1:
+            raise ValueError(f"trainer.{key}: expected at least 1, got {getattr(config, key)}")
+
+
+def _check_layers(layers: list[int] | None) -> None:
+    if not layers or min(layers) < 1:
+        raise ValueError(f"trainer.hidden_layers: expected one or more widths above 0, got {layers}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -112,7 +112,7 @@ class Evaluator:
         learner = np.asarray(self._learner_states(rollouts.qpos, jnp.zeros_like(rollouts.qpos)).direction)
         cosine = np.einsum("dtix,dtjx->dtij", expert, learner)
         angle = np.arccos(np.clip(cosine, -1, 1)).mean(axis=1)
-        return (angle * _shares(env)).sum(axis=1)
+        return (angle * env.config.metric.shares(env.expert, env.learner)).sum(axis=1)
 
 
 def _lower_bound(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
@@ -142,10 +142,3 @@ def _hold_distance(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
     steps = jnp.arange(1, env.config.horizon + 1)
     over_time = jax.vmap(lambda demonstration, step: env.distance(home, 0 * home, demonstration, step), (None, 0))
     return jax.jit(jax.vmap(over_time, (0, None)))(jnp.arange(env.demonstrations.count), steps)
-
-
-def _shares(env: ImitationEnv) -> Float[np.ndarray, "expert learner"]:
-    """How much each expert link counts for a learner link: columns sum to 1; all alike where W depends on the state."""
-    n, n_hat = env.expert.num_links, env.learner.num_links
-    matrix = np.full((n, n_hat), 1.0) if callable(env.correspondence) else np.asarray(env.correspondence)
-    return matrix / matrix.sum(axis=0)

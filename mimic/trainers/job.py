@@ -40,7 +40,7 @@ class Job(abc.ABC):
     @abc.abstractmethod
     def train(
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
-    ) -> Params:
+    ) -> tuple[int, Params]:
         """Trains; saves a checkpoint before each call of `on_evaluation`.
 
         Args:
@@ -48,6 +48,9 @@ class Job(abc.ABC):
           on_evaluation: training ends where it returns True.
           signals: training ends after the next checkpoint if one came.
           restore: steps and parameters to go on from.
+
+        Returns:
+          Steps and parameters of the result.
 
         Raises:
           Interrupted: a signal came; a checkpoint is written.

@@ -2,7 +2,7 @@
 
 import csv
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 
@@ -11,21 +11,22 @@ import matplotlib.pyplot as plt  # noqa: E402
 import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 
-from mimic.trainers.evaluation import Evaluator, Rollouts  # noqa: E402
+if TYPE_CHECKING:
+    from mimic.trainers.evaluation import Evaluator, Rollouts
 
 _COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
-_LABELS = {"train": "training demonstrations", "held_out": "held-out demonstrations"}
+_LABELS = {"train": "training", "held_out": "held-out"}
 
 
-def plot_training(metrics: Path, out: Path, figure_name: str, label: str, *, title: str) -> None:
+def plot_training(metrics: Path, out: Path, figure_name: str, label: str, *, of: str, title: str) -> None:
     """A figure in percent over the steps, on training and held-out data, from the metrics of a run."""
     with metrics.open(newline="") as file:
         rows = list(csv.DictReader(file))
     steps = [int(row["step"]) for row in rows]
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
     for split, colour in _COLOURS.items():
-        gap = [100 * float(row[f"quality/{figure_name}.{split}"]) for row in rows]
-        axes.plot(steps, gap, "o-", markersize=3, color=colour, label=_LABELS[split])
+        percent = [100 * float(row[f"quality/{figure_name}.{split}"]) for row in rows]
+        axes.plot(steps, percent, "o-", markersize=3, color=colour, label=f"{_LABELS[split]} {of}")
     axes.set(xlabel="steps", ylabel=label, title=title, yscale="log")
     axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     axes.yaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
@@ -34,7 +35,7 @@ def plot_training(metrics: Path, out: Path, figure_name: str, label: str, *, tit
     _save(figure, out)
 
 
-def plot_quality(evaluator: Evaluator, rollouts: Rollouts, out: Path, *, title: str) -> None:
+def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, title: str) -> None:
     """Mean distance over the time of an episode, between the kinematic bound and holding still."""
     dt = evaluator.env.config.control_dt
     parts = evaluator.parts
@@ -47,7 +48,7 @@ def plot_quality(evaluator: Evaluator, rollouts: Rollouts, out: Path, *, title: 
         axes.fill_between(time, low, high, color=_COLOURS[split], alpha=0.2, lw=0, label="policy, 10 to 90 %")
         axes.plot(time, distance.mean(axis=0), color=_COLOURS[split], label="policy, mean")
         axes.plot(time, evaluator.lower_bound[part].mean(axis=0), "k--", lw=1, label="lower bound")
-        axes.set(xlabel="time [s]", title=f"{title}, {_LABELS[split]}", ylim=(0, None))
+        axes.set(xlabel="time [s]", title=f"{title}, {_LABELS[split]} demonstrations", ylim=(0, None))
         axes.grid(alpha=0.3)
     all_axes[0].set_ylabel("embodiment distance")
     all_axes[0].legend(fontsize="small")

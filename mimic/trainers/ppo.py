@@ -89,7 +89,7 @@ def train(
     on_evaluation: OnEvaluation,
     signals: Signals,
     restore: tuple[int, Params] | None = None,
-) -> Params:
+) -> tuple[int, Params]:
     """Trains a policy; saves a checkpoint before each call of `on_evaluation`.
 
     Args:
@@ -102,6 +102,9 @@ def train(
       signals: training ends after the next checkpoint if one came.
       restore: steps and parameters to go on from. Networks and observation statistics are kept; the moments of the
         optimiser and the states of the environments start anew.
+
+    Returns:
+      Environment steps and parameters at the end.
 
     Raises:
       Interrupted: a signal came; a checkpoint is written.
@@ -134,7 +137,7 @@ def train(
             restore_params=params,
             seed=seed + done_steps,
         )
-    return latest["params"]
+    return latest["step"], latest["params"]
 
 
 def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> dict[str, Any]:

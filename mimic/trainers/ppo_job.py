@@ -32,7 +32,7 @@ class PPOJob(Job):
         assert isinstance(config.trainer, PPOConfig)
         self._name, self._seed = config.env.name, config.seed
         self.settings: PPOConfig = config.trainer.resolve(jax.default_backend(), jax.device_count())
-        self.total_steps: int = self.settings.num_timesteps  # type: ignore[assignment]
+        self.total_steps = self.settings.total_steps
         self._env, held_out = _environment(config.env, run_dir)
         self._evaluator = Evaluator(self._env, held_out)
         self._demonstrations = concatenate(self._env.demonstrations, held_out)
@@ -57,7 +57,7 @@ class PPOJob(Job):
 
     def train(
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
-    ) -> Params:
+    ) -> tuple[int, Params]:
         """By brax."""
         return ppo.train(
             self._env,
@@ -105,7 +105,12 @@ class PPOJob(Job):
     def plot(self, run_dir: Path, outcome: Rollouts) -> None:
         """How it learned, and the distance over an episode."""
         plots.plot_training(
-            run_dir / runs.METRICS, run_dir / "training.png", "optimality_gap", "optimality gap [%]", title=self._name
+            run_dir / runs.METRICS,
+            run_dir / "training.png",
+            "optimality_gap",
+            "optimality gap [%]",
+            of="demonstrations",
+            title=self._name,
         )
         plots.plot_quality(self._evaluator, outcome, run_dir / "quality.png", title=self._name)
 

@@ -15,7 +15,7 @@ from mimic import compat
 from mimic.config import to_dict
 from mimic.trainers import runs
 from mimic.trainers.checkpoints import check_checkpoint, load_checkpoint
-from mimic.trainers.config import EvaluateConfig, TrainConfig
+from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.job import Job, Params
 from mimic.trainers.progress import TrainingProgress, report_table
 from mimic.trainers.signals import Interrupted, Signals, noted_signals
@@ -88,6 +88,10 @@ def make_job(config: TrainConfig, run_dir: Path | None) -> Job:
     Raises:
       ValueError: a config that cannot be trained.
     """
+    if isinstance(config.trainer, PoseMapperConfig):
+        from mimic.trainers.mapper_job import MapperJob
+
+        return MapperJob(config, run_dir)
     compat.import_mjx()
     from mimic.trainers.ppo_job import PPOJob  # brax and MJX, which take seconds to import
 
@@ -114,10 +118,10 @@ def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str])
         )
     merged = OmegaConf.merge(runs.run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
     config: TrainConfig = OmegaConf.to_object(merged)  # type: ignore[assignment]
-    length = getattr(config.trainer, config.trainer.length_key)
-    if steps >= length:
+    total = config.trainer.total_steps
+    if steps >= total:
         raise ValueError(
-            f"resume: {str(run_dir)!r} is trained for {steps} of {length} steps; "
+            f"resume: {str(run_dir)!r} is trained for {steps} of {total} steps; "
             f"give a larger trainer.{config.trainer.length_key}"
         )
     return dataclasses.replace(config, compilation_cache=given.compilation_cache)
@@ -138,7 +142,7 @@ def _train(
     )
     with noted_signals() as signals:  # also while the report is made: all is done then, and a signal changes nothing
         try:
-            params, steps = _train_and_log(job, run_dir, signals, restore, stopwatch, console)
+            steps, params = _train_and_log(job, run_dir, signals, restore, stopwatch, console)
         except Interrupted as stop:
             console.print(f"stopped by {stop}; go on with: python -m mimic.train resume={run_dir}", soft_wrap=True)
             return stop.exit_code
@@ -160,14 +164,12 @@ def _train_and_log(
     restore: tuple[int, Params] | None,
     stopwatch: runs.Stopwatch,
     console: Console,
-) -> tuple[Params, int]:
-    """Trains; evaluates, logs and shows the result after each stretch. Parameters and steps at the end."""
+) -> tuple[int, Params]:
+    """Trains; evaluates, logs and shows the result after each stretch. Steps and parameters of the result."""
     log = runs.MetricsLog(run_dir)
-    reached = restore[0] if restore else 0
-    with TrainingProgress(console, job.total_steps, reached) as progress, stopwatch.stage("train"):
+    with TrainingProgress(console, job.total_steps, restore[0] if restore else 0) as progress, stopwatch.stage("train"):
 
         def on_evaluation(step: int, params: Params, metrics: Mapping[str, float]) -> bool:
-            nonlocal reached
             with stopwatch.stage("evaluate"):
                 figures = job.figures(job.evaluate(params))
                 if metrics:
@@ -175,12 +177,11 @@ def _train_and_log(
                     row |= {f"training/{key}": value for key, value in metrics.items()}
                     log.write(step, {**row, "wall_time_s": time.perf_counter() - stopwatch.started})
                 progress.update(step, job.status(figures), metrics.get("sps"))
-                reached = step
             return job.good_enough(figures)
 
-        params = job.train(run_dir, on_evaluation, signals, restore)
+        result = job.train(run_dir, on_evaluation, signals, restore)
     log.close()
-    return params, reached
+    return result
 
 
 def _flat(figures: Mapping[str, Any]) -> dict[str, float]:

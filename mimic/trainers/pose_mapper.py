@@ -1,0 +1,222 @@
+"""The pose mapper: a network from a pose of the expert to the learner's nearest pose (paper, eq. 23)."""
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from mimic.distance import embodiment_distance
+from mimic.embodiment import Embodiment
+from mimic.envs.arms import build_arm
+from mimic.envs.config import EnvConfig, MetricConfig
+from mimic.kinematics import link_states
+from mimic.pose import pose_limits
+from mimic.trainers import runs
+from mimic.trainers.checkpoints import load_checkpoint
+from mimic.trainers.config import PoseMapperConfig
+
+Params = Any
+PoseDistance = Callable[[Array, Array], Array]  # expert's pose, learner's pose
+
+_ACTIVATIONS = {"leaky_relu": nn.leaky_relu, "gelu": nn.gelu}
+_LIMIT_TOLERANCE = 1e-4  # rad: what rounding to float32 takes a pose over its limit
+
+
+class _Network(nn.Module):
+    """A fully connected network."""
+
+    hidden_layers: tuple[int, ...]
+    outputs: int
+    activation: str
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        for width in self.hidden_layers:
+            x = _ACTIVATIONS[self.activation](nn.Dense(width)(x))
+        return nn.Dense(self.outputs)(x)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapperModel:
+    """A mapper without its parameters: pure functions of one pose.
+
+    Attributes:
+      expert: n joints.
+      learner: n_hat joints.
+      metric: what near means; chooses among the heads.
+      config: of the network.
+    """
+
+    expert: Embodiment
+    learner: Embodiment
+    metric: MetricConfig
+    config: PoseMapperConfig
+
+    @functools.cached_property
+    def _network(self) -> _Network:
+        outputs = int(self.config.heads or 1) * self.learner.num_joints * 2
+        return _Network(tuple(self.config.hidden_layers or ()), outputs, str(self.config.activation))
+
+    @functools.cached_property
+    def distance(self) -> PoseDistance:
+        """Embodiment distance between a pose of the expert and one of the learner."""
+        correspondence = self.metric.make_correspondence(self.expert, self.learner)
+        weights = self.metric.make_weights()
+
+        def distance(qpos: Array, learner_qpos: Array) -> Array:
+            return embodiment_distance(
+                link_states(self.expert, qpos),
+                link_states(self.learner, learner_qpos),
+                correspondence,
+                weights,
+                rotation=self.metric.rotation_measure,  # type: ignore[arg-type]
+                reduction=self.metric.reduction,  # type: ignore[arg-type]
+            )
+
+        return distance
+
+    def init(self, key: Array) -> Params:
+        """Random parameters."""
+        return self._network.init(key, self._inputs(jnp.zeros(self.expert.num_joints)))
+
+    def candidates(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, "heads learner_joints"]:
+        """The pose that each head proposes."""
+        config = self.config
+        outputs = self._network.apply(params, self._inputs(qpos))
+        outputs = jnp.reshape(outputs, (config.heads, self.learner.num_joints, 2))  # type: ignore[arg-type]
+        lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.learner.joint_range).T)
+        within = (lower + upper) / 2 + (upper - lower) / 2 * jnp.tanh(outputs[..., 0])
+        if config.outputs == "tanh":
+            return within
+        around = jnp.arctan2(outputs[..., 1], outputs[..., 0])  # no seam at pi
+        return jnp.where(np.isinf(pose_limits(self.learner, qpos.dtype)[0]), around, within)
+
+    def __call__(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
+        """The nearest of the poses that the heads propose."""
+        candidates = self.candidates(params, qpos)
+        if self.config.heads == 1:
+            return candidates[0]
+        distances = jax.vmap(lambda candidate: self.distance(qpos, candidate))(candidates)
+        return candidates[jnp.argmin(distances)]
+
+    def _inputs(self, qpos: Array) -> Array:
+        if self.config.inputs == "link_states":
+            states = link_states(self.expert, qpos)
+            assert states.direction is not None
+            return jnp.concatenate([states.position.ravel(), states.direction.ravel()])
+        lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.expert.joint_range).T)
+        full_turn = np.isinf(pose_limits(self.expert, qpos.dtype)[0])
+        qpos = jnp.where(full_turn, qpos - 2 * jnp.pi * jnp.round(qpos / (2 * jnp.pi)), qpos)
+        return (2 * qpos - lower - upper) / (upper - lower)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PoseMapper:
+    """A trained mapper: call it with poses of the expert, one or a batch. Safe under `jax.jit` and `jax.vmap`.
+
+    Attributes:
+      model: network, arms and metric.
+      params: of the network.
+    """
+
+    model: MapperModel
+    params: Params
+
+    @classmethod
+    def load(cls, run_dir: str | os.PathLike[str], checkpoint: int | None = None) -> "PoseMapper":
+        """The mapper of a run of `python -m mimic.train trainer=pose_mapper`.
+
+        Args:
+          run_dir: the run directory.
+          checkpoint: training poses of the checkpoint; the last one where None.
+
+        Raises:
+          ValueError: no run directory, one of another trainer, or no such checkpoint.
+        """
+        config = runs.load_config(Path(run_dir))
+        if not isinstance(config.trainer, PoseMapperConfig):
+            raise ValueError(
+                f"{os.fspath(run_dir)!r}: expected a run of trainer=pose_mapper, got one of {config.trainer.name}"
+            )
+        model = make_model(config.env, config.trainer.resolve())
+        template = jax.eval_shape(model.init, jax.random.key(0))
+        return cls(model, load_checkpoint(Path(run_dir), template, checkpoint)[1])
+
+    @property
+    def expert(self) -> Embodiment:
+        """Whose poses it takes."""
+        return self.model.expert
+
+    @property
+    def learner(self) -> Embodiment:
+        """Whose poses it gives."""
+        return self.model.learner
+
+    def __call__(self, qpos: Float[ArrayLike, "*batch joints"]) -> Float[Array, "*batch learner_joints"]:
+        """The learner's poses [rad].
+
+        Args:
+          qpos: [n] or [..., n] the expert's poses [rad].
+
+        Raises:
+          ValueError: poses of the wrong shape, not finite, or outside of the expert's range.
+        """
+        poses = check_poses(self.expert, qpos)
+        flat = poses.reshape(-1, self.expert.num_joints)
+        found = jax.vmap(functools.partial(self.model, self.params))(flat)
+        return found.reshape(*poses.shape[:-1], self.learner.num_joints)
+
+    def check_fits(self, expert: Embodiment, learner: Embodiment) -> None:
+        """Raises `ValueError` where the mapper is not one from this expert to this learner."""
+        for role, arm, own in (("expert", expert, self.expert), ("learner", learner, self.learner)):
+            if (arm.name, arm.joint_names) != (own.name, own.joint_names):
+                raise ValueError(
+                    f"mapper: its {role} is {own.name} with joints {', '.join(own.joint_names)}, "
+                    f"expected {arm.name} with joints {', '.join(arm.joint_names)}"
+                )
+
+
+def make_model(env: EnvConfig, config: PoseMapperConfig) -> MapperModel:
+    """The mapper of an environment's arms and metric.
+
+    Raises:
+      ValueError: arms that cannot be built.
+    """
+    expert, learner = (build_arm(arm, env.limits).embodiment for arm in (env.expert, env.learner))
+    return MapperModel(expert, learner, env.metric, config)
+
+
+def check_poses(arm: Embodiment, qpos: ArrayLike) -> Array:
+    """Poses as an array of floating point numbers; what is not known while JAX traces is not checked.
+
+    Raises:
+      ValueError: poses of the wrong shape, not finite, or outside of the arm's range.
+    """
+    poses = jnp.asarray(qpos)
+    poses = poses if jnp.issubdtype(poses.dtype, jnp.floating) else poses.astype(float)
+    if poses.ndim < 1 or poses.shape[-1] != arm.num_joints:
+        raise ValueError(f"qpos: expected shape [..., {arm.num_joints}] for {arm.name}, got {poses.shape}")
+    if isinstance(poses, Tracer):
+        return poses
+    values = np.asarray(poses)
+    if not np.all(np.isfinite(values)):
+        raise ValueError("qpos: expected finite angles [rad], got some that are not")
+    lower, upper = pose_limits(arm, values.dtype)
+    outside = (values < lower - _LIMIT_TOLERANCE) | (values > upper + _LIMIT_TOLERANCE)
+    if outside.any():
+        *_, joint = first = tuple(np.argwhere(outside)[0])
+        raise ValueError(
+            f"qpos: {arm.joint_names[joint]} at {values[first]:.4f} rad is outside of its range "
+            f"[{lower[joint]:.4f}, {upper[joint]:.4f}]"
+        )
+    return poses
