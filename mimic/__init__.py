@@ -38,6 +38,7 @@ from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: 
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
+    from mimic.trainers.pose_mapper import PoseMapper
 
 __version__ = "0.1.0"
 
@@ -53,6 +54,7 @@ __all__ = [
     "LinkStates",
     "PairDistances",
     "PoseImitation",
+    "PoseMapper",
     "adaptive_weights",
     "body_twists",
     "build_arm",
@@ -87,4 +89,8 @@ def __getattr__(name: str) -> Any:
         from mimic.envs.imitation import ImitationEnv
 
         return ImitationEnv
+    if name == "PoseMapper":  # checkpoints and metrics, likewise
+        from mimic.trainers.pose_mapper import PoseMapper
+
+        return PoseMapper
     raise AttributeError(f"module 'mimic' has no attribute {name!r}")

@@ -148,6 +148,7 @@ class RetargetConfig:
     Attributes:
       demonstrations: file of the expert's.
       learner: name of the environment whose arms and metric count.
+      mapper: run directory of a pose mapper of that environment, which is used instead of the optimiser.
       limits: see `EnvConfig`.
       out: file of the learner's; must not exist.
       seed: of the random poses that minima are searched from.
@@ -155,6 +156,7 @@ class RetargetConfig:
 
     demonstrations: str = ""
     learner: str = "panda4dof"
+    mapper: str = ""
     limits: str = "none"
     out: str = ""
     seed: int = 0

@@ -17,7 +17,7 @@ from mimic.trainers.pose_mapper import make_model
 from mimic.trainers.signals import Signals
 
 # Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.
-_VALIDATION, _HELD_OUT, _CHANCE = 1, 2, 3
+_TRAINING, _VALIDATION, _HELD_OUT, _CHANCE = range(4)
 
 
 class _Reference(NamedTuple):
@@ -49,13 +49,12 @@ class MapperJob(Job):
         self.total_steps = self.settings.total_steps
         self._model = model = make_model(config.env, self.settings)
         samples = int(self.settings.samples or 0)
-        seen = mapper_training.random_poses(model, jax.random.fold_in(jax.random.key(config.seed), 1), samples)
-        keys = {name: jax.random.fold_in(jax.random.key(0), name) for name in (_VALIDATION, _HELD_OUT)}
+        seen = mapper_training.random_poses(model, jax.random.fold_in(_key(_TRAINING), config.seed), samples)
         self._seen = seen
         self._poses = {
             "train": seen[: self.settings.validation_poses],
-            "validation": mapper_training.random_poses(model, keys[_VALIDATION], self.settings.validation_poses),
-            "held_out": mapper_training.random_poses(model, keys[_HELD_OUT], self.settings.held_out_poses),
+            "validation": mapper_training.random_poses(model, _key(_VALIDATION), self.settings.validation_poses),
+            "held_out": mapper_training.random_poses(model, _key(_HELD_OUT), self.settings.held_out_poses),
         }
         kind = "fresh poses in each epoch" if self.settings.fresh else "training poses"
         self.headline = f"{config.env.name}: {model.expert.name} to {model.learner.name}, {samples} {kind}"
@@ -84,8 +83,7 @@ class MapperJob(Job):
             reduction=metric.reduction,  # type: ignore[arg-type]
         )
         lower, upper = jnp.asarray(model.learner.joint_range, jnp.float32).T
-        key = jax.random.fold_in(jax.random.key(0), _CHANCE)
-        chance = jax.random.uniform(key, (len(every), len(lower)), minval=lower, maxval=upper)
+        chance = jax.random.uniform(_key(_CHANCE), (len(every), len(lower)), minval=lower, maxval=upper)
         ends = np.cumsum([len(poses) for poses in self._poses.values()])[:-1]
         by_split = [
             dict(zip(self._poses, np.split(np.asarray(values), ends), strict=True))
@@ -186,6 +184,10 @@ class MapperJob(Job):
             of="poses",
             title=self._name,
         )
+
+
+def _key(purpose: int) -> jax.Array:
+    return jax.random.fold_in(jax.random.key(0), purpose)
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:

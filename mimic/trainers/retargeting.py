@@ -1,5 +1,6 @@
 """Retargeting: demonstrations of one arm as motions of another, pose by pose."""
 
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from rich.console import Console
 from rich.table import Table
 
@@ -15,13 +17,20 @@ from mimic.envs import env_config
 from mimic.envs.arms import build_arm
 from mimic.envs.config import MetricConfig, RetargetConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
-from mimic.pose import imitate_trajectory
+from mimic.pose import PoseImitation, imitate_trajectory, pose_limits
+from mimic.trainers.pose_mapper import PoseMapper
 
 
 def retarget(
-    demonstrations: Demonstrations, expert: Embodiment, learner: Embodiment, metric: MetricConfig, *, seed: int = 0
+    demonstrations: Demonstrations,
+    expert: Embodiment,
+    learner: Embodiment,
+    metric: MetricConfig,
+    *,
+    mapper: PoseMapper | None = None,
+    seed: int = 0,
 ) -> tuple[Demonstrations, dict[str, Any]]:
-    """The learner's motions that are nearest to the expert's, without a jump (see `imitate_trajectory`).
+    """The learner's motions that are nearest to the expert's, without a jump.
 
     No joint moves faster than its rated speed, pi rad/s where it has none. Velocities are central differences.
 
@@ -30,35 +39,27 @@ def retarget(
       expert: n joints.
       learner: n_hat joints.
       metric: what near means; velocities do not count.
-      seed: of the random poses that minima are searched from.
+      mapper: proposes the poses, see `follow_mapper`; the optimiser does where None, see `imitate_trajectory`.
+      seed: of the random poses that the optimiser searches minima from.
 
     Returns:
       The learner's motions, and a report: `distance`, mean of all; `largest_jump` [rad] of a joint between two times;
-      `converged`, the share of poses at a minimum.
+      `settled`, the share of poses at a minimum, or at one that the mapper proposes.
 
     Raises:
-      ValueError: demonstrations of another arm, or poses outside its range.
+      ValueError: demonstrations of another arm, poses outside its range, or a mapper between other arms.
     """
     _check(demonstrations, expert)
-    correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
     rated = np.where(np.isfinite(learner.velocity_limit), learner.velocity_limit, np.pi)
-
-    def one(qpos: jax.Array) -> Any:
-        return imitate_trajectory(
-            expert,
-            learner,
-            qpos,
-            correspondence,
-            weights,
-            largest_jump=rated * demonstrations.dt,
-            key=jax.random.key(seed),
-            rotation=metric.rotation_measure,  # type: ignore[arg-type]
-            reduction=metric.reduction,  # type: ignore[arg-type]
-        )
-
-    # One demonstration after the other: the minima that are tracked fill the processor, and memory stays small.
-    found = jax.jit(lambda all_qpos: jax.lax.map(one, all_qpos))(jnp.asarray(demonstrations.qpos, jnp.float32))
-    qpos = np.asarray(found.qpos, float)
+    largest_jump = rated * demonstrations.dt
+    expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
+    if mapper is None:
+        found = _optimise(expert, learner, expert_qpos, metric, largest_jump, seed)
+        qpos, distance, settled = (np.asarray(x) for x in (found.qpos, found.distance, found.converged))
+    else:
+        mapper.check_fits(expert, learner)
+        qpos, distance, settled = follow_mapper(mapper, expert_qpos, largest_jump)
+    qpos = np.asarray(qpos, float)
     motions = Demonstrations(
         qpos=qpos,
         qvel=np.gradient(qpos, demonstrations.dt, axis=1),
@@ -69,11 +70,83 @@ def retarget(
         seed=demonstrations.seed,
     )
     report = {
-        "distance": float(np.mean(found.distance)),
+        "distance": float(np.mean(distance)),
         "largest_jump": float(np.abs(np.diff(qpos, axis=1)).max()),
-        "converged": float(np.mean(found.converged)),
+        "settled": float(np.mean(settled)),
     }
     return motions, report
+
+
+def follow_mapper(
+    mapper: PoseMapper, qpos: Float[Array, "motions time joints"], largest_jump: Float[np.ndarray, " learner_joints"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Motions through the poses that a mapper proposes.
+
+    At each time one head's pose is chosen, such that the whole motion has the least sum of distances and of what jumps
+    exceed their bound [rad] (dynamic programming). Where a jump is left, the joints go there at their bound.
+
+    Args:
+      mapper: of the arm.
+      qpos: the expert's motions [rad].
+      largest_jump: of each joint between two times [rad].
+
+    Returns:
+      The learner's poses [motions, time, learner_joints], their distances, and whether each is the proposed one.
+    """
+    model = mapper.model
+    candidates = jax.jit(jax.vmap(jax.vmap(functools.partial(model.candidates, mapper.params))))(qpos)
+    distances = jax.jit(jax.vmap(jax.vmap(jax.vmap(model.distance, (None, 0)))))(qpos, candidates)
+    full_turn = np.isinf(pose_limits(model.learner, np.float32)[0])
+
+    def turn(change: Array) -> Array:
+        return jnp.where(full_turn, change - 2 * jnp.pi * jnp.round(change / (2 * jnp.pi)), change)
+
+    def one(candidates: Array, distances: Array) -> tuple[Array, Array]:
+        def forth(cost: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+            before, after, distance = now
+            change = jnp.abs(turn(after[None] - before[:, None]))
+            total = cost[:, None] + jnp.maximum(change - largest_jump, 0).sum(axis=-1)
+            return total.min(axis=0) + distance, total.argmin(axis=0)
+
+        cost, origin = jax.lax.scan(forth, distances[0], (candidates[:-1], candidates[1:], distances[1:]))
+        last = cost.argmin()
+        _, chosen = jax.lax.scan(lambda head, from_: (from_[head], from_[head]), last, origin, reverse=True)
+        chosen = jnp.append(chosen, last)
+        proposed = jnp.take_along_axis(candidates, chosen[:, None, None], axis=1)[:, 0]
+
+        def follow(pose: Array, target: Array) -> tuple[Array, tuple[Array, Array]]:
+            change = turn(target - pose)
+            bounded = jnp.clip(change, -largest_jump, largest_jump)
+            return pose + bounded, (pose + bounded, jnp.all(bounded == change))
+
+        _, (poses, settled) = jax.lax.scan(follow, proposed[0], proposed)
+        return poses, settled
+
+    poses, settled = jax.jit(jax.vmap(one))(candidates, distances)
+    distance = jax.jit(jax.vmap(jax.vmap(model.distance)))(qpos, poses)
+    return np.asarray(poses), np.asarray(distance), np.asarray(settled)
+
+
+def _optimise(
+    expert: Embodiment, learner: Embodiment, qpos: Array, metric: MetricConfig, largest_jump: np.ndarray, seed: int
+) -> PoseImitation:
+    correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
+
+    def one(qpos: jax.Array) -> PoseImitation:
+        return imitate_trajectory(
+            expert,
+            learner,
+            qpos,
+            correspondence,
+            weights,
+            largest_jump=largest_jump,
+            key=jax.random.key(seed),
+            rotation=metric.rotation_measure,  # type: ignore[arg-type]
+            reduction=metric.reduction,  # type: ignore[arg-type]
+        )
+
+    # One demonstration after the other: the minima that are tracked fill the processor, and memory stays small.
+    return jax.jit(lambda all_qpos: jax.lax.map(one, all_qpos))(qpos)
 
 
 def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
@@ -93,11 +166,14 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
     expert, learner = (build_arm(arm, env.limits).embodiment for arm in (env.expert, env.learner))
     loaded = load_demonstrations(Path(config.demonstrations).expanduser())
     _check(loaded, expert)
+    mapper = PoseMapper.load(Path(config.mapper).expanduser()) if config.mapper else None
+    if mapper:
+        mapper.check_fits(expert, learner)
 
     def run() -> None:
         console = Console()
         with console.status(f"retargeting {loaded.count} motions from {expert.name} to {learner.name}"):
-            motions, report = retarget(loaded, expert, learner, env.metric, seed=config.seed)
+            motions, report = retarget(loaded, expert, learner, env.metric, mapper=mapper, seed=config.seed)
         motions.save(out)
         console.print(_table(motions, report))
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
@@ -123,5 +199,5 @@ def _table(motions: Demonstrations, report: Mapping[str, Any]) -> Table:
     table = Table("", "value", title=f"{motions.count} motions of {motions.arm}", title_justify="left")
     table.add_row("mean distance", f"{report['distance']:.4f}")
     table.add_row("largest jump of a joint", f"{report['largest_jump']:.3f} rad in {motions.dt} s")
-    table.add_row("poses at a minimum", f"{report['converged']:.1%}")
+    table.add_row("poses at a minimum, or as mapped", f"{report['settled']:.1%}")
     return table
