@@ -7,19 +7,15 @@ cold: without a compilation cache.
 """
 
 import argparse
-import datetime
-import json
-import os
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+
+from benchmarks.record import train, write_results
 
 CASES = {
     "panda4dof": ["env=panda4dof"],
@@ -29,39 +25,6 @@ CASES = {
         "trainer.target_gap=0.02",
     ],
 }
-
-
-def run_once(arguments: Sequence[str]) -> dict[str, Any]:
-    """One training run: its report, and the wall time of the whole process [s]."""
-    with tempfile.TemporaryDirectory() as folder:
-        run_dir = Path(folder) / "run"
-        command = [sys.executable, "-m", "mimic.train", *arguments, f"run_dir={run_dir}", "compilation_cache="]
-        began = time.perf_counter()
-        finished = subprocess.run(command, capture_output=True, text=True, check=False)
-        wall = time.perf_counter() - began
-        if finished.returncode:
-            sys.exit(f"error: {' '.join(command)} ended with {finished.returncode}: {finished.stderr[-2000:]}")
-        report = json.loads((run_dir / "report.json").read_text())
-    return {"arguments": list(arguments), "process_wall_s": round(wall, 1), "report": report}
-
-
-def write(out: Path, results: Sequence[dict[str, Any]], commit: str) -> None:
-    """Replaces the file of results, only when the new one is whole."""
-    content = {
-        "benchmark": "training",
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "commit": commit,
-        "hardware": results[0]["report"]["hardware"],
-        "versions": results[0]["report"]["versions"],
-        "runs": [{**result, "report": _without_machine(result["report"])} for result in results],
-    }
-    partial = out.with_name(out.name + ".partial")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
-    os.replace(partial, out)
-
-
-def _without_machine(report: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in report.items() if key not in ("hardware", "versions")}
 
 
 def _table(results: Sequence[dict[str, Any]]) -> Table:
@@ -98,16 +61,11 @@ def main() -> None:
     results: list[dict[str, Any]] = []
     for name in options.case or CASES:
         for seed in options.seeds:
-            results.append({"case": name, **run_once([*CASES[name], f"seed={seed}"])})
+            with tempfile.TemporaryDirectory() as folder:
+                results.append({"case": name, **train(Path(folder) / "run", [*CASES[name], f"seed={seed}"])})
             if options.out:
-                write(options.out, results, options.commit or commit_id())
+                write_results(options.out, "training", options.commit, runs=results)
     Console().print(_table(results))
-
-
-def commit_id() -> str:
-    """What is checked out, where this is a git checkout."""
-    found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-    return found.stdout.strip() if found.returncode == 0 else "unknown"
 
 
 if __name__ == "__main__":

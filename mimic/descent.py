@@ -1,11 +1,17 @@
-"""Descents of a smooth function of joint angles, within limits; each from one start, batched by `jax.vmap`."""
+"""Descents of a smooth function of joint angles, within limits; each from one start, batched by `jax.vmap`.
 
-from collections.abc import Callable
+All is done on scalar components (see `mimic.spatial`): a batch of descents is one elementwise program.
+"""
+
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from mimic.spatial import Scalar, plus, times
 
 _LARGEST_STEP = 1.0  # rad, of a joint in one Newton step
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: at the start, after a success, after a failure
@@ -13,8 +19,22 @@ _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: at the start, a
 # 0.46 for planar arms of 4 and 7 links, 0.64 for two Pandas).
 _GRADIENT_STEP = 0.4
 
-Objective = Callable[[Array], Array]
-Limits = tuple[Any, Any]  # lower, upper [rad]
+Scalars = Sequence[Scalar]
+Limits = tuple[Any, Any]  # lower, upper [rad]; a joint whose limits are known to be infinite costs nothing
+
+
+class Derivatives(NamedTuple):
+    """A function of joint angles at one point, as scalar components.
+
+    Attributes:
+      value: of the function.
+      gradient: by each joint.
+      hessian: rows of the second derivative, at least up to the diagonal.
+    """
+
+    value: Scalar
+    gradient: Scalars
+    hessian: Sequence[Scalars]
 
 
 class End(NamedTuple):
@@ -31,73 +51,113 @@ class End(NamedTuple):
     slope: Float[Array, ""]
 
 
-def newton(objective: Objective, start: Array, limits: Limits, iterations: int) -> End:
+Objective = Callable[[Scalars], Derivatives]
+
+
+def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> End:
     """Damped Newton descent: the exact second derivative, with its concave directions turned round."""
-    lower, upper = limits
-
-    def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
-        value, gradient = jax.value_and_grad(objective)(qpos)
-        return gradient, (value, gradient)
-
-    def derivatives(qpos: Array) -> tuple[Array, Array, Array]:
-        hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(qpos)
-        return value, gradient, hessian
+    joints = start.shape[0]
+    bounds = _bounds(limits, joints)
 
     def iterate(carry: Any, _: None) -> tuple[Any, None]:
-        qpos, (value, gradient, hessian), damping = carry
-        free = _free(qpos, gradient, lower, upper)
-        step = _descent_step(hessian, gradient, free, damping)
-        step = step / jnp.maximum(jnp.abs(step).max() / _LARGEST_STEP, 1.0)
-        tried = jnp.clip(qpos + step, lower, upper)
-        there = derivatives(tried)
-        better = there[0] < value
-        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (tried, there), (qpos, carry[1]))
+        qpos, here, damping = carry
+        free = _free(qpos, here.gradient, bounds)
+        step = _descent_step(here, free, damping)
+        longest = _largest(step)
+        scale = 1 / jnp.maximum(longest / _LARGEST_STEP, 1.0)
+        tried = _within([q + s * scale for q, s in zip(qpos, step, strict=True)], bounds)
+        there = _symmetric(objective(tried))
+        better = there.value < here.value
+        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (tried, there), (qpos, here))
         return (*kept, damping * jnp.where(better, _LESS, _MORE)), None
 
-    start = jnp.clip(start, lower, upper)
+    qpos = _within([start[k] for k in range(joints)], bounds)
     # Nothing is known at the start: the first step is none, and what it finds is better than infinity.
-    unknown = jnp.full_like(start[0], jnp.inf), jnp.zeros_like(start), jnp.zeros_like(start, shape=2 * start.shape)
-    first = start, unknown, jnp.asarray(_FIRST_DAMPING / _LESS, start.dtype)
-    (qpos, (value, gradient, _), _), _ = jax.lax.scan(iterate, first, None, length=iterations + 1)
-    return End(qpos, value, jnp.abs(_free(qpos, gradient, lower, upper) * gradient).max())
+    zero = jnp.zeros_like(start[0])
+    unknown = Derivatives(zero + jnp.inf, (zero,) * joints, tuple((zero,) * (k + 1) for k in range(joints)))
+    first = qpos, unknown, zero + _FIRST_DAMPING / _LESS
+    (qpos, here, _), _ = jax.lax.scan(iterate, first, None, length=iterations + 1)
+    return _end(qpos, here, bounds)
 
 
-def gradient_descent(objective: Objective, start: Array, limits: Limits, iterations: int) -> End:
+def gradient_descent(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> End:
     """Plain descent (paper): each step is the slope times a constant."""
-    lower, upper = limits
+    bounds = _bounds(limits, start.shape[0])
 
-    def iterate(qpos: Array, _: None) -> tuple[Array, None]:
-        slope = jax.grad(objective)(qpos)
-        return jnp.clip(qpos - _GRADIENT_STEP * slope, lower, upper), None
+    def iterate(qpos: Any, _: None) -> tuple[Any, None]:
+        gradient = objective(qpos).gradient  # what is not used of the rest is not computed
+        return _within([q - _GRADIENT_STEP * g for q, g in zip(qpos, gradient, strict=True)], bounds), None
 
-    qpos, _ = jax.lax.scan(iterate, jnp.clip(start, lower, upper), None, length=iterations)
-    value, gradient = jax.value_and_grad(objective)(qpos)
-    return End(qpos, value, jnp.abs(_free(qpos, gradient, lower, upper) * gradient).max())
+    qpos, _ = jax.lax.scan(iterate, _within(list(start), bounds), None, length=iterations)
+    return _end(qpos, objective(qpos), bounds)
 
 
-def _descent_step(hessian: Array, gradient: Array, free: Array, damping: Array) -> Array:
+def _descent_step(here: Derivatives, free: Scalars, damping: Scalar) -> Scalars:
     """-(L |D| L^T)^-1 g for the damped Hessian L D L^T of the free joints: downhill, whatever the curvature."""
-    joints = gradient.shape[0]
-    scale = jnp.abs(jnp.diagonal(hessian)).max() + jnp.finfo(gradient.dtype).tiny
-    matrix = hessian * free[:, None] * free[None, :] / scale
-    matrix = matrix + jnp.diag(damping + (1 - free))
-    least = jnp.finfo(gradient.dtype).eps
-    right, pivots, factors = -gradient * free / scale, [], []
+    joints, eps = len(here.gradient), jnp.finfo(jnp.result_type(here.value)).eps
+    largest = _largest([row[-1] for row in here.hessian])
+    unit = 1 / (largest + jnp.finfo(jnp.result_type(here.value)).tiny)
+    matrix = [[times(times(free[i], free[j]), here.hessian[i][j] * unit) for j in range(i + 1)] for i in range(joints)]
+    for i in range(joints):
+        matrix[i][i] = plus(matrix[i][i] + damping, 1.0 - free[i])
+    step = [times(free[i], -here.gradient[i] * unit) for i in range(joints)]
+    pivots = []
     for k in range(joints):
-        pivot = matrix[k, k]
-        pivot = jnp.where(jnp.abs(pivot) < least, least, pivot)
-        factor = jnp.where(jnp.arange(joints) > k, matrix[:, k] / pivot, 0)
-        matrix = matrix - factor[:, None] * matrix[k][None, :]
-        right = right - factor * right[k]
+        pivot = jnp.where(jnp.abs(matrix[k][k]) < eps, eps, matrix[k][k])
+        below = [matrix[i][k] for i in range(joints) if i > k]
+        for i in range(k + 1, joints):
+            matrix[i][k] = matrix[i][k] / pivot  # from now on an entry of L
+            step[i] = step[i] - matrix[i][k] * step[k]
+            for j in range(k + 1, i + 1):
+                matrix[i][j] = matrix[i][j] - matrix[i][k] * below[j - k - 1]
         pivots.append(jnp.abs(pivot))
-        factors.append(factor)
-    step = right / jnp.stack(pivots)
+    step = [s / pivot for s, pivot in zip(step, pivots, strict=True)]
     for k in reversed(range(joints)):
-        step = step - jnp.where(jnp.arange(joints) == k, jnp.sum(factors[k] * step), 0)
+        for i in range(k + 1, joints):
+            step[k] = step[k] - matrix[i][k] * step[i]
     return step
 
 
-def _free(qpos: Array, gradient: Array, lower: Any, upper: Any) -> Array:
+def _symmetric(derivatives: Derivatives) -> Derivatives:
+    """With the lower triangle of the Hessian alone."""
+    lower = tuple(tuple(row[: i + 1]) for i, row in enumerate(derivatives.hessian))
+    return Derivatives(derivatives.value, tuple(derivatives.gradient), lower)
+
+
+def _bounds(limits: Limits, joints: int) -> list[tuple[Scalar, Scalar] | None]:
+    """Lower and upper limit of each joint, None where they are known to be infinite."""
+    known = all(isinstance(limit, np.ndarray) for limit in limits)
+    lower, upper = limits
+    return [
+        None if known and np.isinf(lower[k]) and np.isinf(upper[k]) else (lower[k], upper[k]) for k in range(joints)
+    ]
+
+
+def _within(qpos: Scalars, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> tuple[Scalar, ...]:
+    return tuple(q if bound is None else jnp.clip(q, *bound) for q, bound in zip(qpos, bounds, strict=True))
+
+
+def _free(qpos: Scalars, gradient: Scalars, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> Scalars:
     """1 for the joints that may move, 0 for those that a limit holds against the descent."""
-    held = ((qpos <= lower) & (gradient > 0)) | ((qpos >= upper) & (gradient < 0))
-    return jnp.where(held, 0, 1).astype(qpos.dtype)
+    return [
+        1.0 if bound is None else _held_open(q, slope, *bound)
+        for q, slope, bound in zip(qpos, gradient, bounds, strict=True)
+    ]
+
+
+def _held_open(qpos: Scalar, slope: Scalar, lower: Scalar, upper: Scalar) -> Scalar:
+    held = ((qpos <= lower) & (slope > 0)) | ((qpos >= upper) & (slope < 0))
+    return jnp.where(held, 0, 1).astype(jnp.result_type(qpos))
+
+
+def _largest(values: Scalars) -> Scalar:
+    largest = jnp.abs(values[0])
+    for value in values[1:]:
+        largest = jnp.maximum(largest, jnp.abs(value))
+    return largest
+
+
+def _end(qpos: Scalars, here: Derivatives, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> End:
+    free = _free(qpos, here.gradient, bounds)
+    slope = _largest([times(f, g) for f, g in zip(free, here.gradient, strict=True)])
+    return End(jnp.stack(qpos), here.value, slope)

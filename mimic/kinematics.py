@@ -1,7 +1,8 @@
 """Frames, twists and link states of an embodiment: one sample per call, batched by `jax.vmap`."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
@@ -156,7 +157,21 @@ def _inverse_adjoint(rotation: Rotation, position: Vector, omega: Vector, v: Vec
     return spatial.rotate(back, omega), spatial.rotate(back, spatial.add(v, spatial.cross(omega, position)))
 
 
-def _joint_frames(arm: Embodiment, qpos: Array, qvel: Array | None) -> list[_JointFrame]:
+def axes_and_directions(arm: Embodiment, qpos: Sequence[spatial.Scalar]) -> tuple[list[Vector], list[Vector]]:
+    """The joints' axes and the links' directions in the base frame, as scalar components.
+
+    Args:
+      arm: the embodiment.
+      qpos: an angle [rad] for each joint.
+    """
+    frames = _joint_frames(arm, qpos, None)
+    turns = [frame.rotation for frame in frames]
+    axes = [spatial.rotate(turn, spatial.vector(axis)) for turn, axis in zip(turns, arm.joint_axis, strict=False)]
+    links = zip(arm.link_joint, arm.link_rotation, strict=True)
+    return axes, [spatial.rotate(turns[joint + 1], spatial.vector(frame[:, 0])) for joint, frame in links]
+
+
+def _joint_frames(arm: Embodiment, qpos: Any, qvel: Array | None) -> list[_JointFrame]:
     """The base, then the body behind each joint."""
     frames = [_JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)]
     previous_anchor = spatial.ZERO  # in the zero pose

@@ -1,5 +1,6 @@
 """Static pose imitation: the learner's pose that is nearest to a pose of the expert."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
@@ -10,10 +11,11 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from mimic.descent import End, gradient_descent, newton
-from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
+from mimic.descent import Derivatives, End, Scalars, gradient_descent, newton
+from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights
 from mimic.embodiment import Embodiment
-from mimic.kinematics import LinkStates, link_states
+from mimic.kinematics import link_states
+from mimic.objective import PoseObjective, Target, pose_objective
 
 Method = Literal["newton", "gradient_descent"]
 METHODS = ("newton", "gradient_descent")
@@ -90,24 +92,26 @@ def imitate_pose(
     rough = max(int(_ROUGH_SHARE * count), 1)
     key = jax.random.key(0) if key is None else key
     batch = poses.shape[:-1]
-    distance = _pose_distance(learner, correspondence, weights, rotation, reduction)
+    objective = pose_objective(learner, correspondence, weights, rotation, reduction)
     limits = pose_limits(learner, poses.dtype)
     descend = newton if method == "newton" else gradient_descent
 
     def solve(poses: Array, warm: Array | None) -> PoseImitation:
         random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
-        scale = _typical_distance(distance, expert, learner, poses, random_poses)
+        scale = _typical_distance(objective, expert, learner, poses, random_poses)
 
         def one(pose: Array, warm: Array | None) -> PoseImitation:
             states = link_states(expert, pose)
-            first = _starts(distance, expert, learner, states, pose, random_poses if starts else None)
+            target = objective.target(states)
+            first = _starts(objective, expert, learner, target, pose, random_poses if starts else None)
             first = first if warm is None else warm[None]
-            objective = lambda q: distance(states, q)  # noqa: E731
-            ends = jax.vmap(lambda start: descend(objective, start, limits, rough))(first)
+            of_qpos = functools.partial(objective.derivatives, target)
+            ends = jax.vmap(lambda start: descend(of_qpos, start, limits, rough))(first)
             chosen = jax.lax.top_k(-ends.value, min(_POLISHED, len(first)))[1]
-            ends = jax.vmap(lambda start: descend(objective, start, limits, count - rough))(ends.qpos[chosen])
+            ends = jax.vmap(lambda start: descend(of_qpos, start, limits, count - rough))(ends.qpos[chosen])
             end: End = jax.tree.map(lambda x: x[jnp.argmin(ends.value)], ends)
-            return PoseImitation(_wrapped(end.qpos, limits), end.value, end.slope <= _FLAT * scale)
+            left = objective.distance(states, link_states(learner, end.qpos))
+            return PoseImitation(_wrapped(end.qpos, limits), left, end.slope <= _FLAT * scale)
 
         in_axes = (0, None if warm is None else 0)
         return jax.vmap(one, in_axes)(poses, warm)
@@ -162,7 +166,7 @@ def imitate_trajectory(
     if starts < 0:
         raise ValueError(f"starts: expected at least 0, got {starts}")
     key = jax.random.key(0) if key is None else key
-    distance = _pose_distance(learner, correspondence, weights, rotation, reduction)
+    objective = pose_objective(learner, correspondence, weights, rotation, reduction)
     limits = lower, upper = pose_limits(learner, poses.dtype)
     jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
     last = poses.shape[0] - 1
@@ -170,18 +174,19 @@ def imitate_trajectory(
 
     def solve(poses: Array) -> PoseImitation:
         random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
-        scale = _typical_distance(distance, expert, learner, poses, random_poses)
+        scale = _typical_distance(objective, expert, learner, poses, random_poses)
         states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
+        targets = jax.vmap(objective.target)(states)
 
-        def at(time: Array) -> LinkStates:
-            return jax.tree.map(lambda x: x[time], states)
+        def at(time: Array) -> Callable[[Scalars], Derivatives]:
+            return functools.partial(objective.derivatives, jax.tree.map(lambda x: x[time], targets))
 
         def track(anchor: Array, start: Array) -> End:
-            begin = newton(lambda q: distance(at(anchor), q), start, (lower, upper), _ITERATIONS["newton"]).qpos
+            begin = newton(at(anchor), start, limits, _ITERATIONS["newton"]).qpos
 
             def follow(pose: Array, time: Array) -> tuple[Array, End]:
                 reach = jnp.maximum(lower, pose - jump), jnp.minimum(upper, pose + jump)
-                end = newton(lambda q: distance(at(time), q), pose, reach, _TRACKING_ITERATIONS)
+                end = newton(at(time), pose, reach, _TRACKING_ITERATIONS)
                 return end.qpos, end
 
             # Forth from the anchor to the end, then back over all: what lies before the anchor is reached that way too.
@@ -190,16 +195,17 @@ def imitate_trajectory(
             return jax.lax.scan(follow, turned, jnp.arange(last + 1), reverse=True)[1]
 
         def from_anchor(anchor: Array) -> End:
-            expert_pose = poses[anchor]
-            first = _starts(distance, expert, learner, at(anchor), expert_pose, random_poses if starts else None)
+            target = jax.tree.map(lambda x: x[anchor], targets)
+            first = _starts(objective, expert, learner, target, poses[anchor], random_poses if starts else None)
             return jax.vmap(lambda start: track(anchor, start))(first)
 
         tracks = jax.vmap(from_anchor)(jnp.asarray(anchors))
         tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
         best = jnp.argmin(tracks.value.mean(axis=1))
         found: End = jax.tree.map(lambda x: x[best], tracks)
+        left = jax.vmap(lambda state, q: objective.distance(state, link_states(learner, q)))(states, found.qpos)
         shift = _wrapped(found.qpos[0], limits) - found.qpos[0]
-        return PoseImitation(found.qpos + shift, found.value, found.slope <= _FLAT * scale)
+        return PoseImitation(found.qpos + shift, left, found.slope <= _FLAT * scale)
 
     return jax.jit(solve)(poses)
 
@@ -219,22 +225,6 @@ def shared_joints(
     return jnp.where(np.array(index) >= 0, values[np.array(index)], 0)
 
 
-def _pose_distance(
-    learner: Embodiment,
-    correspondence: Correspondence,
-    weights: Weights,
-    rotation: RotationMeasure,
-    reduction: Reduction,
-) -> Callable[[LinkStates, Array], Array]:
-    def distance(states: LinkStates, qpos: Array) -> Array:
-        learner_states = link_states(learner, qpos)
-        return embodiment_distance(
-            states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
-        )
-
-    return distance
-
-
 def _checked_poses(arm: Embodiment, values: ArrayLike, name: str) -> Array:
     poses = jnp.asarray(values)
     if poses.ndim < 1 or poses.shape[-1] != arm.num_joints:
@@ -252,22 +242,19 @@ def _random_poses(arm: Embodiment, key: Array, sets: int, dtype: Any) -> Float[A
 
 
 def _typical_distance(
-    distance: Callable[[LinkStates, Array], Array],
-    expert: Embodiment,
-    learner: Embodiment,
-    poses: Array,
-    random_poses: Array,
+    objective: PoseObjective, expert: Embodiment, learner: Embodiment, poses: Array, random_poses: Array
 ) -> Float[Array, ""]:
     """Mean distance of random poses to one of the expert's: the scale of the metric."""
     states = link_states(expert, poses.reshape(-1, expert.num_joints)[0])
-    return jax.vmap(lambda q: distance(states, q))(random_poses.reshape(-1, learner.num_joints)).mean()
+    tried = random_poses.reshape(-1, learner.num_joints)
+    return jax.vmap(lambda q: objective.distance(states, link_states(learner, q)))(tried).mean()
 
 
 def _starts(
-    distance: Callable[[LinkStates, Array], Array],
+    objective: PoseObjective,
     expert: Embodiment,
     learner: Embodiment,
-    states: LinkStates,
+    target: Target,
     expert_qpos: Array,
     random_poses: Float[Array, "sets poses joints"] | None,
 ) -> Float[Array, "starts joints"]:
@@ -275,7 +262,7 @@ def _starts(
     own = shared_joints(expert, learner, expert_qpos)
     if random_poses is None:
         return own[None]
-    tried = jax.vmap(jax.vmap(lambda q: distance(states, q)))(random_poses)
+    tried = jax.vmap(jax.vmap(lambda q: objective.value(target, link_states(learner, q))))(random_poses)
     nearest = jnp.take_along_axis(random_poses, jnp.argmin(tried, axis=1)[:, None, None], axis=1)[:, 0]
     return jnp.concatenate([own[None], nearest])
 

@@ -18,7 +18,7 @@ from mimic import compat
 
 Scalar = Any  # a traced scalar, or a number
 Vector = tuple[Scalar, Scalar, Scalar]
-Rotation = tuple[Vector, Vector, Vector]  # rows
+Rotation = tuple[Vector, Vector, Vector]  # rows of it, or of any 3x3 matrix
 
 IDENTITY: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 ZERO: Vector = (0.0, 0.0, 0.0)
@@ -117,6 +117,12 @@ def compose(a: Rotation, b: Rotation) -> Rotation:
     """A B."""
     columns = transpose(b)
     return rotate(columns, a[0]), rotate(columns, a[1]), rotate(columns, a[2])
+
+
+def add_outer(matrix: Rotation, a: Vector, b: Vector) -> Rotation:
+    """M + a b^T."""
+    x, y, z = matrix
+    return add(x, scale(a[0], b)), add(y, scale(a[1], b)), add(z, scale(a[2], b))
 
 
 def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:

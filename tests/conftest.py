@@ -11,7 +11,18 @@ from jaxtyping import install_import_hook
 REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
 
 # Not mimic.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
-CORE = ("chain", "descent", "mjcf", "embodiment", "kinematics", "distance", "correspondence", "imitation", "pose")
+CORE = (
+    "chain",
+    "descent",
+    "mjcf",
+    "embodiment",
+    "kinematics",
+    "distance",
+    "correspondence",
+    "imitation",
+    "objective",
+    "pose",
+)
 
 
 def pytest_configure(config: pytest.Config) -> None:

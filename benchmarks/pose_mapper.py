@@ -1,0 +1,126 @@
+"""Trains pose mappers as a user does, each a process of its own: quality, training time, and poses per second.
+
+    python -m benchmarks.pose_mapper --out FILE [--seeds 0 1 2] [--plot FILE]
+
+The file holds each run's report, its curves, and the mapper's speed on a batch; the plot shows training and unseen
+poses over training for both presets.
+"""
+
+import argparse
+import csv
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import mimic
+from benchmarks.record import train, write_results
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+ENVIRONMENTS = ("planar4dof", "planar7dof", "panda7dof", "panda4dof", "panda3dof")
+PRESETS = ("paper", "large")
+BATCH, REPEATS = 100_000, 5
+_SPLITS = {"train": ("training poses", "--"), "held_out": ("unseen poses", "-")}
+
+
+def poses_per_second(run_dir: Path, batch: int) -> float:
+    """Speed of a trained mapper on a batch, once it is compiled; the median of some repeats."""
+    mapper = mimic.PoseMapper.load(run_dir)
+    lower, upper = mapper.expert.joint_range.T
+    qpos = jax.device_put(np.random.default_rng(0).uniform(lower, upper, (batch, len(lower))).astype(np.float32))
+    program = jax.jit(mapper)
+    jax.block_until_ready(program(qpos))
+    seconds = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        jax.block_until_ready(program(qpos))
+        seconds.append(time.perf_counter() - began)
+    return batch / float(np.median(seconds))
+
+
+def curves(run_dir: Path) -> dict[str, list[float]]:
+    """Quality on training and unseen poses after each evaluation."""
+    with (run_dir / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    quality = {split: [round(float(row[f"quality/quality.{split}"]), 6) for row in rows] for split in _SPLITS}
+    return {"training_poses": [int(row["step"]) for row in rows], **quality}
+
+
+def plot(results: Sequence[dict[str, Any]], out: Path) -> None:
+    """Curves of the first seed, a panel for each preset."""
+    figure, all_axes = plt.subplots(1, len(PRESETS), figsize=(9, 3.8), sharey=True, layout="constrained")
+    first_seed = results[0]["report"]["seed"]
+    for axes, preset in zip(all_axes, PRESETS, strict=True):
+        shown = [r for r in results if r["preset"] == preset and r["report"]["seed"] == first_seed]
+        for index, result in enumerate(shown):
+            curve = result["curves"]
+            for split, (label, style) in _SPLITS.items():
+                percent = 100 * np.asarray(curve[split])
+                name = f"{result['report']['env']}, {label}" if preset == PRESETS[0] else None
+                axes.plot(curve["training_poses"], percent, style, color=f"C{index}", lw=1.2, label=name)
+        axes.set(xlabel="training poses", title=f"preset {preset}", xscale="log", yscale="log")
+        axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))  # type: ignore[attr-defined]
+        axes.grid(alpha=0.3)
+    all_axes[0].set_ylabel("above the optimum [%]")
+    figure.legend(loc="outside right center", fontsize="x-small")
+    figure.savefig(out, dpi=150)
+    plt.close(figure)
+
+
+def _table(results: Sequence[dict[str, Any]]) -> Table:
+    table = Table("env", "preset", "training", "unseen", "angle to optimum", "train [s]", "process [s]", "poses/s")
+    for result in results:
+        report = result["report"]
+        angles = report["link_angle_to_optimum_deg_by_link"].values()
+        table.add_row(
+            f"{report['env']} {report['seed']}",
+            result["preset"],
+            f"{report['quality']['train']:.2%}",
+            f"{report['quality']['held_out']:.2%}",
+            " ".join(f"{angle:.1f}" for angle in angles),
+            f"{report['wall_time_s']['train']:.1f}",
+            f"{result['process_wall_s']:.1f}",
+            f"{result['poses_per_second']:,.0f}",
+        )
+    return table
+
+
+def main() -> None:
+    """Trains all, and writes the file after each run."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.pose_mapper", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("--out", type=Path, help="file of results; printed only where none is given")
+    parser.add_argument("--plot", type=Path, help="picture of the curves")
+    parser.add_argument("--env", choices=ENVIRONMENTS, action="append", help="only this one (may be repeated)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="N")
+    parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
+    options = parser.parse_args()
+    results = []
+    for preset in PRESETS:
+        for name in options.env or ENVIRONMENTS:
+            for seed in options.seeds:
+                with tempfile.TemporaryDirectory() as folder:
+                    run_dir = Path(folder) / "run"
+                    arguments = ["trainer=pose_mapper", f"trainer.preset={preset}", f"env={name}", f"seed={seed}"]
+                    result = {"preset": preset, **train(run_dir, arguments)}
+                    result |= {"curves": curves(run_dir), "poses_per_second": poses_per_second(run_dir, BATCH)}
+                results.append(result)
+                if options.out:
+                    write_results(options.out, "pose_mapper", options.commit, batch=BATCH, runs=results)
+    if options.plot:
+        plot(results, options.plot)
+    Console().print(_table(results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""What all benchmarks share: a training run as a process of its own, and files of results that can be trusted."""
+
+import datetime
+import importlib.metadata
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mimic.trainers import runs
+
+
+def write_results(out: Path, benchmark: str, commit: str | None, **content: Any) -> None:
+    """Replaces a file of results, with what they were made on, only when the new one is whole."""
+    results = {
+        "benchmark": benchmark,
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "commit": commit or commit_id(),
+        "hardware": runs.hardware(),
+        "versions": {**runs.versions(), "mink": importlib.metadata.version("mink")},
+        **content,
+    }
+    partial = out.with_name(out.name + ".partial")
+    partial.write_text(json.dumps(results, indent=2) + "\n")
+    os.replace(partial, out)
+
+
+def commit_id() -> str:
+    """What is checked out, where this is a git checkout."""
+    found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    return found.stdout.strip() if found.returncode == 0 else "unknown"
+
+
+def train(run_dir: Path, arguments: Sequence[str]) -> dict[str, Any]:
+    """One training run, cold, into a new folder: its report, and the wall time of the whole process [s]."""
+    command = [sys.executable, "-m", "mimic.train", *arguments, f"run_dir={run_dir}", "compilation_cache="]
+    began = time.perf_counter()
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    wall = time.perf_counter() - began
+    if finished.returncode:
+        sys.exit(f"error: {' '.join(command)} ended with {finished.returncode}: {finished.stderr[-2000:]}")
+    report = json.loads((run_dir / "report.json").read_text())
+    report = {key: value for key, value in report.items() if key not in ("hardware", "versions")}
+    return {"arguments": list(arguments), "process_wall_s": round(wall, 1), "report": report}
