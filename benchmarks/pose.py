@@ -196,7 +196,7 @@ def main() -> None:
             )
         if options.out:
             write_results(options.out, "pose", options.commit, results=results)
-    Console().print(table)
+    Console(width=120).print(table)  # also where there is no terminal
 
 
 if __name__ == "__main__":

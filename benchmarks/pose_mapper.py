@@ -101,12 +101,13 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, help="file of results; printed only where none is given")
     parser.add_argument("--plot", type=Path, help="picture of the curves")
+    parser.add_argument("--preset", choices=PRESETS, action="append", help="only this one (may be repeated)")
     parser.add_argument("--env", choices=ENVIRONMENTS, action="append", help="only this one (may be repeated)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], metavar="N")
     parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
     options = parser.parse_args()
     results = []
-    for preset in PRESETS:
+    for preset in options.preset or PRESETS:
         for name in options.env or ENVIRONMENTS:
             for seed in options.seeds:
                 with tempfile.TemporaryDirectory() as folder:

@@ -115,11 +115,9 @@ def _directional_derivatives(
     unit: Float[Array, "links 3"],
     strength: Float[Array, " links"],
 ) -> Derivatives:
-    value, turning, outer = (
-        0.0,
-        spatial.ZERO,
-        spatial.transpose((spatial.ZERO,) * 3),
-    )  # sums over the links behind a joint
+    # Sums over the links behind a joint.
+    value, turning = 0.0, spatial.ZERO
+    outer: spatial.Rotation = (spatial.ZERO, spatial.ZERO, spatial.ZERO)
     gradient, moments = [], []
     for joint in reversed(range(len(axes))):
         for link in (link for link, own in enumerate(link_joint) if own == joint):
