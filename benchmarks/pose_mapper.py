@@ -57,15 +57,18 @@ def curves(run_dir: Path) -> dict[str, list[float]]:
 
 def plot(results: Sequence[dict[str, Any]], out: Path) -> None:
     """Curves of the first seed, a panel for each preset."""
-    figure, all_axes = plt.subplots(1, len(PRESETS), figsize=(9, 3.8), sharey=True, layout="constrained")
-    first_seed = results[0]["report"]["seed"]
-    for axes, preset in zip(all_axes, PRESETS, strict=True):
+    presets = list(dict.fromkeys(result["preset"] for result in results))
+    figure, all_axes = plt.subplots(
+        1, len(presets), figsize=(2.2 + 3.6 * len(presets), 3.8), sharey=True, layout="constrained", squeeze=False
+    )
+    all_axes, first_seed = all_axes[0], results[0]["report"]["seed"]
+    for axes, preset in zip(all_axes, presets, strict=True):
         shown = [r for r in results if r["preset"] == preset and r["report"]["seed"] == first_seed]
         for index, result in enumerate(shown):
             curve = result["curves"]
             for split, (label, style) in _SPLITS.items():
                 percent = 100 * np.asarray(curve[split])
-                name = f"{result['report']['env']}, {label}" if preset == PRESETS[0] else None
+                name = f"{result['report']['env']}, {label}" if preset == presets[0] else None
                 axes.plot(curve["training_poses"], percent, style, color=f"C{index}", lw=1.2, label=name)
         axes.set(xlabel="training poses", title=f"preset {preset}", xscale="log", yscale="log")
         axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))  # type: ignore[attr-defined]
@@ -120,7 +123,7 @@ def main() -> None:
                     write_results(options.out, "pose_mapper", options.commit, batch=BATCH, runs=results)
     if options.plot:
         plot(results, options.plot)
-    Console().print(_table(results))
+    Console(width=140).print(_table(results))  # also where there is no terminal
 
 
 if __name__ == "__main__":
