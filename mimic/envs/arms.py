@@ -8,12 +8,14 @@ import mujoco
 import numpy as np
 
 from mimic.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
+from mimic.mjcf import read_model
 
 # Planar arms are ours to define: slender rods, whose joints feel about as heavy for their size as the Panda's.
 _PLANAR_MASS = 1.0  # kg/m
 _PLANAR_ARMATURE = 0.02  # kg m^2
 _PLANAR_DAMPING = 0.1  # N m s/rad
 _PLANAR_VELOCITY_LIMIT = 2.5  # rad/s
+_PLANAR_RADIUS, _PLANAR_COLOUR = 0.03, [0.35, 0.55, 0.85, 1.0]  # what is seen of them [m]
 
 _IGNORED = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
@@ -41,10 +43,30 @@ class ArmConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Arm:
-    """An embodiment and the MuJoCo model that simulates it: one degree of freedom per joint, in the same order."""
+    """An embodiment and the MuJoCo model that simulates it: one degree of freedom per joint, in the same order.
+
+    Attributes:
+      embodiment: its free joints and links.
+      model: of the free joints alone.
+      locked: angle [rad] of the joints that are held, by name.
+    """
 
     embodiment: Embodiment
     model: mujoco.MjModel
+    locked: Mapping[str, float]
+
+
+def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
+    """The model of an arm as it was written, geoms and all joints included.
+
+    Raises:
+      ValueError: no such file, or MuJoCo cannot read it.
+    """
+    if config.model == "planar":
+        return _planar_spec(planar_arm(config.link_lengths))
+    path = panda_path() if config.model == "panda" else config.model
+    read_model(path)  # says what is wrong
+    return mujoco.MjSpec.from_file(path)
 
 
 def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
@@ -55,11 +77,11 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
     """
     if config.model == "planar":
         embodiment = planar_arm(config.link_lengths)
-        source = _planar_model(embodiment)
+        source = _planar_spec(embodiment).compile()
         embodiment, source, angles = load_arm(
             source, name=embodiment.name, locked=config.locked, limits=cast(Limits, limits)
         )
-        return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles))
+        return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles)
     is_panda = config.model == "panda"
     embodiment, source, angles = load_arm(
         panda_path() if is_panda else config.model,
@@ -72,7 +94,7 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
     model = simulation_model(source, embodiment.joint_names, angles)
     if model.nq != embodiment.num_joints:
         raise ValueError(f"model: the hinges of {config.model!r} need names to be simulated; some have none")
-    return Arm(embodiment, model)
+    return Arm(embodiment, model, angles)
 
 
 def simulation_model(
@@ -145,7 +167,7 @@ def _turned(position: np.ndarray, quaternion: np.ndarray, joint: Any, angle: flo
     return position + before - after, turned
 
 
-def _planar_model(arm: Embodiment) -> mujoco.MjModel:
+def _planar_spec(arm: Embodiment) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = arm.name
     parent, start = spec.worldbody, 0.0
@@ -153,6 +175,10 @@ def _planar_model(arm: Embodiment) -> mujoco.MjModel:
         body = parent.add_body(pos=[start, 0, 0])
         body.add_joint(name=joint_name, axis=[0, 0, 1], armature=_PLANAR_ARMATURE, damping=_PLANAR_DAMPING)
         body.add_site(name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, length, 0, 0], size=[0.01, 0, 0])
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, length, 0, 0], size=[_PLANAR_RADIUS, 0, 0],
+            rgba=_PLANAR_COLOUR, contype=0, conaffinity=0,
+        )  # fmt: skip
         mass = _PLANAR_MASS * length
         inertia = mass * length**2 / 12
         body.explicitinertial = True
@@ -160,4 +186,4 @@ def _planar_model(arm: Embodiment) -> mujoco.MjModel:
         parent, start = body, float(length)
     numeric = spec.add_numeric(name="velocity_limit", size=arm.num_joints)
     numeric.data = [_PLANAR_VELOCITY_LIMIT] * arm.num_joints
-    return spec.compile()
+    return spec

@@ -350,3 +350,22 @@ class EvaluateConfig:
     checkpoint: int | None = None
     out: str = ""
     compilation_cache: str = "~/.cache/mimic/jax"
+
+
+@dataclasses.dataclass(frozen=True)
+class FiguresConfig:
+    """The figures of static pose imitation.
+
+    Attributes:
+      out: folder for the figures.
+      only: names of some of them; all where empty.
+      runs: folder of the mappers' run directories, one for each environment; `runs` within `out` where empty.
+      seed: of mappers that must be trained.
+      compilation_cache: see `TrainConfig`.
+    """
+
+    out: str = ""
+    only: list[str] = dataclasses.field(default_factory=list)
+    runs: str = ""
+    seed: int = 0
+    compilation_cache: str = "~/.cache/mimic/jax"

@@ -1,0 +1,15 @@
+"""`python -m mimic.figures out=DIR`: the paper's figures on static pose imitation, from our own runs."""
+
+from mimic import cli
+from mimic.trainers.config import FiguresConfig
+
+
+def prepare(config: FiguresConfig) -> cli.Work:
+    """The figures that the config describes."""
+    from mimic.trainers import figure_session  # not needed for --help
+
+    return figure_session.prepare_figures(config)
+
+
+if __name__ == "__main__":
+    cli.run(prepare, "figures")

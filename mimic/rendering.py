@@ -1,0 +1,144 @@
+"""Pictures of arms, by MuJoCo's renderer; with EGL where there is no display."""
+
+import dataclasses
+import os
+import platform
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mimic.envs.arms import ArmConfig, arm_spec, build_arm
+
+_SPACING = 0.9  # chain lengths between two arms
+_LOCKED = (0.85, 0.12, 0.10, 1.0)
+_FLOOR, _GRID = (0.94, 0.95, 0.96), (0.88, 0.89, 0.91)
+_MARK = 0.05, 0.019  # radius and half width of a locked joint's disc, as shares of the chain length
+
+
+class ArmScene:
+    """Arms side by side, each in a pose of its own; locked joints are red. Use it in a `with` statement.
+
+    Args:
+      arms: from left to right.
+      limits: see `EnvConfig`; says where locked joints are held.
+      width: of a picture [pixels].
+      height: of a picture [pixels].
+
+    Raises:
+      ValueError: an arm that cannot be built, or no OpenGL to render with.
+    """
+
+    def __init__(self, arms: Sequence[ArmConfig], *, limits: str = "none", width: int = 640, height: int = 480):
+        built = [build_arm(arm, limits) for arm in arms]
+        free = [build_arm(dataclasses.replace(arm, locked=()), limits).embodiment for arm in arms]
+        reach = max(float(arm.chain_length) for arm in free)  # whatever is locked, arms look their size
+        spec = _empty_room(width, height)
+        self._joints: list[list[str]] = []
+        self._locked: dict[str, float] = {}
+        for index, (config, arm) in enumerate(zip(arms, built, strict=True)):
+            prefix = f"arm{index}-"
+            source = arm_spec(config)
+            _share_options(source, spec)
+            for name in arm.locked:
+                _mark_locked(source, name, float(free[index].chain_length))
+            place = [0.0, (index - 0.5 * (len(arms) - 1)) * _SPACING * reach, 0.0]
+            spec.attach(source, prefix=prefix, frame=spec.worldbody.add_frame(pos=place))
+            self._joints.append([prefix + name for name in arm.embodiment.joint_names])
+            self._locked |= {prefix + name: angle for name, angle in arm.locked.items()}
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        self._camera = mujoco.MjvCamera()
+        is_flat = all(arm.model == "planar" for arm in arms)
+        self._camera.lookat[:] = 0.0, 0.0, 0.0 if is_flat else 0.4 * reach
+        self._camera.distance = (1.4 + 0.45 * (len(arms) - 1) + 1.3 * is_flat) * reach
+        self._camera.azimuth, self._camera.elevation = (90.0, -89.0) if is_flat else (165.0, -14.0)
+        self._renderer = _renderer(self._model, width, height)
+
+    def image(self, poses: Sequence[Float[np.ndarray, " joints"]]) -> UInt8[np.ndarray, "height width 3"]:
+        """The arms in their poses [rad]."""
+        for name, angle in self._locked.items():
+            self._data.joint(name).qpos[0] = angle
+        for names, pose in zip(self._joints, poses, strict=True):
+            for name, angle in zip(names, pose, strict=True):
+                self._data.joint(name).qpos[0] = float(angle)
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)
+        self._renderer.update_scene(self._data, self._camera)
+        return self._renderer.render()
+
+    def __enter__(self) -> "ArmScene":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._renderer.close()
+
+
+def _empty_room(width: int, height: int) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    visual = spec.visual
+    visual.global_.offwidth, visual.global_.offheight = width, height
+    visual.quality.shadowsize, visual.quality.offsamples = 4096, 8
+    visual.headlight.ambient, visual.headlight.diffuse = [0.45] * 3, [0.25] * 3
+    visual.headlight.specular = [0.1] * 3
+    visual.map.shadowclip = 3.0  # m; what lies beyond it gets specks
+    visual.rgba.haze = [*_FLOOR, 1]
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[1, 1, 1], rgb2=[0.93, 0.95, 0.97], width=256, height=256,
+    )  # fmt: skip
+    spec.add_texture(
+        name="floor", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=list(_FLOOR), rgb2=list(_GRID), width=256, height=256,
+    )  # fmt: skip
+    floor = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True)
+    floor.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "floor"
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="floor")
+    for place, strength in (([1.5, -2.0, 3.5], 0.55), ([1.5, 2.5, 3.0], 0.2)):
+        spec.worldbody.add_light(
+            pos=place, dir=[-x for x in place], diffuse=[strength] * 3, castshadow=strength > 0.5,
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        )  # fmt: skip
+    return spec
+
+
+def _share_options(source: mujoco.MjSpec, room: mujoco.MjSpec) -> None:
+    """Physics options do not matter to a picture, but where two models differ in them MuJoCo warns."""
+    for name in dir(room.option):
+        if not name.startswith("_"):
+            setattr(source.option, name, getattr(room.option, name))
+
+
+def _mark_locked(spec: mujoco.MjSpec, joint_name: str, chain_length: float) -> None:
+    """A red disc about the joint's axis."""
+    joint = spec.joint(joint_name)
+    axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
+    radius, half_width = _MARK[0] * chain_length, _MARK[1] * chain_length
+    ends = np.concatenate([joint.pos - half_width * axis, joint.pos + half_width * axis])
+    joint.parent.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=ends, size=[radius, 0, 0], rgba=_LOCKED,
+        contype=0, conaffinity=0, mass=0,
+    )  # fmt: skip
+
+
+def _renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+    try:
+        if _is_headless():
+            from mujoco.egl import GLContext
+
+            # MuJoCo settles on a window system when it is imported, which nobody can be asked to know beforehand.
+            sys.modules[mujoco.Renderer.__module__].gl_context.GLContext = GLContext
+        return mujoco.Renderer(model, height, width)
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise ValueError(
+            "rendering: no OpenGL library that works; expected EGL (Debian, Ubuntu: libegl1), or MUJOCO_GL=osmesa with "
+            f"libosmesa6: {' '.join(str(error).split())}"
+        ) from error
+
+
+def _is_headless() -> bool:
+    asked_for = any(os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"))
+    return platform.system() == "Linux" and not asked_for
