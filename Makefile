@@ -23,7 +23,7 @@ PYTEST := $(BIN)/python -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help train test test-all lint static format clean
+.PHONY: help install train test test-all lint static format clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
@@ -32,6 +32,8 @@ help: ## list the targets
 	@echo '            EXTRAS=cuda                          install jax for NVIDIA GPUs'
 	@echo '            ARGS="env=panda7dof seed=1"          arguments of the training command'
 	@echo '            PYTEST_ARGS="-k distance" JOBS=0     arguments and number of workers of pytest'
+
+install: $(STAMP) ## install alone
 
 train: $(STAMP) ## install if needed, then train: make train ARGS="env=panda4dof"
 	@$(BIN)/python -m mimic.train $(ARGS)

@@ -72,6 +72,7 @@ def plot(results: Sequence[dict[str, Any]], out: Path) -> None:
                 axes.plot(curve["training_poses"], percent, style, color=f"C{index}", lw=1.2, label=name)
         axes.set(xlabel="training poses", title=f"preset {preset}", xscale="log", yscale="log")
         axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))  # type: ignore[attr-defined]
+        axes.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())  # type: ignore[attr-defined]
         axes.grid(alpha=0.3)
     all_axes[0].set_ylabel("above the optimum [%]")
     figure.legend(loc="outside right center", fontsize="x-small")

@@ -57,6 +57,11 @@ def refused(monkeypatch, capsys, tmp_path):
         (["env.metric.rotation=inf"], "finite weight"),
         (["env=planar4dof", "env.learner.link_lengths=[0.5,0]"], "above 0 [m]"),
         (["env.learner.model=missing.xml"], "missing.xml"),
+        (["trainer=pose_mapper", "trainer.preset=huge"], "expected one of paper, large, got 'huge'"),
+        (["trainer=pose_mapper", "trainer.batch_size=1000"], "expected a divisor of samples = 65536, got 1000"),
+        (["trainer=pose_mapper", "trainer.heads=0"], "trainer.heads: expected at least 1, got 0"),
+        (["trainer=pose_mapper", "trainer.inputs=pixels"], "expected one of angles, link_states"),
+        (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),
     ],
 )
 def test_bad_training_input(refused, arguments, message):
@@ -145,6 +150,12 @@ def test_a_loop_is_refused(refused, tmp_path):
     path = tmp_path / "loop.xml"
     path.write_text(spec.to_xml())
     assert "loop" in refused("train", "env=planar4dof", f"env.learner.model={path}")
+
+
+def test_bad_retargeting_input(refused, demonstrations, tmp_path):
+    whole, _ = contents(demonstrations, tmp_path)
+    arguments = [f"demonstrations={whole}", "learner=planar4dof", "out=new.npz", f"mapper={tmp_path}"]
+    assert "not a run directory" in refused("retarget", *arguments)
 
 
 def test_bad_run_directories(refused, tmp_path):
