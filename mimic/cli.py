@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, RetargetConfig
-from mimic.trainers.config import TRAINERS, EvaluateConfig, FiguresConfig, TrainConfig
+from mimic.trainers.config import TRAINERS, EvaluateConfig, FiguresConfig, RenderConfig, TrainConfig
 from mimic.trainers.signals import STOPPED_BY_SIGNAL
 
 BAD_INPUT = 2
@@ -71,6 +71,7 @@ def _register_schemas() -> None:
     store.store(name="train_schema", node=schema(TrainConfig))
     store.store(name="evaluate_schema", node=schema(EvaluateConfig))
     store.store(name="figures_schema", node=schema(FiguresConfig))
+    store.store(name="render_schema", node=schema(RenderConfig))
     store.store(name="retarget_schema", node=schema(RetargetConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
     for name, config_class in TRAINERS.items():

@@ -54,7 +54,7 @@ class ArmScene:
         self._camera = mujoco.MjvCamera()
         is_flat = all(arm.model == "planar" for arm in arms)
         self._camera.lookat[:] = 0.0, 0.0, 0.0 if is_flat else 0.4 * reach
-        self._camera.distance = (1.4 + 0.45 * (len(arms) - 1) + 1.3 * is_flat) * reach
+        self._camera.distance = (1.4 + 0.7 * (len(arms) - 1) + 1.3 * is_flat) * reach
         self._camera.azimuth, self._camera.elevation = (90.0, -89.0) if is_flat else (165.0, -14.0)
         self._renderer = _renderer(self._model, width, height)
 
@@ -81,7 +81,7 @@ def _empty_room(width: int, height: int) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     visual = spec.visual
     visual.global_.offwidth, visual.global_.offheight = width, height
-    visual.quality.shadowsize, visual.quality.offsamples = 4096, 8
+    visual.quality.shadowsize, visual.quality.offsamples = 2048, 4
     visual.headlight.ambient, visual.headlight.diffuse = [0.45] * 3, [0.25] * 3
     visual.headlight.specular = [0.1] * 3
     visual.map.shadowclip = 3.0  # m; what lies beyond it gets specks

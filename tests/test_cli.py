@@ -9,11 +9,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic import cli, evaluate, retarget, train
+from mimic import cli, evaluate, figures, render, retarget, train
 from mimic.envs.arms import ArmConfig, build_arm
 from mimic.envs.recording import record_demonstrations
 
-COMMANDS = {"train": train.prepare, "evaluate": evaluate.prepare, "retarget": retarget.prepare}
+MODULES = {"train": train, "evaluate": evaluate, "retarget": retarget, "figures": figures, "render": render}
+COMMANDS = {name: module.prepare for name, module in MODULES.items()}
 PLANAR = ["env=planar4dof", "env.demonstrations.count=1", "env.demonstrations.held_out=1"]
 HINGE = '<joint name="{0}" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
 
@@ -158,13 +159,27 @@ def test_bad_retargeting_input(refused, demonstrations, tmp_path):
     assert "not a run directory" in refused("retarget", *arguments)
 
 
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"),
+    [
+        ("figures", [], "out: expected a folder"),
+        ("figures", ["out=new", "only=[contour]"], "expected some of weights, contours, planar, panda"),
+        ("render", [], "run: expected the run directory"),
+        ("render", ["run=missing"], "not a run directory"),
+        ("render", ["run=missing", "split=test"], "expected one of held_out, train, got 'test'"),
+    ],
+)
+def test_bad_input_of_pictures(refused, command, arguments, message):
+    assert message in refused(command, *arguments)
+
+
 def test_bad_run_directories(refused, tmp_path):
     run_dir = tmp_path / "run"
     run_dir.mkdir()
     assert "exists" in refused("train", f"run_dir={run_dir}")
 
 
-@pytest.mark.parametrize(("command", "key"), [("train", "resume"), ("evaluate", "run")])
+@pytest.mark.parametrize(("command", "key"), [("train", "resume"), ("evaluate", "run"), ("render", "run")])
 @pytest.mark.parametrize(
     ("config", "message"),
     [

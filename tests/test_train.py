@@ -9,9 +9,11 @@ import subprocess
 import sys
 import time
 
+import imageio_ffmpeg
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 import mimic
 from mimic import compat
@@ -88,6 +90,21 @@ def test_evaluate_repeats_the_report(finished, tmp_path):
     again, report = json.loads(out.read_text()), json.loads((run_dir / "report.json").read_text())
     for key in ("optimality_gap", "mean_distance", "lower_bound"):
         assert again[key] == pytest.approx(report[key], rel=1e-5)
+
+
+def test_a_video_shows_the_whole_motion(finished):
+    run_dir, _ = finished
+    result = command("render", f"run={run_dir}", "demonstration=1", "gif=true")
+    assert result.returncode == 0, result.stderr[-2000:]
+    video = run_dir / "videos" / "held_out-1.mp4"
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
+    assert frames == 151 and seconds == pytest.approx(5, abs=0.1)  # 5 s at 30 frames a second, both ends
+    with Image.open(video.with_suffix(".gif")) as gif:
+        assert gif.n_frames == 51 and gif.size == (640, 320)  # type: ignore[attr-defined]
+    again = command("render", f"run={run_dir}", "demonstration=1")
+    assert again.returncode == 2 and "exists; name a new file" in again.stderr
+    beyond = command("render", f"run={run_dir}", "demonstration=2")
+    assert beyond.returncode == 2 and "expected 0 to 1, the held_out ones of the run, got 2" in beyond.stderr
 
 
 def test_resume_goes_on_from_the_last_checkpoint(finished):

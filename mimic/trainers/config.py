@@ -369,3 +369,29 @@ class FiguresConfig:
     runs: str = ""
     seed: int = 0
     compilation_cache: str = "~/.cache/mimic/jax"
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderConfig:
+    """A video of a trained policy.
+
+    Attributes:
+      run: the run directory.
+      checkpoint: environment steps of the checkpoint; the last one where None.
+      split: "held_out" or "train".
+      demonstration: which one of these, from 0.
+      out: the file; videos/SPLIT-N.mp4 in the run directory where empty.
+      gif: whether to make a GIF too.
+      compilation_cache: see `TrainConfig`.
+    """
+
+    run: str = ""
+    checkpoint: int | None = None
+    split: str = "held_out"
+    demonstration: int = 0
+    out: str = ""
+    gif: bool = False
+    compilation_cache: str = "~/.cache/mimic/jax"
+
+    def __post_init__(self) -> None:
+        _check_choice("split", self.split, ("held_out", "train"))

@@ -25,11 +25,13 @@ class Rollouts:
 
     Attributes:
       qpos: [demonstrations, T, joints] learner's joint angles after each step [rad].
+      qvel: [demonstrations, T, joints] its velocities [rad/s].
       distance: [demonstrations, T] embodiment distance after each step.
       torque_saturation: [demonstrations, T] 1 where a torque is at its limit.
     """
 
     qpos: Float[Array, "demonstrations time joints"]
+    qvel: Float[Array, "demonstrations time joints"]
     distance: Float[Array, "demonstrations time"]
     torque_saturation: Float[Array, "demonstrations time"]
 
@@ -73,7 +75,10 @@ class Evaluator:
             def step(state: State, _: None) -> tuple[State, Rollouts]:
                 state = env.step(state, controller(state.obs))
                 metrics = state.metrics
-                return state, Rollouts(state.pipeline_state.qpos, metrics["distance"], metrics["torque_saturation"])
+                arm_state: Any = state.pipeline_state
+                return state, Rollouts(
+                    arm_state.qpos, arm_state.qvel, metrics["distance"], metrics["torque_saturation"]
+                )
 
             return jax.lax.scan(step, state, None, length=env.config.horizon)[1]
 

@@ -22,6 +22,9 @@ class PPOJob(Job):
       config: of the run.
       run_dir: of a run that exists, whose demonstrations count.
 
+    Attributes:
+      evaluator: of controllers on the run's demonstrations.
+
     Raises:
       ValueError: settings, arms or demonstrations that do not fit each other.
     """
@@ -34,7 +37,7 @@ class PPOJob(Job):
         self.settings: PPOConfig = config.trainer.resolve(jax.default_backend(), jax.device_count())
         self.total_steps = self.settings.total_steps
         self._env, held_out = _environment(config.env, run_dir)
-        self._evaluator = Evaluator(self._env, held_out)
+        self.evaluator = Evaluator(self._env, held_out)
         self._demonstrations = concatenate(self._env.demonstrations, held_out)
         self.headline = (
             f"{config.env.name}: {self._env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once"
@@ -43,7 +46,7 @@ class PPOJob(Job):
 
         @jax.jit
         def program(params: Params) -> Rollouts:
-            return self._evaluator.rollout(controller(params))
+            return self.evaluator.rollout(controller(params))
 
         self._program = program
 
@@ -76,7 +79,7 @@ class PPOJob(Job):
 
     def figures(self, outcome: Rollouts) -> Figures:
         """See `Evaluator.summary`."""
-        return self._evaluator.summary(outcome)
+        return self.evaluator.summary(outcome)
 
     def status(self, figures: Figures) -> str:
         """Distance and optimality gap."""
@@ -112,7 +115,7 @@ class PPOJob(Job):
             of="demonstrations",
             title=self._name,
         )
-        plots.plot_quality(self._evaluator, outcome, run_dir / "quality.png", title=self._name)
+        plots.plot_quality(self.evaluator, outcome, run_dir / "quality.png", title=self._name)
 
 
 def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:

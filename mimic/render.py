@@ -1,0 +1,16 @@
+"""`python -m mimic.render run=DIR`: a video of expert and learner, from a checkpoint alone."""
+
+from mimic import cli, compat
+from mimic.trainers.config import RenderConfig
+
+
+def prepare(config: RenderConfig) -> cli.Work:
+    """The video that the config describes."""
+    compat.import_mjx()
+    from mimic.trainers import video  # not needed for --help
+
+    return video.prepare_video(config)
+
+
+if __name__ == "__main__":
+    cli.run(prepare, "render")
