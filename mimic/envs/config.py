@@ -15,6 +15,7 @@ from mimic.envs.arms import ArmConfig
 from mimic.envs.recording import KINDS
 
 CORRESPONDENCES = ("overlap", "hard", "soft")
+PHYSICS = ("mjx", "fused")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,6 +102,29 @@ class DemonstrationConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class RandomizationConfig:
+    """How the learner differs from its model, drawn anew for each episode; nothing is random where both bounds agree.
+
+    Attributes:
+      mass: least and largest factor of the masses and inertias of the learner's bodies.
+      damping: least and largest factor of the damping of its joints.
+      torque_noise: standard deviation of a noise on each torque, as a share of the largest torque.
+    """
+
+    mass: list[float] = dataclasses.field(default_factory=lambda: [1.0, 1.0])
+    damping: list[float] = dataclasses.field(default_factory=lambda: [1.0, 1.0])
+    torque_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "damping"):
+            bounds = list(getattr(self, name))
+            if len(bounds) != 2 or not 0 < bounds[0] <= bounds[1] < math.inf:
+                raise ValueError(f"randomization.{name}: expected [least, largest] factor above 0, got {bounds}")
+        if not 0 <= self.torque_noise < math.inf:
+            raise ValueError(f"randomization.torque_noise: expected at least 0, got {self.torque_noise}")
+
+
+@dataclasses.dataclass(frozen=True)
 class EnvConfig:
     """An imitation environment.
 
@@ -113,6 +137,8 @@ class EnvConfig:
       horizon: steps of an episode.
       control_dt: time that a torque is held [s].
       substeps: physics steps in a control step.
+      physics: "mjx", the reference, or "fused": the same equations as one small program, many times faster.
+      randomization: how the learner differs from its model.
       preview: expert steps that the learner sees beyond the present one; 0 is the paper.
       action_scale: of the torque range; 1 is twice the torque that takes a joint to its rated speed in one step.
       speed_bound: joint speed [rad/s] at which an episode ends as a runaway.
@@ -126,13 +152,16 @@ class EnvConfig:
     demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
     horizon: int = 50
     control_dt: float = 0.1
-    substeps: int = 5
+    substeps: int = 10
+    physics: str = "mjx"
+    randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     preview: int = 1
     action_scale: float = 1.0
     speed_bound: float = 30.0
 
     def __post_init__(self) -> None:
         _check_choice("limits", self.limits, LIMITS)
+        _check_choice("physics", self.physics, PHYSICS)
         for name, least in (("horizon", 1), ("substeps", 1), ("preview", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")

@@ -91,6 +91,27 @@ def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations
     return dataclasses.replace(first, **join)
 
 
+def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonstrations:
+    """More demonstrations out of some: each joint moves as it does in a random one of them.
+
+    Where joints are controlled apart from each other, as under joint-space PD control from one home pose, the result is
+    what the expert would have shown for goals mixed in the same way. Else it is at least smooth, and within its range.
+
+    Args:
+      demonstrations: the given ones.
+      count: how many to make.
+      seed: of the choice.
+    """
+    joints = np.arange(len(demonstrations.joint_names))
+    chosen = np.random.default_rng(seed).integers(demonstrations.count, size=(count, len(joints)))
+    mixed = {
+        "qpos": demonstrations.qpos.swapaxes(1, 2)[chosen, joints].swapaxes(1, 2),
+        "qvel": demonstrations.qvel.swapaxes(1, 2)[chosen, joints].swapaxes(1, 2),
+        "goals": demonstrations.goals[chosen, joints],
+    }
+    return dataclasses.replace(demonstrations, **mixed)
+
+
 def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
     """Reads and validates a file that `Demonstrations.save` wrote, or one made like it.
 

@@ -17,7 +17,7 @@ from mimic.embodiment import Embodiment
 from mimic.envs.arms import Arm, build_arm, effective_inertia
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
-from mimic.envs.physics import make_advance
+from mimic.envs.physics import Load, make_advance
 from mimic.envs.recording import record_demonstrations
 from mimic.kinematics import LinkStates, link_states
 
@@ -35,7 +35,8 @@ class ArmState:
       qvel: learner's joint velocities [rad/s].
       step: control steps since the demonstration began.
       demonstration: index of the one that is imitated.
-      key: for the demonstrations of later episodes.
+      key: for the noise of this episode, and for later episodes.
+      load: how the arm differs from its model in this episode; None where that is the same in all.
     """
 
     qpos: Float[Array, " joints"]
@@ -43,6 +44,7 @@ class ArmState:
     step: Int[Array, ""]
     demonstration: Int[Array, ""]
     key: Array
+    load: Load | None = None
 
 
 class ImitationEnv(Env):
@@ -58,6 +60,7 @@ class ImitationEnv(Env):
 
     Attributes:
       expert, learner: the embodiments.
+      arm: the learner with the model that simulates it.
       correspondence, weights: of the reward.
       demonstrations: what is imitated.
       torque_scale: [joints] largest torque [N m].
@@ -73,8 +76,9 @@ class ImitationEnv(Env):
         self.weights = config.metric.make_weights()
         self.correspondence = config.metric.make_correspondence(self.expert, self.learner)
         self.torque_scale = jnp.asarray(_torque_scale(learner, config))
-        self._arm, self._expert_arm = learner, expert
-        self._advance = make_advance(learner.model, config.control_dt / config.substeps, config.substeps)
+        self.arm = learner
+        timestep = config.control_dt / config.substeps
+        self._advance = make_advance(learner.model, timestep, config.substeps, config.physics)
         if demonstrations is None:
             demonstrations = training_and_held_out(config, expert)[0]
         self._set_demonstrations(demonstrations)
@@ -100,19 +104,33 @@ class ImitationEnv(Env):
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
         """The first state of an episode, of a random demonstration where none is named."""
-        key_demonstration, key_next = jax.random.split(key)
+        key_demonstration, key_load, key_next = jax.random.split(key, 3)
         if demonstration is None:
             demonstration = jax.random.randint(key_demonstration, (), 0, self.demonstrations.count)
         home = jnp.asarray(self.learner.home, jnp.float32)
         zero = jnp.zeros((), jnp.int32)
-        return ArmState(home, jnp.zeros_like(home), zero, jnp.asarray(demonstration, jnp.int32), key_next)
+        demonstration = jnp.asarray(demonstration, jnp.int32)
+        return ArmState(home, jnp.zeros_like(home), zero, demonstration, key_next, self._draw_load(key_load))
+
+    def _draw_load(self, key: Array) -> Load | None:
+        mass, damping = self.config.randomization.mass, self.config.randomization.damping
+        if mass[0] == mass[1] and damping[0] == damping[1]:
+            return None
+        least, largest = (jnp.array(bounds) for bounds in zip(mass, damping, strict=True))
+        return Load(*jax.random.uniform(key, (2,), minval=least, maxval=largest))
 
     def step(self, state: State, action: Float[Array, " joints"]) -> State:
         """Holds a torque for one control step."""
         before: ArmState = state.pipeline_state  # type: ignore[assignment]
         command = jnp.clip(action, -1.0, 1.0)
-        qpos, qvel = self._advance(before.qpos, before.qvel, command * self.torque_scale)
         step = before.step + 1
+        randomization = self.config.randomization
+        torque = command
+        if randomization.torque_noise:
+            noise = jax.random.normal(jax.random.fold_in(before.key, step), command.shape)
+            torque = jnp.clip(command + randomization.torque_noise * noise, -1.0, 1.0)
+        load = before.load or Load(randomization.mass[0], randomization.damping[0])
+        qpos, qvel = self._advance(before.qpos, before.qvel, torque * self.torque_scale, load)
         runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # also where not a number
         remaining = (self.config.horizon - step).astype(jnp.float32)
         distance = jnp.where(runaway, self._worst_distance, self.distance(qpos, qvel, before.demonstration, step))

@@ -7,7 +7,9 @@ from typing import Any, ClassVar
 
 from omegaconf import MISSING
 
-from mimic.envs.config import EnvConfig
+from mimic.envs.config import PHYSICS, EnvConfig
+
+CONTROLLERS = ("policy", "hold", "pd", "computed_torque")
 
 PRESETS: dict[str, dict[str, Any]] = {
     # Two cores: few environments, many gradient steps on each sample, since the physics is what costs.
@@ -23,21 +25,23 @@ PRESETS: dict[str, dict[str, Any]] = {
         "discounting": 0.8,
         "entropy_cost": 0.01,
         "hidden_layers": [128, 128],
+        "crossovers": 0,
         "evaluations": 10,
     },
-    # One GPU: as many environments as keep it busy; a batch is 8192 short stretches of motion.
+    # One GPU: as many environments as keep it busy. The high entropy makes the arm try other branches of poses.
     "gpu": {
-        "num_timesteps": 40_000_000,
-        "num_envs": 4096,
+        "num_timesteps": 120_000_000,
+        "num_envs": 8192,
         "unroll_length": 10,
-        "batch_size": 512,
+        "batch_size": 1024,
         "num_minibatches": 32,
         "num_updates_per_batch": 8,
         "learning_rate": 1e-3,
         "final_learning_rate": 0.01,
-        "discounting": 0.9,
-        "entropy_cost": 0.1,
+        "discounting": 0.95,
+        "entropy_cost": 0.2,
         "hidden_layers": [512, 256],
+        "crossovers": 400,
         "evaluations": 8,
     },
 }
@@ -85,6 +89,8 @@ class PPOConfig(TrainerConfig):
       max_grad_norm: gradients are clipped to it.
       reward_scaling: of the reward inside PPO.
       hidden_layers: widths of policy and value network.
+      crossovers: demonstrations to train on beyond the given ones, mixed from them joint by joint: see `crossovers` in
+        mimic/envs/demonstrations.py.
       target_gap: training ends early once the optimality gap on the training demonstrations is no larger; 0 never.
       evaluations: how often the policy is evaluated and saved.
     """
@@ -108,6 +114,7 @@ class PPOConfig(TrainerConfig):
     max_grad_norm: float = 1.0
     reward_scaling: float = 10.0
     hidden_layers: list[int] | None = None
+    crossovers: int | None = None
     target_gap: float = 0.0
     evaluations: int | None = None
 
@@ -140,8 +147,9 @@ class PPOConfig(TrainerConfig):
         for key in ("discounting", "gae_lambda", "final_learning_rate"):
             if not 0 <= getattr(self, key) <= 1:
                 raise ValueError(f"trainer.{key}: expected a number in [0, 1], got {getattr(self, key)}")
-        if not self.target_gap >= 0:
-            raise ValueError(f"trainer.target_gap: expected at least 0, got {self.target_gap}")
+        for key in ("target_gap", "crossovers"):
+            if not getattr(self, key) >= 0:
+                raise ValueError(f"trainer.{key}: expected at least 0, got {getattr(self, key)}")
         _check_layers(self.hidden_layers)
         unrolls = self.batch_size * self.num_minibatches  # type: ignore[operator]
         if unrolls % self.num_envs:  # type: ignore[operator]
@@ -337,19 +345,34 @@ class TrainConfig:
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateConfig:
-    """An evaluation of a trained policy.
+    """An evaluation of a trained policy, or of another controller in its place.
 
     Attributes:
       run: the run directory.
       checkpoint: environment steps of the checkpoint; the last one where None.
-      out: file that the report is written to; printed only where empty.
+      controller: "policy", or what a user would do without it: see `run_controller`.
+      demonstrations: file of demonstrations to evaluate on in place of the held-out ones.
+      physics: see `EnvConfig`; the run's where empty.
+      mass, damping, torque_noise: how the arm differs from its model, see `RandomizationConfig`; as in training where
+        None.
+      out: new folder for report, table and plots; the report is printed only where empty.
       compilation_cache: see `TrainConfig`.
     """
 
     run: str = ""
     checkpoint: int | None = None
+    controller: str = "policy"
+    demonstrations: str = ""
+    physics: str = ""
+    mass: float | None = None
+    damping: float | None = None
+    torque_noise: float | None = None
     out: str = ""
     compilation_cache: str = "~/.cache/mimic/jax"
+
+    def __post_init__(self) -> None:
+        _check_choice("controller", self.controller, CONTROLLERS)
+        _check_choice("physics", self.physics, ("", *PHYSICS))
 
 
 @dataclasses.dataclass(frozen=True)

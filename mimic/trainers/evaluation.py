@@ -1,7 +1,10 @@
 """How good a controller is: every demonstration once, against the kinematic bound and against holding still."""
 
+import csv
 import functools
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,9 +17,11 @@ from jaxtyping import Array, Float
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv, link_state_program
 from mimic.imitation import kinematic_bound
+from mimic.trainers.measures import Table, gaps, measure
 
-Controller = Callable[[Array], Array]  # observation -> action
+Controller = Callable[[State], Array]  # state of the environment -> action
 SPLITS = ("train", "held_out")
+_WORST = 3  # demonstrations of each split that are named
 
 
 @struct.dataclass
@@ -26,14 +31,14 @@ class Rollouts:
     Attributes:
       qpos: [demonstrations, T, joints] learner's joint angles after each step [rad].
       qvel: [demonstrations, T, joints] its velocities [rad/s].
+      torque: [demonstrations, T, joints] that the controller asked for in each step, within its range [N m].
       distance: [demonstrations, T] embodiment distance after each step.
-      torque_saturation: [demonstrations, T] 1 where a torque is at its limit.
     """
 
     qpos: Float[Array, "demonstrations time joints"]
     qvel: Float[Array, "demonstrations time joints"]
+    torque: Float[Array, "demonstrations time joints"]
     distance: Float[Array, "demonstrations time"]
-    torque_saturation: Float[Array, "demonstrations time"]
 
 
 class Evaluator:
@@ -69,16 +74,15 @@ class Evaluator:
         env = self.env
 
         def one(demonstration: Array) -> Rollouts:
-            arm_state = env.start(jax.random.PRNGKey(0), demonstration)
-            state = env.reset(jax.random.PRNGKey(0)).replace(pipeline_state=arm_state, obs=env.observe(arm_state))
+            key = jax.random.fold_in(jax.random.PRNGKey(0), demonstration)
+            arm_state = env.start(key, demonstration)
+            state = env.reset(key).replace(pipeline_state=arm_state, obs=env.observe(arm_state))
 
             def step(state: State, _: None) -> tuple[State, Rollouts]:
-                state = env.step(state, controller(state.obs))
-                metrics = state.metrics
-                arm_state: Any = state.pipeline_state
-                return state, Rollouts(
-                    arm_state.qpos, arm_state.qvel, metrics["distance"], metrics["torque_saturation"]
-                )
+                action = jnp.clip(controller(state), -1.0, 1.0)
+                state = env.step(state, action)
+                after: Any = state.pipeline_state
+                return state, Rollouts(after.qpos, after.qvel, action * env.torque_scale, state.metrics["distance"])
 
             return jax.lax.scan(step, state, None, length=env.config.horizon)[1]
 
@@ -89,35 +93,58 @@ class Evaluator:
         """Which demonstrations are trained on, and which are held out."""
         return {"train": slice(0, self._num_train), "held_out": slice(self._num_train, None)}
 
-    def summary(self, rollouts: Rollouts) -> dict[str, Any]:
-        """The quality figures of a controller, for the training and the held-out demonstrations."""
-        distance = np.asarray(rollouts.distance)
-        parts = self.parts
-
-        def mean(values: np.ndarray) -> dict[str, float]:
-            return {split: float(values[part].mean()) for split, part in parts.items()}
-
-        mean_distance, bound, hold = mean(distance), mean(self.lower_bound), mean(self.hold_distance)
-        gap = {split: (mean_distance[split] - bound[split]) / (hold[split] - bound[split]) for split in SPLITS}
-        angles = np.degrees(self._angle_error(rollouts)[parts["train"]].mean(axis=0))
+    def table(self, rollouts: Rollouts) -> Table:
+        """One row for each demonstration: see `measure`; and mean distance, bound, holding still, and the gap."""
+        qpos, qvel, torque = (np.asarray(x) for x in (rollouts.qpos, rollouts.qvel, rollouts.torque))
+        distances = np.asarray(rollouts.distance), self.lower_bound, self.hold_distance
+        distance, bound, hold = (x.mean(axis=1, dtype=float) for x in distances)
         return {
-            "optimality_gap": gap,
-            "mean_distance": mean_distance,
+            "optimality_gap": gaps(distance, bound, hold),
+            "mean_distance": distance,
             "lower_bound": bound,
             "hold_distance": hold,
-            "link_angle_error_deg": float(angles.mean()),
-            "link_angle_error_deg_by_link": dict(zip(self.env.learner.link_names, map(float, angles), strict=True)),
-            "torque_saturation": float(np.asarray(rollouts.torque_saturation)[parts["train"]].mean()),
+            **measure(self.env, self._learner_states(rollouts.qpos, rollouts.qvel), qpos, qvel, torque),
         }
 
-    def _angle_error(self, rollouts: Rollouts) -> Float[np.ndarray, "demonstrations links"]:
-        """Mean angle [rad] of each learner link to the expert links that correspond to it, by their share in W."""
-        env = self.env
-        expert = np.asarray(env.expert_states.direction)[:, 1 : env.config.horizon + 1]
-        learner = np.asarray(self._learner_states(rollouts.qpos, jnp.zeros_like(rollouts.qpos)).direction)
-        cosine = np.einsum("dtix,dtjx->dtij", expert, learner)
-        angle = np.arccos(np.clip(cosine, -1, 1)).mean(axis=1)
-        return (angle * env.config.metric.shares(env.expert, env.learner)).sum(axis=1)
+    def summary(self, rollouts: Rollouts) -> dict[str, Any]:
+        """The quality figures of a controller, for the training and the held-out demonstrations."""
+        table, parts = self.table(rollouts), self.parts
+
+        def by_split(values: np.ndarray, total: Callable[..., Any] = np.mean) -> dict[str, float]:
+            return {split: total(values[part]).item() for split, part in parts.items()}
+
+        means = {key: by_split(table[key]) for key in ("mean_distance", "lower_bound", "hold_distance")}
+        return {
+            "optimality_gap": {split: gaps(*(mean[split] for mean in means.values())) for split in SPLITS},
+            **means,
+            **{
+                key: by_split(values, np.sum if key.endswith("violations") else np.mean)
+                for key, values in table.items()
+                if key not in means and key != "optimality_gap"
+            },
+        }
+
+    def worst(self, rollouts: Rollouts) -> dict[str, dict[str, float]]:
+        """Gap of the worst demonstrations of each split, by their number."""
+        gap = self.table(rollouts)["optimality_gap"]
+        named = {}
+        for split, part in self.parts.items():
+            order = np.argsort(-gap[part])[:_WORST]
+            named[split] = {str(index): float(gap[part][index]) for index in order}
+        return named
+
+    def save_table(self, rollouts: Rollouts, out: Path) -> None:
+        """Writes the table as CSV, with the split and the number of each demonstration."""
+        table = self.table(rollouts)
+        numbers = [(split, i) for split, part in self.parts.items() for i in range(len(self.hold_distance[part]))]
+        partial = out.with_name(out.name + ".partial")
+        with partial.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(["split", "demonstration", *table])
+            writer.writerows(
+                [*number, *row] for number, row in zip(numbers, zip(*table.values(), strict=True), strict=True)
+            )
+        os.replace(partial, out)
 
 
 def _lower_bound(env: ImitationEnv) -> Float[Array, "demonstrations time"]:

@@ -58,7 +58,7 @@ class Job(abc.ABC):
 
     @abc.abstractmethod
     def evaluate(self, params: Params) -> Any:
-        """What `figures` and `plot` are made of."""
+        """What `figures`, `details` and `save_outcome` are made of."""
 
     @abc.abstractmethod
     def figures(self, outcome: Any) -> Figures:
@@ -76,6 +76,11 @@ class Job(abc.ABC):
     def rows(self, figures: Figures) -> list[Row]:
         """The figures as rows of the final table."""
 
+    def details(self, outcome: Any) -> Figures:
+        """What the report says beyond the figures."""
+        del outcome
+        return {}
+
     @abc.abstractmethod
-    def plot(self, run_dir: Path, outcome: Any) -> None:
-        """Writes the plots of a finished run."""
+    def save_outcome(self, folder: Path, outcome: Any) -> None:
+        """Writes plots and tables of an evaluation; in a run directory, of its training too."""

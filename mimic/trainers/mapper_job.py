@@ -173,17 +173,18 @@ class MapperJob(Job):
             ("median angle to the optimum, worst link", "", f"{to_optimum:.1f} deg"),
         ]
 
-    def plot(self, run_dir: Path, outcome: Any) -> None:
-        """How it learned."""
+    def save_outcome(self, folder: Path, outcome: Any) -> None:
+        """In a run directory, how it learned."""
         del outcome
-        plots.plot_training(
-            run_dir / runs.METRICS,
-            run_dir / "training.png",
-            "quality",
-            "above the optimum [%]",
-            of="poses",
-            title=self._name,
-        )
+        if (folder / runs.METRICS).is_file():
+            plots.plot_training(
+                folder / runs.METRICS,
+                folder / "training.png",
+                "quality",
+                "above the optimum [%]",
+                of="poses",
+                title=self._name,
+            )
 
 
 def _key(purpose: int) -> jax.Array:

@@ -55,6 +55,31 @@ def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, tit
     _save(figure, out)
 
 
+def plot_demonstrations(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, title: str) -> None:
+    """Mean distance of each demonstration between its bound and holding still, the worst first."""
+    table = evaluator.table(rollouts)
+    figure, all_axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
+    for axes, (split, part) in zip(all_axes, evaluator.parts.items(), strict=True):
+        order = np.argsort(-table["optimality_gap"][part])
+        bound, distance, hold = (table[key][part][order] for key in ("lower_bound", "mean_distance", "hold_distance"))
+        places = np.arange(len(order))
+        axes.vlines(places, bound, hold, color="lightgrey", lw=1)
+        axes.plot(places, hold, "_", color="grey", label="holding the start pose")
+        axes.plot(places, distance, ".", color=_COLOURS[split], label="reached")
+        axes.plot(places, bound, "k_", label="lower bound")
+        for place in range(min(3, len(order))):
+            axes.annotate(
+                str(order[place]), (place, distance[place]), textcoords="offset points", xytext=(3, 3), fontsize=7
+            )
+        axes.set(
+            xlabel="demonstration, worst gap first", title=f"{title}, {_LABELS[split]} demonstrations", ylim=(0, None)
+        )
+        axes.grid(alpha=0.3, axis="y")
+    all_axes[0].set_ylabel("mean embodiment distance")
+    all_axes[0].legend(fontsize="small")
+    _save(figure, out)
+
+
 def _save(figure: Any, out: Path) -> None:
     figure.savefig(out, dpi=150)
     plt.close(figure)

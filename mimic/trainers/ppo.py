@@ -75,7 +75,7 @@ def make_controller(config: PPOConfig, observation_size: int, action_size: int) 
 
     def controller(params: Params) -> Controller:
         policy = make_policy(params, deterministic=True)
-        return lambda observation: policy(observation, unused_key)[0]
+        return lambda state: policy(state.obs, unused_key)[0]
 
     return controller
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import jax
 
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, concatenate
+from mimic.envs.demonstrations import Demonstrations, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.trainers import plots, ppo, runs
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.evaluation import Evaluator, Rollouts
+from mimic.trainers.evaluation import SPLITS, Evaluator, Rollouts
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
 from mimic.trainers.signals import Signals
 
@@ -21,6 +21,7 @@ class PPOJob(Job):
     Args:
       config: of the run.
       run_dir: of a run that exists, whose demonstrations count.
+      unseen: demonstrations to evaluate on in place of the held-out ones.
 
     Attributes:
       evaluator: of controllers on the run's demonstrations.
@@ -31,16 +32,20 @@ class PPOJob(Job):
 
     unit = "env_steps"
 
-    def __init__(self, config: TrainConfig, run_dir: Path | None):
+    def __init__(self, config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None):
         assert isinstance(config.trainer, PPOConfig)
         self._name, self._seed = config.env.name, config.seed
         self.settings: PPOConfig = config.trainer.resolve(jax.default_backend(), jax.device_count())
         self.total_steps = self.settings.total_steps
-        self._env, held_out = _environment(config.env, run_dir)
-        self.evaluator = Evaluator(self._env, held_out)
-        self._demonstrations = concatenate(self._env.demonstrations, held_out)
+        env, held_out = _environment(config.env, run_dir)
+        if unseen is not None:
+            unseen.check_fits(env.expert, config.env.control_dt, config.env.horizon)
+            held_out = unseen
+        self.evaluator = Evaluator(env, held_out)
+        self._env = _with_crossovers(env, self.settings.crossovers or 0, config.env.demonstrations.seed)
+        self._demonstrations = concatenate(env.demonstrations, held_out)
         self.headline = (
-            f"{config.env.name}: {self._env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once"
+            f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once"
         )
         controller = ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)
 
@@ -90,6 +95,10 @@ class PPOJob(Job):
         """At the target gap."""
         return figures["optimality_gap"]["train"] <= self.settings.target_gap
 
+    def details(self, outcome: Rollouts) -> Figures:
+        """The demonstrations that went worst."""
+        return {"worst_demonstrations": self.evaluator.worst(outcome)}
+
     def rows(self, figures: Figures) -> list[Row]:
         """The gap and what it is made of."""
         by_split = (
@@ -97,25 +106,34 @@ class PPOJob(Job):
             ("mean distance", "mean_distance", "{:.4f}"),
             ("  lower bound of this arm", "lower_bound", "{:.4f}"),
             ("  holding the start pose", "hold_distance", "{:.4f}"),
+            ("angle to the expert's links", "link_angle_error_deg", "{:.1f} deg"),
+            ("angular velocity from theirs", "angular_velocity_error", "{:.2f} rad/s"),
+            ("torque, of the largest: rms", "torque_rms", "{:.1%}"),
+            ("  change from step to step, rms", "torque_change", "{:.1%}"),
+            ("  steps with one at its largest", "torque_saturation", "{:.1%}"),
+            ("steps with a joint out of its range", "position_violations", "{:.0f}"),
+            ("  above its rated speed", "speed_violations", "{:.0f}"),
+            ("  above its torque limit", "torque_violations", "{:.0f}"),
         )
-        return [
-            *((label, form.format(figures[key]["train"]), form.format(figures[key]["held_out"]))
-              for label, key, form in by_split),
-            ("angle to the expert's links", f"{figures['link_angle_error_deg']:.1f} deg", ""),
-            ("steps with a torque at its limit", f"{figures['torque_saturation']:.1%}", ""),
-        ]  # fmt: skip
+        rows = [(label, *(form.format(figures[key][split]) for split in SPLITS)) for label, key, form in by_split]
+        worst = figures["worst_demonstrations"]
+        named = ("  ".join(f"{i}: {gap:.0%}" for i, gap in worst[split].items()) for split in SPLITS)
+        return [*rows, ("worst demonstrations and their gaps", *named)]  # type: ignore[list-item]
 
-    def plot(self, run_dir: Path, outcome: Rollouts) -> None:
-        """How it learned, and the distance over an episode."""
-        plots.plot_training(
-            run_dir / runs.METRICS,
-            run_dir / "training.png",
-            "optimality_gap",
-            "optimality gap [%]",
-            of="demonstrations",
-            title=self._name,
-        )
-        plots.plot_quality(self.evaluator, outcome, run_dir / "quality.png", title=self._name)
+    def save_outcome(self, folder: Path, outcome: Rollouts) -> None:
+        """A table of all demonstrations, the distance over an episode, and in a run directory how it learned."""
+        self.evaluator.save_table(outcome, folder / "demonstrations.csv")
+        plots.plot_quality(self.evaluator, outcome, folder / "quality.png", title=self._name)
+        plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", title=self._name)
+        if (folder / runs.METRICS).is_file():
+            plots.plot_training(
+                folder / runs.METRICS,
+                folder / "training.png",
+                "optimality_gap",
+                "optimality gap [%]",
+                of="demonstrations",
+                title=self._name,
+            )
 
 
 def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
@@ -126,3 +144,11 @@ def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv,
         config = dataclasses.replace(config, demonstrations=stored)
     training, held_out = training_and_held_out(config)
     return ImitationEnv(config, training), held_out
+
+
+def _with_crossovers(env: ImitationEnv, count: int, seed: int) -> ImitationEnv:
+    """The environment that is trained on."""
+    given = env.demonstrations
+    if count == 0 or given.count == 1:  # one demonstration mixes with nothing
+        return env
+    return env.with_demonstrations(concatenate(given, crossovers(given, count, seed)))

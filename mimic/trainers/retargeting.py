@@ -50,15 +50,14 @@ def retarget(
       ValueError: demonstrations of another arm, poses outside its range, or a mapper between other arms.
     """
     _check(demonstrations, expert)
-    rated = np.where(np.isfinite(learner.velocity_limit), learner.velocity_limit, np.pi)
-    largest_jump = rated * demonstrations.dt
+    jump = largest_jump(learner, demonstrations.dt)
     expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
     if mapper is None:
-        found = _optimise(expert, learner, expert_qpos, metric, largest_jump, seed)
+        found = optimal_motions(expert, learner, expert_qpos, metric, jump, seed)
         qpos, distance, settled = (np.asarray(x) for x in (found.qpos, found.distance, found.converged))
     else:
         mapper.check_fits(expert, learner)
-        qpos, distance, settled = follow_mapper(mapper, expert_qpos, largest_jump)
+        qpos, distance, settled = follow_mapper(mapper, expert_qpos, jump)
     qpos = np.asarray(qpos, float)
     motions = Demonstrations(
         qpos=qpos,
@@ -127,9 +126,15 @@ def follow_mapper(
     return np.asarray(poses), np.asarray(distance), np.asarray(settled)
 
 
-def _optimise(
+def largest_jump(arm: Embodiment, dt: float) -> Float[np.ndarray, " joints"]:
+    """How far each joint goes in a time [s] at its rated speed, pi rad/s where it has none [rad]."""
+    return np.where(np.isfinite(arm.velocity_limit), arm.velocity_limit, np.pi) * dt
+
+
+def optimal_motions(
     expert: Embodiment, learner: Embodiment, qpos: Array, metric: MetricConfig, largest_jump: np.ndarray, seed: int
 ) -> PoseImitation:
+    """The `imitate_trajectory` of each of an expert's motions [motions, time, joints] under a metric."""
     correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
 
     def one(qpos: jax.Array) -> PoseImitation:

@@ -1,7 +1,6 @@
 """One run from config to report: what `python -m mimic.train` and `python -m mimic.evaluate` do."""
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from rich.console import Console
 
 from mimic import compat
 from mimic.config import to_dict
+from mimic.envs.demonstrations import load_demonstrations
 from mimic.trainers import runs
 from mimic.trainers.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
@@ -53,7 +53,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
     """An evaluation of a run from a checkpoint alone, ready to start.
 
     Raises:
-      ValueError: no run directory, or no such checkpoint.
+      ValueError: no run directory, no such checkpoint, an `out` that exists, or what only a policy can be asked for.
     """
     stopwatch = runs.Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
@@ -63,23 +63,65 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
     trained = runs.load_config(run_dir)  # saved resolved: the machine does not matter
     check_checkpoint(run_dir, config.checkpoint)
     out = Path(config.out).expanduser() if config.out else None
-    if out and not out.parent.is_dir():
-        raise ValueError(f"out: there is no folder {str(out.parent)!r}")
+    if out and (out.exists() or not out.parent.is_dir()):
+        reason = "exists; name a new folder" if out.exists() else f"there is no folder {str(out.parent)!r}"
+        raise ValueError(f"out: {str(out)!r}: {reason}")
     with stopwatch.stage("build"):
-        job = make_job(trained, run_dir)
+        trained, job = _job_to_evaluate(trained, run_dir, config)
         steps, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
 
     def run() -> None:
         console = Console()
         with stopwatch.stage("evaluate"):
-            outcome = job.evaluate(params)
-        report = _report(trained, job, job.figures(outcome), stopwatch, steps, 0)
+            outcome, controller = _outcome(job, params, config.controller)
+            figures = {**job.figures(outcome), **job.details(outcome)}
+        report = {**_report(trained, job, figures, stopwatch, steps, 0), **controller}
         console.print(report_table(report, job))
         if out:
-            runs.write_atomically(out, json.dumps(report, indent=2) + "\n")
+            out.mkdir()
+            job.save_outcome(out, outcome)
+            runs.write_report(out, report)
             console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
 
     return run
+
+
+def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Job]:
+    """A run as it was, or with other demonstrations, physics or loads."""
+    factors = {"mass": config.mass, "damping": config.damping}
+    changes: dict[str, Any] = {key: [value, value] for key, value in factors.items() if value is not None}
+    if config.torque_noise is not None:
+        changes["torque_noise"] = config.torque_noise
+    if trained.trainer.name != "ppo":
+        if changes or config.physics or config.demonstrations or config.controller != "policy":
+            raise ValueError(
+                "controller, demonstrations, physics, mass, damping and torque_noise: expected a run of trainer=ppo, "
+                f"got one of {trained.trainer.name}"
+            )
+        return trained, make_job(trained, run_dir)
+    env = dataclasses.replace(
+        trained.env,
+        physics=config.physics or trained.env.physics,
+        randomization=dataclasses.replace(trained.env.randomization, **changes),
+    )
+    trained = dataclasses.replace(trained, env=env)
+    compat.import_mjx()
+    from mimic.trainers.ppo_job import PPOJob
+
+    unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
+    return trained, PPOJob(trained, run_dir, unseen)
+
+
+def _outcome(job: Job, params: Params, controller: str) -> tuple[Any, dict[str, Any]]:
+    """What a controller did, and what the report says of the controller."""
+    if controller == "policy":
+        return job.evaluate(params), {}
+    from mimic.trainers.ppo_job import PPOJob
+    from mimic.trainers.tracking import run_controller
+
+    assert isinstance(job, PPOJob)
+    outcome, frequency = run_controller(job.evaluator, controller)
+    return outcome, {"trainer": controller, "frequency_rad_s": frequency}
 
 
 def make_job(config: TrainConfig, run_dir: Path | None) -> Job:
@@ -148,10 +190,11 @@ def _train(
             return stop.exit_code
         with stopwatch.stage("evaluate"):
             outcome = job.evaluate(params)
+            figures = {**job.figures(outcome), **job.details(outcome)}
         done_before = restore[0] if restore else 0
-        report = _report(config, job, job.figures(outcome), stopwatch, steps, steps - done_before)
+        report = _report(config, job, figures, stopwatch, steps, steps - done_before)
         runs.write_report(run_dir, report)
-        job.plot(run_dir, outcome)
+        job.save_outcome(run_dir, outcome)
     console.print(report_table(report, job))
     console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
     return 0

@@ -1,0 +1,68 @@
+"""What is measured on each demonstration: how near, how smooth, and within which limits a controller moves."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.envs.imitation import ImitationEnv
+from mimic.kinematics import LinkStates
+
+Table = dict[str, Float[np.ndarray, " demonstrations"]]
+_SPARE = 1 + 1e-5  # what float32 leaves of a torque at its limit, or of a joint at its stop
+
+
+def measure(
+    env: ImitationEnv,
+    learner: LinkStates,
+    qpos: Float[np.ndarray, "demonstrations time joints"],
+    qvel: Float[np.ndarray, "demonstrations time joints"],
+    torque: Float[np.ndarray, "demonstrations time joints"],
+) -> Table:
+    """Columns of a table with one row for each demonstration; means over time, joints and links.
+
+    - `link_angle_error_deg`: angle of each learner link to the expert links that correspond to it, by their share in W;
+      `link_angle_error_deg.LINK` for each link.
+    - `angular_velocity_error`: the same for the links' angular velocities [rad/s], length of the difference.
+    - `torque_rms`: torque as a share of the largest one.
+    - `torque_change`: change of the torque from step to step, likewise; 0 is smooth.
+    - `torque_saturation`: share of the steps with a torque at its largest.
+    - `position_violations`, `speed_violations`, `torque_violations`: steps with a joint beyond its range, its rated
+      speed, or its torque limit.
+
+    Args:
+      env: with the demonstrations that were imitated.
+      learner: link states after each step, [demonstrations, time, links, 3].
+      qpos: learner's joint angles after each step [rad].
+      qvel: its velocities [rad/s].
+      torque: that was held in each step [N m].
+    """
+    arm = env.learner
+    shares = env.config.metric.shares(env.expert, arm)
+    expert = {key: np.asarray(value)[:, 1 : qpos.shape[1] + 1] for key, value in vars(env.expert_states).items()}
+    cosine = np.einsum("dtix,dtjx->dtij", expert["direction"], np.asarray(learner.direction))
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=1)
+    by_link = (angle * shares).sum(axis=1)
+    turning = expert["angular_velocity"][:, :, :, None] - np.asarray(learner.angular_velocity)[:, :, None]
+    relative = torque / np.asarray(env.torque_scale)
+    change = np.diff(relative, axis=1)
+    lower, upper = np.asarray(arm.joint_range).T
+    beyond = {
+        "position": (qpos < lower - _SPARE + 1) | (qpos > upper + _SPARE - 1),
+        "speed": np.abs(qvel) > np.asarray(arm.velocity_limit) * _SPARE,
+        "torque": np.abs(torque) > np.asarray(arm.torque_limit) * _SPARE,
+    }
+    return {
+        "link_angle_error_deg": by_link.mean(axis=1),
+        **{f"link_angle_error_deg.{name}": by_link[:, i] for i, name in enumerate(arm.link_names)},
+        "angular_velocity_error": (np.linalg.norm(turning, axis=-1).mean(axis=1) * shares).sum(axis=1).mean(axis=1),
+        "torque_rms": np.sqrt((relative**2).mean(axis=(1, 2))),
+        "torque_change": np.sqrt((change**2).mean(axis=(1, 2))) if change.size else np.zeros(len(qpos)),
+        "torque_saturation": (np.abs(relative) > 0.99).any(axis=-1).mean(axis=1),
+        **{f"{name}_violations": flags.any(axis=-1).sum(axis=1) for name, flags in beyond.items()},
+    }
+
+
+def gaps(distance: Any, bound: Any, hold: Any) -> Any:
+    """Optimality gap of distances, numbers or arrays: 0 at the kinematic bound, 1 at holding the start pose."""
+    return (distance - bound) / (hold - bound)
