@@ -22,7 +22,7 @@ from mimic.distance import (  # noqa: E402
 from mimic.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
 from mimic.envs import env_config, environments, make  # noqa: E402
 from mimic.envs.arms import ArmConfig, build_arm  # noqa: E402
-from mimic.envs.demonstrations import Demonstrations, load_demonstrations  # noqa: E402
+from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
 from mimic.envs.recording import record_demonstrations  # noqa: E402
 from mimic.imitation import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
 from mimic.kinematics import (  # noqa: E402
@@ -59,6 +59,7 @@ __all__ = [
     "body_twists",
     "build_arm",
     "candidate_points",
+    "check_effort",
     "closest_motion",
     "distance_landscape",
     "embodiment_distance",

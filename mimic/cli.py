@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic.config import explain, schema
-from mimic.envs.config import EnvConfig, RetargetConfig
+from mimic.envs.config import EnvConfig, RecordingConfig, RetargetConfig
 from mimic.trainers.config import TRAINERS, EvaluateConfig, FiguresConfig, RenderConfig, TrainConfig
 from mimic.trainers.signals import STOPPED_BY_SIGNAL
 
@@ -72,6 +72,7 @@ def _register_schemas() -> None:
     store.store(name="evaluate_schema", node=schema(EvaluateConfig))
     store.store(name="figures_schema", node=schema(FiguresConfig))
     store.store(name="render_schema", node=schema(RenderConfig))
+    store.store(name="demonstrations_schema", node=schema(RecordingConfig))
     store.store(name="retarget_schema", node=schema(RetargetConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
     for name, config_class in TRAINERS.items():

@@ -1,5 +1,6 @@
-"""Typed configs: frozen dataclasses as OmegaConf schemas, and their errors in one line."""
+"""Typed configs: frozen dataclasses as OmegaConf schemas, and what is wrong with a value in one line."""
 
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -29,6 +30,25 @@ def explain(error: Exception) -> str:
     if " not in " in message and isinstance(parent, DictConfig):
         return f"unknown key {str(key)!r}; valid are {', '.join(str(name) for name in parent if name != 'hydra')}"
     return f"{key}: {message}" if key and str(key) not in message else message
+
+
+def new_file(name: str, path: str) -> Path:
+    """Where a command shall write a file.
+
+    Args:
+      name: of the key.
+      path: its value.
+
+    Raises:
+      ValueError: no path, one that exists, or one in no folder.
+    """
+    if not path:
+        raise ValueError(f"{name}: expected a file, as in {name}=FILE")
+    file = Path(path).expanduser()
+    if file.exists() or not file.parent.is_dir():
+        reason = "exists; name a new file" if file.exists() else f"there is no folder {str(file.parent)!r}"
+        raise ValueError(f"{name}: {str(file)!r}: {reason}")
+    return file
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -1,7 +1,9 @@
 """What all tests share: shapes checked at run time, compiled programs kept, both precisions."""
 
+import importlib
 import importlib.util
 import pathlib
+import sys
 
 import jax
 import pytest
@@ -59,3 +61,25 @@ def unchecked():
     jaxtyping_config.update("jaxtyping_disable", True)
     yield
     jaxtyping_config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys, tmp_path):
+    """A function that runs a command in an empty folder and returns the line that it is refused with."""
+
+    def run(name, *arguments):
+        from mimic import cli
+
+        folder = tmp_path / "empty"
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", [f"mimic.{name}", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.run(importlib.import_module(f"mimic.{name}").prepare, name)
+        error = capsys.readouterr().err
+        assert stop.value.code == 2, error
+        assert error.startswith("error: ") and error.count("\n") == 1
+        assert not list(folder.iterdir())
+        return error
+
+    return run

@@ -9,34 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic import cli, evaluate, figures, render, retarget, train
 from mimic.envs.arms import ArmConfig, build_arm
 from mimic.envs.recording import record_demonstrations
 
-MODULES = {"train": train, "evaluate": evaluate, "retarget": retarget, "figures": figures, "render": render}
-COMMANDS = {name: module.prepare for name, module in MODULES.items()}
 PLANAR = ["env=planar4dof", "env.demonstrations.count=1", "env.demonstrations.held_out=1"]
 HINGE = '<joint name="{0}" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-
-
-@pytest.fixture
-def refused(monkeypatch, capsys, tmp_path):
-    """A function that runs a command in an empty folder and returns the line that it is refused with."""
-
-    def run(name, *arguments):
-        folder = tmp_path / "empty"
-        folder.mkdir()
-        monkeypatch.chdir(folder)
-        monkeypatch.setattr(sys, "argv", [f"mimic.{name}", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            cli.run(COMMANDS[name], name)
-        error = capsys.readouterr().err
-        assert stop.value.code == 2, error
-        assert error.startswith("error: ") and error.count("\n") == 1
-        assert not list(folder.iterdir())
-        return error
-
-    return run
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -99,6 +100,8 @@ class DemonstrationConfig:
             raise ValueError(
                 f"demonstrations: expected count and held_out of at least 1, got {self.count}, {self.held_out}"
             )
+        if self.seed < 0:
+            raise ValueError(f"demonstrations.seed: expected at least 0, got {self.seed}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,6 +174,37 @@ class EnvConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class RecordingConfig:
+    """A recording of demonstrations to a file.
+
+    Attributes:
+      env: the environment whose expert is recorded, in its time steps.
+      kind, count, seed: see `DemonstrationConfig`; those of the environment where None.
+      limits: see `EnvConfig`; those of the environment where None.
+      out: the file, which ends in .npz; must not exist.
+      plot: picture of what was recorded; `out` with .png instead where empty. Must not exist.
+    """
+
+    env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
+    kind: str | None = None
+    count: int | None = None
+    seed: int | None = None
+    limits: str | None = None
+    out: str = ""
+    plot: str = ""
+
+    def resolve(self) -> EnvConfig:
+        """The environment with what is given here.
+
+        Raises:
+          ValueError: a value that it cannot have.
+        """
+        wanted = {name: getattr(self, name) for name in ("kind", "count", "seed")}
+        demonstrations = dataclasses.replace(self.env.demonstrations, **_given(wanted))
+        return dataclasses.replace(self.env, demonstrations=demonstrations, **_given({"limits": self.limits}))
+
+
+@dataclasses.dataclass(frozen=True)
 class RetargetConfig:
     """A retargeting of demonstrations.
 
@@ -189,6 +223,10 @@ class RetargetConfig:
     limits: str = "none"
     out: str = ""
     seed: int = 0
+
+
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _check_choice(name: str, value: str, valid: tuple[str, ...]) -> None:

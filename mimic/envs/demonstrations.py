@@ -5,6 +5,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +14,8 @@ from mimic.embodiment import Embodiment
 
 FORMAT = "mimic-demonstrations-1"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
+_OPTIONAL_ARRAYS = ("torque",)
+_ROUNDING = 1e-6  # relative, what a value may be above its limit: a file in float32 rounds by 6e-8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +30,8 @@ class Demonstrations:
       arm: the expert's name.
       joint_names: the expert's joints, base to tip.
       seed: of the random goals.
+      torque: [N, T, n] what was held from each sample to the next [N m], beside the one that carries the arm's weight;
+        None where nobody knows.
     """
 
     qpos: Float[np.ndarray, "demonstrations samples joints"]
@@ -36,6 +41,7 @@ class Demonstrations:
     arm: str
     joint_names: tuple[str, ...]
     seed: int = 0
+    torque: Float[np.ndarray, "demonstrations steps joints"] | None = None
 
     @property
     def count(self) -> int:
@@ -49,11 +55,15 @@ class Demonstrations:
 
     def select(self, index: slice | Sequence[int]) -> "Demonstrations":
         """Some of the demonstrations."""
-        return dataclasses.replace(self, qpos=self.qpos[index], qvel=self.qvel[index], goals=self.goals[index])
+        torque = None if self.torque is None else self.torque[index]
+        return dataclasses.replace(
+            self, qpos=self.qpos[index], qvel=self.qvel[index], goals=self.goals[index], torque=torque
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one `.npz` file; a file of that name is replaced only when the new one is whole."""
         partial = f"{os.fspath(path)}.partial"
+        optional: dict[str, Any] = {} if self.torque is None else {"torque": self.torque}
         with open(partial, "wb") as file:
             np.savez_compressed(
                 file,
@@ -65,6 +75,7 @@ class Demonstrations:
                 seed=np.array(self.seed),
                 arm=np.array(self.arm),
                 joint_names=np.array(self.joint_names),
+                **optional,
             )
         os.replace(partial, path)
 
@@ -86,9 +97,30 @@ class Demonstrations:
 
 
 def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations:
-    """The demonstrations of both, of one arm and time step."""
+    """The demonstrations of both, of one arm and time step; with torques where both have them."""
     join = {key: np.concatenate([getattr(first, key), getattr(second, key)]) for key in ("qpos", "qvel", "goals")}
-    return dataclasses.replace(first, **join)
+    torques = [part.torque for part in (first, second) if part.torque is not None]
+    return dataclasses.replace(first, **join, torque=np.concatenate(torques) if len(torques) == 2 else None)
+
+
+def check_effort(demonstrations: Demonstrations, arm: Embodiment) -> None:
+    """Refuses what the arm cannot do: a joint above its rated speed, or above its torque limit where torques are known.
+
+    Raises:
+      ValueError: names the first demonstration above a limit, with joint, time, value and limit.
+    """
+    checks = [("turns at", demonstrations.qvel, "rad/s", "rated speed", arm.velocity_limit)]
+    if demonstrations.torque is not None:
+        checks.append(("is held at", demonstrations.torque, "N m", "torque limit", arm.torque_limit))
+    for does, values, unit, limit_name, limit in checks:
+        beyond = np.argwhere(np.abs(values) > np.asarray(limit) * (1 + _ROUNDING))
+        if len(beyond):
+            which, sample, joint = beyond[0]
+            raise ValueError(
+                f"demonstrations: {arm.joint_names[joint]} of demonstration {which} {does} "
+                f"{values[which, sample, joint]:.7g} {unit} at {sample * demonstrations.dt:.4g} s, "
+                f"but its {limit_name} is {limit[joint]:.7g} {unit}"
+            )
 
 
 def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonstrations:
@@ -104,12 +136,12 @@ def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonst
     """
     joints = np.arange(len(demonstrations.joint_names))
     chosen = np.random.default_rng(seed).integers(demonstrations.count, size=(count, len(joints)))
-    mixed = {
+    mixed: dict[str, Any] = {
         "qpos": demonstrations.qpos.swapaxes(1, 2)[chosen, joints].swapaxes(1, 2),
         "qvel": demonstrations.qvel.swapaxes(1, 2)[chosen, joints].swapaxes(1, 2),
         "goals": demonstrations.goals[chosen, joints],
     }
-    return dataclasses.replace(demonstrations, **mixed)
+    return dataclasses.replace(demonstrations, torque=None, **mixed)
 
 
 def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
@@ -130,7 +162,8 @@ def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
             missing = [key for key in _ARRAYS if key not in archive.files]
             if missing:
                 raise ValueError(f"it lacks {', '.join(missing)}; expected are {', '.join(_ARRAYS)}")
-            content = {key: archive[key] for key in _ARRAYS}
+            optional = [key for key in _OPTIONAL_ARRAYS if key in archive.files]
+            content = {key: archive[key] for key in (*_ARRAYS, *optional)}
     except (ValueError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         reason = "it holds pickled objects" if "allow_pickle" in str(error) else str(error)
         raise ValueError(f"demonstrations: {name!r} is not a whole npz file of demonstrations: {reason}") from error
@@ -142,7 +175,8 @@ def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
 def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
     qpos, qvel, goals = content["qpos"], content["qvel"], content["goals"]
     joint_names = tuple(map(str, np.atleast_1d(content["joint_names"])))
-    numeric = {key: content[key] for key in ("qpos", "qvel", "goals", "dt")}
+    torque = content.get("torque")
+    numeric = {key: content[key] for key in ("qpos", "qvel", "goals", "dt", "torque") if key in content}
     for key, array in numeric.items():
         if not np.issubdtype(array.dtype, np.floating):
             raise ValueError(f"demonstrations: {key} in {name!r} must be floating point, got {array.dtype}")
@@ -158,6 +192,9 @@ def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
             f"demonstrations: qvel and goals in {name!r} must be {list(qpos.shape)} and "
             f"{[qpos.shape[0], qpos.shape[2]]}, got {list(qvel.shape)} and {list(goals.shape)}"
         )
+    steps = [qpos.shape[0], qpos.shape[1] - 1, qpos.shape[2]]
+    if torque is not None and list(torque.shape) != steps:
+        raise ValueError(f"demonstrations: torque in {name!r} must be {steps}, got {list(torque.shape)}")
     for key in ("dt", "seed", "arm"):
         if content[key].shape != ():
             raise ValueError(f"demonstrations: {key} in {name!r} must be one value, got shape {content[key].shape}")
@@ -173,4 +210,5 @@ def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
         arm=str(content["arm"]),
         joint_names=joint_names,
         seed=int(content["seed"]),
+        torque=torque,
     )

@@ -33,6 +33,7 @@ from mimic.spatial import (
 )
 
 _Z: Vector = (0.0, 0.0, 1.0)
+_NONE: Rotation = (ZERO, ZERO, ZERO)
 _ROUNDING = 1e-12  # what rotations to and fro leave of a zero
 
 
@@ -95,7 +96,7 @@ def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
                 placement=rotation(_rounded(previous_frame.T @ frame)),
                 offset=vector(_rounded(previous_frame.T @ (origin - previous_origin))),
                 reference=float(model.qpos0[joint]),
-                inertia=_inertia(model, data, body, frame, origin) if carries else Inertia(0.0, ZERO, (ZERO,) * 3),
+                inertia=_inertia(model, data, body, frame, origin) if carries else Inertia(0.0, ZERO, _NONE),
                 armature=float(model.dof_armature[joint]),
                 damping=float(model.dof_damping[joint]),
             )
@@ -161,7 +162,7 @@ def mass_matrix(arm: Sequence[Segment], turns: Sequence[Rotation]) -> list[list[
       turns: maps each joint's frame into the one before.
     """
     matrix: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(len(arm))]
-    composite = Inertia(0.0, ZERO, (ZERO,) * 3)
+    composite = Inertia(0.0, ZERO, _NONE)
     for i in reversed(range(len(arm))):
         if i + 1 < len(arm):
             composite = _moved(composite, turns[i + 1], arm[i + 1].offset)

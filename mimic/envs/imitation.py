@@ -16,7 +16,7 @@ from mimic.distance import embodiment_distance
 from mimic.embodiment import Embodiment
 from mimic.envs.arms import Arm, build_arm, effective_inertia
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, load_demonstrations
+from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.envs.physics import Load, make_advance
 from mimic.envs.recording import record_demonstrations
 from mimic.kinematics import LinkStates, link_states
@@ -227,13 +227,14 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
     """The demonstrations of a config, split: the first `count` are trained on, the next `held_out` are not.
 
     Raises:
-      ValueError: a file that cannot be read, does not fit the expert, or holds too few.
+      ValueError: a file that cannot be read, does not fit the expert, asks more of it than it can, or holds too few.
     """
     expert = expert or build_arm(config.expert, config.limits)
     wanted = config.demonstrations
     if wanted.path:
         loaded = load_demonstrations(Path(wanted.path).expanduser())
         loaded.check_fits(expert.embodiment, config.control_dt, config.horizon)
+        check_effort(loaded, expert.embodiment)
         if loaded.count < wanted.count + wanted.held_out:
             raise ValueError(
                 f"demonstrations: {wanted.path!r} holds {loaded.count}, but count={wanted.count} to train on and "

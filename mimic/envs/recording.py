@@ -4,6 +4,7 @@ The expert is controlled as the learner will be, by torques that are held within
 same.
 """
 
+import copy
 from collections.abc import Callable
 
 import mujoco
@@ -38,6 +39,7 @@ def record_demonstrations(
     horizon: int = 50,
     dt: float = 0.1,
     substeps: int = 5,
+    on_recorded: Callable[[int], None] = lambda redrawn: None,
 ) -> Demonstrations:
     """Records an expert on its way to random goals (paper, "Dynamic Motion Imitation").
 
@@ -53,6 +55,7 @@ def record_demonstrations(
       horizon: steps T of a demonstration.
       dt: control step [s].
       substeps: physics steps in a control step.
+      on_recorded: called after each demonstration with the number of its goals that were drawn anew.
 
     Raises:
       ValueError: an unknown kind, a count, horizon or time below its least value, or an arm whose limits leave no goal.
@@ -64,24 +67,29 @@ def record_demonstrations(
             raise ValueError(f"{name}: expected at least {least}, got {value}")
     if not dt > 0:
         raise ValueError(f"dt: expected a time above 0 s, got {dt}")
-    recordings = [_record_one(arm, kind, np.random.default_rng([seed, i]), horizon, dt, substeps) for i in range(count)]
-    qpos, qvel, goals = (np.stack(column) for column in zip(*recordings, strict=True))
+    recordings = []
+    for index in range(count):
+        recording, redrawn = _record_one(arm, kind, np.random.default_rng([seed, index]), horizon, dt, substeps)
+        recordings.append(recording)
+        on_recorded(redrawn)
+    qpos, qvel, torque, goals = (np.stack(column) for column in zip(*recordings, strict=True))
     embodiment = arm.embodiment
-    return Demonstrations(qpos, qvel, goals, float(dt), embodiment.name, embodiment.joint_names, seed)
+    return Demonstrations(qpos, qvel, goals, float(dt), embodiment.name, embodiment.joint_names, seed, torque)
 
 
 def _record_one(
     arm: Arm, kind: str, rng: np.random.Generator, horizon: int, dt: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]:
+    """Angles, velocities, torques and goal of a demonstration, and how many goals before it broke limits."""
     embodiment = arm.embodiment
     home = np.asarray(embodiment.home)
     lower, upper = np.asarray(embodiment.joint_range).T
     make_control = {"pd": _pd_control, "reach": _reach_control}[kind]
-    for _ in range(_MAX_DRAWS):
+    for redrawn in range(_MAX_DRAWS):
         goal = home + GOAL_SHARE * (rng.uniform(lower, upper) - home)
-        qpos, qvel, torque = _simulate(arm, make_control(arm, goal, horizon, dt), horizon, dt, substeps)
-        if _within_limits(embodiment, qpos, qvel, torque):
-            return qpos, qvel, goal
+        trajectory = _simulate(arm, make_control(arm, goal, horizon, dt), horizon, dt, substeps)
+        if trajectory is not None:
+            return (*trajectory, goal), redrawn
     raise ValueError(f"demonstrations: {_MAX_DRAWS} random goals of {embodiment.name!r} all break its limits")
 
 
@@ -139,10 +147,12 @@ def _reach_path(
 
 def _simulate(
     arm: Arm, control: _Control, horizon: int, dt: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Trajectory [T+1, n] and torques [T, n] under a control: computed torque, once a step."""
-    model, data = arm.model, mujoco.MjData(arm.model)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Trajectory [T+1, n] and torques [T, n] under a control: computed torque, once a step. None beyond a limit."""
+    model = copy.copy(arm.model)
     model.opt.timestep = dt / substeps
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else what diverges seems to rest
+    data = mujoco.MjData(model)
     data.qpos[:] = arm.embodiment.home
     inertial = np.zeros(model.nv)
     qpos, qvel, torques = [data.qpos.copy()], [data.qvel.copy()], []
@@ -154,4 +164,6 @@ def _simulate(
         mujoco.mj_step(model, data, substeps)
         qpos.append(data.qpos.copy())
         qvel.append(data.qvel.copy())
+        if not _within_limits(arm.embodiment, qpos[-1], qvel[-1], torques[-1]):
+            return None
     return np.stack(qpos), np.stack(qvel), np.stack(torques)

@@ -141,9 +141,8 @@ class Evaluator:
         with partial.open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(["split", "demonstration", *table])
-            writer.writerows(
-                [*number, *row] for number, row in zip(numbers, zip(*table.values(), strict=True), strict=True)
-            )
+            for number, *row in zip(numbers, *table.values(), strict=True):
+                writer.writerow([*number, *row])
         os.replace(partial, out)
 
 

@@ -9,7 +9,7 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.kinematics import LinkStates
 
 Table = dict[str, Float[np.ndarray, " demonstrations"]]
-_SPARE = 1 + 1e-5  # what float32 leaves of a torque at its limit, or of a joint at its stop
+_ROUNDING = 1e-5  # what float32 leaves of a torque at its limit, or of a joint at its stop; relative and in rad
 
 
 def measure(
@@ -48,9 +48,9 @@ def measure(
     change = np.diff(relative, axis=1)
     lower, upper = np.asarray(arm.joint_range).T
     beyond = {
-        "position": (qpos < lower - _SPARE + 1) | (qpos > upper + _SPARE - 1),
-        "speed": np.abs(qvel) > np.asarray(arm.velocity_limit) * _SPARE,
-        "torque": np.abs(torque) > np.asarray(arm.torque_limit) * _SPARE,
+        "position": (qpos < lower - _ROUNDING) | (qpos > upper + _ROUNDING),
+        "speed": np.abs(qvel) > np.asarray(arm.velocity_limit) * (1 + _ROUNDING),
+        "torque": np.abs(torque) > np.asarray(arm.torque_limit) * (1 + _ROUNDING),
     }
     return {
         "link_angle_error_deg": by_link.mean(axis=1),

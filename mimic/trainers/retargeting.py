@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from rich.console import Console
 from rich.table import Table
 
+from mimic.config import new_file
 from mimic.embodiment import Embodiment
 from mimic.envs import env_config
 from mimic.envs.arms import build_arm
@@ -59,9 +60,10 @@ def retarget(
         mapper.check_fits(expert, learner)
         qpos, distance, settled = follow_mapper(mapper, expert_qpos, jump)
     qpos = np.asarray(qpos, float)
+    velocity = np.gradient(qpos, demonstrations.dt, axis=1)
     motions = Demonstrations(
         qpos=qpos,
-        qvel=np.gradient(qpos, demonstrations.dt, axis=1),
+        qvel=np.clip(velocity, -rated, rated),  # angles came in float32, whose rounding may lift a bounded jump
         goals=qpos[:, -1],
         dt=demonstrations.dt,
         arm=learner.name,
@@ -160,13 +162,9 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
     Raises:
       ValueError: a name that is missing, an `out` that exists, a file or an environment that does not fit.
     """
-    for name in ("demonstrations", "out"):
-        if not getattr(config, name):
-            raise ValueError(f"{name}: expected a file, as in {name}=FILE")
-    out = Path(config.out).expanduser()
-    if out.exists() or not out.parent.is_dir():
-        reason = "exists; name a new file" if out.exists() else f"there is no folder {str(out.parent)!r}"
-        raise ValueError(f"out: {str(out)!r}: {reason}")
+    if not config.demonstrations:
+        raise ValueError("demonstrations: expected a file, as in demonstrations=FILE")
+    out = new_file("out", config.out)
     env = env_config(config.learner, limits=config.limits)
     expert, learner = (build_arm(arm, env.limits).embodiment for arm in (env.expert, env.learner))
     loaded = load_demonstrations(Path(config.demonstrations).expanduser())
