@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from mimic.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
 from mimic.mjcf import read_model
@@ -145,6 +146,11 @@ def simulation_model(
                     damping=float(joint.damping[0]),
                 )
     return spec.compile()
+
+
+def rated_speed(arm: Embodiment) -> Float[np.ndarray, " joints"]:
+    """Largest speed of each joint [rad/s], pi where none is known."""
+    return np.where(np.isfinite(arm.velocity_limit), arm.velocity_limit, np.pi)
 
 
 def effective_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:

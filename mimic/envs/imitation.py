@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from mimic.distance import embodiment_distance
 from mimic.embodiment import Embodiment
-from mimic.envs.arms import Arm, build_arm, effective_inertia
+from mimic.envs.arms import Arm, build_arm, effective_inertia, rated_speed
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.envs.physics import Load, make_advance
@@ -218,7 +218,7 @@ def _torque_scale(arm: Arm, config: EnvConfig) -> np.ndarray:
     """
     embodiment: Embodiment = arm.embodiment
     inertia = effective_inertia(arm.model, np.asarray(embodiment.home))
-    rated = np.where(np.isfinite(embodiment.velocity_limit), embodiment.velocity_limit, np.pi)
+    rated = rated_speed(embodiment)
     torque = config.action_scale * _OFFERED_SPEED_FACTOR * rated * inertia / config.control_dt
     return np.minimum(torque, embodiment.torque_limit).astype(np.float32)
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.embodiment import Embodiment
-from mimic.envs.arms import Arm
+from mimic.envs.arms import Arm, rated_speed
 from mimic.envs.demonstrations import Demonstrations
 
 KINDS = ("pd", "reach")
@@ -128,7 +128,7 @@ def _reach_path(
 
     model, embodiment = arm.model, arm.embodiment
     hand = model.nbody - 1
-    rated = np.where(np.isfinite(embodiment.velocity_limit), embodiment.velocity_limit, np.pi) * _REACH_SPEED_SHARE
+    rated = rated_speed(embodiment) * _REACH_SPEED_SHARE
     limits = [mink.VelocityLimit(model, dict(zip(embodiment.joint_names, rated, strict=True)))]
     configuration = mink.Configuration(model, np.asarray(embodiment.home, float))
     start = configuration.get_transform_frame_to_world(hand, "body")

@@ -15,7 +15,7 @@ from rich.table import Table
 from mimic.config import new_file
 from mimic.embodiment import Embodiment
 from mimic.envs import env_config
-from mimic.envs.arms import build_arm
+from mimic.envs.arms import build_arm, rated_speed
 from mimic.envs.config import MetricConfig, RetargetConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.pose import PoseImitation, imitate_trajectory, pose_limits
@@ -51,7 +51,7 @@ def retarget(
       ValueError: demonstrations of another arm, poses outside its range, or a mapper between other arms.
     """
     _check(demonstrations, expert)
-    jump = largest_jump(learner, demonstrations.dt)
+    rated, jump = rated_speed(learner), largest_jump(learner, demonstrations.dt)
     expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
     if mapper is None:
         found = optimal_motions(expert, learner, expert_qpos, metric, jump, seed)
@@ -129,8 +129,8 @@ def follow_mapper(
 
 
 def largest_jump(arm: Embodiment, dt: float) -> Float[np.ndarray, " joints"]:
-    """How far each joint goes in a time [s] at its rated speed, pi rad/s where it has none [rad]."""
-    return np.where(np.isfinite(arm.velocity_limit), arm.velocity_limit, np.pi) * dt
+    """How far each joint goes in a time [s] at its rated speed [rad]."""
+    return rated_speed(arm) * dt
 
 
 def optimal_motions(
