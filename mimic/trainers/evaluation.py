@@ -3,7 +3,7 @@
 import csv
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -133,17 +133,33 @@ class Evaluator:
             named[split] = {str(index): float(gap[part][index]) for index in order}
         return named
 
+    def save_curves(self, rollouts: Rollouts, out: Path) -> None:
+        """Writes the distance over the time of an episode as CSV, for each split: what `quality.png` shows."""
+        dt, distance = self.env.config.control_dt, np.asarray(rollouts.distance)
+        rows = []
+        for split, part in self.parts.items():
+            low, high = np.quantile(distance[part], [0.1, 0.9], axis=0)
+            curves = distance[part].mean(axis=0), low, high, self.lower_bound[part].mean(axis=0)
+            columns = *curves, self.hold_distance[part].mean(axis=0)
+            rows += [(split, round(dt * (i + 1), 9), *values) for i, values in enumerate(zip(*columns, strict=True))]
+        _write_csv(out, ["split", "time", "mean", "low", "high", "bound", "hold"], rows)
+
     def save_table(self, rollouts: Rollouts, out: Path) -> None:
         """Writes the table as CSV, with the split and the number of each demonstration."""
         table = self.table(rollouts)
         numbers = [(split, i) for split, part in self.parts.items() for i in range(len(self.hold_distance[part]))]
-        partial = out.with_name(out.name + ".partial")
-        with partial.open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(["split", "demonstration", *table])
-            for number, *row in zip(numbers, *table.values(), strict=True):
-                writer.writerow([*number, *row])
-        os.replace(partial, out)
+        rows = [(*number, *row) for number, *row in zip(numbers, *table.values(), strict=True)]
+        _write_csv(out, ["split", "demonstration", *table], rows)
+
+
+def _write_csv(out: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Replaces a file only when the new one is whole."""
+    partial = out.with_name(out.name + ".partial")
+    with partial.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows(rows)
+    os.replace(partial, out)
 
 
 def _lower_bound(env: ImitationEnv) -> Float[Array, "demonstrations time"]:

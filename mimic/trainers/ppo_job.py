@@ -123,6 +123,7 @@ class PPOJob(Job):
     def save_outcome(self, folder: Path, outcome: Rollouts) -> None:
         """A table of all demonstrations, the distance over an episode, and in a run directory how it learned."""
         self.evaluator.save_table(outcome, folder / "demonstrations.csv")
+        self.evaluator.save_curves(outcome, folder / "quality.csv")
         plots.plot_quality(self.evaluator, outcome, folder / "quality.png", title=self._name)
         plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", title=self._name)
         if (folder / runs.METRICS).is_file():
