@@ -25,7 +25,7 @@ from mimic.envs.arms import ArmConfig, build_arm
 from mimic.envs.recording import record_demonstrations
 
 ARMS = ("panda7dof", "panda4dof", "panda3dof")
-_PAPER = ("env.preview=0", "trainer.discounting=0.4", "trainer.crossovers=0")  # weights (0, 1, .001, .01) are ours too
+_PAPER = ("env.preview=0", "trainer.discounting=0.4", "trainer.crossovers=0")  # its weights are ours too
 _ONE = ("env=panda7dof", "env.demonstrations.count=1")
 _RANDOM = (
     "env.randomization.mass=[0.8,1.2]",
@@ -110,8 +110,11 @@ def cases(preset: Preset) -> list[Case]:
         *(Case("given_only", f"{arm}-given", (f"env={arm}", "trainer.crossovers=0"), many) for arm in ARMS),
         *(Case("hardware", f"{arm}-hardware", (f"env={arm}", "env.limits=hardware"), 1) for arm in ARMS),
         Case("loads", "panda4dof-random", ("env=panda4dof", *_RANDOM), 1),
-        Case("mjx", "panda4dof-mjx", ("env=panda4dof", "env.physics=mjx"), 1),
-        *(Case("variants", f"variant-{name}", ("env=panda4dof", *short, *change), 1) for name, change in variants.items()),
+        Case("mjx", "panda4dof-mjx", ("env=panda4dof", "env.physics=mjx", *short), 1),
+        *(
+            Case("variants", f"variant-{name}", ("env=panda4dof", *short, *change), 1)
+            for name, change in variants.items()
+        ),
         *(
             Case("locked", f"locked-{'-'.join(map(str, joints))}", (learner, *short, _locked(joints), _SCALE), 1)
             for joints in locked
@@ -141,7 +144,7 @@ def evaluation_tasks(chosen: Sequence[Case], folder: Path, unseen: Path) -> list
     tasks = []
 
     def evaluate(run: str, kind: str, *arguments: str) -> None:
-        tasks.append(Task(folder / f"{run}={kind}", arguments, of=folder / run))
+        tasks.append(Task(folder / f"{run}--{kind}", arguments, of=folder / run))
 
     for name in ("one_demonstration", "panda7dof"):
         for seed in range(names[name].seeds) if name in names else ():

@@ -24,10 +24,10 @@ _JOINTS = range(1, 8)
 
 
 def collect(folder: Path) -> dict[str, Any]:
-    """What the reports say, by case: `NAME` of the runs, `NAME=KIND` of their evaluations; a list over seeds."""
+    """What the reports say, by case: `NAME` of the runs, `NAME--KIND` of their evaluations; a list over seeds."""
     found: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for path in sorted(folder.glob("*/report.json")):
-        match = re.fullmatch(r"(.+)-(\d+)(=.+)?", path.parent.name)
+        match = re.fullmatch(r"(.+?)-(\d+)(--.+)?", path.parent.name)
         if not match:
             continue
         report = json.loads(path.read_text())
@@ -85,9 +85,9 @@ def spread(values: list[float]) -> str:
 
 def draw(results: dict[str, Any], out: Path) -> None:
     """Figures of what is there: `OUT_unseen.png`, `OUT_controllers.png`, `OUT_locked.png`."""
-    if "one_demonstration=unseen" in results and "panda7dof=unseen" in results:
+    if "one_demonstration--unseen" in results and "panda7dof--unseen" in results:
         _draw_unseen(results, out.with_name(out.name + "_unseen.png"))
-    if "panda7dof=computed_torque" in results:
+    if "panda7dof--computed_torque" in results:
         _draw_controllers(results, out.with_name(out.name + "_controllers.png"))
     if all(f"locked-{joint}" in results for joint in _JOINTS):
         _draw_locked(results, out.with_name(out.name + "_locked.png"))
@@ -98,7 +98,7 @@ def _draw_unseen(results: dict[str, Any], out: Path) -> None:
     figure, axes = plt.subplots(figsize=(6, 3.8), layout="constrained")
     labels = {"one_demonstration": "trained on one demonstration", "panda7dof": "trained on 124"}
     for (name, label), colour in zip(labels.items(), ("tab:orange", "tab:blue"), strict=True):
-        curves = results[f"{name}=unseen"][0]["curves"]
+        curves = results[f"{name}--unseen"][0]["curves"]
         axes.plot(curves["time"], curves["mean"], color=colour, label=label)
         axes.fill_between(curves["time"], curves["low"], curves["high"], color=colour, alpha=0.2, lw=0)
     axes.plot(curves["time"], curves["hold"], ":", color="grey", label="holding still")
@@ -112,9 +112,9 @@ def _draw_unseen(results: dict[str, Any], out: Path) -> None:
 
 def _draw_controllers(results: dict[str, Any], out: Path) -> None:
     """PPO among what a user would do instead."""
-    kinds = {"": "PPO", "=computed_torque": "computed torque", "=pd": "PD"}
+    kinds = {"": "PPO", "--computed_torque": "computed torque", "--pd": "PD"}
     figure, axes = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
-    arms = [arm for arm in _SIMULATIONS[1:] if f"{arm}=pd" in results]
+    arms = [arm for arm in _SIMULATIONS[1:] if f"{arm}--pd" in results]
     for place, (kind, label) in enumerate(kinds.items()):
         gaps = [100 * np.mean([entry["optimality_gap"]["held_out"] for entry in results[arm + kind]]) for arm in arms]
         bars = axes.bar(np.arange(len(arms)) + 0.27 * (place - 1), gaps, 0.25, label=label)

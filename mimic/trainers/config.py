@@ -31,11 +31,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     # One GPU: as many environments as keep it busy. The high entropy makes the arm try other branches of poses.
     "gpu": {
         "num_timesteps": 120_000_000,
-        "num_envs": 8192,
+        "num_envs": 4096,
         "unroll_length": 10,
-        "batch_size": 1024,
+        "batch_size": 512,
         "num_minibatches": 32,
-        "num_updates_per_batch": 8,
+        "num_updates_per_batch": 4,
         "learning_rate": 1e-3,
         "final_learning_rate": 0.01,
         "discounting": 0.95,
