@@ -63,7 +63,8 @@ def run_tasks(tasks: Sequence[Task], *, jobs: int, devices: int) -> list[Task]:
         shown = bar.add_task("runs", total=len(tasks), completed=len(tasks) - len(waiting), now="")
         try:
             while waiting or running:
-                for task in [task for task in waiting if task.of is None or (task.of / runs.REPORT).is_file()]:
+                ready = [task for task in waiting if task.of is None or (task.of / runs.REPORT).is_file()]
+                for task in sorted(ready, key=lambda task: task.of is None):  # evaluations first: they are short
                     if len(running) < jobs * max(devices, 1):
                         waiting.remove(task)
                         used = [device for _, device in running.values()]
