@@ -115,6 +115,7 @@ def simulation_model(
     spec = mujoco.MjSpec()
     spec.compiler.fusestatic = True
     spec.compiler.autolimits = False
+    spec.compiler.degree = False  # the reference angles below are in radians
     spec.option.disableflags = int(_IGNORED)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     bodies = {0: spec.worldbody}
