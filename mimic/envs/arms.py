@@ -115,6 +115,7 @@ def simulation_model(
     spec = mujoco.MjSpec()
     spec.compiler.fusestatic = True
     spec.compiler.autolimits = False
+    spec.compiler.degree = False  # the reference angles below are in radians
     spec.option.disableflags = int(_IGNORED)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     bodies = {0: spec.worldbody}
@@ -122,29 +123,30 @@ def simulation_model(
         body = source.body(body_id)
         position, quaternion = np.array(body.pos), np.array(body.quat)
         joint_ids = range(source.body_jntadr[body_id], source.body_jntadr[body_id] + source.body_jntnum[body_id])
-        for joint_id in joint_ids:  # a removed joint turns its body for good
-            joint = source.joint(joint_id)
-            if joint.name not in joint_names and joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE:
+        kept = []  # hinges with their anchors and axes
+        for joint in map(source.joint, joint_ids):
+            if joint.name in joint_names:
+                kept.append((joint, joint.pos, joint.axis))
+            elif joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE:  # a removed joint turns its body for good
                 angle = locked.get(joint.name, 0.0) - float(source.qpos0[joint.qposadr[0]])
                 position, quaternion = _turned(position, quaternion, joint, angle)
+                kept = [(other, *_turned_back(*line, joint, angle)) for other, *line in kept]
         copy = bodies[int(source.body_parentid[body_id])].add_body(pos=position, quat=quaternion)
         bodies[body_id] = copy
         if source.body_mass[body_id] > 0:
             copy.explicitinertial = True
             copy.mass, copy.ipos, copy.iquat = float(body.mass[0]), body.ipos, body.iquat
             copy.inertia = body.inertia
-        for joint_id in joint_ids:
-            joint = source.joint(joint_id)
-            if joint.name in joint_names:
-                copy.add_joint(
-                    name=joint.name,
-                    type=mujoco.mjtJoint.mjJNT_HINGE,
-                    axis=joint.axis,
-                    pos=joint.pos,
-                    ref=float(source.qpos0[joint.qposadr[0]]),
-                    armature=float(joint.armature[0]),
-                    damping=float(joint.damping[0]),
-                )
+        for joint, anchor, axis in kept:
+            copy.add_joint(
+                name=joint.name,
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=axis,
+                pos=anchor,
+                ref=float(source.qpos0[joint.qposadr[0]]),
+                armature=float(joint.armature[0]),
+                damping=float(joint.damping[0]),
+            )
     return spec.compile()
 
 
@@ -171,6 +173,15 @@ def _turned(position: np.ndarray, quaternion: np.ndarray, joint: Any, angle: flo
     mujoco.mju_rotVecQuat(before, joint.pos, quaternion)
     mujoco.mju_rotVecQuat(after, joint.pos, turned)
     return position + before - after, turned
+
+
+def _turned_back(anchor: np.ndarray, axis: np.ndarray, joint: Any, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Anchor and axis, in the frame of their body, of a hinge that does not feel a turn about a later one in it."""
+    back, lever, turned = np.zeros(4), np.zeros(3), np.zeros(3)
+    mujoco.mju_axisAngle2Quat(back, joint.axis, -angle)
+    mujoco.mju_rotVecQuat(lever, anchor - joint.pos, back)
+    mujoco.mju_rotVecQuat(turned, axis, back)
+    return joint.pos + lever, turned
 
 
 def _planar_spec(arm: Embodiment) -> mujoco.MjSpec:

@@ -88,7 +88,7 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
         ]
         return jax.lax.platform_dependent(*rows, cuda=kernel, default=plain), (True, True)
 
-    return lambda qpos, qvel, torque, load: advance(qpos, qvel, torque, *map(jnp.float32, load))
+    return lambda qpos, qvel, torque, load: advance(qpos, qvel, torque, *(jnp.asarray(x, qpos.dtype) for x in load))
 
 
 def _kernel(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: int) -> Callable[..., Any]:
@@ -135,6 +135,7 @@ def _runge_kutta(
     acceleration: Callable[[Any, Any], Any], qpos: Any, qvel: Any, timestep: float, substeps: int
 ) -> tuple[Any, Any]:
     """Steps over arrays or tuples of them. The stages run in a loop, so that the dynamics are compiled once."""
+    dtype = jax.tree.leaves(qpos)[0].dtype
 
     def along(start: Any, reach: Any, rate: Any) -> Any:
         return jax.tree.map(lambda x, y: x + reach * y, start, rate)
@@ -142,8 +143,8 @@ def _runge_kutta(
     def stage(index: Any, carry: Any) -> Any:
         start, (stage_qpos, stage_qvel), (end_qpos, end_qvel) = carry
         qacc = acceleration(stage_qpos, stage_qvel)
-        weight = timestep / 6 * jnp.float32(1 + jnp.minimum(index, 3 - index))  # 1 2 2 1, of this stage in the step
-        reach = timestep / 2 * jnp.float32(1 + index // 2)  # 1 1 2, from the start of the step to the next stage
+        weight = timestep / 6 * (1 + jnp.minimum(index, 3 - index)).astype(dtype)  # 1 2 2 1, of this stage in the step
+        reach = timestep / 2 * (1 + index // 2).astype(dtype)  # 1 1 2, from the start of the step to the next stage
         return (
             start,
             (along(start[0], reach, stage_qvel), along(start[1], reach, qacc)),
