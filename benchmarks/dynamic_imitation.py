@@ -61,7 +61,7 @@ class Preset:
 
 
 PRESETS = {
-    "paper": Preset(("env.physics=fused",), ("trainer.num_timesteps=40000000",), 3, 10),
+    "paper": Preset(("env.physics=fused",), ("trainer.num_timesteps=30000000",), 3, 10),
     # Of no value but to see that everything runs.
     "quick": Preset(
         (
@@ -172,6 +172,7 @@ def _arguments() -> argparse.Namespace:
     groups = sorted({case.group for case in cases(PRESETS["quick"])})
     parser.add_argument("--only", nargs="+", choices=groups, default=groups, metavar="GROUP", help=", ".join(groups))
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes on each device at once")
+    parser.add_argument("--collect", action="store_true", help="run nothing more: results of what is there")
     parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
     return parser.parse_args()
 
@@ -188,7 +189,7 @@ def main() -> None:
         record_demonstrations(build_arm(ArmConfig()), _UNSEEN, seed=_UNSEEN_SEED).save(unseen)
     tasks = [*training_tasks(chosen, preset, options.runs), *evaluation_tasks(chosen, options.runs, unseen)]
     devices = jax.device_count() if jax.default_backend() == "gpu" else 0
-    failed = run_tasks(tasks, jobs=options.jobs, devices=devices)
+    failed = [] if options.collect else run_tasks(tasks, jobs=options.jobs, devices=devices)
     results = study_results.collect(options.runs)
     study_results.show(results, Console())
     if options.out:
