@@ -4,8 +4,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # Extras of the package to install with it; `EXTRAS=cuda` on a machine with an NVIDIA GPU.
 EXTRAS ?=
-# Passed on to `python -m mimic.train`.
-ARGS ?=
+# Passed on to `python -m mimic.train`. The fused physics is the same as the default, MJX, and ten times as fast on CPUs.
+ARGS ?= env.physics=fused
 # Passed on to pytest, and the number of its workers (0: none, run in one process).
 PYTEST_ARGS ?=
 JOBS ?= auto
@@ -30,7 +30,7 @@ help: ## list the targets
 	@echo
 	@echo 'variables:  PYTHON=python3.12 VENV=.venv-3.12    another interpreter, in an environment of its own'
 	@echo '            EXTRAS=cuda                          install jax for NVIDIA GPUs'
-	@echo '            ARGS="env=panda7dof seed=1"          arguments of the training command'
+	@echo '            ARGS="env=panda7dof seed=1"          other arguments of the training command'
 	@echo '            PYTEST_ARGS="-k distance" JOBS=0     arguments and number of workers of pytest'
 
 install: $(STAMP) ## install alone

@@ -18,9 +18,10 @@ from rich.table import Table
 from benchmarks.record import train, write_results
 
 CASES = {
-    "panda4dof": ["env=panda4dof"],
+    "panda4dof": ["env=panda4dof", "env.physics=fused"],
     "panda7dof_single": [
         "env=panda7dof",
+        "env.physics=fused",
         "env.demonstrations.count=1",
         "trainer.target_gap=0.02",
     ],

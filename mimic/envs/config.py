@@ -143,6 +143,8 @@ class EnvConfig:
       physics: "mjx", the reference, or "fused": the same equations as one small program, many times faster.
       randomization: how the learner differs from its model.
       preview: expert steps that the learner sees beyond the present one; 0 is the paper.
+      limit_weight: in the reward, of joints near or beyond their range and rated speed; only where `limits` is
+        "hardware".
       action_scale: of the torque range; 1 is twice the torque that takes a joint to its rated speed in one step.
       speed_bound: joint speed [rad/s] at which an episode ends as a runaway.
     """
@@ -159,6 +161,7 @@ class EnvConfig:
     physics: str = "mjx"
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     preview: int = 1
+    limit_weight: float = 1.0
     action_scale: float = 1.0
     speed_bound: float = 30.0
 
@@ -171,6 +174,8 @@ class EnvConfig:
         for name in ("control_dt", "action_scale", "speed_bound"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
+        if not 0 <= self.limit_weight < math.inf:
+            raise ValueError(f"limit_weight: expected at least 0, got {self.limit_weight}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,6 +24,10 @@ from mimic.kinematics import LinkStates, link_states
 _OFFERED_SPEED_FACTOR = (
     2.0  # the largest torque takes a joint from rest to this multiple of its rated speed in one step
 )
+_MARGIN, _FAR = (
+    0.03,
+    0.1,
+)  # of a limit, in rad or as a share of the rated speed: where it begins to cost, and all it can
 
 
 @struct.dataclass
@@ -50,7 +54,8 @@ class ArmState:
 class ImitationEnv(Env):
     """One learner imitating one of the demonstrations; a brax environment over MJX.
 
-    Reward: minus the embodiment distance to the expert at the new step. Observation: link states of the learner, of the
+    Reward: minus the embodiment distance to the expert at the new step; with hardware limits, and minus `limit_weight`
+    times `limit_excess`. Observation: link states of the learner, of the
     expert, and of the expert `preview` steps ahead, as one vector. Action: a torque for each joint in [-1, 1], scaled
     by `torque_scale`. The episode ends at the horizon, a true end: there is nothing to imitate after it.
 
@@ -99,7 +104,7 @@ class ImitationEnv(Env):
         """A new episode: the learner at rest in its home pose, a random demonstration from its first step."""
         arm_state = self.start(rng)
         zero = jnp.zeros(())
-        metrics = {"distance": zero, "torque_saturation": zero, "runaway": zero}
+        metrics = {"distance": zero, "limit_excess": zero, "torque_saturation": zero, "runaway": zero}
         return State(arm_state, self.observe(arm_state), zero, zero, metrics, {})
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
@@ -134,18 +139,19 @@ class ImitationEnv(Env):
         runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # also where not a number
         remaining = (self.config.horizon - step).astype(jnp.float32)
         distance = jnp.where(runaway, self._worst_distance, self.distance(qpos, qvel, before.demonstration, step))
-        penalty = jnp.where(runaway, 1.0 + remaining, 1.0)  # as if it stayed this bad: ending early never pays
+        excess = jnp.where(runaway, 1.0, self.limit_excess(qpos, qvel))
+        steps = jnp.where(runaway, 1.0 + remaining, 1.0)  # as if it stayed this bad: ending early never pays
         done = (runaway | (step >= self.config.horizon)).astype(jnp.float32)
         after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=step)
         metrics = {
             **state.metrics,
             "distance": distance,
+            "limit_excess": excess,
             "torque_saturation": jnp.any(jnp.abs(command) > 0.99).astype(jnp.float32),
             "runaway": runaway.astype(jnp.float32),
         }
-        return state.replace(
-            pipeline_state=after, obs=self.observe(after), reward=-distance * penalty, done=done, metrics=metrics
-        )
+        reward = -(distance + self._limit_weight * excess) * steps
+        return state.replace(pipeline_state=after, obs=self.observe(after), reward=reward, done=done, metrics=metrics)
 
     def distance(
         self, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"], demonstration: Array, step: Array
@@ -160,6 +166,17 @@ class ImitationEnv(Env):
             rotation=metric.rotation_measure,  # type: ignore[arg-type]
             reduction=metric.reduction,  # type: ignore[arg-type]
         )
+
+    def limit_excess(self, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]) -> Float[Array, ""]:
+        """How much joints are at or beyond their limits: 0 within a margin of them, 1 where all are far beyond."""
+        lower, upper = jnp.asarray(self.learner.joint_range, jnp.float32).T
+        position = jnp.maximum(qpos - upper, lower - qpos) + _MARGIN
+        speed = jnp.abs(qvel) / jnp.asarray(self.learner.velocity_limit, jnp.float32) - 1 + _MARGIN
+        return 0.5 * jnp.mean(jnp.clip(position / _FAR, 0, 1) + jnp.clip(speed / _FAR, 0, 1))
+
+    @property
+    def _limit_weight(self) -> float:
+        return self.config.limit_weight if self.config.limits == "hardware" else 0.0
 
     @property
     def _worst_distance(self) -> float:

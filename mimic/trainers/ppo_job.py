@@ -45,7 +45,8 @@ class PPOJob(Job):
         self._env = _with_crossovers(env, self.settings.crossovers or 0, config.env.demonstrations.seed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
         self.headline = (
-            f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once"
+            f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once, "
+            f"{config.env.physics} physics"
         )
         controller = ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)
 
