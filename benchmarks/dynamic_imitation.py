@@ -12,7 +12,7 @@ import dataclasses
 import itertools
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -22,7 +22,7 @@ from benchmarks import study_results
 from benchmarks.processes import Task, run_tasks
 from benchmarks.record import write_results
 from mimic.envs.arms import ArmConfig, build_arm
-from mimic.envs.recording import record_demonstrations
+from mimic.envs.recording import KINDS, record_demonstrations
 
 ARMS = ("panda7dof", "panda4dof", "panda3dof")
 _PAPER = ("env.preview=0", "trainer.discounting=0.4", "trainer.crossovers=0")  # its weights are ours too
@@ -109,6 +109,7 @@ def cases(preset: Preset) -> list[Case]:
         *(Case("paper_setting", f"{arm}-paper", (f"env={arm}", *_PAPER, *short), many) for arm in ARMS),
         *(Case("given_only", f"{arm}-given", (f"env={arm}", "trainer.crossovers=0"), 1) for arm in ARMS),
         *(Case("hardware", f"{arm}-hardware", (f"env={arm}", "env.limits=hardware"), 1) for arm in ARMS),
+        *(Case("reaches", f"{arm}-reach", (f"env={arm}", "env.demonstrations.kind=reach"), 1) for arm in ARMS),
         Case("loads", "panda4dof-random", ("env=panda4dof", *_RANDOM), 1),
         Case("mjx", "panda4dof-mjx", ("env=panda4dof", "env.physics=mjx", *short), 1),
         *(
@@ -138,7 +139,16 @@ def training_tasks(chosen: Sequence[Case], preset: Preset, folder: Path) -> list
     ]
 
 
-def evaluation_tasks(chosen: Sequence[Case], folder: Path, unseen: Path) -> list[Task]:
+def unseen_demonstrations(folder: Path) -> dict[str, Path]:
+    """Files of demonstrations of each kind that no run is trained on."""
+    files = {kind: folder / f"unseen-{kind}.npz" for kind in KINDS}
+    for kind, path in files.items():
+        if not path.exists():
+            record_demonstrations(build_arm(ArmConfig()), _UNSEEN, kind=kind, seed=_UNSEEN_SEED).save(path)
+    return files
+
+
+def evaluation_tasks(chosen: Sequence[Case], folder: Path, unseen: Mapping[str, Path]) -> list[Task]:
     """The same policies on other demonstrations and arms, and other controllers in their place."""
     names = {case.name: case for case in chosen}
     tasks = []
@@ -148,12 +158,15 @@ def evaluation_tasks(chosen: Sequence[Case], folder: Path, unseen: Path) -> list
 
     for name in ("one_demonstration", "panda7dof"):
         for seed in range(names[name].seeds) if name in names else ():
-            evaluate(f"{name}-{seed}", "unseen", f"demonstrations={unseen}")
+            evaluate(f"{name}-{seed}", "unseen", f"demonstrations={unseen['pd']}")
     for arm in ARMS:
         if arm in names:
             for controller in ("hold", "pd", "computed_torque"):
                 evaluate(f"{arm}-0", controller, f"controller={controller}")
             evaluate(f"{arm}-0", "mjx", "physics=mjx")
+            evaluate(f"{arm}-0", "reaches", f"demonstrations={unseen['reach']}")
+        if f"{arm}-reach" in names:
+            evaluate(f"{arm}-reach-0", "goals", f"demonstrations={unseen['pd']}")
     for kind, load in _LOADS.items():
         for name in ("panda4dof", "panda4dof-random"):
             if name in names:
@@ -184,9 +197,7 @@ def main() -> None:
     preset = PRESETS[options.preset]
     chosen = [case for case in cases(preset) if case.group in options.only]
     options.runs.mkdir(parents=True, exist_ok=True)
-    unseen = options.runs / "unseen.npz"
-    if not unseen.exists():
-        record_demonstrations(build_arm(ArmConfig()), _UNSEEN, seed=_UNSEEN_SEED).save(unseen)
+    unseen = unseen_demonstrations(options.runs)
     tasks = [*training_tasks(chosen, preset, options.runs), *evaluation_tasks(chosen, options.runs, unseen)]
     devices = jax.device_count() if jax.default_backend() == "gpu" else 0
     failed = [] if options.collect else run_tasks(tasks, jobs=options.jobs, devices=devices)
