@@ -24,6 +24,7 @@ from mimic.kinematics import LinkStates, link_states
 _OFFERED_SPEED_FACTOR = (
     2.0  # the largest torque takes a joint from rest to this multiple of its rated speed in one step
 )
+_NOISE = 3  # what the noise folds into an episode's key; 0 to 2 would give the keys that `start` splits it into
 
 
 @struct.dataclass
@@ -127,7 +128,8 @@ class ImitationEnv(Env):
         randomization = self.config.randomization
         torque = command
         if randomization.torque_noise:
-            noise = jax.random.normal(jax.random.fold_in(before.key, step), command.shape)
+            key_noise = jax.random.fold_in(jax.random.fold_in(before.key, _NOISE), step)
+            noise = jax.random.normal(key_noise, command.shape)
             torque = jnp.clip(command + randomization.torque_noise * noise, -1.0, 1.0)
         load = before.load or Load(randomization.mass[0], randomization.damping[0])
         qpos, qvel = self._advance(before.qpos, before.qvel, torque * self.torque_scale, load)

@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, concatenate, crossovers
+from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.trainers import plots, ppo, runs
 from mimic.trainers.config import PPOConfig, TrainConfig
@@ -40,7 +40,8 @@ class PPOJob(Job):
         env, held_out = _environment(config.env, run_dir)
         if unseen is not None:
             unseen.check_fits(env.expert, config.env.control_dt, config.env.horizon)
-            held_out = unseen
+            check_effort(unseen, env.expert)
+            held_out = unseen.of_length(env.demonstrations.horizon)
         self.evaluator = Evaluator(env, held_out)
         self._env = _with_crossovers(env, self.settings.crossovers or 0, config.env.demonstrations.seed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
