@@ -22,6 +22,7 @@ def planar_env():
     return mimic.make("planar4dof", demonstrations=FEW)
 
 
+@pytest.fixture(scope="module")
 def panda_scale():
     """Largest torques."""
     return np.asarray(mimic.make("panda7dof", demonstrations={"count": 1, "held_out": 1}).torque_scale)
@@ -29,12 +30,12 @@ def panda_scale():
 
 @pytest.mark.parametrize("load", [Load(), Load(mass=1.2, damping=3.0)])
 @pytest.mark.parametrize("physics", PHYSICS)
-def test_the_panda_moves_as_in_mujoco(physics, load):
+def test_the_panda_moves_as_in_mujoco(panda_scale, physics, load):
     """1 s of random torques at the default step: 1e-4 rad, what ten control steps leave of float32."""
     model = build_arm(ArmConfig()).model
     substeps = mimic.env_config("panda7dof").substeps
     model.opt.timestep = DT / substeps
-    torques = np.random.default_rng(0).uniform(-1, 1, (10, 7)) * panda_scale()
+    torques = np.random.default_rng(0).uniform(-1, 1, (10, 7)) * panda_scale
     advance = jax.jit(make_advance(model, DT / substeps, substeps, physics))
     model.body_mass *= load.mass
     model.body_inertia *= load.mass

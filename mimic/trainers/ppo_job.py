@@ -121,11 +121,12 @@ class PPOJob(Job):
         named = ("  ".join(f"{i}: {gap:.0%}" for i, gap in worst[split].items()) for split in SPLITS)
         return [*rows, ("worst demonstrations and their gaps", *named)]  # type: ignore[list-item]
 
-    def save_outcome(self, folder: Path, outcome: Rollouts) -> None:
+    def save_outcome(self, folder: Path, outcome: Rollouts, controller: str = "policy") -> None:
         """A table of all demonstrations, the distance over an episode, and in a run directory how it learned."""
         self.evaluator.save_table(outcome, folder / "demonstrations.csv")
-        plots.plot_quality(self.evaluator, outcome, folder / "quality.png", title=self._name)
-        plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", title=self._name)
+        names = {"controller": controller.replace("_", " "), "title": self._name}
+        plots.plot_quality(self.evaluator, outcome, folder / "quality.png", **names)
+        plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", **names)
         if (folder / runs.METRICS).is_file():
             plots.plot_training(
                 folder / runs.METRICS,

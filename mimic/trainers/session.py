@@ -79,7 +79,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         console.print(report_table(report, job))
         if out:
             out.mkdir()
-            job.save_outcome(out, outcome)
+            job.save_outcome(out, outcome, config.controller)
             runs.write_report(out, report)
             console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
 
