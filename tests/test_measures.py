@@ -2,6 +2,7 @@
 
 import copy
 import csv
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
+from mimic.trainers import plots
 from mimic.trainers.evaluation import Evaluator, Rollouts
 from mimic.trainers.measures import measure
 from mimic.trainers.tracking import run_controller
@@ -64,7 +66,10 @@ def test_errors_are_those_of_a_known_turn(evaluator, by, links):
 
 
 def test_angles_count_by_the_share_of_each_expert_link():
-    """One learner link along x against expert links at 0 and at 90 degrees: by the overlap of 3 to 1, 22.5 degrees."""
+    """One learner link along x against expert links at 0 and at 90 degrees.
+
+    W has 1 + 3/4 and 1 + 1/4, the shares of the expert's links and of the learner's that overlap: 5/12 for the second.
+    """
     config = mimic.env_config(
         "planar4dof",
         expert={"link_lengths": [0.75, 0.25]},
@@ -78,8 +83,8 @@ def test_angles_count_by_the_share_of_each_expert_link():
     evaluator = Evaluator(mimic.ImitationEnv(config, given), given)
     still = jnp.zeros((2, 1, 1))
     table = measure(evaluator.env, evaluator._learner_states(still, still), *(np.zeros((2, 1, 1)),) * 3)
-    np.testing.assert_allclose(table["link_angle_error_deg"], 22.5, atol=0.05)
-    np.testing.assert_allclose(table["angular_velocity_error"], 0.5, rtol=1e-5)
+    np.testing.assert_allclose(table["link_angle_error_deg"], 90 * 5 / 12, atol=0.05)
+    np.testing.assert_allclose(table["angular_velocity_error"], 2 * 5 / 12, rtol=1e-5)
 
 
 def test_torques_and_limits_by_hand(evaluator):
@@ -130,7 +135,7 @@ def test_gaps_are_of_mean_distances(evaluator):
 
 def test_a_summary_averages_but_counts_violations(evaluator):
     ran = rollouts(evaluator, faster=(100.0, 0.0))
-    ran = ran.replace(torque=jnp.full_like(ran.torque, 0.5) * evaluator.env.torque_scale)
+    ran = dataclasses.replace(ran, torque=jnp.full_like(ran.torque, 0.5) * evaluator.env.torque_scale)
     summary = evaluator.summary(ran)
     assert summary["speed_violations"] == {"train": COUNT * HORIZON, "held_out": HELD_OUT * HORIZON}
     assert summary["torque_rms"] == pytest.approx({"train": 0.5, "held_out": 0.5}, rel=1e-6)
@@ -156,6 +161,21 @@ def test_the_table_as_a_file(evaluator, tmp_path):
     for key, values in evaluator.table(ran).items():
         written = np.array([row[key] for row in rows], values.dtype)  # digits enough for its precision
         np.testing.assert_array_equal(written, values)
+
+
+@pytest.mark.parametrize("plot", [plots.plot_quality, plots.plot_demonstrations])
+def test_pictures_show_all_and_name_the_controller(evaluator, monkeypatch, tmp_path, plot):
+    """The held-out demonstrations went worse than the training ones, whose axes come first."""
+    figures = []
+    monkeypatch.setattr(plots, "_save", lambda figure, out: figures.append(figure))
+    ran = between(evaluator, [0.1] * COUNT + [3.0, 2.0, 1.0, 0.0])
+    plot(evaluator, ran, tmp_path / "picture.png", controller="pd", title="env")
+    (figure,) = figures
+    assert figure.get_suptitle().startswith("env: pd")
+    assert any(text.get_text().startswith("pd") for text in figure.legends[0].get_texts())
+    for axes in figure.axes:
+        low, high = axes.get_ylim()
+        assert all(np.all((line.get_ydata() >= low) & (line.get_ydata() <= high)) for line in axes.lines)
 
 
 def test_holding_is_what_the_gap_is_measured_against(evaluator):

@@ -59,7 +59,7 @@ def plot_demonstrations(
     """Gap of each demonstration, the worst first; below it the distances that it is made of."""
     table, parts = evaluator.table(rollouts), evaluator.parts
     counts = [len(table["optimality_gap"][part]) for part in parts.values()]
-    widths = np.maximum(counts, max(counts) / 3)
+    widths = [max(count, max(counts) / 3) for count in counts]
     figure, rows = plt.subplots(
         2, 2, figsize=(9, 6), sharex="col", sharey="row", layout="constrained", width_ratios=widths
     )
