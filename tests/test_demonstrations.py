@@ -10,7 +10,7 @@ import pytest
 
 import mimic
 from mimic.envs.config import RecordingConfig
-from mimic.envs.demonstrations import concatenate
+from mimic.envs.demonstrations import concatenate, crossovers
 from mimic.envs.recording import KINDS
 from mimic.trainers.recording_session import prepare_recording
 from mimic.trainers.retargeting import retarget
@@ -70,6 +70,38 @@ def test_torques_are_kept_where_all_have_them(recorded, tmp_path):
     assert bare.select([1]).torque is None
     np.testing.assert_array_equal(concatenate(recorded.select([0]), recorded.select([1])).torque, recorded.torque)
     assert concatenate(recorded, bare).torque is None and concatenate(bare, recorded).torque is None
+
+
+def test_crossovers_move_each_joint_as_a_given_one_does():
+    given = mimic.record_demonstrations(panda(), 3)
+    mixed = crossovers(given, 20, seed=4)
+    assert mixed.count == 20 and mixed.torque is None  # nobody knows what holds the mixture
+    assert (mixed.arm, mixed.joint_names, mixed.dt) == (given.arm, given.joint_names, given.dt)
+    sources = set()
+    for which in range(mixed.count):
+        chosen = []
+        for joint in range(7):
+            (source,) = np.flatnonzero((given.qpos[:, :, joint] == mixed.qpos[which, :, joint]).all(axis=1))
+            np.testing.assert_array_equal(mixed.qvel[which, :, joint], given.qvel[source, :, joint])
+            assert mixed.goals[which, joint] == given.goals[source, joint]
+            chosen.append(int(source))
+        sources.add(tuple(chosen))
+    assert len(sources) > 15  # of 3^7 choices
+    np.testing.assert_array_equal(crossovers(given, 20, seed=4).qpos, mixed.qpos)
+    assert not np.array_equal(crossovers(given, 20, seed=5).qpos, mixed.qpos)
+
+
+@pytest.mark.parametrize("steps", [30, 50, 55])
+def test_another_length_cuts_or_repeats_the_last_sample(recorded, steps):
+    other = recorded.of_length(steps)
+    assert other.horizon == steps
+    for key in ("qpos", "qvel"):
+        samples, given = getattr(other, key), getattr(recorded, key)
+        np.testing.assert_array_equal(samples[:, :51], given[:, : steps + 1])
+        assert np.all(samples[:, 51:] == given[:, -1:])
+    assert (other.torque is None) == (steps > 50)  # nobody knows what would hold it longer
+    if other.torque is not None:
+        np.testing.assert_array_equal(other.torque, recorded.torque[:, :steps])
 
 
 def test_a_recording_counts_the_goals_that_it_drew_anew():

@@ -8,8 +8,9 @@ import pytest
 
 import mimic
 from mimic.envs.arms import ArmConfig, build_arm, effective_inertia, simulation_model
+from mimic.envs.config import PHYSICS
 from mimic.envs.imitation import training_and_held_out
-from mimic.envs.physics import make_advance
+from mimic.envs.physics import Load, make_advance
 from mimic.envs.wrappers import wrap_for_training
 
 DT = 0.1
@@ -21,20 +22,30 @@ def planar_env():
     return mimic.make("planar4dof", demonstrations=FEW)
 
 
-def test_mjx_moves_the_panda_as_mujoco_does():
+@pytest.fixture(scope="module")
+def panda_scale():
+    """Largest torques."""
+    return np.asarray(mimic.make("panda7dof", demonstrations={"count": 1, "held_out": 1}).torque_scale)
+
+
+@pytest.mark.parametrize("load", [Load(), Load(mass=1.2, damping=3.0)])
+@pytest.mark.parametrize("physics", PHYSICS)
+def test_the_panda_moves_as_in_mujoco(panda_scale, physics, load):
     """1 s of random torques at the default step: 1e-4 rad, what ten control steps leave of float32."""
-    env = mimic.make("panda7dof", demonstrations={"count": 1, "held_out": 1})
     model = build_arm(ArmConfig()).model
-    substeps = env.config.substeps
+    substeps = mimic.env_config("panda7dof").substeps
     model.opt.timestep = DT / substeps
+    torques = np.random.default_rng(0).uniform(-1, 1, (10, 7)) * panda_scale
+    advance = jax.jit(make_advance(model, DT / substeps, substeps, physics))
+    model.body_mass *= load.mass
+    model.body_inertia *= load.mass
+    model.dof_damping *= load.damping
     data = mujoco.MjData(model)
-    torques = np.random.default_rng(0).uniform(-1, 1, (10, 7)) * np.asarray(env.torque_scale)
-    advance = jax.jit(make_advance(model, DT / substeps, substeps))
     qpos, qvel = jnp.zeros(7), jnp.zeros(7)
     for torque in torques:
         data.qfrc_applied[:] = torque
         mujoco.mj_step(model, data, substeps)
-        qpos, qvel = advance(qpos, qvel, jnp.asarray(torque, jnp.float32))
+        qpos, qvel = advance(qpos, qvel, jnp.asarray(torque, jnp.float32), load)
         np.testing.assert_allclose(qpos, data.qpos, atol=1e-4)
 
 

@@ -58,9 +58,9 @@ def test_it_learns(trained):
 
 def test_evaluate_repeats_the_report(trained, tmp_path):
     run_dir, report = trained
-    out = tmp_path / "again.json"
+    out = tmp_path / "again"
     session.prepare_evaluation(EvaluateConfig(str(run_dir), out=str(out), compilation_cache=""), 0.0)()
-    again = json.loads(out.read_text())
+    again = json.loads((out / "report.json").read_text())
     for key in ("quality", "mean_distance", "optimal_distance"):
         assert again[key] == pytest.approx(report[key], rel=1e-5)
 

@@ -30,10 +30,12 @@ TINY = [
     "trainer.num_timesteps=5000",
     "trainer.evaluations=4",
 ]
-REPORT_KEYS = {
-    "env", "trainer", "seed", "optimality_gap", "mean_distance", "lower_bound", "hold_distance", "link_angle_error_deg",
-    "torque_saturation", "wall_time_s", "env_steps", "steps_per_second", "hardware", "versions",
+BY_SPLIT = {
+    "optimality_gap", "mean_distance", "lower_bound", "hold_distance", "link_angle_error_deg", "angular_velocity_error",
+    "torque_rms", "torque_change", "torque_saturation", "position_violations", "speed_violations", "torque_violations",
+    "worst_demonstrations",
 }  # fmt: skip
+REPORT_KEYS = {"env", "trainer", "seed", "wall_time_s", "env_steps", "steps_per_second", "hardware", "versions"}
 
 
 def command(module, *arguments, **more):
@@ -62,9 +64,10 @@ def test_a_run_directory_holds_everything(finished):
     names = {path.name for path in run_dir.iterdir()}
     assert {"config.yaml", "report.json", "metrics.csv", "demonstrations.npz", "checkpoints", "tensorboard"} <= names
     report = json.loads((run_dir / "report.json").read_text())
-    assert report.keys() >= REPORT_KEYS
-    for key in ("optimality_gap", "mean_distance", "lower_bound", "hold_distance"):
+    assert report.keys() >= REPORT_KEYS | BY_SPLIT
+    for key in BY_SPLIT:
         assert report[key].keys() == {"train", "held_out"}
+    assert {"demonstrations.csv", "quality.png", "demonstrations.png", "training.png"} <= names
     assert report["wall_time_s"].keys() == {"import", "build", "compile", "train", "evaluate", "total"}
     assert report["env_steps"] >= 5000
     assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 4
@@ -84,12 +87,16 @@ def test_brax_compiles_its_training_epoch_once(finished):
 
 def test_evaluate_repeats_the_report(finished, tmp_path):
     run_dir, _ = finished
-    out = tmp_path / "again.json"
+    out = tmp_path / "again"
     result = command("evaluate", f"run={run_dir}", f"out={out}")
     assert result.returncode == 0, result.stderr[-2000:]
-    again, report = json.loads(out.read_text()), json.loads((run_dir / "report.json").read_text())
-    for key in ("optimality_gap", "mean_distance", "lower_bound"):
-        assert again[key] == pytest.approx(report[key], rel=1e-5)
+    pictures = {"quality.png", "demonstrations.png"}
+    assert {path.name for path in out.iterdir()} == {"report.json", "demonstrations.csv", *pictures}
+    again, report = (json.loads((folder / "report.json").read_text()) for folder in (out, run_dir))
+    for key in BY_SPLIT - {"worst_demonstrations"}:
+        assert again[key] == pytest.approx(report[key], rel=1e-5)  # float32, in another process
+    for split, gaps in report["worst_demonstrations"].items():
+        assert again["worst_demonstrations"][split] == pytest.approx(gaps, rel=1e-5)
 
 
 def test_a_video_shows_the_whole_motion(finished):
@@ -192,7 +199,7 @@ def test_no_rollout_goes_below_the_bound():
     config = mimic.env_config("planar4dof", demonstrations={"count": 3, "held_out": 2})
     training, held_out = training_and_held_out(config)
     evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
-    rollout = jax.jit(lambda gain: evaluator.rollout(lambda obs: gain @ obs))
+    rollout = jax.jit(lambda gain: evaluator.rollout(lambda state: gain @ state.obs))
     size = evaluator.env.action_size, evaluator.env.observation_size
     for seed in range(5):
         gain = np.random.default_rng(seed).normal(size=size) * 0.02 * seed

@@ -60,6 +60,12 @@ class Demonstrations:
             self, qpos=self.qpos[index], qvel=self.qvel[index], goals=self.goals[index], torque=torque
         )
 
+    def of_length(self, steps: int) -> "Demonstrations":
+        """Cut to some steps, or with the last sample repeated, which is what is imitated after the end."""
+        sample = np.minimum(np.arange(steps + 1), self.horizon)
+        torque = None if self.torque is None or steps > self.horizon else self.torque[:, :steps]
+        return dataclasses.replace(self, qpos=self.qpos[:, sample], qvel=self.qvel[:, sample], torque=torque)
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one `.npz` file; a file of that name is replaced only when the new one is whole."""
         partial = f"{os.fspath(path)}.partial"

@@ -21,13 +21,11 @@ from mimic.envs.physics import Load, make_advance
 from mimic.envs.recording import record_demonstrations
 from mimic.kinematics import LinkStates, link_states
 
-_OFFERED_SPEED_FACTOR = (
-    2.0  # the largest torque takes a joint from rest to this multiple of its rated speed in one step
-)
-_MARGIN, _FAR = (
-    0.03,
-    0.1,
-)  # of a limit, in rad or as a share of the rated speed: where it begins to cost, and all it can
+# The largest torque takes a joint from rest to this multiple of its rated speed in one step.
+_OFFERED_SPEED_FACTOR = 2.0
+# Of a limit, in rad or as a share of the rated speed: where nearness begins to cost, and how much further all it can.
+_MARGIN, _FAR = 0.03, 0.1
+_NOISE = 3  # what the noise folds into an episode's key; 0 to 2 would give the keys that `start` splits it into
 
 
 @struct.dataclass
@@ -132,7 +130,8 @@ class ImitationEnv(Env):
         randomization = self.config.randomization
         torque = command
         if randomization.torque_noise:
-            noise = jax.random.normal(jax.random.fold_in(before.key, step), command.shape)
+            key_noise = jax.random.fold_in(jax.random.fold_in(before.key, _NOISE), step)
+            noise = jax.random.normal(key_noise, command.shape)
             torque = jnp.clip(command + randomization.torque_noise * noise, -1.0, 1.0)
         load = before.load or Load(randomization.mass[0], randomization.damping[0])
         qpos, qvel = self._advance(before.qpos, before.qvel, torque * self.torque_scale, load)

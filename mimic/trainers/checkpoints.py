@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 
 FOLDER = "checkpoints"
@@ -53,14 +54,28 @@ def load_checkpoint(run_dir: Path, template: Any, step: int | None = None) -> tu
       step: environment steps of the checkpoint; the last one where None.
 
     Raises:
-      ValueError: no such checkpoint, or one of another structure.
+      ValueError: no such checkpoint, a damaged one, or one of other arms or another network.
     """
     step = check_checkpoint(run_dir, step)
     path = (run_dir / FOLDER / f"{step:012d}").absolute()
     abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, template)
+    expected = _shapes(template)
     try:
         with ocp.StandardCheckpointer() as checkpointer:
-            return step, checkpointer.restore(path, abstract)
-    except Exception as error:  # orbax has many kinds for a folder that is damaged or of another structure
+            stored = _shapes(checkpointer.metadata(path).item_metadata.tree)
+            if stored == expected:  # else orbax would fail in its threads, which print what they think of it
+                return step, checkpointer.restore(path, abstract)
+    except Exception as error:  # orbax has many kinds for a folder that is damaged
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"checkpoint {str(path)!r} cannot be read: {reason}") from error
+    name = next(key for key in {**expected, **stored} if expected.get(key) != stored.get(key))
+    raise ValueError(
+        f"checkpoint {str(path)!r} does not fit the config of its run: it is of other arms or another network "
+        f"({name}: expected shape {expected.get(name)}, got {stored.get(name)})"
+    )
+
+
+def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    """Shape of each leaf, by its path; saved or not, a tuple is a list, and a dataclass a dict."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: hasattr(node, "shape"))
+    return {jax.tree_util.keystr(path, simple=True, separator="."): np.shape(leaf) for path, leaf in leaves}

@@ -372,7 +372,8 @@ class EvaluateConfig:
 
     def __post_init__(self) -> None:
         _check_choice("controller", self.controller, CONTROLLERS)
-        _check_choice("physics", self.physics, ("", *PHYSICS))
+        if self.physics:
+            _check_choice("physics", self.physics, PHYSICS)
 
 
 @dataclasses.dataclass(frozen=True)

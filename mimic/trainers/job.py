@@ -82,5 +82,5 @@ class Job(abc.ABC):
         return {}
 
     @abc.abstractmethod
-    def save_outcome(self, folder: Path, outcome: Any) -> None:
-        """Writes plots and tables of an evaluation; in a run directory, of its training too."""
+    def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
+        """Writes plots and tables of an evaluation of a controller; in a run directory, of its training too."""

@@ -173,9 +173,9 @@ class MapperJob(Job):
             ("median angle to the optimum, worst link", "", f"{to_optimum:.1f} deg"),
         ]
 
-    def save_outcome(self, folder: Path, outcome: Any) -> None:
+    def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
         """In a run directory, how it learned."""
-        del outcome
+        del outcome, controller
         if (folder / runs.METRICS).is_file():
             plots.plot_training(
                 folder / runs.METRICS,

@@ -47,10 +47,10 @@ def measure(
     relative = torque / np.asarray(env.torque_scale)
     change = np.diff(relative, axis=1)
     lower, upper = np.asarray(arm.joint_range).T
-    beyond = {
-        "position": (qpos < lower - _ROUNDING) | (qpos > upper + _ROUNDING),
-        "speed": np.abs(qvel) > np.asarray(arm.velocity_limit) * (1 + _ROUNDING),
-        "torque": np.abs(torque) > np.asarray(arm.torque_limit) * (1 + _ROUNDING),
+    within = {  # what is not a number, after a runaway, is within nothing
+        "position": (qpos >= lower - _ROUNDING) & (qpos <= upper + _ROUNDING),
+        "speed": np.abs(qvel) <= np.asarray(arm.velocity_limit) * (1 + _ROUNDING),
+        "torque": np.abs(torque) <= np.asarray(arm.torque_limit) * (1 + _ROUNDING),
     }
     return {
         "link_angle_error_deg": by_link.mean(axis=1),
@@ -59,7 +59,7 @@ def measure(
         "torque_rms": np.sqrt((relative**2).mean(axis=(1, 2))),
         "torque_change": np.sqrt((change**2).mean(axis=(1, 2))) if change.size else np.zeros(len(qpos)),
         "torque_saturation": (np.abs(relative) > 0.99).any(axis=-1).mean(axis=1),
-        **{f"{name}_violations": flags.any(axis=-1).sum(axis=1) for name, flags in beyond.items()},
+        **{f"{name}_violations": (~flags.all(axis=-1)).sum(axis=1) for name, flags in within.items()},
     }
 
 

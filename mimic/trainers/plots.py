@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mimic.trainers.evaluation import Evaluator, Rollouts
 
 _COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
+_WORST = 3  # demonstrations of each split that are named
 _LABELS = {"train": "training", "held_out": "held-out"}
 
 
@@ -35,48 +36,62 @@ def plot_training(metrics: Path, out: Path, figure_name: str, label: str, *, of:
     _save(figure, out)
 
 
-def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, title: str) -> None:
+def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, controller: str, title: str) -> None:
     """Mean distance over the time of an episode, between the kinematic bound and holding still."""
-    dt = evaluator.env.config.control_dt
-    parts = evaluator.parts
-    figure, all_axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
-    for axes, (split, part) in zip(all_axes, parts.items(), strict=True):
-        time = dt * np.arange(1, evaluator.env.config.horizon + 1)
+    time = evaluator.env.config.control_dt * np.arange(1, evaluator.env.config.horizon + 1)
+    figure, all_axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
+    for axes, (split, part) in zip(all_axes, evaluator.parts.items(), strict=True):
         distance = np.asarray(rollouts.distance)[part]
         low, high = np.quantile(distance, [0.1, 0.9], axis=0)
         axes.plot(time, evaluator.hold_distance[part].mean(axis=0), ":", color="grey", label="holding the start pose")
-        axes.fill_between(time, low, high, color=_COLOURS[split], alpha=0.2, lw=0, label="policy, 10 to 90 %")
-        axes.plot(time, distance.mean(axis=0), color=_COLOURS[split], label="policy, mean")
+        axes.plot(time, distance.mean(axis=0), color=_COLOURS[split], label=f"{controller}, mean")
+        axes.fill_between(time, low, high, color=_COLOURS[split], alpha=0.2, lw=0, label=f"{controller}, 10 to 90 %")
         axes.plot(time, evaluator.lower_bound[part].mean(axis=0), "k--", lw=1, label="lower bound")
-        axes.set(xlabel="time [s]", title=f"{title}, {_LABELS[split]} demonstrations", ylim=(0, None))
+        axes.set(xlabel="time [s]", title=f"{_LABELS[split]} demonstrations: {len(distance)}")
         axes.grid(alpha=0.3)
-    all_axes[0].set_ylabel("embodiment distance")
-    all_axes[0].legend(fontsize="small")
-    _save(figure, out)
+    all_axes[0].set(ylabel="embodiment distance", ylim=(0, None))  # shared, so after all is drawn
+    _finish(figure, all_axes[0], f"{title}: {controller}", out)
 
 
-def plot_demonstrations(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, title: str) -> None:
-    """Mean distance of each demonstration between its bound and holding still, the worst first."""
-    table = evaluator.table(rollouts)
-    figure, all_axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
-    for axes, (split, part) in zip(all_axes, evaluator.parts.items(), strict=True):
+def plot_demonstrations(
+    evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, controller: str, title: str
+) -> None:
+    """Gap of each demonstration, the worst first; below it the distances that it is made of."""
+    table, parts = evaluator.table(rollouts), evaluator.parts
+    counts = [len(table["optimality_gap"][part]) for part in parts.values()]
+    widths = [max(count, max(counts) / 3) for count in counts]
+    figure, rows = plt.subplots(
+        2, 2, figsize=(9, 6), sharex="col", sharey="row", layout="constrained", width_ratios=widths
+    )
+    for (above, below), count, (split, part) in zip(rows.T, counts, parts.items(), strict=True):
         order = np.argsort(-table["optimality_gap"][part])
-        bound, distance, hold = (table[key][part][order] for key in ("lower_bound", "mean_distance", "hold_distance"))
-        places = np.arange(len(order))
-        axes.vlines(places, bound, hold, color="lightgrey", lw=1)
-        axes.plot(places, hold, "_", color="grey", label="holding the start pose")
-        axes.plot(places, distance, ".", color=_COLOURS[split], label="reached")
-        axes.plot(places, bound, "k_", label="lower bound")
-        for place in range(min(3, len(order))):
-            axes.annotate(
-                str(order[place]), (place, distance[place]), textcoords="offset points", xytext=(3, 3), fontsize=7
-            )
-        axes.set(
-            xlabel="demonstration, worst gap first", title=f"{title}, {_LABELS[split]} demonstrations", ylim=(0, None)
+        place = np.arange(1, count + 1)
+        gap, bound, distance, hold = (
+            table[key][part][order] for key in ("optimality_gap", "lower_bound", "mean_distance", "hold_distance")
         )
-        axes.grid(alpha=0.3, axis="y")
-    all_axes[0].set_ylabel("mean embodiment distance")
-    all_axes[0].legend(fontsize="small")
+        above.plot(place, 100 * gap, ".", color=_COLOURS[split])
+        for x, y, number in zip(place, 100 * gap, order[:_WORST], strict=False):
+            above.annotate(str(number), (x, y), textcoords="offset points", xytext=(4, 2), fontsize=7)
+        below.vlines(place, bound, hold, color="lightgrey", lw=1)
+        below.plot(place, hold, "_", color="grey", markersize=4, label="holding the start pose")
+        below.plot(place, distance, ".", color=_COLOURS[split], label=controller)
+        below.plot(place, bound, "k_", markersize=4, label="lower bound")
+        above.set(title=f"{_LABELS[split]}: {count}")
+        below.set(xlabel="place, worst gap first", xlim=(0, count + 1))
+        below.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(7, integer=True, min_n_ticks=1))
+        above.margins(y=0.12)  # for the numbers of the worst
+        for axes in (above, below):
+            axes.grid(alpha=0.3, axis="y")
+    rows[0, 0].set(ylabel="optimality gap [%]", ylim=(min(0, 100 * table["optimality_gap"].min()), None))
+    rows[1, 0].set(ylabel="mean embodiment distance", ylim=(0, None))
+    _finish(figure, rows[1, 0], f"{title}: {controller}, each demonstration; the worst by their numbers", out)
+
+
+def _finish(figure: Any, labelled: Any, title: str, out: Path) -> None:
+    """Title above, one legend below all axes, where it hides nothing."""
+    figure.suptitle(title)
+    handles, labels = labelled.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize="small")
     _save(figure, out)
 
 

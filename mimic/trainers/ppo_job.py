@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, concatenate, crossovers
+from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.trainers import plots, ppo, runs
 from mimic.trainers.config import PPOConfig, TrainConfig
@@ -40,7 +40,8 @@ class PPOJob(Job):
         env, held_out = _environment(config.env, run_dir)
         if unseen is not None:
             unseen.check_fits(env.expert, config.env.control_dt, config.env.horizon)
-            held_out = unseen
+            check_effort(unseen, env.expert)
+            held_out = unseen.of_length(env.demonstrations.horizon)
         self.evaluator = Evaluator(env, held_out)
         self._env = _with_crossovers(env, self.settings.crossovers or 0, config.env.demonstrations.seed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
@@ -121,12 +122,13 @@ class PPOJob(Job):
         named = ("  ".join(f"{i}: {gap:.0%}" for i, gap in worst[split].items()) for split in SPLITS)
         return [*rows, ("worst demonstrations and their gaps", *named)]  # type: ignore[list-item]
 
-    def save_outcome(self, folder: Path, outcome: Rollouts) -> None:
+    def save_outcome(self, folder: Path, outcome: Rollouts, controller: str = "policy") -> None:
         """A table of all demonstrations, the distance over an episode, and in a run directory how it learned."""
         self.evaluator.save_table(outcome, folder / "demonstrations.csv")
         self.evaluator.save_curves(outcome, folder / "quality.csv")
-        plots.plot_quality(self.evaluator, outcome, folder / "quality.png", title=self._name)
-        plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", title=self._name)
+        names = {"controller": controller.replace("_", " "), "title": self._name}
+        plots.plot_quality(self.evaluator, outcome, folder / "quality.png", **names)
+        plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", **names)
         if (folder / runs.METRICS).is_file():
             plots.plot_training(
                 folder / runs.METRICS,

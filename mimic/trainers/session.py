@@ -79,7 +79,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         console.print(report_table(report, job))
         if out:
             out.mkdir()
-            job.save_outcome(out, outcome)
+            job.save_outcome(out, outcome, config.controller)
             runs.write_report(out, report)
             console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
 
@@ -173,16 +173,16 @@ def _train(
     config: TrainConfig, job: Job, run_dir: Path, restore: tuple[int, Params] | None, stopwatch: runs.Stopwatch
 ) -> int:
     console = Console()
-    run_dir.mkdir(parents=True, exist_ok=restore is not None)
-    runs.save_config(run_dir, config)
-    job.save_inputs(run_dir)
     device = runs.hardware()["device"]
-    console.print(
-        f"{job.headline} on {device} (preset {job.settings.preset})\nrun directory: {run_dir}",
-        highlight=False,
-        soft_wrap=True,
-    )
     with noted_signals() as signals:  # also while the report is made: all is done then, and a signal changes nothing
+        run_dir.mkdir(parents=True, exist_ok=restore is not None)
+        runs.save_config(run_dir, config)
+        job.save_inputs(run_dir)
+        console.print(
+            f"{job.headline} on {device} (preset {job.settings.preset})\nrun directory: {run_dir}",
+            highlight=False,
+            soft_wrap=True,
+        )
         try:
             steps, params = _train_and_log(job, run_dir, signals, restore, stopwatch, console)
         except Interrupted as stop:

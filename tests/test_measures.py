@@ -1,0 +1,199 @@
+"""What is measured of a controller on each demonstration, and controllers whose figures are known."""
+
+import copy
+import csv
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.envs.imitation import training_and_held_out
+from mimic.trainers import plots
+from mimic.trainers.evaluation import Evaluator, Rollouts
+from mimic.trainers.measures import measure
+from mimic.trainers.tracking import run_controller
+
+COUNT, HELD_OUT, HORIZON = 5, 4, 30
+SPLITS = {"train": slice(0, COUNT), "held_out": slice(COUNT, None)}
+LINKS = {"link_lengths": [0.6, 0.4]}
+
+
+@pytest.fixture(scope="module")
+def evaluator():
+    """Of an arm that imitates its equal."""
+    config = mimic.env_config(
+        "planar4dof",
+        expert=LINKS,
+        learner=LINKS,
+        demonstrations={"count": COUNT, "held_out": HELD_OUT},
+        horizon=HORIZON,
+        physics="fused",
+    )
+    training, held_out = training_and_held_out(config)
+    return Evaluator(mimic.ImitationEnv(config, training), held_out)
+
+
+def rollouts(evaluator, turned=(0.0, 0.0), faster=(0.0, 0.0), distance=None):
+    """The learner at the expert's joint angles and velocities, plus something."""
+    given = evaluator.env.demonstrations
+    qpos, qvel = (np.asarray(x[:, 1:], np.float32) for x in (given.qpos + turned, given.qvel + faster))
+    distance = np.zeros(qpos.shape[:2]) if distance is None else distance
+    return Rollouts(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, 0 * qpos, distance)))
+
+
+def test_no_error_where_the_learner_does_as_the_expert(evaluator):
+    """0.05 deg is what the arc cosine leaves of float32 near 1; velocities of some rad/s are rounded by 1e-6."""
+    table = evaluator.table(rollouts(evaluator))
+    assert np.all(table["link_angle_error_deg"] < 0.05)
+    assert np.all(table["angular_velocity_error"] < 1e-5)
+    assert not table["speed_violations"].any() and not table["torque_rms"].any()
+
+
+@pytest.mark.parametrize(("by", "links"), [((0.3, 0.0), (0.3, 0.3)), ((0.0, -0.3), (0, 0.3)), ((0.3, -0.3), (0.3, 0))])
+def test_errors_are_those_of_a_known_turn(evaluator, by, links):
+    """An angle or speed at a joint moves all links beyond it. Tolerances as above."""
+    turned = evaluator.table(rollouts(evaluator, turned=by))
+    names = evaluator.env.learner.link_names
+    for name, angle in zip(names, links, strict=True):
+        np.testing.assert_allclose(turned[f"link_angle_error_deg.{name}"], np.degrees(angle), atol=0.05)
+    np.testing.assert_allclose(turned["link_angle_error_deg"], np.degrees(np.mean(links)), atol=0.05)
+    faster = evaluator.table(rollouts(evaluator, faster=by))
+    np.testing.assert_allclose(faster["angular_velocity_error"], np.mean(links), atol=1e-5)
+    assert np.all(faster["link_angle_error_deg"] < 0.05)
+
+
+def test_angles_count_by_the_share_of_each_expert_link():
+    """One learner link along x against expert links at 0 and at 90 degrees.
+
+    W has 1 + 3/4 and 1 + 1/4, the shares of the expert's links and of the learner's that overlap: 5/12 for the second.
+    """
+    config = mimic.env_config(
+        "planar4dof",
+        expert={"link_lengths": [0.75, 0.25]},
+        learner={"link_lengths": [1.0]},
+        demonstrations={"count": 1, "held_out": 1},
+        horizon=1,
+        physics="fused",
+    )
+    given = training_and_held_out(config)[0]
+    given.qpos[:], given.qvel[:] = [0, np.pi / 2], [0, 2.0]
+    evaluator = Evaluator(mimic.ImitationEnv(config, given), given)
+    still = jnp.zeros((2, 1, 1))
+    table = measure(evaluator.env, evaluator._learner_states(still, still), *(np.zeros((2, 1, 1)),) * 3)
+    np.testing.assert_allclose(table["link_angle_error_deg"], 90 * 5 / 12, atol=0.05)
+    np.testing.assert_allclose(table["angular_velocity_error"], 2 * 5 / 12, rtol=1e-5)
+
+
+def test_torques_and_limits_by_hand(evaluator):
+    env = copy.copy(evaluator.env)
+    scale = np.asarray(env.torque_scale, float)
+    env.learner = env.learner.replace(
+        joint_range=np.array([[-1, 1], [-2, 2]]), velocity_limit=np.array([3.0, 4.0]), torque_limit=scale / 2
+    )
+    share = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, -0.5]])  # of the largest torques, over three steps
+    qpos = np.array([[1.0, -2.0], [1.1, 0.0], [np.nan, 0.0]])
+    qvel = np.array([[3.0, -4.1], [3.1, 4.1], [0.0, -4.0]])
+    count = env.demonstrations.count
+    motion = [np.broadcast_to(x, (count, 3, 2)) for x in (qpos, qvel, share * scale)]
+    states = evaluator._learner_states(*(jnp.asarray(np.nan_to_num(x)) for x in motion[:2]))
+    table = measure(env, states, *motion)
+    expected = {
+        "torque_rms": np.sqrt((0.25 + 1 + 0.25) / 6),
+        "torque_change": np.sqrt((0.25 + 0.25 + 0.25) / 4),
+        "torque_saturation": 1 / 3,
+        "position_violations": 2,  # at the stop is within it, not a number is not
+        "speed_violations": 2,
+        "torque_violations": 1,
+    }
+    for key, value in expected.items():
+        np.testing.assert_allclose(table[key], np.full(count, value), rtol=1e-6)  # the largest torques are in float32
+
+
+def between(evaluator, share):
+    """Distances at a share of the way from the bound to holding still, one for each demonstration: their gaps."""
+    bound, hold = evaluator.lower_bound, evaluator.hold_distance
+    return rollouts(evaluator, distance=bound + np.asarray(share)[:, None] * (hold - bound))
+
+
+def test_gaps_are_of_mean_distances(evaluator):
+    """1e-5: the distances of a rollout are float32."""
+    gap = np.random.default_rng(0).uniform(0, 1, COUNT + HELD_OUT)
+    ran = between(evaluator, gap)
+    np.testing.assert_allclose(evaluator.table(ran)["optimality_gap"], gap, rtol=1e-5)
+    summary = evaluator.summary(ran)
+    for split, part in SPLITS.items():
+        distance, bound, hold = (
+            x[part].mean() for x in (np.asarray(ran.distance), evaluator.lower_bound, evaluator.hold_distance)
+        )
+        assert summary["optimality_gap"][split] == pytest.approx((distance - bound) / (hold - bound), rel=1e-5)
+        assert summary["optimality_gap"][split] != pytest.approx(gap[part].mean(), rel=1e-3)  # not the mean of ratios
+        assert summary["mean_distance"][split] == pytest.approx(distance, rel=1e-5)
+
+
+def test_a_summary_averages_but_counts_violations(evaluator):
+    ran = rollouts(evaluator, faster=(100.0, 0.0))
+    ran = dataclasses.replace(ran, torque=jnp.full_like(ran.torque, 0.5) * evaluator.env.torque_scale)
+    summary = evaluator.summary(ran)
+    assert summary["speed_violations"] == {"train": COUNT * HORIZON, "held_out": HELD_OUT * HORIZON}
+    assert summary["torque_rms"] == pytest.approx({"train": 0.5, "held_out": 0.5}, rel=1e-6)
+
+
+def test_the_worst_are_named_by_their_number_in_the_split(evaluator):
+    worst = evaluator.worst(between(evaluator, [0.1, 0.5, 0.3, 0.2, 0.4, 0.6, 0.9, 0.7, 0.8]))
+    assert {split: list(named) for split, named in worst.items()} == {
+        "train": ["1", "4", "2"],
+        "held_out": ["1", "3", "2"],
+    }
+    assert list(worst["held_out"].values()) == pytest.approx([0.9, 0.8, 0.7], rel=1e-5)
+
+
+def test_the_table_as_a_file(evaluator, tmp_path):
+    ran = between(evaluator, np.linspace(0.1, 0.9, COUNT + HELD_OUT))
+    evaluator.save_table(ran, tmp_path / "demonstrations.csv")
+    assert [path.name for path in tmp_path.iterdir()] == ["demonstrations.csv"]
+    with (tmp_path / "demonstrations.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    numbers = [("train", str(i)) for i in range(COUNT)] + [("held_out", str(i)) for i in range(HELD_OUT)]
+    assert [(row["split"], row["demonstration"]) for row in rows] == numbers
+    for key, values in evaluator.table(ran).items():
+        written = np.array([row[key] for row in rows], values.dtype)  # digits enough for its precision
+        np.testing.assert_array_equal(written, values)
+
+
+@pytest.mark.parametrize("plot", [plots.plot_quality, plots.plot_demonstrations])
+def test_pictures_show_all_and_name_the_controller(evaluator, monkeypatch, tmp_path, plot):
+    """The held-out demonstrations went worse than the training ones, whose axes come first."""
+    figures = []
+    monkeypatch.setattr(plots, "_save", lambda figure, out: figures.append(figure))
+    ran = between(evaluator, [0.1] * COUNT + [3.0, 2.0, 1.0, 0.0])
+    plot(evaluator, ran, tmp_path / "picture.png", controller="pd", title="env")
+    (figure,) = figures
+    assert figure.get_suptitle().startswith("env: pd")
+    assert any(text.get_text().startswith("pd") for text in figure.legends[0].get_texts())
+    for axes in figure.axes:
+        low, high = axes.get_ylim()
+        assert all(np.all((line.get_ydata() >= low) & (line.get_ydata() <= high)) for line in axes.lines)
+
+
+def test_holding_is_what_the_gap_is_measured_against(evaluator):
+    """1e-6: float32, of the same distances in another program."""
+    ran, frequency = run_controller(evaluator, "hold")
+    np.testing.assert_allclose(ran.distance, evaluator.hold_distance, atol=1e-6)
+    assert frequency == 0 and not np.asarray(ran.torque).any()
+
+
+def test_exact_dynamics_track_better_than_none(evaluator):
+    feedback, exact = (run_controller(evaluator, name)[0] for name in ("pd", "computed_torque"))
+    gaps = [evaluator.summary(ran)["optimality_gap"] for ran in (exact, feedback)]
+    for split in SPLITS:
+        assert gaps[0][split] < 1e-3  # 1e-4 by measurement: a torque is held for 0.1 s while the dynamics go on
+        assert 5 * gaps[0][split] < gaps[1][split] < 0.05  # 4e-3 by measurement: it does without the coupling of joints
+
+
+def test_controllers_that_ask_for_too_much_get_the_largest_torque(evaluator):
+    greedy = jax.jit(lambda: evaluator.rollout(lambda state: jnp.array([5.0, -5.0])))()
+    scale = np.asarray(evaluator.env.torque_scale)
+    np.testing.assert_array_equal(greedy.torque, np.broadcast_to(scale * [1, -1], greedy.torque.shape))
