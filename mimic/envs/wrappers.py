@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
-from mimic.envs.imitation import ArmState, ImitationEnv
+from mimic.envs.imitation import FIRST_STEP, ArmState, ImitationEnv
 
 
 class FreshEpisodeWrapper(Wrapper):
@@ -26,7 +26,7 @@ class FreshEpisodeWrapper(Wrapper):
         """Batched reset."""
         state = self.env.reset(rng)
         arm_state: ArmState = state.pipeline_state  # type: ignore[assignment]
-        keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(arm_state.key, 0)
+        keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(arm_state.key, FIRST_STEP)
         steps = jax.vmap(lambda key: jax.random.randint(key, (), 0, self._imitation.config.horizon))(keys)
         arm_state = dataclasses.replace(arm_state, step=steps)
         return state.replace(pipeline_state=arm_state, obs=jax.vmap(self._imitation.observe)(arm_state))

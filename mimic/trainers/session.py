@@ -75,7 +75,8 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         with stopwatch.stage("evaluate"):
             outcome, controller = _outcome(job, params, config.controller)
             figures = {**job.figures(outcome), **job.details(outcome)}
-        report = {**_report(trained, job, figures, stopwatch, steps, 0), **controller}
+        report = _report(trained, job, figures, stopwatch, steps, 0)
+        report |= {**controller, "evaluated": _conditions(trained, config)}
         console.print(report_table(report, job))
         if out:
             out.mkdir()
@@ -110,6 +111,17 @@ def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig
 
     unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
     return trained, PPOJob(trained, run_dir, unseen)
+
+
+def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
+    """What an evaluation was made under."""
+    env = trained.env
+    return {
+        "run": config.run,
+        "demonstrations": config.demonstrations,
+        "physics": env.physics,
+        **dataclasses.asdict(env.randomization),
+    }
 
 
 def _outcome(job: Job, params: Params, controller: str) -> tuple[Any, dict[str, Any]]:
