@@ -88,7 +88,7 @@ def test_every_environment_resets_and_steps():
         state = env.reset(jax.random.PRNGKey(0))
         assert state.obs.shape == (env.observation_size,)
         after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
-        assert after.reward == pytest.approx(-float(after.metrics["distance"]))
+        assert after.reward == pytest.approx(-float(after.metrics["distance"]))  # at rest at home, far from any limit
         assert np.all(np.isfinite(after.obs)) and not after.done
 
 
@@ -121,6 +121,27 @@ def test_a_runaway_ends_the_episode_and_never_pays(planar_env):
     assert after.done == 1 and after.metrics["runaway"] == 1
     worst_rest = -planar_env.config.horizon * float(after.metrics["distance"])
     assert after.reward == pytest.approx(worst_rest, rel=1e-5)
+
+
+def test_hardware_limits_cost_where_they_are_near_and_beyond():
+    free, limited = (
+        mimic.make("panda4dof", physics="fused", demonstrations=FEW, limits=limits, limit_weight=2.0)
+        for limits in ("none", "hardware")
+    )
+    home, still = jnp.asarray(limited.learner.home, jnp.float32), jnp.zeros(4)
+    upper, rated = limited.learner.joint_range[:, 1], limited.learner.velocity_limit
+    assert limited.limit_excess(home, still) == 0
+    beyond = limited.limit_excess(home.at[0].set(upper[0] + 0.02), still)
+    assert beyond == pytest.approx(0.5 * (0.02 + 0.03) / 0.1 / 4, rel=1e-3)  # 3e-7 of an angle, over 0.05
+    assert limited.limit_excess(home.at[0].set(upper[0] + 9.0), still) == pytest.approx(0.5 / 4)
+    assert limited.limit_excess(home, still.at[1].set(-1.5 * rated[1])) == pytest.approx(0.5 / 4)
+    for env, weight in ((free, 0.0), (limited, 2.0)):
+        state = env.reset(jax.random.PRNGKey(0))
+        arm = state.pipeline_state.replace(qvel=still.at[1].set(1.2 * rated[1]))
+        after = jax.jit(env.step)(state.replace(pipeline_state=arm), still)
+        costs = after.metrics["distance"] + weight * after.metrics["limit_excess"]
+        assert after.metrics["limit_excess"] > 0
+        assert after.reward == pytest.approx(-float(costs), rel=1e-6)
 
 
 def test_demonstrations_are_reproducible_and_within_limits():

@@ -25,8 +25,8 @@ from mimic.kinematics import LinkStates, link_states
 _OFFERED_SPEED_FACTOR = 2.0
 # Of a limit, in rad or as a share of the rated speed: where nearness begins to cost, and how much further all it can.
 _MARGIN, _FAR = 0.03, 0.1
-# What is folded into an episode's key for its noise, and for the step that it starts at; 0 to 2 would give the keys that
-# `start` splits it into.
+# What is folded into an episode's key for its noise, and for the step that it starts at; 0 to 2 would give the keys
+# that `start` splits it into.
 _NOISE, FIRST_STEP = 3, 4
 
 
