@@ -104,23 +104,23 @@ class PPOJob(Job):
     def rows(self, figures: Figures) -> list[Row]:
         """The gap and what it is made of."""
         by_split = (
-            ("optimality gap (0 best, 1 holding still)", "optimality_gap", "{:.2%}"),
+            ("optimality gap", "optimality_gap", "{:.2%}"),
             ("mean distance", "mean_distance", "{:.4f}"),
-            ("  lower bound of this arm", "lower_bound", "{:.4f}"),
-            ("  holding the start pose", "hold_distance", "{:.4f}"),
-            ("angle to the expert's links", "link_angle_error_deg", "{:.1f} deg"),
-            ("angular velocity from theirs", "angular_velocity_error", "{:.2f} rad/s"),
-            ("torque, of the largest: rms", "torque_rms", "{:.1%}"),
-            ("  change from step to step, rms", "torque_change", "{:.1%}"),
-            ("  steps with one at its largest", "torque_saturation", "{:.1%}"),
-            ("steps with a joint out of its range", "position_violations", "{:.0f}"),
-            ("  above its rated speed", "speed_violations", "{:.0f}"),
-            ("  above its torque limit", "torque_violations", "{:.0f}"),
+            ("  lower bound (gap 0)", "lower_bound", "{:.4f}"),
+            ("  holding still (1)", "hold_distance", "{:.4f}"),
+            ("angle to expert links", "link_angle_error_deg", "{:.1f} deg"),
+            ("angular velocity error", "angular_velocity_error", "{:.2f} rad/s"),
+            ("torque / largest, rms", "torque_rms", "{:.1%}"),
+            ("  change in a step, rms", "torque_change", "{:.1%}"),
+            ("  steps at the largest", "torque_saturation", "{:.1%}"),
+            ("steps out of range", "position_violations", "{:.0f}"),
+            ("  above rated speed", "speed_violations", "{:.0f}"),
+            ("  above torque limit", "torque_violations", "{:.0f}"),
         )
         rows = [(label, *(form.format(figures[key][split]) for split in SPLITS)) for label, key, form in by_split]
         worst = figures["worst_demonstrations"]
         named = ("  ".join(f"{i}: {gap:.0%}" for i, gap in worst[split].items()) for split in SPLITS)
-        return [*rows, ("worst demonstrations and their gaps", *named)]  # type: ignore[list-item]
+        return [*rows, ("worst (number: gap)", *named)]  # type: ignore[list-item]
 
     def save_outcome(self, folder: Path, outcome: Rollouts, controller: str = "policy") -> None:
         """A table of all demonstrations, the distance over an episode, and in a run directory how it learned."""
