@@ -1,5 +1,6 @@
 """Typed configs: frozen dataclasses as OmegaConf schemas, and what is wrong with a value in one line."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,12 @@ def explain(error: Exception) -> str:
     if " not in " in message and isinstance(parent, DictConfig):
         return f"unknown key {str(key)!r}; valid are {', '.join(str(name) for name in parent if name != 'hydra')}"
     return f"{key}: {message}" if key and str(key) not in message else message
+
+
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Raises a ValueError that names the choices, unless the value is one of them."""
+    if value not in choices:
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
 
 
 def new_file(name: str, path: str) -> Path:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mimic.config import check_choice
 from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
 from mimic.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
 from mimic.embodiment import LIMITS, Embodiment
@@ -43,9 +44,9 @@ class MetricConfig:
     reduction: str = "mean"
 
     def __post_init__(self) -> None:
-        _check_choice("correspondence", self.correspondence, CORRESPONDENCES)
-        _check_choice("rotation_measure", self.rotation_measure, ("cosine", "angle"))
-        _check_choice("reduction", self.reduction, ("mean", "frobenius"))
+        check_choice("correspondence", self.correspondence, CORRESPONDENCES)
+        check_choice("rotation_measure", self.rotation_measure, ("cosine", "angle"))
+        check_choice("reduction", self.reduction, ("mean", "frobenius"))
         if not -math.inf < self.xi < 0:
             raise ValueError(f"xi: expected a finite number below 0 (soft minimum), got {self.xi}")
         for name in ("translation", "rotation", "linear_velocity", "angular_velocity"):
@@ -95,7 +96,7 @@ class DemonstrationConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _check_choice("demonstrations.kind", self.kind, KINDS)
+        check_choice("demonstrations.kind", self.kind, KINDS)
         if self.count < 1 or self.held_out < 1:
             raise ValueError(
                 f"demonstrations: expected count and held_out of at least 1, got {self.count}, {self.held_out}"
@@ -166,8 +167,8 @@ class EnvConfig:
     speed_bound: float = 30.0
 
     def __post_init__(self) -> None:
-        _check_choice("limits", self.limits, LIMITS)
-        _check_choice("physics", self.physics, PHYSICS)
+        check_choice("limits", self.limits, LIMITS)
+        check_choice("physics", self.physics, PHYSICS)
         for name, least in (("horizon", 1), ("substeps", 1), ("preview", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
@@ -232,8 +233,3 @@ class RetargetConfig:
 
 def _given(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
-
-
-def _check_choice(name: str, value: str, valid: tuple[str, ...]) -> None:
-    if value not in valid:
-        raise ValueError(f"{name}: expected one of {', '.join(valid)}, got {value!r}")

@@ -2,11 +2,11 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from omegaconf import MISSING
 
+from mimic.config import check_choice
 from mimic.envs.config import PHYSICS, EnvConfig
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque")
@@ -119,8 +119,8 @@ class PPOConfig(TrainerConfig):
     evaluations: int | None = None
 
     def __post_init__(self) -> None:
-        _check_choice("trainer.preset", self.preset, ("auto", *PRESETS))
-        _check_choice("trainer.name", self.name, ("ppo",))
+        check_choice("trainer.preset", self.preset, ("auto", *PRESETS))
+        check_choice("trainer.name", self.name, ("ppo",))
 
     def resolve(self, backend: str, devices: int = 1) -> "PPOConfig":
         """The same with every field filled in, and the preset's name.
@@ -259,8 +259,8 @@ class PoseMapperConfig(TrainerConfig):
     held_out_poses: int = 10_000
 
     def __post_init__(self) -> None:
-        _check_choice("trainer.preset", self.preset, tuple(MAPPER_PRESETS))
-        _check_choice("trainer.name", self.name, ("pose_mapper",))
+        check_choice("trainer.preset", self.preset, tuple(MAPPER_PRESETS))
+        check_choice("trainer.name", self.name, ("pose_mapper",))
 
     def resolve(self) -> "PoseMapperConfig":
         """The same with every field filled in.
@@ -274,9 +274,9 @@ class PoseMapperConfig(TrainerConfig):
         return resolved
 
     def _check(self) -> None:
-        _check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
-        _check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
-        _check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
+        check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
+        check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
+        check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
         _check_whole(
             self, "heads", "samples", "batch_size", "epochs", "evaluations", "validation_poses", "held_out_poses"
         )
@@ -304,11 +304,6 @@ class PoseMapperConfig(TrainerConfig):
 
 
 TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig, "pose_mapper": PoseMapperConfig}
-
-
-def _check_choice(what: str, value: str, choices: Sequence[str]) -> None:
-    if value not in choices:
-        raise ValueError(f"{what}: expected one of {', '.join(choices)}, got {value!r}")
 
 
 def _check_whole(config: TrainerConfig, *keys: str) -> None:
@@ -371,9 +366,9 @@ class EvaluateConfig:
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
-        _check_choice("controller", self.controller, CONTROLLERS)
+        check_choice("controller", self.controller, CONTROLLERS)
         if self.physics:
-            _check_choice("physics", self.physics, PHYSICS)
+            check_choice("physics", self.physics, PHYSICS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -418,4 +413,4 @@ class RenderConfig:
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
-        _check_choice("split", self.split, ("held_out", "train"))
+        check_choice("split", self.split, ("held_out", "train"))

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from mimic.envs.imitation import ImitationEnv
 from mimic.kinematics import LinkStates
+from mimic.pose import pose_limits
 
 Table = dict[str, Float[np.ndarray, " demonstrations"]]
 _ROUNDING = 1e-5  # what float32 leaves of a torque at its limit, or of a joint at its stop; relative and in rad
@@ -27,8 +28,8 @@ def measure(
     - `torque_rms`: torque as a share of the largest one.
     - `torque_change`: change of the torque from step to step, likewise; 0 is smooth.
     - `torque_saturation`: share of the steps with a torque at its largest.
-    - `position_violations`, `speed_violations`, `torque_violations`: steps with a joint beyond its range, its rated
-      speed, or its torque limit.
+    - `position_violations`, `speed_violations`, `torque_violations`: steps with a joint beyond its range (if that is
+      less than a full turn), its rated speed, or its torque limit.
 
     Args:
       env: with the demonstrations that were imitated.
@@ -46,7 +47,7 @@ def measure(
     turning = expert["angular_velocity"][:, :, :, None] - np.asarray(learner.angular_velocity)[:, :, None]
     relative = torque / np.asarray(env.torque_scale)
     change = np.diff(relative, axis=1)
-    lower, upper = np.asarray(arm.joint_range).T
+    lower, upper = pose_limits(arm, float)
     within = {  # what is not a number, after a runaway, is within nothing
         "position": (qpos >= lower - _ROUNDING) & (qpos <= upper + _ROUNDING),
         "speed": np.abs(qvel) <= np.asarray(arm.velocity_limit) * (1 + _ROUNDING),
