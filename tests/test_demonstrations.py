@@ -15,7 +15,7 @@ from mimic.envs.recording import KINDS
 from mimic.trainers.recording_session import prepare_recording
 from mimic.trainers.retargeting import retarget
 
-DT, SUBSTEPS = 0.1, 5
+DT, SUBSTEPS = 0.1, 10
 TRAIN = ["env=panda4dof", "env.demonstrations.count=1", "env.demonstrations.held_out=1"]
 
 

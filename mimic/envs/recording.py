@@ -38,7 +38,7 @@ def record_demonstrations(
     seed: int = 0,
     horizon: int = 50,
     dt: float = 0.1,
-    substeps: int = 5,
+    substeps: int = 10,
     on_recorded: Callable[[int], None] = lambda redrawn: None,
 ) -> Demonstrations:
     """Records an expert on its way to random goals (paper, "Dynamic Motion Imitation").
