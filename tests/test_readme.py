@@ -51,5 +51,8 @@ def test_the_readme_names_every_environment_and_only_what_exists():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
-    for path in re.findall(r"\]\(((?!http)[^)]+)\)", page.read_text()):
-        assert (page.parent / path).exists(), path
+    for link in re.findall(r"\]\(((?!http)[^)]+)\)", page.read_text()):
+        path, _, heading = link.partition("#")
+        assert (page.parent / path).exists(), link
+        headings = re.findall(r"^#+ (.*)$", (page.parent / path).read_text(), re.MULTILINE) if heading else []
+        assert not heading or heading in [text.lower().replace(" ", "-") for text in headings], link
