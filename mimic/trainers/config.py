@@ -14,7 +14,7 @@ CONTROLLERS = ("policy", "hold", "pd", "computed_torque")
 PRESETS: dict[str, dict[str, Any]] = {
     # Two cores: few environments, many gradient steps on each sample, since the physics is what costs.
     "cpu": {
-        "num_timesteps": 4_000_000,
+        "num_timesteps": 3_000_000,
         "num_envs": 512,
         "unroll_length": 10,
         "batch_size": 128,
