@@ -135,7 +135,7 @@ class ImitationEnv(Env):
             key_noise = jax.random.fold_in(jax.random.fold_in(before.key, _NOISE), step)
             noise = jax.random.normal(key_noise, command.shape)
             torque = jnp.clip(command + randomization.torque_noise * noise, -1.0, 1.0)
-        load = before.load or Load(randomization.mass[0], randomization.damping[0])
+        load = Load(randomization.mass[0], randomization.damping[0]) if before.load is None else before.load
         qpos, qvel = self._advance(before.qpos, before.qvel, torque * self.torque_scale, load)
         runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # also where not a number
         remaining = (self.config.horizon - step).astype(jnp.float32)

@@ -17,11 +17,10 @@ from jaxtyping import Array, Float
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv, link_state_program
 from mimic.imitation import kinematic_bound
-from mimic.trainers.measures import Table, gaps, measure
+from mimic.trainers.measures import WORST, Table, gaps, measure
 
 Controller = Callable[[State], Array]  # state of the environment -> action
 SPLITS = ("train", "held_out")
-_WORST = 3  # demonstrations of each split that are named
 
 
 @struct.dataclass
@@ -129,7 +128,7 @@ class Evaluator:
         gap = self.table(rollouts)["optimality_gap"]
         named = {}
         for split, part in self.parts.items():
-            order = np.argsort(-gap[part])[:_WORST]
+            order = np.argsort(-gap[part])[:WORST]
             named[split] = {str(index): float(gap[part][index]) for index in order}
         return named
 

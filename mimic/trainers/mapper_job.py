@@ -10,7 +10,7 @@ import numpy as np
 
 from mimic.kinematics import link_states
 from mimic.pose import imitate_pose
-from mimic.trainers import mapper_training, plots, runs
+from mimic.trainers import mapper_training, plots
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
 from mimic.trainers.pose_mapper import make_model
@@ -176,15 +176,7 @@ class MapperJob(Job):
     def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
         """In a run directory, how it learned."""
         del outcome, controller
-        if (folder / runs.METRICS).is_file():
-            plots.plot_training(
-                folder / runs.METRICS,
-                folder / "training.png",
-                "quality",
-                "above the optimum [%]",
-                of="poses",
-                title=self._name,
-            )
+        plots.plot_training(folder, "quality", "above the optimum [%]", of="poses", title=self._name)
 
 
 def _key(purpose: int) -> jax.Array:

@@ -10,6 +10,7 @@ from mimic.kinematics import LinkStates
 from mimic.pose import pose_limits
 
 Table = dict[str, Float[np.ndarray, " demonstrations"]]
+WORST = 3  # demonstrations of each split that are named
 _ROUNDING = 1e-5  # what float32 leaves of a torque at its limit, or of a joint at its stop; relative and in rad
 
 

@@ -11,16 +11,21 @@ import matplotlib.pyplot as plt  # noqa: E402
 import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 
+from mimic.trainers.measures import WORST  # noqa: E402
+from mimic.trainers.runs import METRICS  # noqa: E402
+
 if TYPE_CHECKING:
     from mimic.trainers.evaluation import Evaluator, Rollouts
 
 _COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
-_WORST = 3  # demonstrations of each split that are named
 _LABELS = {"train": "training", "held_out": "held-out"}
 
 
-def plot_training(metrics: Path, out: Path, figure_name: str, label: str, *, of: str, title: str) -> None:
-    """A figure in percent over the steps, on training and held-out data, from the metrics of a run."""
+def plot_training(folder: Path, figure_name: str, label: str, *, of: str, title: str) -> None:
+    """A figure in percent over the steps, on training and held-out data; of a folder that holds no run, nothing."""
+    metrics = folder / METRICS
+    if not metrics.is_file():
+        return
     with metrics.open(newline="") as file:
         rows = list(csv.DictReader(file))
     steps = [int(row["step"]) for row in rows]
@@ -33,7 +38,7 @@ def plot_training(metrics: Path, out: Path, figure_name: str, label: str, *, of:
     axes.yaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     axes.grid(alpha=0.3, which="both")
     axes.legend()
-    _save(figure, out)
+    _save(figure, folder / "training.png")
 
 
 def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, controller: str, title: str) -> None:
@@ -70,7 +75,7 @@ def plot_demonstrations(
             table[key][part][order] for key in ("optimality_gap", "lower_bound", "mean_distance", "hold_distance")
         )
         above.plot(place, 100 * gap, ".", color=_COLOURS[split])
-        for x, y, number in zip(place, 100 * gap, order[:_WORST], strict=False):
+        for x, y, number in zip(place, 100 * gap, order[:WORST], strict=False):
             above.annotate(str(number), (x, y), textcoords="offset points", xytext=(4, 2), fontsize=7)
         below.vlines(place, bound, hold, color="lightgrey", lw=1)
         below.plot(place, hold, "_", color="grey", markersize=4, label="holding the start pose")

@@ -129,15 +129,7 @@ class PPOJob(Job):
         names = {"controller": controller.replace("_", " "), "title": self._name}
         plots.plot_quality(self.evaluator, outcome, folder / "quality.png", **names)
         plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", **names)
-        if (folder / runs.METRICS).is_file():
-            plots.plot_training(
-                folder / runs.METRICS,
-                folder / "training.png",
-                "optimality_gap",
-                "optimality gap [%]",
-                of="demonstrations",
-                title=self._name,
-            )
+        plots.plot_training(folder, "optimality_gap", "optimality gap [%]", of="demonstrations", title=self._name)
 
 
 def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
