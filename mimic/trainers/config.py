@@ -30,7 +30,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     # One GPU: as many environments as keep it busy. The high entropy makes the arm try other branches of poses.
     "gpu": {
-        "num_timesteps": 120_000_000,
+        "num_timesteps": 150_000_000,
         "num_envs": 4096,
         "unroll_length": 10,
         "batch_size": 512,
@@ -41,7 +41,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "discounting": 0.95,
         "entropy_cost": 0.2,
         "hidden_layers": [512, 256],
-        "crossovers": 400,
+        "crossovers": 800,
         "evaluations": 8,
     },
 }
