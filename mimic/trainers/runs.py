@@ -4,6 +4,7 @@ import contextlib
 import csv
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import time
@@ -77,8 +78,16 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:
-    """Writes report.json."""
-    write_atomically(run_dir / REPORT, json.dumps(report, indent=2) + "\n")
+    """Writes report.json; what is not a number, as after a divergence, is null there."""
+    write_atomically(run_dir / REPORT, json.dumps(_finite(report), indent=2, allow_nan=False) + "\n")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,54 @@
+"""`python -m benchmarks.rollout`, and how benchmarks take times."""
+
+import time
+
+import jax.numpy as jnp
+import pytest
+
+import mimic
+from benchmarks import rollout
+from benchmarks.timing import time_call, time_program
+
+
+def test_the_time_of_a_call_is_what_it_takes():
+    timing = time_call(lambda: time.sleep(0.03))
+    assert timing.low <= timing.median <= timing.high
+    assert 0.03 <= timing.median < 0.06  # a busy machine wakes late
+
+
+def test_compilation_is_apart_and_memory_is_known():
+    timing = time_program(lambda x: jnp.sin(x) * 2, jnp.ones(1000))
+    assert timing.compile > timing.median > 0
+    assert timing.bytes >= 8000  # a thousand numbers in, and as many out
+    assert set(timing.summary()) == {"compile_s", "median_ms", "spread"}
+
+
+def test_own_programs_are_measured(tmp_path):
+    rows = rollout.run(["panda4dof"], [16], peers=False)
+    assert {(row["group"], row["case"]) for row in rows} == rollout.OWN
+    assert all(row["steps_per_s"] > 0 and row["bytes_per_arm"] > 0 for row in rows)
+    rollout.draw(rows, tmp_path / "rollout.png")
+    assert (tmp_path / "rollout.png").stat().st_size > 10_000
+
+
+def test_a_peer_that_cannot_run_says_why(monkeypatch):
+    def out_of_memory(*_):
+        raise RuntimeError("no room\nand more")
+
+    monkeypatch.setitem(rollout.CASES["physics"], "fused", out_of_memory)
+    monkeypatch.setattr(rollout, "OWN", {("physics", "fused")})
+    (row,) = rollout.run(["panda4dof"], [16], peers=False)
+    assert row["failed"] == "no room"
+
+
+@pytest.mark.parametrize("group, case", [("physics", "C MuJoCo, all cores"), ("part", "observation")])
+def test_peers_run(group, case):
+    env = mimic.make("panda4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    assert rollout.CASES[group][case](env, 16).median > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("group, case", [("physics", "mjx"), ("physics", "mjx.Data carried"), ("environment", "stock")])
+def test_peers_on_mjx_run(group, case):
+    env = mimic.make("panda4dof", demonstrations={"count": 1, "held_out": 1})
+    assert rollout.CASES[group][case](env, 8).median > 0
