@@ -61,7 +61,8 @@ def own_physics(physics: str) -> Case:
         advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
 
         def step(state: Any, torque: jax.Array) -> Any:
-            return jax.vmap(lambda q, v, held: advance(q, v, held, Load()))(*state, torque), None
+            qpos, qvel = state
+            return jax.vmap(lambda q, v, held: advance(q, v, held, Load()))(qpos, qvel, torque), None
 
         return time_program(lambda q, v, torques: jax.lax.scan(step, (q, v), torques)[0], *random_motion(env, arms))
 
