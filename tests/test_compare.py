@@ -1,0 +1,60 @@
+"""`python -m benchmarks.compare`."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks.compare import Figure, figures, moved
+
+
+def _results(**rows):
+    return {"benchmark": "b", "hardware": {"cpu_cores": 2}, "commit": "a", **rows}
+
+
+def test_figures_are_named_by_the_text_and_the_sizes_of_their_row():
+    rows = [{"case": "fused", "arms": 64, "steps_per_s": 10.0, "median_ms": 2.0, "spread": 0.1, "compile_s": 3.0}]
+    found = figures(_results(rows=rows, deep={"a": {"b": 1}}))
+    assert found == {
+        "rows / fused / arms=64 / steps_per_s": Figure(10.0, 1.0),
+        "rows / fused / arms=64 / median_ms": Figure(2.0, 0.2),
+        "rows / fused / arms=64 / compile_s": Figure(3.0, 0.0),
+        "deep / a / b": Figure(1.0, 0.0),
+    }
+
+
+def test_seeds_are_one_figure_with_their_standard_deviation():
+    rows = [{"case": "x", "seed": seed, "gap": gap} for seed, gap in enumerate((1.0, 2.0, 3.0))]
+    assert figures(_results(rows=rows)) == {"rows / x / gap": Figure(2.0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    "before, after, is_moved",
+    [
+        (Figure(1.0, 0.1), Figure(1.19, 0.1), False),  # within both spreads
+        (Figure(1.0, 0.1), Figure(1.21, 0.1), True),
+        (Figure(1.0, 0.0), Figure(1.04, 0.0), False),  # less than the least change
+        (Figure(1.0, 0.0), Figure(0.94, 0.0), True),
+    ],
+)
+def test_moved_is_beyond_the_spread_and_the_least_change(before, after, is_moved):
+    assert bool(moved({"x": before}, {"x": after}, 0.05)) == is_moved
+
+
+def _compare(*paths):
+    return subprocess.run(
+        [sys.executable, "-m", "benchmarks.compare", *map(str, paths)], capture_output=True, text=True, check=False
+    )
+
+
+def test_the_command_shows_what_moved_and_refuses_what_is_no_result(tmp_path):
+    old, new, other = (tmp_path / name for name in ("old.json", "new.json", "other.json"))
+    old.write_text(json.dumps(_results(rows=[{"case": "x", "time": 1.0, "gone": 1.0}])))
+    new.write_text(json.dumps(_results(rows=[{"case": "x", "time": 2.0}])))
+    other.write_text(json.dumps({**_results(), "benchmark": "c"}))
+    shown = _compare(old, new).stdout
+    assert "+100.0%" in shown and "1 of 1 figures moved" in shown and "1 figures are not in the new file" in shown
+    for wrong in (tmp_path / "none.json", other):
+        refused = _compare(old, wrong)
+        assert refused.returncode == 1 and refused.stderr.startswith("error: ") and refused.stderr.count("\n") == 1
