@@ -71,12 +71,12 @@ def gpu_kernel(
         def kernel(*refs: Any) -> None:
             inside = pl.program_id(0) * block + jnp.arange(block) < count  # the last block may stick out
             inputs = [
-                [triton.load(ref.at[:, k], mask=inside, other=0.0) for k in range(ref.shape[1])]
+                [triton.load(ref.at[:, jnp.int32(k)], mask=inside, other=0.0) for k in range(ref.shape[1])]
                 for ref in refs[: len(rows)]
             ]
             for ref, scalars in zip(refs[len(rows) :], program(*inputs), strict=True):
                 for k, value in enumerate(scalars):
-                    triton.store(ref.at[:, k], jnp.broadcast_to(value, block).astype(dtype), mask=inside)
+                    triton.store(ref.at[:, jnp.int32(k)], jnp.broadcast_to(value, block).astype(dtype), mask=inside)
 
         return tuple(
             pl.pallas_call(
