@@ -69,6 +69,7 @@ def gpu_kernel(
         count, dtype = rows[0].shape[0], rows[0].dtype
 
         def kernel(*refs: Any) -> None:
+            # Columns are named by arrays, because interpret mode refuses plain numbers.
             inside = pl.program_id(0) * block + jnp.arange(block) < count  # the last block may stick out
             inputs = [
                 [triton.load(ref.at[:, jnp.int32(k)], mask=inside, other=0.0) for k in range(ref.shape[1])]

@@ -26,10 +26,7 @@ from mimic.distance import (
 from mimic.embodiment import Embodiment
 from mimic.kinematics import joint_values, link_states
 
-MotionDistance = Callable[
-    [Float[Any, " joints"], Float[Any, " joints"], Float[Any, " joints_hat"], Float[Any, " joints_hat"]],
-    Float[Array, ""],
-]
+MotionDistance = Callable[..., Float[Array, ""]]  # expert_qpos, expert_qvel, learner_qpos, learner_qvel
 
 
 def motion_distance(
