@@ -63,7 +63,7 @@ def jax_distance(method: str, arms: Arms) -> Function:
         return kernel_peers.matrix_distance(*arms, np.asarray(correspondence), WEIGHTS)
 
     def composition(*motion: jax.Array) -> jax.Array:
-        states = [mimic.link_states(arm, *motion[2 * side : 2 * side + 2]) for side, arm in enumerate(arms)]
+        states = mimic.link_states(arms[0], *motion[:2]), mimic.link_states(arms[1], *motion[2:])
         return mimic.embodiment_distance(*states, correspondence, WEIGHTS)
 
     return composition
@@ -232,8 +232,8 @@ def print_table(results: Sequence[dict[str, Any]], device: dict[str, float], con
         )
     console.print(table)
     console.print(
-        f"A copy moves {device['copy_bytes_per_second'] / 1e12:.2f} TB/s; multiply-adds run at "
-        f"{device['flops'] / 1e12:.2f} TFLOP/s."
+        f"A copy moves {device['copy_bytes_per_second'] / 1e9:,.0f} GB/s; multiply-adds run at "
+        f"{device['flops'] / 1e9:,.0f} GFLOP/s."
     )
 
 

@@ -63,13 +63,13 @@ def motion_distance(
     arms = expert, learner
 
     def composed(*motion: Array) -> Array:
-        states = [link_states(arm, *motion[2 * side : 2 * side + 2]) for side, arm in enumerate(arms)]
+        states = link_states(expert, *motion[:2]), link_states(learner, *motion[2:])
         return embodiment_distance(*states, correspondence, weights, rotation=rotation, reduction=reduction)
 
     # Refuses what it does not know, for all of the ways below.
     jax.eval_shape(composed, *(jax.ShapeDtypeStruct((arm.num_joints,), jnp.float32) for arm in arms for _ in range(2)))
-    usual = rotation == "cosine" and reduction == "mean" and isinstance(weights, DistanceWeights)
-    if usual and not callable(correspondence) and _is_known((arms, correspondence, weights)):
+    usual = rotation == "cosine" and reduction == "mean" and not callable(correspondence)
+    if usual and isinstance(weights, DistanceWeights) and _is_known((arms, correspondence, weights)):
         distance = _closed_form(arms, _factors(np.asarray(correspondence, float), weights))
     else:
         distance = composed

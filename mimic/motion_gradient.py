@@ -46,16 +46,17 @@ def distance_and_gradient(
     arms = expert, learner
     frames = [joint_frames(arm, *motion[2 * side : 2 * side + 2]) for side, arm in enumerate(arms)]
     links = [link_vectors(arm, own) for arm, own in zip(arms, frames, strict=True)]
-    value, *slopes = _compare(factors, *links)
+    value, slopes = _compare(factors, *links)
     gradients: list[list[Scalar]] = []
-    for arm, *rest in zip(arms, frames, links, slopes, strict=True):
-        gradients.extend(_by_joints(arm, *rest))
+    for side, arm in enumerate(arms):
+        is_wanted = any(index // 2 == side for index in wanted)
+        gradients.extend(_by_joints(arm, frames[side], links[side], slopes[side]) if is_wanted else ([], []))
     return [[value], *(gradients[k] for k in wanted)]
 
 
 def _compare(
     factors: Float[np.ndarray, "parts expert learner"], expert: list[LinkVectors], learner: list[LinkVectors]
-) -> tuple[Scalar, list[LinkVectors], list[LinkVectors]]:
+) -> tuple[Scalar, list[list[LinkVectors]]]:
     """The distance of links, and its slopes with respect to the states of the expert's and of the learner's links."""
     value: Scalar = 0.0
     slopes = [[list(_REST) for _ in links] for links in (expert, learner)]
@@ -72,7 +73,7 @@ def _compare(
             slope = scale(factor * inverse, apart)
         slopes[0][i][part] = subtract(slopes[0][i][part], slope)
         slopes[1][j][part] = add(slopes[1][j][part], slope)
-    return value, *([LinkVectors(*slope) for slope in side] for side in slopes)
+    return value, [[LinkVectors(*slope) for slope in side] for side in slopes]
 
 
 def _inverse_root(square: Scalar) -> Scalar:
