@@ -34,6 +34,7 @@ from mimic.kinematics import (  # noqa: E402
     link_states,
 )
 from mimic.landscape import distance_landscape, local_minima  # noqa: E402
+from mimic.motion import motion_distance  # noqa: E402
 from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ __all__ = [
     "load_mjcf",
     "local_minima",
     "make",
+    "motion_distance",
     "overlap_correspondence",
     "panda",
     "planar_arm",

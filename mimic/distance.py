@@ -19,7 +19,7 @@ Reduction = Literal["mean", "frobenius"]
 ROTATION_MEASURES = ("cosine", "angle")
 REDUCTIONS = ("mean", "frobenius")
 
-_PARTS = ("translation", "rotation", "linear_velocity", "angular_velocity")
+PARTS = ("translation", "rotation", "linear_velocity", "angular_velocity")
 
 
 @struct.dataclass
@@ -101,7 +101,7 @@ def link_distances(
     parts = jax.vmap(over_learner, in_axes=(0, None))(expert_states, learner_states)
     alpha = jax.vmap(jax.vmap(weights))(parts) if callable(weights) else weights
     total: Any = 0.0
-    for part in _PARTS:
+    for part in PARTS:
         distances = getattr(parts, part)
         weight = _weight(part, getattr(alpha, part), distances)  # a constant 0 costs nothing, in time and in NaNs
         total = spatial.plus(total, spatial.times(weight, distances))

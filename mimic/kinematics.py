@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from flax import struct
@@ -44,13 +44,22 @@ class LinkStates:
     angular_velocity: Float[Array, "links 3"] | None
 
 
-class _JointFrame(NamedTuple):
+class JointFrame(NamedTuple):
     """A body that moves with a joint: its rotation from the zero pose, the joint's anchor, and how both move."""
 
     rotation: Rotation
     anchor: Vector
     angular_velocity: Vector
     linear_velocity: Vector
+
+
+class LinkVectors(NamedTuple):
+    """The state of one link as scalar components; the fields are those of `LinkStates`."""
+
+    position: Vector
+    direction: Vector
+    linear_velocity: Vector
+    angular_velocity: Vector
 
 
 def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Frames:
@@ -63,8 +72,8 @@ def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Fr
     Raises:
       ValueError: `qpos` is not one angle for each joint.
     """
-    qpos = _prepare(arm, qpos, "qpos")
-    frames = _joint_frames(arm, qpos, None)
+    qpos = joint_values(arm, qpos, "qpos")
+    frames = joint_frames(arm, qpos, None)
     positions, rotations = [], []
     for link, joint in enumerate(arm.link_joint):
         position, _ = _link_point(arm, frames, link, joint)
@@ -94,21 +103,18 @@ def link_states(
     Raises:
       ValueError: `qpos` or `qvel` is not one number for each joint.
     """
-    qpos = _prepare(arm, qpos, "qpos")
+    qpos = joint_values(arm, qpos, "qpos")
     if qvel is not None:
-        qvel = _prepare(arm, qvel, "qvel")
-    frames = _joint_frames(arm, qpos, qvel)
+        qvel = joint_values(arm, qvel, "qvel")
     unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
-    columns: tuple[list[Vector], ...] = ([], [], [], [])
-    for link, joint in enumerate(arm.link_joint):
-        position, lever = _link_point(arm, frames, link, joint)
-        frame = frames[joint + 1]
-        velocity = spatial.add(frame.linear_velocity, spatial.cross(frame.angular_velocity, lever))
-        direction = spatial.rotate(frame.rotation, spatial.vector(arm.link_rotation[link, :, 0]))
-        state = spatial.scale(unit, position), direction, spatial.scale(unit, velocity), frame.angular_velocity
-        for column, value in zip(columns, state, strict=True):
-            column.append(value)
-    return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
+    links = link_vectors(arm, joint_frames(arm, qpos, qvel))
+    links = [
+        link._replace(
+            position=spatial.scale(unit, link.position), linear_velocity=spatial.scale(unit, link.linear_velocity)
+        )
+        for link in links
+    ]
+    return LinkStates(*(spatial.stack(column, qpos.dtype) for column in zip(*links, strict=True)))
 
 
 def candidate_points(states: LinkStates) -> LinkStates:
@@ -131,8 +137,8 @@ def body_twists(
     Raises:
       ValueError: `qpos` or `qvel` is not one number for each joint.
     """
-    qpos = _prepare(arm, qpos, "qpos")
-    qvel = _prepare(arm, qvel, "qvel")
+    qpos = joint_values(arm, qpos, "qpos")
+    qvel = joint_values(arm, qvel, "qvel")
     omega, v = spatial.ZERO, spatial.ZERO
     twists = [(omega, v)]
     for joint in range(arm.num_joints):
@@ -164,16 +170,24 @@ def axes_and_directions(arm: Embodiment, qpos: Sequence[spatial.Scalar]) -> tupl
       arm: the embodiment.
       qpos: an angle [rad] for each joint.
     """
-    frames = _joint_frames(arm, qpos, None)
+    frames = joint_frames(arm, qpos, None)
     turns = [frame.rotation for frame in frames]
     axes = [spatial.rotate(turn, spatial.vector(axis)) for turn, axis in zip(turns, arm.joint_axis, strict=False)]
     links = zip(arm.link_joint, arm.link_rotation, strict=True)
     return axes, [spatial.rotate(turns[joint + 1], spatial.vector(frame[:, 0])) for joint, frame in links]
 
 
-def _joint_frames(arm: Embodiment, qpos: Any, qvel: Array | None) -> list[_JointFrame]:
-    """The base, then the body behind each joint."""
-    frames = [_JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)]
+def joint_frames(
+    arm: Embodiment, qpos: Sequence[spatial.Scalar] | Array, qvel: Sequence[spatial.Scalar] | Array | None
+) -> list[JointFrame]:
+    """The base, then the body behind each joint, in the base frame and the arm's own unit of length.
+
+    Args:
+      arm: the embodiment.
+      qpos: an angle [rad] for each joint.
+      qvel: a velocity [rad/s] for each joint; at rest where None.
+    """
+    frames = [JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)]
     previous_anchor = spatial.ZERO  # in the zero pose
     for joint in range(arm.num_joints):
         parent = frames[-1]
@@ -185,12 +199,24 @@ def _joint_frames(arm: Embodiment, qpos: Any, qvel: Array | None) -> list[_Joint
             spin = spatial.scale(qvel[joint], spatial.rotate(parent.rotation, axis))
             angular_velocity = spatial.add(angular_velocity, spin)
         rotation = spatial.compose(parent.rotation, spatial.axis_rotation(axis, qpos[joint]))
-        frames.append(_JointFrame(rotation, spatial.add(parent.anchor, lever), angular_velocity, linear_velocity))
+        frames.append(JointFrame(rotation, spatial.add(parent.anchor, lever), angular_velocity, linear_velocity))
         previous_anchor = zero_anchor
     return frames
 
 
-def _link_point(arm: Embodiment, frames: list[_JointFrame], link: int, joint: int) -> tuple[Vector, Vector]:
+def link_vectors(arm: Embodiment, frames: Sequence[JointFrame]) -> list[LinkVectors]:
+    """The links' states, of the frames that `joint_frames` gives."""
+    links = []
+    for link, joint in enumerate(arm.link_joint):
+        position, lever = _link_point(arm, frames, link, joint)
+        frame = frames[joint + 1]
+        velocity = spatial.add(frame.linear_velocity, spatial.cross(frame.angular_velocity, lever))
+        direction = spatial.rotate(frame.rotation, spatial.vector(arm.link_rotation[link, :, 0]))
+        links.append(LinkVectors(position, direction, velocity, frame.angular_velocity))
+    return links
+
+
+def _link_point(arm: Embodiment, frames: Sequence[JointFrame], link: int, joint: int) -> tuple[Vector, Vector]:
     """A link frame's origin, and the lever from the anchor of the joint that moves it."""
     zero_anchor = spatial.vector(arm.joint_anchor[joint]) if joint >= 0 else spatial.ZERO
     zero_lever = spatial.subtract(spatial.vector(arm.link_position[link]), zero_anchor)
@@ -198,7 +224,7 @@ def _link_point(arm: Embodiment, frames: list[_JointFrame], link: int, joint: in
     return spatial.add(frames[joint + 1].anchor, lever), lever
 
 
-def _prepare(arm: Embodiment, values: ArrayLike, what: str) -> Array:
+def joint_values(arm: Embodiment, values: ArrayLike, what: str) -> Array:
     """One floating number for each joint."""
     values = jnp.asarray(values)
     if values.shape != (arm.num_joints,):

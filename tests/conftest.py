@@ -24,6 +24,7 @@ CORE = (
     "imitation",
     "objective",
     "pose",
+    "motion",
 )
 
 

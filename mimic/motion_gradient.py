@@ -1,0 +1,117 @@
+"""The usual embodiment distance of two arms' motions, and its gradient in closed form, on scalar components.
+
+Usual: a given correspondence and constant weights, the smooth rotational measure, the mean. The distance is then a sum
+over pairs of links and parts, sum_k f_k |x_k - y_k| (translation, velocities) + sum_k f_k (pi/4) |e_k - e^_k|^2
+(rotation). Its slopes with respect to the links' states are carried to the joints as forces are by the transposed
+Jacobian: one sweep from the tip to the base, whatever the number of joints.
+"""
+
+import math
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mimic import spatial
+from mimic.distance import PARTS
+from mimic.embodiment import Embodiment
+from mimic.kinematics import JointFrame, LinkVectors, joint_frames, link_vectors
+from mimic.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract
+
+_ROTATION = PARTS.index("rotation")
+_REST = LinkVectors(ZERO, ZERO, ZERO, ZERO)
+
+
+def distance_and_gradient(
+    expert: Embodiment,
+    learner: Embodiment,
+    factors: Float[np.ndarray, "parts expert learner"],
+    wanted: Sequence[int],
+    *motion: Sequence[Scalar],
+) -> list[list[Scalar]]:
+    """The distance, and its gradient by some of the arguments.
+
+    Args:
+      expert: in units of its chain length.
+      learner: likewise.
+      factors: what each part of each pair's distance counts for; one that is 0 costs nothing.
+      wanted: indices into `motion`.
+      *motion: qpos [rad] and qvel [rad/s] of the expert, then of the learner.
+
+    Returns:
+      [distance], then a gradient for each that is wanted.
+    """
+    arms = expert, learner
+    frames = [joint_frames(arm, *motion[2 * side : 2 * side + 2]) for side, arm in enumerate(arms)]
+    links = [link_vectors(arm, own) for arm, own in zip(arms, frames, strict=True)]
+    value, slopes = _compare(factors, *links)
+    gradients: list[list[Scalar]] = []
+    for side, arm in enumerate(arms):
+        is_wanted = any(index // 2 == side for index in wanted)
+        gradients.extend(_by_joints(arm, frames[side], links[side], slopes[side]) if is_wanted else ([], []))
+    return [[value], *(gradients[k] for k in wanted)]
+
+
+def _compare(
+    factors: Float[np.ndarray, "parts expert learner"], expert: list[LinkVectors], learner: list[LinkVectors]
+) -> tuple[Scalar, list[list[LinkVectors]]]:
+    """The distance of links, and its slopes with respect to the states of the expert's and of the learner's links."""
+    value: Scalar = 0.0
+    slopes = [[list(_REST) for _ in links] for links in (expert, learner)]
+    for part, i, j in np.argwhere(factors).tolist():
+        factor = float(factors[part, i, j])
+        apart = subtract(learner[j][part], expert[i][part])
+        square = dot(apart, apart)
+        if part == _ROTATION:
+            value = plus(value, 0.25 * math.pi * factor * square)
+            slope = scale(0.5 * math.pi * factor, apart)
+        else:
+            inverse = _inverse_root(square)
+            value = plus(value, factor * square * inverse)
+            slope = scale(factor * inverse, apart)
+        slopes[0][i][part] = subtract(slopes[0][i][part], slope)
+        slopes[1][j][part] = add(slopes[1][j][part], slope)
+    return value, [[LinkVectors(*slope) for slope in side] for side in slopes]
+
+
+def _inverse_root(square: Scalar) -> Scalar:
+    """1 / sqrt, but finite at 0: a norm and its gradient are then 0 at a match."""
+    if isinstance(square, float):
+        return 1 / math.sqrt(square) if square else 0.0
+    return jax.lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny))
+
+
+def _by_joints(
+    arm: Embodiment, frames: Sequence[JointFrame], links: Sequence[LinkVectors], slopes: Sequence[LinkVectors]
+) -> tuple[list[Scalar], list[Scalar]]:
+    """The gradient by qpos and by qvel.
+
+    With joint k's axis a, its anchor c that moves at u, and the angular velocity w_k of the body behind it, for a link
+    behind it at r = p - c
+
+        dp/dq = a x r    de/dq = a x e    dw/dq = a x (w - w_k)    dv/dq = a x (v - u) + (w_k x a) x r
+                                          dw/dqdot = a             dv/dqdot = a x r
+
+    so that only sums of the slopes and of their moments are needed, over all links behind the joint.
+    """
+    force, push, spin, moment, swing = ZERO, ZERO, ZERO, ZERO, ZERO
+    by_qpos, by_qvel = [], []
+    for joint in reversed(range(arm.num_joints)):
+        for link, slope in ((links[i], slopes[i]) for i, own in enumerate(arm.link_joint) if own == joint):
+            force = add(force, slope.position)
+            push = add(push, slope.linear_velocity)
+            spin = add(spin, slope.angular_velocity)
+            swing = add(swing, cross(link.position, slope.linear_velocity))
+            for state, by_state in zip(link, slope, strict=True):
+                moment = add(moment, cross(state, by_state))
+        frame = frames[joint + 1]
+        axis: Vector = spatial.rotate(frame.rotation, spatial.vector(arm.joint_axis[joint]))
+        about_anchor = subtract(swing, cross(frame.anchor, push))
+        turning = subtract(moment, cross(frame.anchor, force))
+        turning = subtract(turning, cross(frame.linear_velocity, push))
+        turning = add(turning, cross(frame.angular_velocity, subtract(ZERO, add(spin, about_anchor))))
+        by_qpos.append(dot(axis, turning))
+        by_qvel.append(dot(axis, add(spin, about_anchor)))
+    return by_qpos[::-1], by_qvel[::-1]
