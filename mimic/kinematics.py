@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -97,6 +98,36 @@ def link_states(
     qpos = _prepare(arm, qpos, "qpos")
     if qvel is not None:
         qvel = _prepare(arm, qvel, "qvel")
+    columns = _link_state_columns(arm, qpos, qvel, normalized)
+    return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
+
+
+def link_state_table(
+    arm: Embodiment, qpos: Float[np.ndarray, "*batch joints"], qvel: Float[np.ndarray, "*batch joints"]
+) -> LinkStates:
+    """Link states of whole trajectories, by NumPy: what is made once needs no compiler.
+
+    Args:
+      arm: the embodiment.
+      qpos: joint angles [rad].
+      qvel: joint velocities [rad/s].
+
+    Returns:
+      Each [*batch, links, 3]: computed in double precision, rounded to float32.
+    """
+    angles, speeds = (list(np.moveaxis(np.asarray(x, float), -1, 0)) for x in (qpos, qvel))
+    shape = np.shape(qpos)[:-1]
+
+    def table(column: list[Vector]) -> np.ndarray:
+        rows = [[np.broadcast_to(x, shape) for x in row] for row in column]
+        return np.moveaxis(np.asarray(rows, np.float32), (0, 1), (-2, -1)).copy()
+
+    with np.errstate(invalid="ignore", over="ignore"):  # of an arm that ran away
+        return LinkStates(*map(table, _link_state_columns(arm, angles, speeds, normalized=True)))  # pyright: ignore[reportArgumentType]
+
+
+def _link_state_columns(arm: Embodiment, qpos: Any, qvel: Any, normalized: bool) -> tuple[list[Vector], ...]:
+    """Position, direction, linear and angular velocity of each link, as scalar components."""
     frames = _joint_frames(arm, qpos, qvel)
     unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
     columns: tuple[list[Vector], ...] = ([], [], [], [])
@@ -108,7 +139,7 @@ def link_states(
         state = spatial.scale(unit, position), direction, spatial.scale(unit, velocity), frame.angular_velocity
         for column, value in zip(columns, state, strict=True):
             column.append(value)
-    return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
+    return columns
 
 
 def candidate_points(states: LinkStates) -> LinkStates:
@@ -171,7 +202,7 @@ def axes_and_directions(arm: Embodiment, qpos: Sequence[spatial.Scalar]) -> tupl
     return axes, [spatial.rotate(turns[joint + 1], spatial.vector(frame[:, 0])) for joint, frame in links]
 
 
-def _joint_frames(arm: Embodiment, qpos: Any, qvel: Array | None) -> list[_JointFrame]:
+def _joint_frames(arm: Embodiment, qpos: Any, qvel: Any) -> list[_JointFrame]:
     """The base, then the body behind each joint."""
     frames = [_JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)]
     previous_anchor = spatial.ZERO  # in the zero pose

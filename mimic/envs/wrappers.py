@@ -37,14 +37,19 @@ class FreshEpisodeWrapper(Wrapper):
         state = state.replace(done=jnp.zeros_like(state.done), info={**state.info, "steps": steps})
         state = self.env.step(state, action)
         arm_state: ArmState = state.pipeline_state  # type: ignore[assignment]
-        fresh = jax.vmap(self._imitation.start)(arm_state.key)
+        # Observed by itself: all fresh arms are in one pose, which costs less than to observe every arm once more.
+        fresh, fresh_obs = jax.vmap(self._begin)(arm_state.key)
         done = state.done.astype(bool)
 
         def where_done(new, old):
             return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
 
         arm_state = jax.tree.map(where_done, fresh, arm_state)
-        return state.replace(pipeline_state=arm_state, obs=jax.vmap(self._imitation.observe)(arm_state))
+        return state.replace(pipeline_state=arm_state, obs=where_done(fresh_obs, state.obs))
+
+    def _begin(self, key: jax.Array) -> tuple[ArmState, jax.Array]:
+        arm_state = self._imitation.start(key)
+        return arm_state, self._imitation.observe(arm_state)
 
 
 def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn=None) -> Wrapper:

@@ -1,6 +1,7 @@
 """`trainer=ppo`: a policy that moves the learner like the expert, by torques."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -12,6 +13,7 @@ from mimic.trainers import plots, ppo, runs
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.evaluation import SPLITS, Evaluator, Rollouts
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
+from mimic.trainers.prepared import Prepared
 from mimic.trainers.signals import Signals
 
 
@@ -49,26 +51,34 @@ class PPOJob(Job):
             f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once, "
             f"{config.env.physics} physics"
         )
-        controller = ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)
-
-        @jax.jit
-        def program(params: Params) -> Rollouts:
-            return self.evaluator.rollout(controller(params))
-
-        self._program = program
+        self._program = Prepared(self._compile)
 
     def save_inputs(self, run_dir: Path) -> None:
         """The demonstrations."""
         self._demonstrations.save(run_dir / runs.DEMONSTRATIONS)
 
     def params_template(self) -> Params:
-        """Observation statistics, policy and value network."""
+        """Observation statistics, policy and value network: their shapes."""
         return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
+
+    def _compile(self) -> Callable[[Params], Rollouts]:
+        controller = ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)
+
+        def rollouts(params: Params) -> Rollouts:
+            return self.evaluator.rollout(controller(params))
+
+        return jax.jit(rollouts).lower(self.params_template()).compile()
+
+    def prepare(self) -> None:
+        """Begins to compile the evaluation, and to compute what it is measured against, beside the training program."""
+        self._program.start()
+        self.evaluator.prepare()
 
     def train(
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
     ) -> tuple[int, Params]:
         """By brax."""
+        self.prepare()
         return ppo.train(
             self._env,
             self.settings,
@@ -82,7 +92,7 @@ class PPOJob(Job):
     def evaluate(self, params: Params) -> Rollouts:
         """Each demonstration once, without exploration."""
         # From the host: how brax or orbax spread the parameters over devices would each ask for a program of its own.
-        return self._program(jax.device_get(params))
+        return self._program()(jax.device_get(params))
 
     def figures(self, outcome: Rollouts) -> Figures:
         """See `Evaluator.summary`."""
