@@ -9,7 +9,7 @@ import jax
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.trainers import plots, ppo, runs
+from mimic.trainers import ppo, runs
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.evaluation import SPLITS, Evaluator, Rollouts
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
@@ -134,6 +134,8 @@ class PPOJob(Job):
 
     def save_outcome(self, folder: Path, outcome: Rollouts, controller: str = "policy") -> None:
         """A table of all demonstrations, the distance over an episode, and in a run directory how it learned."""
+        from mimic.trainers import plots  # matplotlib, a second; not before there is something to plot
+
         self.evaluator.save_table(outcome, folder / "demonstrations.csv")
         self.evaluator.save_curves(outcome, folder / "quality.csv")
         names = {"controller": controller.replace("_", " "), "title": self._name}
