@@ -115,12 +115,12 @@ def link_state_table(
     Returns:
       Each [*batch, links, 3]: computed in double precision, rounded to float32.
     """
-    angles, speeds = (list(np.moveaxis(np.asarray(x, float), -1, 0)) for x in (qpos, qvel))
     shape = np.shape(qpos)[:-1]
+    angles, speeds = (np.asarray(x, float).reshape(-1, arm.num_joints).T for x in (qpos, qvel))
 
     def table(column: list[Vector]) -> np.ndarray:
-        rows = [[np.broadcast_to(x, shape) for x in row] for row in column]
-        return np.moveaxis(np.asarray(rows, np.float32), (0, 1), (-2, -1)).copy()
+        rows = [np.stack(np.broadcast_arrays(*row, angles[0])[:3], axis=-1) for row in column]
+        return np.stack(rows, axis=1).reshape(*shape, len(rows), 3).astype(np.float32)
 
     with np.errstate(invalid="ignore", over="ignore"):  # of an arm that ran away
         return LinkStates(*map(table, _link_state_columns(arm, angles, speeds, normalized=True)))  # pyright: ignore[reportArgumentType]

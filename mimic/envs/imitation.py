@@ -81,6 +81,8 @@ class ImitationEnv(Env):
         self.correspondence = config.metric.make_correspondence(self.expert, self.learner)
         self.torque_scale = jnp.asarray(_torque_scale(learner, config))
         self.arm = learner
+        home = np.asarray(self.learner.home)
+        self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
         timestep = config.control_dt / config.substeps
         self._advance = make_advance(learner.model, timestep, config.substeps, config.physics)
         if demonstrations is None:
@@ -105,10 +107,10 @@ class ImitationEnv(Env):
         return self.begin(self.start(rng))
 
     def begin(self, arm_state: ArmState) -> State:
-        """An episode from a first state."""
+        """An episode from what `start` gave."""
         zero = jnp.zeros(())
         metrics = {"distance": zero, "limit_excess": zero, "torque_saturation": zero, "runaway": zero}
-        return State(arm_state, self.observe(arm_state), zero, zero, metrics, {})
+        return State(arm_state, self.observe_home(arm_state), zero, zero, metrics, {})
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
         """The first state of an episode, of a random demonstration where none is named."""
@@ -205,6 +207,10 @@ class ImitationEnv(Env):
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """What the learner sees: its own link states, then the expert's now and at the steps ahead."""
         return self._seen(link_states(self.learner, state.qpos, state.qvel), state)
+
+    def observe_home(self, state: ArmState) -> Float[Array, " observation"]:
+        """The same of an arm at rest in its home pose: less to compute, and to compile."""
+        return self._seen(self._home_states, state)
 
     def _seen(self, learner_states: LinkStates, state: ArmState) -> Float[Array, " observation"]:
         seen = [learner_states]

@@ -29,7 +29,7 @@ class FreshEpisodeWrapper(Wrapper):
         keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(arm_state.key, FIRST_STEP)
         steps = jax.vmap(lambda key: jax.random.randint(key, (), 0, self._imitation.config.horizon))(keys)
         arm_state = dataclasses.replace(arm_state, step=steps)
-        return state.replace(pipeline_state=arm_state, obs=jax.vmap(self._imitation.observe)(arm_state))
+        return state.replace(pipeline_state=arm_state, obs=jax.vmap(self._imitation.observe_home)(arm_state))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Batched step."""
@@ -37,7 +37,6 @@ class FreshEpisodeWrapper(Wrapper):
         state = state.replace(done=jnp.zeros_like(state.done), info={**state.info, "steps": steps})
         state = self.env.step(state, action)
         arm_state: ArmState = state.pipeline_state  # type: ignore[assignment]
-        # Observed by itself: all fresh arms are in one pose, which costs less than to observe every arm once more.
         fresh, fresh_obs = jax.vmap(self._begin)(arm_state.key)
         done = state.done.astype(bool)
 
@@ -49,7 +48,7 @@ class FreshEpisodeWrapper(Wrapper):
 
     def _begin(self, key: jax.Array) -> tuple[ArmState, jax.Array]:
         arm_state = self._imitation.start(key)
-        return arm_state, self._imitation.observe(arm_state)
+        return arm_state, self._imitation.observe_home(arm_state)
 
 
 def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn=None) -> Wrapper:

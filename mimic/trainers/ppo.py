@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from brax.envs.base import Env, State
+from brax.envs.base import Env, State, Wrapper
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as brax_ppo
@@ -26,6 +26,9 @@ Params = Any  # observation statistics, policy parameters, value parameters
 OnEvaluation = Callable[[int, Params, dict[str, float]], bool]  # whether that is good enough to stop
 
 
+_LOWERED = "/jax/core/compile/jaxpr_to_mlir_module_duration"  # what JAX tells before it calls the compiler
+
+
 class _NoEpisodes(Env):
     """What brax's own evaluator is given, which compiles its reset although it is never used."""
 
@@ -40,6 +43,30 @@ class _NoEpisodes(Env):
     def step(self, state: State, action: jax.Array) -> State:
         """Never called."""
         raise NotImplementedError
+
+
+class _Announced(Wrapper):
+    """Tells when the first program that steps the environment, the training, has been traced and is to be compiled.
+
+    From then on the compiler leaves Python to other threads; what they traced before would hold the training up.
+    """
+
+    def __init__(self, env: Env, then: Callable[[], None]):
+        super().__init__(env)
+        self._then = then
+        self._traced = False
+        jax.monitoring.register_event_duration_secs_listener(self._on_event)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Of the environment."""
+        self._traced = True
+        return self.env.step(state, action)
+
+    def _on_event(self, event: str, duration_secs: float, **_: Any) -> None:
+        del duration_secs
+        if self._traced and event == _LOWERED:
+            jax.monitoring.unregister_event_duration_listener(self._on_event)
+            self._then()
 
 
 class _GoodEnough(Exception):  # noqa: N818 - not an error: brax has no other way to be stopped
@@ -119,6 +146,7 @@ def train(
     on_evaluation: OnEvaluation,
     signals: Signals,
     restore: tuple[int, Params] | None = None,
+    on_compiling: Callable[[], None] = lambda: None,
 ) -> tuple[int, Params]:
     """Trains a policy; saves a checkpoint before each call of `on_evaluation`.
 
@@ -132,6 +160,7 @@ def train(
       signals: training ends after the next checkpoint if one came.
       restore: steps and parameters to go on from. Networks and observation statistics are kept; the moments of the
         optimiser and the states of the environments start anew.
+      on_compiling: called when the training program begins to compile: time for work in other threads.
 
     Returns:
       Environment steps and parameters at the end.
@@ -166,15 +195,21 @@ def train(
         brax_ppo.train(
             progress_fn=on_metrics,
             policy_params_fn=on_params,
-            **_brax_arguments(env, config, done_steps),
+            **_brax_arguments(env, config, done_steps, on_compiling),
             restore_params=params,
             seed=seed + done_steps,
         )
     return latest["step"], latest["params"]
 
 
-def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> dict[str, Any]:
+def _brax_arguments(
+    env: ImitationEnv, config: PPOConfig, done_steps: int, on_compiling: Callable[[], None]
+) -> dict[str, Any]:
     unused = _NoEpisodes()
+
+    def wrap(env: Env, *how: Any, **more: Any) -> Env:
+        return env if env is unused else _Announced(wrap_for_training(env, *how, **more), on_compiling)
+
     updates_per_batch = config.num_minibatches * config.num_updates_per_batch  # type: ignore[operator]
     updates = config.num_timesteps // config.steps_per_batch * updates_per_batch  # type: ignore[operator]
     done_updates = done_steps // config.steps_per_batch * updates_per_batch
@@ -187,7 +222,7 @@ def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> di
         "num_timesteps": left,
         "num_envs": config.num_envs,
         "episode_length": env.config.horizon + 1,  # the environment ends first
-        "wrap_env_fn": lambda env, *how, **more: env if env is unused else wrap_for_training(env, *how, **more),
+        "wrap_env_fn": wrap,
         "eval_env": unused,
         "learning_rate": LearningRate(rate, rate * final_share, updates, done_updates),
         "entropy_cost": config.entropy_cost,

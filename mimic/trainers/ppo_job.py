@@ -69,8 +69,8 @@ class PPOJob(Job):
 
         return jax.jit(rollouts).lower(self.params_template()).compile()
 
-    def prepare(self) -> None:
-        """Begins to compile the evaluation, and to compute what it is measured against, beside the training program."""
+    def _prepare(self) -> None:
+        """Begins to compile the evaluation, and to compute what it is measured against."""
         self._program.start()
         self.evaluator.prepare()
 
@@ -78,7 +78,6 @@ class PPOJob(Job):
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
     ) -> tuple[int, Params]:
         """By brax."""
-        self.prepare()
         return ppo.train(
             self._env,
             self.settings,
@@ -87,6 +86,7 @@ class PPOJob(Job):
             on_evaluation=on_evaluation,
             signals=signals,
             restore=restore,
+            on_compiling=self._prepare,
         )
 
     def evaluate(self, params: Params) -> Rollouts:
