@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
 from mimic.imitation import kinematic_bound
-from mimic.kinematics import LinkStates, link_state_table
+from mimic.kinematics import link_state_table
 from mimic.pose import pose_limits, shared_joints
 from mimic.trainers.measures import WORST, Table, gaps, measure
 from mimic.trainers.prepared import Prepared
@@ -199,4 +199,3 @@ def _lower_bound(env: ImitationEnv, qpos: np.ndarray, qvel: np.ndarray) -> np.nd
     # On the host's processor in any case: there the program compiles several times faster, and it runs once.
     with jax.default_device(jax.devices("cpu")[0]):
         return np.asarray(jax.jit(jax.vmap(bound))(qpos.astype(np.float32), qvel.astype(np.float32)))
-
