@@ -99,7 +99,7 @@ def test_torques_and_limits_by_hand(evaluator):
     qvel = np.array([[3.0, -4.1], [3.1, 4.1], [0.0, -4.0]])
     count = env.demonstrations.count
     motion = [np.broadcast_to(x, (count, 3, 2)) for x in (qpos, qvel, share * scale)]
-    states = evaluator._learner_states(*(jnp.asarray(np.nan_to_num(x)) for x in motion[:2]))
+    states = link_state_table(evaluator.env.learner, *(np.nan_to_num(x) for x in motion[:2]))
     table = measure(env, states, *motion)
     expected = {
         "torque_rms": np.sqrt((0.25 + 1 + 0.25) / 6),

@@ -115,7 +115,7 @@ def _network_factory(config: PPOConfig) -> Callable[..., ppo_networks.PPONetwork
 
 
 def params_template(config: PPOConfig, observation_size: int, action_size: int) -> Params:
-    """Shapes of the parameters, to restore a checkpoint into."""
+    """Parameters of the right structure, to restore a checkpoint into."""
     networks = make_networks(config, observation_size, action_size)
 
     def initial() -> Params:
@@ -123,7 +123,7 @@ def params_template(config: PPOConfig, observation_size: int, action_size: int) 
         statistics = running_statistics.init_state(specs.Array((observation_size,), jnp.dtype("float32")))
         return statistics, networks.policy_network.init(key), networks.value_network.init(key)
 
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), jax.eval_shape(initial))
+    return jax.jit(initial)()
 
 
 def make_controller(config: PPOConfig, observation_size: int, action_size: int) -> Callable[[Params], Controller]:

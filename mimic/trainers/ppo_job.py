@@ -58,7 +58,7 @@ class PPOJob(Job):
         self._demonstrations.save(run_dir / runs.DEMONSTRATIONS)
 
     def params_template(self) -> Params:
-        """Observation statistics, policy and value network: their shapes."""
+        """Observation statistics, policy and value network."""
         return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
 
     def _compile(self) -> Callable[[Params], Rollouts]:
@@ -67,7 +67,9 @@ class PPOJob(Job):
         def rollouts(params: Params) -> Rollouts:
             return self.evaluator.rollout(controller(params))
 
-        return jax.jit(rollouts).lower(self.params_template()).compile()
+        template = jax.eval_shape(self.params_template)
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
+        return jax.jit(rollouts).lower(shapes).compile()
 
     def _prepare(self) -> None:
         """Begins to compile the evaluation, and to compute what it is measured against."""
