@@ -1,11 +1,15 @@
 """How every command starts and fails: Hydra reads the config, and bad input is one line and exit code 2."""
 
+import contextlib
 import os
 import re
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
+from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
@@ -59,6 +63,27 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
 def _refuse(error: BaseException) -> NoReturn:
     print(f"error: {_one_line(error)}", file=sys.stderr)
     sys.exit(BAD_INPUT)
+
+
+def process_started() -> float:
+    """`time.perf_counter()` at the start of this process; where the system does not tell, what it is now."""
+    now = time.perf_counter()
+    with contextlib.suppress(OSError, AttributeError, ValueError):
+        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])  # since boot: see proc(5)
+        return now - (time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK"))
+    return now
+
+
+def start_backend() -> None:
+    """Lets JAX find its devices while this thread goes on to import: CUDA alone takes seconds."""
+    threading.Thread(target=_find_devices, name="backend").start()
+
+
+def _find_devices() -> None:
+    import jax
+
+    with contextlib.suppress(RuntimeError):  # said by whoever asks for them next
+        jax.devices()
 
 
 def overrides() -> list[str]:

@@ -1,18 +1,15 @@
 """`python -m mimic.evaluate run=DIR`: repeats the report of a run from a checkpoint alone."""
 
-import time
-
-_STARTED = time.perf_counter()
-
-from mimic import cli  # noqa: E402
-from mimic.trainers.config import EvaluateConfig  # noqa: E402
+from mimic import cli
+from mimic.trainers.config import EvaluateConfig
 
 
 def prepare(config: EvaluateConfig) -> cli.Work:
     """The evaluation that the config describes."""
+    cli.start_backend()
     from mimic.trainers import session  # not needed for --help
 
-    return session.prepare_evaluation(config, _STARTED)
+    return session.prepare_evaluation(config, cli.process_started())
 
 
 if __name__ == "__main__":

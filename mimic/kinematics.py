@@ -2,9 +2,10 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
@@ -106,15 +107,44 @@ def link_states(
     qpos = joint_values(arm, qpos, "qpos")
     if qvel is not None:
         qvel = joint_values(arm, qvel, "qvel")
+    columns = _link_state_columns(arm, qpos, qvel, normalized)
+    return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
+
+
+def link_state_table(
+    arm: Embodiment, qpos: Float[np.ndarray, "*batch joints"], qvel: Float[np.ndarray, "*batch joints"]
+) -> LinkStates:
+    """Link states of whole trajectories, by NumPy: what is made once needs no compiler.
+
+    Args:
+      arm: the embodiment.
+      qpos: joint angles [rad].
+      qvel: joint velocities [rad/s].
+
+    Returns:
+      Each [*batch, links, 3]: computed in double precision, rounded to float32.
+    """
+    shape = np.shape(qpos)[:-1]
+    angles, speeds = (np.asarray(x, float).reshape(-1, arm.num_joints).T for x in (qpos, qvel))
+
+    def table(column: list[Vector]) -> np.ndarray:
+        rows = [np.stack(np.broadcast_arrays(*row, angles[0])[:3], axis=-1) for row in column]
+        return np.stack(rows, axis=1).reshape(*shape, len(rows), 3).astype(np.float32)
+
+    with np.errstate(invalid="ignore", over="ignore"):  # of an arm that ran away
+        return LinkStates(*map(table, _link_state_columns(arm, angles, speeds, normalized=True)))  # pyright: ignore[reportArgumentType]
+
+
+def _link_state_columns(arm: Embodiment, qpos: Any, qvel: Any, normalized: bool) -> tuple[list[Vector], ...]:
+    """Position, direction, linear and angular velocity of each link, as scalar components."""
     unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
-    links = link_vectors(arm, joint_frames(arm, qpos, qvel))
     links = [
         link._replace(
             position=spatial.scale(unit, link.position), linear_velocity=spatial.scale(unit, link.linear_velocity)
         )
-        for link in links
+        for link in link_vectors(arm, joint_frames(arm, qpos, qvel))
     ]
-    return LinkStates(*(spatial.stack(column, qpos.dtype) for column in zip(*links, strict=True)))
+    return tuple(list(column) for column in zip(*links, strict=True))
 
 
 def candidate_points(states: LinkStates) -> LinkStates:

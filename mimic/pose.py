@@ -218,11 +218,13 @@ def pose_limits(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shared_joints(
-    expert: Embodiment, learner: Embodiment, values: Float[Array, " expert_joints"]
-) -> Float[Array, " learner_joints"]:
+    expert: Embodiment, learner: Embodiment, values: Float[Any, "*batch expert_joints"]
+) -> Float[Any, "*batch learner_joints"]:
     """The expert's values in the joints that both arms have by name, zero in the learner's others."""
-    index = [expert.joint_names.index(name) if name in expert.joint_names else -1 for name in learner.joint_names]
-    return jnp.where(np.array(index) >= 0, values[np.array(index)], 0)
+    names = expert.joint_names
+    index = np.array([names.index(name) if name in names else -1 for name in learner.joint_names])
+    library = np if isinstance(values, np.ndarray) else jnp
+    return library.where(index >= 0, values[..., index], 0)
 
 
 def _checked_poses(arm: Embodiment, values: ArrayLike, name: str) -> Array:

@@ -126,8 +126,9 @@ def add_outer(matrix: Rotation, a: Vector, b: Vector) -> Rotation:
 
 
 def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:
-    """exp([axis] angle) for a unit axis (Rodrigues)."""
-    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    """exp([axis] angle) for a unit axis (Rodrigues); by NumPy where the angle is its array."""
+    library = np if isinstance(angle, np.ndarray) else jnp
+    sine, cosine = library.sin(angle), library.cos(angle)
     versine = 1 - cosine
 
     def entry(i: int, j: int) -> Scalar:

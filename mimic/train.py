@@ -2,15 +2,16 @@
 
 import time
 
-_process_started = [time.perf_counter()]  # for the first job; those that follow in a sweep start when they start
+from mimic import cli
+from mimic.trainers.config import TrainConfig
 
-from mimic import cli  # noqa: E402
-from mimic.trainers.config import TrainConfig  # noqa: E402
+_process_started = [cli.process_started()]  # for the first job; those that follow in a sweep start when they start
 
 
 def prepare(config: TrainConfig) -> cli.Work:
     """The run that the config describes."""
     began = time.perf_counter()
+    cli.start_backend()
     from mimic.trainers import session  # not needed for --help
 
     started = _process_started.pop() if _process_started else began

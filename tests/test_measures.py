@@ -11,6 +11,7 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
+from mimic.kinematics import link_state_table
 from mimic.trainers import plots
 from mimic.trainers.evaluation import Evaluator, Rollouts
 from mimic.trainers.measures import measure
@@ -81,8 +82,8 @@ def test_angles_count_by_the_share_of_each_expert_link():
     given = training_and_held_out(config)[0]
     given.qpos[:], given.qvel[:] = [0, np.pi / 2], [0, 2.0]
     evaluator = Evaluator(mimic.ImitationEnv(config, given), given)
-    still = jnp.zeros((2, 1, 1))
-    table = measure(evaluator.env, evaluator._learner_states(still, still), *(np.zeros((2, 1, 1)),) * 3)
+    still = np.zeros((2, 1, 1))
+    table = measure(evaluator.env, link_state_table(evaluator.env.learner, still, still), *(np.zeros((2, 1, 1)),) * 3)
     np.testing.assert_allclose(table["link_angle_error_deg"], 90 * 5 / 12, atol=0.05)
     np.testing.assert_allclose(table["angular_velocity_error"], 2 * 5 / 12, rtol=1e-5)
 
@@ -98,7 +99,7 @@ def test_torques_and_limits_by_hand(evaluator):
     qvel = np.array([[3.0, -4.1], [3.1, 4.1], [0.0, -4.0]])
     count = env.demonstrations.count
     motion = [np.broadcast_to(x, (count, 3, 2)) for x in (qpos, qvel, share * scale)]
-    states = evaluator._learner_states(*(jnp.asarray(np.nan_to_num(x)) for x in motion[:2]))
+    states = link_state_table(evaluator.env.learner, *(np.nan_to_num(x) for x in motion[:2]))
     table = measure(env, states, *motion)
     expected = {
         "torque_rms": np.sqrt((0.25 + 1 + 0.25) / 6),

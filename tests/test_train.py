@@ -82,7 +82,9 @@ def test_brax_compiles_its_training_epoch_once(finished):
     shapes = {name: [arguments for other, arguments in programs if other == name] for name, _ in programs}
     assert len(shapes["_fun"]) >= 2  # the resets and the training epoch
     assert len(set(shapes["_fun"])) == len(shapes["_fun"])
-    assert 1 <= len(shapes["program"]) <= 2  # evaluations
+    assert len(shapes["rollouts"]) == 1  # of the evaluation
+    # Most are brax's own small ones, a tenth of a second each on a GPU: 54 where this was written, 80 before.
+    assert len(programs) < 65
 
 
 def test_evaluate_repeats_the_report(finished, tmp_path):

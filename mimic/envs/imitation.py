@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -19,7 +18,7 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.envs.physics import Load, make_advance
 from mimic.envs.recording import record_demonstrations
-from mimic.kinematics import LinkStates, link_states
+from mimic.kinematics import LinkStates, link_state_table, link_states
 
 # The largest torque takes a joint from rest to this multiple of its rated speed in one step.
 _OFFERED_SPEED_FACTOR = 2.0
@@ -82,6 +81,8 @@ class ImitationEnv(Env):
         self.correspondence = config.metric.make_correspondence(self.expert, self.learner)
         self.torque_scale = jnp.asarray(_torque_scale(learner, config))
         self.arm = learner
+        home = np.asarray(self.learner.home)
+        self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
         timestep = config.control_dt / config.substeps
         self._advance = make_advance(learner.model, timestep, config.substeps, config.physics)
         if demonstrations is None:
@@ -97,15 +98,19 @@ class ImitationEnv(Env):
     def _set_demonstrations(self, demonstrations: Demonstrations) -> None:
         demonstrations.check_fits(self.expert, self.config.control_dt, self.config.horizon)
         self.demonstrations = demonstrations
-        qpos, qvel = (jnp.asarray(x, jnp.float32) for x in (demonstrations.qpos, demonstrations.qvel))
-        self.expert_states: LinkStates = link_state_table(self.expert, qpos, qvel)  # made once; `step` looks them up
+        # Made once; `step` looks them up.
+        table = link_state_table(self.expert, demonstrations.qpos, demonstrations.qvel)
+        self.expert_states: LinkStates = jax.tree.map(jnp.asarray, table)
 
     def reset(self, rng: Array) -> State:
         """A new episode: the learner at rest in its home pose, a random demonstration from its first step."""
-        arm_state = self.start(rng)
+        return self.begin(self.start(rng))
+
+    def begin(self, arm_state: ArmState) -> State:
+        """An episode from what `start` gave."""
         zero = jnp.zeros(())
         metrics = {"distance": zero, "limit_excess": zero, "torque_saturation": zero, "runaway": zero}
-        return State(arm_state, self.observe(arm_state), zero, zero, metrics, {})
+        return State(arm_state, self.observe_home(arm_state), zero, zero, metrics, {})
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
         """The first state of an episode, of a random demonstration where none is named."""
@@ -139,7 +144,9 @@ class ImitationEnv(Env):
         qpos, qvel = self._advance(before.qpos, before.qvel, torque * self.torque_scale, load)
         runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # also where not a number
         remaining = (self.config.horizon - step).astype(jnp.float32)
-        distance = jnp.where(runaway, self._worst_distance, self.distance(qpos, qvel, before.demonstration, step))
+        states = link_states(self.learner, qpos, qvel)
+        expert_states = self.expert_at(before.demonstration, step)
+        distance = jnp.where(runaway, self._worst_distance, self.states_distance(expert_states, states))
         excess = jnp.where(runaway, 1.0, self.limit_excess(qpos, qvel))
         steps = jnp.where(runaway, 1.0 + remaining, 1.0)  # as if it stayed this bad: ending early never pays
         done = (runaway | (step >= self.config.horizon)).astype(jnp.float32)
@@ -152,16 +159,21 @@ class ImitationEnv(Env):
             "runaway": runaway.astype(jnp.float32),
         }
         reward = -(distance + self._limit_weight * excess) * steps
-        return state.replace(pipeline_state=after, obs=self.observe(after), reward=reward, done=done, metrics=metrics)
+        obs = self._seen(states, after)
+        return state.replace(pipeline_state=after, obs=obs, reward=reward, done=done, metrics=metrics)
 
     def distance(
         self, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"], demonstration: Array, step: Array
     ) -> Float[Array, ""]:
         """Embodiment distance of a learner's joint state to a demonstration at a step."""
+        return self.states_distance(self.expert_at(demonstration, step), link_states(self.learner, qpos, qvel))
+
+    def states_distance(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, ""]:
+        """Embodiment distance of link states, in this environment's metric."""
         metric = self.config.metric
         return embodiment_distance(
-            self.expert_at(demonstration, step),
-            link_states(self.learner, qpos, qvel),
+            expert_states,
+            learner_states,
             self.correspondence,
             self.weights,
             rotation=metric.rotation_measure,  # type: ignore[arg-type]
@@ -194,7 +206,14 @@ class ImitationEnv(Env):
 
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """What the learner sees: its own link states, then the expert's now and at the steps ahead."""
-        seen = [link_states(self.learner, state.qpos, state.qvel)]
+        return self._seen(link_states(self.learner, state.qpos, state.qvel), state)
+
+    def observe_home(self, state: ArmState) -> Float[Array, " observation"]:
+        """The same of an arm at rest in its home pose: less to compute, and to compile."""
+        return self._seen(self._home_states, state)
+
+    def _seen(self, learner_states: LinkStates, state: ArmState) -> Float[Array, " observation"]:
+        seen = [learner_states]
         seen += [self.expert_at(state.demonstration, state.step + ahead) for ahead in range(self.config.preview + 1)]
         return jnp.concatenate([leaf.ravel() for states in seen for leaf in jax.tree.leaves(states)])
 
@@ -212,21 +231,6 @@ class ImitationEnv(Env):
     def backend(self) -> str:
         """What simulates."""
         return "mjx"
-
-
-def link_state_table(
-    arm: Embodiment,
-    qpos: Float[Array, "demonstrations time joints"],
-    qvel: Float[Array, "demonstrations time joints"],
-) -> LinkStates:
-    """Link states of whole trajectories: each [demonstrations, time, links, 3]."""
-    return link_state_program(arm)(qpos, qvel)
-
-
-def link_state_program(arm: Embodiment) -> Callable[[Array, Array], LinkStates]:
-    """The compiled function behind `link_state_table`, for callers that use it more than once."""
-    over_time = jax.vmap(lambda *motion: link_states(arm, *motion))
-    return jax.jit(jax.vmap(over_time))
 
 
 def _torque_scale(arm: Arm, config: EnvConfig) -> np.ndarray:

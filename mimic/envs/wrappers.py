@@ -29,7 +29,7 @@ class FreshEpisodeWrapper(Wrapper):
         keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(arm_state.key, FIRST_STEP)
         steps = jax.vmap(lambda key: jax.random.randint(key, (), 0, self._imitation.config.horizon))(keys)
         arm_state = dataclasses.replace(arm_state, step=steps)
-        return state.replace(pipeline_state=arm_state, obs=jax.vmap(self._imitation.observe)(arm_state))
+        return state.replace(pipeline_state=arm_state, obs=jax.vmap(self._imitation.observe_home)(arm_state))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Batched step."""
@@ -37,14 +37,18 @@ class FreshEpisodeWrapper(Wrapper):
         state = state.replace(done=jnp.zeros_like(state.done), info={**state.info, "steps": steps})
         state = self.env.step(state, action)
         arm_state: ArmState = state.pipeline_state  # type: ignore[assignment]
-        fresh = jax.vmap(self._imitation.start)(arm_state.key)
+        fresh, fresh_obs = jax.vmap(self._begin)(arm_state.key)
         done = state.done.astype(bool)
 
         def where_done(new, old):
             return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
 
         arm_state = jax.tree.map(where_done, fresh, arm_state)
-        return state.replace(pipeline_state=arm_state, obs=jax.vmap(self._imitation.observe)(arm_state))
+        return state.replace(pipeline_state=arm_state, obs=where_done(fresh_obs, state.obs))
+
+    def _begin(self, key: jax.Array) -> tuple[ArmState, jax.Array]:
+        arm_state = self._imitation.start(key)
+        return arm_state, self._imitation.observe_home(arm_state)
 
 
 def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn=None) -> Wrapper:

@@ -1,7 +1,6 @@
 """How good a controller is: every demonstration once, against the kinematic bound and against holding still."""
 
 import csv
-import functools
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -15,9 +14,12 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from mimic.envs.demonstrations import Demonstrations, concatenate
-from mimic.envs.imitation import ImitationEnv, link_state_program
+from mimic.envs.imitation import ImitationEnv
 from mimic.imitation import kinematic_bound
+from mimic.kinematics import link_state_table
+from mimic.pose import pose_limits, shared_joints
 from mimic.trainers.measures import WORST, Table, gaps, measure
+from mimic.trainers.prepared import Prepared
 
 Controller = Callable[[State], Array]  # state of the environment -> action
 SPLITS = ("train", "held_out")
@@ -56,17 +58,21 @@ class Evaluator:
         self.training_env = env
         self._num_train = env.demonstrations.count
         self.env = env.with_demonstrations(concatenate(env.demonstrations, held_out))
-        self._learner_states = link_state_program(self.env.learner)
+        self._references = Prepared(lambda: _references(self.env))
 
-    @functools.cached_property
+    def prepare(self) -> None:
+        """Begins to compute `lower_bound` and `hold_distance` in the background."""
+        self._references.start()
+
+    @property
     def lower_bound(self) -> Float[np.ndarray, "demonstrations time"]:
-        """The kinematic bound; computed when it is first asked for."""
-        return np.asarray(_lower_bound(self.env))
+        """The kinematic bound; computed when it is first asked for, if not before."""
+        return self._references()[0]
 
-    @functools.cached_property
+    @property
     def hold_distance(self) -> Float[np.ndarray, "demonstrations time"]:
         """Distance of the learner at rest in its home pose."""
-        return np.asarray(_hold_distance(self.env))
+        return self._references()[1]
 
     def rollout(self, controller: Controller) -> Rollouts:
         """Runs a controller on every demonstration; the caller jits this, with the parameters inside."""
@@ -74,8 +80,7 @@ class Evaluator:
 
         def one(demonstration: Array) -> Rollouts:
             key = jax.random.fold_in(jax.random.PRNGKey(0), demonstration)
-            arm_state = env.start(key, demonstration)
-            state = env.reset(key).replace(pipeline_state=arm_state, obs=env.observe(arm_state))
+            state = env.begin(env.start(key, demonstration))
 
             def step(state: State, _: None) -> tuple[State, Rollouts]:
                 action = jnp.clip(controller(state), -1.0, 1.0)
@@ -95,6 +100,7 @@ class Evaluator:
     def table(self, rollouts: Rollouts) -> Table:
         """One row for each demonstration: see `measure`; and mean distance, bound, holding still, and the gap."""
         qpos, qvel, torque = (np.asarray(x) for x in (rollouts.qpos, rollouts.qvel, rollouts.torque))
+        states = link_state_table(self.env.learner, qpos, qvel)
         distances = np.asarray(rollouts.distance), self.lower_bound, self.hold_distance
         distance, bound, hold = (x.mean(axis=1, dtype=float) for x in distances)
         return {
@@ -102,7 +108,7 @@ class Evaluator:
             "mean_distance": distance,
             "lower_bound": bound,
             "hold_distance": hold,
-            **measure(self.env, self._learner_states(rollouts.qpos, rollouts.qvel), qpos, qvel, torque),
+            **measure(self.env, states, qpos, qvel, torque),
         }
 
     def summary(self, rollouts: Rollouts) -> dict[str, Any]:
@@ -161,8 +167,22 @@ def _write_csv(out: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
     os.replace(partial, out)
 
 
-def _lower_bound(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
-    metric, demonstrations = env.config.metric, env.demonstrations
+def _references(env: ImitationEnv) -> tuple[np.ndarray, np.ndarray]:
+    """What a controller is measured against, each [demonstrations, time]: the kinematic bound, and holding still."""
+    steps, home = env.config.horizon, np.asarray(env.learner.home)
+    qpos, qvel = (x[:, 1 : steps + 1] for x in (env.demonstrations.qpos, env.demonstrations.qvel))
+    own_qpos, own_qvel = (shared_joints(env.expert, env.learner, x) for x in (qpos, qvel))
+    own_qpos = np.clip(own_qpos, *pose_limits(env.learner, float))
+    expert = jax.tree.map(lambda x: np.asarray(x)[:, 1 : steps + 1], env.expert_states)
+    distance = jax.jit(jax.vmap(jax.vmap(env.states_distance)))
+    still = link_state_table(env.learner, np.broadcast_to(home, own_qpos.shape), np.zeros_like(own_qvel))
+    own, hold = (np.asarray(distance(expert, x)) for x in (link_state_table(env.learner, own_qpos, own_qvel), still))
+    # Where the learner can do just what the expert does there is nothing to search: no distance is below 0.
+    return (_lower_bound(env, qpos, qvel) if own.any() else own), hold
+
+
+def _lower_bound(env: ImitationEnv, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    metric = env.config.metric
 
     def bound(qpos: Array, qvel: Array) -> Array:
         return kinematic_bound(
@@ -176,15 +196,6 @@ def _lower_bound(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
             reduction=metric.reduction,  # type: ignore[arg-type]
         )
 
-    after_start = slice(1, env.config.horizon + 1)
     # On the host's processor in any case: there the program compiles several times faster, and it runs once.
     with jax.default_device(jax.devices("cpu")[0]):
-        qpos, qvel = (jnp.asarray(x[:, after_start], jnp.float32) for x in (demonstrations.qpos, demonstrations.qvel))
-        return jax.jit(jax.vmap(bound))(qpos, qvel)
-
-
-def _hold_distance(env: ImitationEnv) -> Float[Array, "demonstrations time"]:
-    home = jnp.asarray(env.learner.home, jnp.float32)
-    steps = jnp.arange(1, env.config.horizon + 1)
-    over_time = jax.vmap(lambda demonstration, step: env.distance(home, 0 * home, demonstration, step), (None, 0))
-    return jax.jit(jax.vmap(over_time, (0, None)))(jnp.arange(env.demonstrations.count), steps)
+        return np.asarray(jax.jit(jax.vmap(bound))(qpos.astype(np.float32), qvel.astype(np.float32)))

@@ -10,7 +10,7 @@ import numpy as np
 
 from mimic.kinematics import link_states
 from mimic.pose import imitate_pose
-from mimic.trainers import mapper_training, plots
+from mimic.trainers import mapper_training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
 from mimic.trainers.pose_mapper import make_model
@@ -176,6 +176,8 @@ class MapperJob(Job):
     def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
         """In a run directory, how it learned."""
         del outcome, controller
+        from mimic.trainers import plots  # matplotlib, a second; not before there is something to plot
+
         plots.plot_training(folder, "quality", "above the optimum [%]", of="poses", title=self._name)
 
 

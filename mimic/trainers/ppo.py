@@ -1,7 +1,7 @@
 """Brax PPO on an imitation environment: called as the library that it is, watched from its callback."""
 
 import contextlib
-import functools
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from brax.envs.base import Env, State, Wrapper
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as brax_ppo
@@ -23,6 +24,49 @@ from mimic.trainers.signals import Signals
 
 Params = Any  # observation statistics, policy parameters, value parameters
 OnEvaluation = Callable[[int, Params, dict[str, float]], bool]  # whether that is good enough to stop
+
+
+_LOWERED = "/jax/core/compile/jaxpr_to_mlir_module_duration"  # what JAX tells before it calls the compiler
+
+
+class _NoEpisodes(Env):
+    """What brax's own evaluator is given, which compiles its reset although it is never used."""
+
+    observation_size = action_size = 0
+    backend = ""
+
+    def reset(self, rng: jax.Array) -> State:
+        """Nothing, for each key."""
+        zero = jnp.zeros(rng.shape[0])
+        return State(None, zero, zero, zero)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Never called."""
+        raise NotImplementedError
+
+
+class _Announced(Wrapper):
+    """Tells when the first program that steps the environment, the training, has been traced and is to be compiled.
+
+    From then on the compiler leaves Python to other threads; what they traced before would hold the training up.
+    """
+
+    def __init__(self, env: Env, then: Callable[[], None]):
+        super().__init__(env)
+        self._then = then
+        self._traced = False
+        jax.monitoring.register_event_duration_secs_listener(self._on_event)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Of the environment."""
+        self._traced = True
+        return self.env.step(state, action)
+
+    def _on_event(self, event: str, duration_secs: float, **_: Any) -> None:
+        del duration_secs
+        if self._traced and event == _LOWERED:
+            jax.monitoring.unregister_event_duration_listener(self._on_event)
+            self._then()
 
 
 class _GoodEnough(Exception):  # noqa: N818 - not an error: brax has no other way to be stopped
@@ -54,27 +98,40 @@ def make_networks(config: PPOConfig, observation_size: int, action_size: int) ->
 
 
 def _network_factory(config: PPOConfig) -> Callable[..., ppo_networks.PPONetworks]:
+    """Brax's networks, each initialised by one program: flax would compile one for each operation."""
     hidden = tuple(config.hidden_layers or ())
-    return functools.partial(
-        ppo_networks.make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden
-    )
+
+    def make(*sizes: Any, **more: Any) -> ppo_networks.PPONetworks:
+        networks = ppo_networks.make_ppo_networks(
+            *sizes, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden, **more
+        )
+        policy, value = (
+            dataclasses.replace(network, init=jax.jit(network.init))
+            for network in (networks.policy_network, networks.value_network)
+        )
+        return networks.replace(policy_network=policy, value_network=value)
+
+    return make
 
 
 def params_template(config: PPOConfig, observation_size: int, action_size: int) -> Params:
     """Parameters of the right structure, to restore a checkpoint into."""
     networks = make_networks(config, observation_size, action_size)
-    key = jax.random.PRNGKey(0)
-    statistics = running_statistics.init_state(specs.Array((observation_size,), jnp.dtype("float32")))
-    return statistics, networks.policy_network.init(key), networks.value_network.init(key)
+
+    def initial() -> Params:
+        key = jax.random.PRNGKey(0)
+        statistics = running_statistics.init_state(specs.Array((observation_size,), jnp.dtype("float32")))
+        return statistics, networks.policy_network.init(key), networks.value_network.init(key)
+
+    return jax.jit(initial)()
 
 
 def make_controller(config: PPOConfig, observation_size: int, action_size: int) -> Callable[[Params], Controller]:
     """The deterministic policy as a function of its parameters."""
     make_policy = ppo_networks.make_inference_fn(make_networks(config, observation_size, action_size))
-    unused_key = jax.random.PRNGKey(0)
 
     def controller(params: Params) -> Controller:
-        policy = make_policy(params, deterministic=True)
+        policy, unused_key = make_policy(params, deterministic=True), jax.random.PRNGKey(0)
         return lambda state: policy(state.obs, unused_key)[0]
 
     return controller
@@ -89,6 +146,7 @@ def train(
     on_evaluation: OnEvaluation,
     signals: Signals,
     restore: tuple[int, Params] | None = None,
+    on_compiling: Callable[[], None] = lambda: None,
 ) -> tuple[int, Params]:
     """Trains a policy; saves a checkpoint before each call of `on_evaluation`.
 
@@ -102,6 +160,7 @@ def train(
       signals: training ends after the next checkpoint if one came.
       restore: steps and parameters to go on from. Networks and observation statistics are kept; the moments of the
         optimiser and the states of the environments start anew.
+      on_compiling: called when the training program begins to compile: time for work in other threads.
 
     Returns:
       Environment steps and parameters at the end.
@@ -118,10 +177,13 @@ def train(
         save_checkpoint(run_dir, step, params)
         latest.update(step=step, params=params)
         if step == done_steps:
-            on_evaluation(step, params, {})
+            # Looked at with the first result: the evaluation compiles while brax compiles the training.
+            latest["start"] = jax.device_get(params)
             signals.check()
 
     def on_metrics(_: int, metrics: dict[str, Any]) -> None:
+        if "start" in latest:
+            on_evaluation(done_steps, latest.pop("start"), {})
         named = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
         enough = on_evaluation(latest["step"], latest["params"], named)
         if latest["step"] < config.num_timesteps:  # else all is done, and there is nothing to resume
@@ -133,14 +195,21 @@ def train(
         brax_ppo.train(
             progress_fn=on_metrics,
             policy_params_fn=on_params,
-            **_brax_arguments(env, config, done_steps),
+            **_brax_arguments(env, config, done_steps, on_compiling),
             restore_params=params,
             seed=seed + done_steps,
         )
     return latest["step"], latest["params"]
 
 
-def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> dict[str, Any]:
+def _brax_arguments(
+    env: ImitationEnv, config: PPOConfig, done_steps: int, on_compiling: Callable[[], None]
+) -> dict[str, Any]:
+    unused = _NoEpisodes()
+
+    def wrap(env: Env, *how: Any, **more: Any) -> Env:
+        return env if env is unused else _Announced(wrap_for_training(env, *how, **more), on_compiling)
+
     updates_per_batch = config.num_minibatches * config.num_updates_per_batch  # type: ignore[operator]
     updates = config.num_timesteps // config.steps_per_batch * updates_per_batch  # type: ignore[operator]
     done_updates = done_steps // config.steps_per_batch * updates_per_batch
@@ -153,7 +222,8 @@ def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> di
         "num_timesteps": left,
         "num_envs": config.num_envs,
         "episode_length": env.config.horizon + 1,  # the environment ends first
-        "wrap_env_fn": wrap_for_training,
+        "wrap_env_fn": wrap,
+        "eval_env": unused,
         "learning_rate": LearningRate(rate, rate * final_share, updates, done_updates),
         "entropy_cost": config.entropy_cost,
         "discounting": config.discounting,
@@ -168,5 +238,6 @@ def _brax_arguments(env: ImitationEnv, config: PPOConfig, done_steps: int) -> di
         "max_grad_norm": config.max_grad_norm,
         "network_factory": _network_factory(config),
         "num_evals": evaluations + 1,
+        "num_eval_envs": 1,
         "run_evals": False,  # our evaluator's program is smaller, and it knows the held-out demonstrations
     }

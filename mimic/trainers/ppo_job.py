@@ -1,6 +1,7 @@
 """`trainer=ppo`: a policy that moves the learner like the expert, by torques."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -8,10 +9,11 @@ import jax
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.trainers import plots, ppo, runs
+from mimic.trainers import ppo, runs
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.evaluation import SPLITS, Evaluator, Rollouts
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
+from mimic.trainers.prepared import Prepared
 from mimic.trainers.signals import Signals
 
 
@@ -49,13 +51,7 @@ class PPOJob(Job):
             f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once, "
             f"{config.env.physics} physics"
         )
-        controller = ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)
-
-        @jax.jit
-        def program(params: Params) -> Rollouts:
-            return self.evaluator.rollout(controller(params))
-
-        self._program = program
+        self._program = Prepared(self._compile)
 
     def save_inputs(self, run_dir: Path) -> None:
         """The demonstrations."""
@@ -64,6 +60,21 @@ class PPOJob(Job):
     def params_template(self) -> Params:
         """Observation statistics, policy and value network."""
         return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
+
+    def _compile(self) -> Callable[[Params], Rollouts]:
+        controller = ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)
+
+        def rollouts(params: Params) -> Rollouts:
+            return self.evaluator.rollout(controller(params))
+
+        template = jax.eval_shape(self.params_template)
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
+        return jax.jit(rollouts).lower(shapes).compile()
+
+    def _prepare(self) -> None:
+        """Begins to compile the evaluation, and to compute what it is measured against."""
+        self._program.start()
+        self.evaluator.prepare()
 
     def train(
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
@@ -77,12 +88,13 @@ class PPOJob(Job):
             on_evaluation=on_evaluation,
             signals=signals,
             restore=restore,
+            on_compiling=self._prepare,
         )
 
     def evaluate(self, params: Params) -> Rollouts:
         """Each demonstration once, without exploration."""
         # From the host: how brax or orbax spread the parameters over devices would each ask for a program of its own.
-        return self._program(jax.device_get(params))
+        return self._program()(jax.device_get(params))
 
     def figures(self, outcome: Rollouts) -> Figures:
         """See `Evaluator.summary`."""
@@ -124,6 +136,8 @@ class PPOJob(Job):
 
     def save_outcome(self, folder: Path, outcome: Rollouts, controller: str = "policy") -> None:
         """A table of all demonstrations, the distance over an episode, and in a run directory how it learned."""
+        from mimic.trainers import plots  # matplotlib, a second; not before there is something to plot
+
         self.evaluator.save_table(outcome, folder / "demonstrations.csv")
         self.evaluator.save_curves(outcome, folder / "quality.csv")
         names = {"controller": controller.replace("_", " "), "title": self._name}

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import platform
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -18,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mimic.config import explain, schema, to_dict
 from mimic.trainers.config import TRAINERS, TrainConfig
+from mimic.trainers.prepared import WAITED
 
 CONFIG, REPORT, METRICS, DEMONSTRATIONS = "config.yaml", "report.json", "metrics.csv", "demonstrations.npz"
 _PACKAGES = ("mimic-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -144,19 +146,23 @@ class MetricsLog:
 
 
 class Stopwatch:
-    """Wall time by stage, with the time that JAX traces and compiles kept apart. Stages may lie within stages."""
+    """Wall time by stage, with the time that JAX traces and compiles kept apart. Stages may lie within stages.
 
-    _COMPILE_EVENTS = ("/jax/core/compile/",)
+    What compiles in other threads counts as far as this one waits for it.
+    """
+
+    _COMPILE_EVENTS = ("/jax/core/compile/", WAITED)
 
     def __init__(self, started: float):
         """`started`: `time.perf_counter()` at the start of the process."""
         self.started = started
         self._compiling = 0.0
+        self._thread = threading.get_ident()
         self.seconds: dict[str, float] = {"import": time.perf_counter() - started, "compile": 0.0}
         jax.monitoring.register_event_duration_secs_listener(self._count)
 
     def _count(self, event: str, duration_secs: float, **_: Any) -> None:
-        if event.startswith(self._COMPILE_EVENTS):
+        if event.startswith(self._COMPILE_EVENTS) and threading.get_ident() == self._thread:
             self._compiling += duration_secs
 
     @contextlib.contextmanager

@@ -1,0 +1,42 @@
+"""Work that goes on in the background: compilers leave Python free to do something else."""
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Generic, TypeVar
+
+import jax
+
+WAITED = "/mimic/prepared/wait"  # an event of `jax.monitoring`
+
+T = TypeVar("T")
+
+
+class Prepared(Generic[T]):
+    """What is made once: in a thread of its own from `start` on, else when it is first asked for.
+
+    Args:
+      make: returns it; what it raises is raised where it is asked for.
+    """
+
+    def __init__(self, make: Callable[[], T]):
+        self._make = make
+        self._future: Future[T] | None = None
+
+    def start(self) -> None:
+        """Begins, unless it has begun."""
+        if self._future is None:
+            executor = ThreadPoolExecutor(1, thread_name_prefix="prepared")
+            self._future = executor.submit(self._make)
+            executor.shutdown(wait=False)
+
+    def __call__(self) -> T:
+        """The result; waits for it."""
+        if self._future is None:
+            made, self._future = self._make(), Future()
+            self._future.set_result(made)
+        if not self._future.done():
+            began = time.perf_counter()
+            self._future.result()
+            jax.monitoring.record_event_duration_secs(WAITED, time.perf_counter() - began)
+        return self._future.result()

@@ -1,0 +1,103 @@
+"""What happens before the first training step: nothing heavy is imported, compiled or computed that is not needed."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic import cli
+from mimic.envs.imitation import training_and_held_out
+from mimic.envs.wrappers import wrap_for_training
+from mimic.kinematics import link_state_table
+from mimic.trainers import evaluation
+from mimic.trainers.config import PRESETS, PPOConfig
+from mimic.trainers.evaluation import Evaluator
+from mimic.trainers.prepared import Prepared
+
+HEAVY = ("brax", "mujoco.mjx", "orbax", "matplotlib", "tensorboardX", "mink", "optax", "scipy", "trimesh")
+REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_initialized()\nprint(*sys.modules)"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import mimic, sys",
+        "import sys\nfrom mimic import cli, train\nsys.argv = ['mimic.train', '--help']\n"
+        "try:\n    cli.run(train.prepare, 'train')\nexcept SystemExit:\n    pass",
+    ],
+    ids=["import", "help"],
+)
+def test_what_is_heavy_is_imported_when_it_is_needed(code):
+    result = subprocess.run([sys.executable, "-c", code + REPORT], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr[-2000:]
+    imported = set(result.stdout.splitlines()[-1].split())
+    assert "mimic.envs.config" in imported
+    assert not imported.intersection(HEAVY)
+
+
+def test_the_process_started_before_now():
+    code = "import time\nfrom mimic import cli\nprint(time.perf_counter() - cli.process_started())"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert 0 <= float(result.stdout) < 60  # imports, on a busy machine; a wrong clock would be off by its uptime
+    assert cli.process_started() == pytest.approx(cli.process_started(), abs=0.05)  # ticks of 0.01 s
+
+
+def test_the_table_of_link_states_is_what_they_are():
+    arm = mimic.panda(locked=[3])
+    qpos, qvel = np.random.default_rng(0).normal(size=(2, 3, 4, arm.num_joints))
+    table = link_state_table(arm, qpos, qvel)
+    one_by_one = jax.vmap(jax.vmap(lambda *motion: mimic.link_states(arm, *motion)))(
+        jnp.asarray(qpos), jnp.asarray(qvel)
+    )
+    for name, values in vars(one_by_one).items():
+        found = getattr(table, name)
+        assert isinstance(found, np.ndarray) and found.dtype == np.float32
+        np.testing.assert_allclose(found, values, atol=1e-5)  # float32 against float64 that is rounded
+
+
+def test_a_learner_that_can_do_what_the_expert_does_needs_no_search(monkeypatch):
+    monkeypatch.setattr(evaluation, "kinematic_bound", None)  # would fail
+    config = mimic.env_config("panda7dof", demonstrations={"count": 2, "held_out": 1}, physics="fused")
+    training, held_out = training_and_held_out(config)
+    evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
+    assert evaluator.lower_bound.shape == evaluator.hold_distance.shape == (3, 50)
+    assert not evaluator.lower_bound.any() and evaluator.hold_distance[:, -1].min() > 0.01
+
+
+def test_observations_of_fresh_episodes_fit_their_states():
+    """In a batch of which some episodes end: the wrapper puts the observations together by itself."""
+    env = mimic.make("planar4dof", demonstrations={"count": 3}, physics="fused")
+    wrapped = wrap_for_training(env, env.config.horizon + 1)
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
+    step, observe = jax.jit(wrapped.step), jax.jit(jax.vmap(env.observe))
+    ended = 0.0
+    for _ in range(12):
+        np.testing.assert_allclose(state.obs, observe(state.pipeline_state), atol=1e-5)
+        state = step(state, jnp.full((16, env.action_size), 0.3))
+        ended += float(state.done.sum())
+    assert ended > 0
+
+
+def test_what_is_prepared_is_made_once():
+    made = []
+    lazy, started = Prepared(lambda: made.append("lazy")), Prepared(lambda: made.append("started"))
+    started.start()
+    started.start()
+    for prepared in (started, started, lazy, lazy):
+        prepared()
+    assert made == ["started", "lazy"]
+    failing = Prepared(lambda: 1 / 0)
+    failing.start()
+    with pytest.raises(ZeroDivisionError):
+        failing()
+
+
+def test_a_run_with_a_target_looks_more_often():
+    usual, targeted = (PPOConfig(target_gap=gap).resolve("cpu").evaluations for gap in (0.0, 0.02))
+    assert usual and targeted
+    assert usual == PRESETS["cpu"]["evaluations"] and targeted > usual
+    assert PPOConfig(target_gap=0.02, evaluations=3).resolve("cpu").evaluations == 3
