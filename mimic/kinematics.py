@@ -132,7 +132,7 @@ def link_state_table(
         return np.stack(rows, axis=1).reshape(*shape, len(rows), 3).astype(np.float32)
 
     with np.errstate(invalid="ignore", over="ignore"):  # of an arm that ran away
-        return LinkStates(*map(table, _link_state_columns(arm, angles, speeds, normalized=True)))  # pyright: ignore[reportArgumentType]
+        return LinkStates(*map(table, _link_state_columns(arm, [*angles], [*speeds], normalized=True)))  # pyright: ignore[reportArgumentType]
 
 
 def _link_state_columns(arm: Embodiment, qpos: Any, qvel: Any, normalized: bool) -> tuple[list[Vector], ...]:
