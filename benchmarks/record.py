@@ -35,9 +35,16 @@ def commit_id() -> str:
     return found.stdout.strip() if found.returncode == 0 else "unknown"
 
 
-def train(run_dir: Path, arguments: Sequence[str]) -> dict[str, Any]:
-    """One training run, cold, into a new folder: its report, and the wall time of the whole process [s]."""
-    command = [sys.executable, "-m", "mimic.train", *arguments, f"run_dir={run_dir}", "compilation_cache="]
+def train(run_dir: Path, arguments: Sequence[str], cache: Path | None = None) -> dict[str, Any]:
+    """One training run into a new folder: its report, and the wall time of the whole process [s].
+
+    Args:
+      run_dir: the new folder.
+      arguments: of `python -m mimic.train`.
+      cache: where compiled programs are kept; the run is cold where None, or where the folder is empty.
+    """
+    command = [sys.executable, "-m", "mimic.train", *arguments, f"run_dir={run_dir}"]
+    command.append(f"compilation_cache={cache or ''}")
     began = time.perf_counter()
     finished = subprocess.run(command, capture_output=True, text=True, check=False)
     wall = time.perf_counter() - began

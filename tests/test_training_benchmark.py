@@ -1,0 +1,49 @@
+"""`python -m benchmarks.training`."""
+
+import jax
+import pytest
+from rich.console import Console
+
+from benchmarks import training
+from mimic import cli
+
+
+@pytest.mark.parametrize(
+    "gaps, reached",
+    [
+        ([0.5, 0.02, 0.05, 0.02, 0.01, 0.02, 0.3], 3.0),  # the first time did not last
+        ([0.5, 0.4, 0.3, 0.01], 3.0),  # and then it ended
+        ([0.5, 0.01, 0.03], None),
+    ],
+)
+def test_the_goal_is_reached_when_it_is_held(gaps, reached, tmp_path):
+    rows = [f"{step},{gap},{step}.0" for step, gap in enumerate(gaps)]
+    (tmp_path / "metrics.csv").write_text("\n".join(["step,quality/optimality_gap.train,wall_time_s", *rows]))
+    assert training.time_to_goal(tmp_path / "metrics.csv", 0.02) == reached
+
+
+def test_a_case_runs_cold_and_warm(monkeypatch, tmp_path):
+    small = (
+        "env=planar4dof", "env.physics=fused", "env.demonstrations.count=2", "env.demonstrations.held_out=1",
+        "trainer.preset=cpu", "trainer.num_timesteps=5000", "trainer.num_envs=16", "trainer.batch_size=16",
+        "trainer.num_minibatches=2", "trainer.num_updates_per_batch=1", "trainer.evaluations=1",
+    )  # fmt: skip
+    monkeypatch.setitem(training.CASES, "small", training.Case(small, goal=1e9))
+    cold, warm = training.run_case("small", seed=1)
+    assert (cold["start"], warm["start"]) == ("cold", "warm")
+    assert 0 < cold["to_goal_s"] < cold["process_wall_s"] + 1
+    # Programs come out of the cache, and the same seed gives the same policy.
+    assert warm["report"]["wall_time_s"]["compile"] < cold["report"]["wall_time_s"]["compile"]
+    assert warm["report"]["optimality_gap"] == cold["report"]["optimality_gap"]
+    Console(file=(tmp_path / "table").open("w")).print(training.table([cold, warm]))
+
+
+def test_cases_have_arguments_that_the_command_takes():
+    import hydra
+
+    cli._register_schemas()
+    with hydra.initialize_config_module("mimic.conf", version_base="1.3"):
+        for case in training.CASES.values():
+            for on in case.on.values() or [()]:
+                hydra.compose("train", [*case.arguments, *on])
+    assert jax.default_backend() in training.CASES["one_demonstration"].on
