@@ -7,11 +7,12 @@ overlap correspondence, the mean; "gradient" is the value with the gradient by t
 both arms'. The pairs of poses are made on the device. Batches are of the Panda with 7 joints and the one with 4; links
 are of two planar arms with as many. `mimic` is `motion_distance`, `composition` its parts as they are called one by
 one, `matrices` a straightforward JAX program on 4x4 matrices, `torch` the same in PyTorch, where it is installed. What
-does not fit into memory, or would take more than PATIENCE seconds a call, has no figures. Limits of the device, from
-the same run: memory traffic of a copy, and the rate of fused multiply-adds.
+does not fit into memory, or follows a case of more than PATIENCE seconds a call, has no figures. Limits of the device,
+from the same run: memory traffic of a copy, and the rate of fused multiply-adds.
 """
 
 import argparse
+import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
@@ -28,14 +29,14 @@ import mimic
 from benchmarks import kernel_peers
 from benchmarks.kernel_figure import plot
 from benchmarks.record import write_results
+from benchmarks.timing import Timing, compiled, time_call
 
 BATCHES = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
 LINKS = (3, 4, 7, 16, 32, 64)
 METHODS = ("mimic", "composition", "matrices", "torch", "torch.compile")
 QUANTITIES = {"value": (), "gradient": (2, 3), "all": (0, 1, 2, 3)}  # what is differentiated by
 WEIGHTS = mimic.PAPER_WEIGHTS
-PATIENCE = 10.0  # s
-SHORTEST = 0.02  # s, of what is timed at once: shorter calls are repeated
+PATIENCE = 1.0  # s a call; the next case is about ten times as large
 JUDGED = 1000  # pairs that are compared with double precision
 TWO_TO = {"copy": 26, "multiply_add": 22}  # numbers that the limits are measured with
 
@@ -95,35 +96,19 @@ def reference(arms: Arms, motions: Sequence[jax.Array], quantity: str) -> Any:
         return jax.tree.map(np.asarray, jax.jit(batched(jax_distance("composition", arms), quantity))(*numbers))
 
 
-def timed(call: Callable[[], Any], wait: Callable[[Any], Any], repeats: int) -> dict[str, Any]:
-    """Seconds of a call that is ready to run: median and interquartile range."""
-
-    def seconds(calls: int) -> float:
-        began = time.perf_counter()
-        for _ in range(calls):
-            result = call()
-        wait(result)
-        return (time.perf_counter() - began) / calls
-
-    seconds(1)
-    first = seconds(1)
-    calls = max(1, round(SHORTEST / first))
-    taken = [first] if first > PATIENCE else [seconds(calls) for _ in range(repeats)]
-    low, median, high = np.quantile(taken, (0.25, 0.5, 0.75))
-    return {"seconds": float(median), "iqr_s": float(high - low), "calls": calls}
-
-
-def run_jax(method: str, arms: Arms, batch: int, quantity: str, repeats: int) -> dict[str, Any]:
+def run_jax(method: str, arms: Arms, batch: int, quantity: str) -> dict[str, Any]:
     motions = random_motions(arms, batch)
-    began = time.perf_counter()
-    program = jax.jit(batched(jax_distance(method, arms), quantity)).lower(*motions).compile()
-    compile_s = time.perf_counter() - began
-    figures = timed(lambda: program(*motions), jax.block_until_ready, repeats)
+    program, compile_s = compiled(batched(jax_distance(method, arms), quantity), *motions)
+    timing = dataclasses.replace(time_call(lambda: program(*motions)), compile=compile_s)
     found = jax.tree.map(lambda x: np.asarray(x[:JUDGED]), program(*motions))
-    return {"compile_s": compile_s, **figures, "largest_error": largest_error(found, arms, motions, quantity)}
+    return {**_figures(timing, batch), "largest_error": largest_error(found, arms, motions, quantity)}
 
 
-def run_torch(method: str, arms: Arms, batch: int, quantity: str, repeats: int) -> dict[str, Any]:
+def _figures(timing: Timing, batch: int) -> dict[str, float]:
+    return {**timing.summary(), "pairs_per_s": batch / timing.median}
+
+
+def run_torch(method: str, arms: Arms, batch: int, quantity: str) -> dict[str, Any]:
     """PyTorch on the same numbers."""
     import torch  # pyright: ignore[reportMissingImports]
 
@@ -152,8 +137,8 @@ def run_torch(method: str, arms: Arms, batch: int, quantity: str, repeats: int) 
     wait(found)
     first_call = time.perf_counter() - began
     found = jax.tree.map(lambda x: x[:JUDGED].detach().cpu().numpy(), found)
-    figures = timed(call, wait, repeats)
-    return {"first_call_s": first_call, **figures, "largest_error": largest_error(found, arms, motions, quantity)}
+    timing = dataclasses.replace(time_call(call, wait), compile=first_call)
+    return {**_figures(timing, batch), "largest_error": largest_error(found, arms, motions, quantity)}
 
 
 def largest_error(found: Any, arms: Arms, motions: Sequence[jax.Array], quantity: str) -> dict[str, float]:
@@ -176,7 +161,7 @@ def available(methods: Sequence[str]) -> dict[str, str | None]:
 
 
 def sweep(
-    name: str, cases: dict[int, tuple[Arms, int]], methods: Sequence[str], repeats: int, console: Console
+    name: str, cases: dict[int, tuple[Arms, int]], methods: Sequence[str], console: Console
 ) -> list[dict[str, Any]]:
     """All methods on cases that grow; one that was too large for a method is its last."""
     results = []
@@ -187,22 +172,22 @@ def sweep(
                 row: dict[str, Any] = {"sweep": name, "size": size, "batch": batch}
                 row |= {"method": method, "quantity": quantity}
                 try:
-                    row |= run(method, arms, batch, quantity, repeats)
+                    row |= run(method, arms, batch, quantity)
                 except Exception as error:  # the kinds for memory differ by backend; the message is in the file
                     results.append(row | {"failed": f"{type(error).__name__}: {error}"[:200]})
                     console.print(f"{name} {size:g}, {method}, {quantity}: {type(error).__name__}", markup=False)
                     break
-                results.append(row | {"pairs_per_second": batch / row["seconds"]})
-                if row["seconds"] > PATIENCE / 10:  # cases grow about tenfold
+                results.append(row)
+                if row["median_ms"] > 1e3 * PATIENCE:
                     break
     return results
 
 
-def limits(repeats: int) -> dict[str, float]:
+def limits() -> dict[str, float]:
     """Bytes per second of a copy, read and written, and floating point operations per second."""
     numbers = jnp.zeros(2 ** TWO_TO["copy"], jnp.float32)
     copy = jax.jit(lambda x: x + 1).lower(numbers).compile()
-    copied = timed(lambda: copy(numbers), jax.block_until_ready, repeats)["seconds"]
+    copied = time_call(lambda: copy(numbers)).median
     few, length = jnp.ones(2 ** TWO_TO["multiply_add"], jnp.float32), 512
 
     @jax.jit
@@ -210,23 +195,23 @@ def limits(repeats: int) -> dict[str, float]:
         return functools.reduce(lambda y, _: y * 0.999 + x, range(length), x)
 
     program = multiply_add.lower(few).compile()
-    added = timed(lambda: program(few), jax.block_until_ready, repeats)["seconds"]
+    added = time_call(lambda: program(few)).median
     return {"copy_bytes_per_second": 2 * numbers.nbytes / copied, "flops": 2 * length * few.size / added}
 
 
 def print_table(results: Sequence[dict[str, Any]], device: dict[str, float], console: Console) -> None:
-    heads = "sweep", "size", "method", "quantity", "pairs/s", "IQR", "compile [s]", "error", "error of gradient"
+    heads = "sweep", "size", "method", "quantity", "pairs/s", "spread", "compile [s]", "error", "error of gradient"
     table = Table(*heads)
-    for row in (row for row in results if "seconds" in row):
+    for row in (row for row in results if "median_ms" in row):
         error = row["largest_error"]
         table.add_row(
             row["sweep"],
             f"{row['size']:g}",
             row["method"],
             row["quantity"],
-            f"{row['pairs_per_second']:.3g}",
-            f"{row['iqr_s'] / row['seconds']:.1%}",
-            f"{row.get('compile_s', row.get('first_call_s')):.1f}",
+            f"{row['pairs_per_s']:.3g}",
+            f"{row['spread']:.1%}",
+            f"{row['compile_s']:.1f}",
             f"{error['value']:.1e}",
             f"{error['gradient']:.1e}" if "gradient" in error else "",
         )
@@ -246,7 +231,6 @@ def main() -> None:
     parser.add_argument("--links", type=int, nargs="*", default=LINKS, metavar="N", help="of both planar arms")
     parser.add_argument("--link-batch", type=float, default=1e6 if on_gpu else 1e3, metavar="N", help="pairs of those")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
-    parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
     options = parser.parse_args()
     absent = available(options.methods)
@@ -257,9 +241,9 @@ def main() -> None:
         "links": {links: (planar_pair(links), link_batch) for links in sorted(options.links)},
     }
     console = Console(width=120)  # also where there is no terminal
-    device, results = limits(options.repeats), []
+    device, results = limits(), []
     for name, cases in sweeps.items():
-        results += sweep(name, cases, methods, options.repeats, console)
+        results += sweep(name, cases, methods, console)
         if options.out:
             absentees = {method: missing for method, missing in absent.items() if missing}
             content = {"limits": device, "absent": absentees, "results": results}

@@ -17,14 +17,14 @@ BYTES = 4 * (22 + 1)  # that a pair of Pandas must move for its value: joint ang
 def plot(results: Sequence[dict[str, Any]], limits: dict[str, float], out: Path) -> None:
     """One panel for each sweep."""
     figure, panels = plt.subplots(1, len(LABELS), figsize=(11, 4.5), sharey=True, layout="constrained")
-    measured = [row for row in results if "pairs_per_second" in row]
+    measured = [row for row in results if "pairs_per_s" in row]
     methods = list(dict.fromkeys(row["method"] for row in measured))
     for axes, (sweep, label) in zip(panels, LABELS.items(), strict=True):
         for index, method in enumerate(methods):
             for quantity, style in STYLES.items():
                 chosen = (sweep, method, quantity)
                 rows = [row for row in measured if (row["sweep"], row["method"], row["quantity"]) == chosen]
-                sizes, speeds = [row["size"] for row in rows], [row["pairs_per_second"] for row in rows]
+                sizes, speeds = [row["size"] for row in rows], [row["pairs_per_s"] for row in rows]
                 if rows:
                     axes.plot(sizes, speeds, style, color=f"C{index}", markersize=4, label=f"{method}, {quantity}")
         axes.set(xscale="log", yscale="log", xlabel=label)

@@ -8,7 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-_REPEATS = 7
+_REPEATS = 9
+_PATIENCE_S = 10.0  # a call that takes longer is timed once
 _LEAST_S = 0.02  # a repeat makes as many calls as take this long: the clock's start and stop are nothing to that
 
 
@@ -36,9 +37,7 @@ class Timing:
 
 def time_program(function: Callable[..., Any], *arguments: Any) -> Timing:
     """Compiles a function of arrays, and times calls of it."""
-    began = time.perf_counter()
-    program = jax.jit(function).lower(*arguments).compile()
-    compile_s = time.perf_counter() - began
+    program, compile_s = compiled(function, *arguments)
     memory: Any = program.memory_analysis()
     kinds = ("argument_size_in_bytes", "output_size_in_bytes", "temp_size_in_bytes")
     size = sum(getattr(memory, kind) for kind in kinds) if memory else 0
@@ -46,17 +45,31 @@ def time_program(function: Callable[..., Any], *arguments: Any) -> Timing:
     return dataclasses.replace(timing, compile=compile_s, bytes=size)
 
 
-def time_call(call: Callable[[], Any]) -> Timing:
-    """Times calls of a function, and what JAX computes for them."""
+def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
+    """A function of arrays, compiled for these; and the seconds that took."""
+    began = time.perf_counter()
+    program = jax.jit(function).lower(*arguments).compile()
+    return program, time.perf_counter() - began
+
+
+def time_call(call: Callable[[], Any], wait: Callable[[Any], Any] = jax.block_until_ready) -> Timing:
+    """Times calls of a function, until what it returns is there.
+
+    Args:
+      call: of no arguments; called once before, for what is done the first time only.
+      wait: for its result.
+    """
 
     def seconds(calls: int) -> float:
         began = time.perf_counter()
         for _ in range(calls):
             result = call()
-        jax.block_until_ready(result)
+        wait(result)
         return (time.perf_counter() - began) / calls
 
     seconds(1)
-    calls = max(1, round(_LEAST_S / seconds(1)))
-    low, median, high = np.quantile([seconds(calls) for _ in range(_REPEATS)], [0.25, 0.5, 0.75])
+    first = seconds(1)
+    calls = max(1, round(_LEAST_S / first))
+    taken = [first] if first > _PATIENCE_S else [seconds(calls) for _ in range(_REPEATS)]
+    low, median, high = np.quantile(taken, [0.25, 0.5, 0.75])
     return Timing(0.0, float(median), float(low), float(high))

@@ -1,0 +1,45 @@
+"""`python -m benchmarks.kernel`: all that can run without a GPU, on few pairs."""
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from benchmarks import kernel
+from benchmarks.kernel_figure import plot
+
+
+@pytest.fixture(scope="module")
+def rows():
+    arms = kernel.planar_pair(3)
+    return kernel.sweep("links", {3: (arms, 8)}, ["mimic", "composition", "matrices"], Console(quiet=True))
+
+
+def test_all_methods_compute_the_same(rows):
+    assert {(row["method"], row["quantity"]) for row in rows} >= {("mimic", "all"), ("matrices", "gradient")}
+    for row in rows:
+        assert row["pairs_per_s"] > 0
+        assert all(0 <= error < 1e-5 for error in row["largest_error"].values())  # float32 against double precision
+
+
+def test_the_figure_shows_what_was_measured(rows, tmp_path):
+    plot(rows, {"copy_bytes_per_second": 1e9}, tmp_path / "kernel.png")
+    assert (tmp_path / "kernel.png").stat().st_size > 10_000
+
+
+def test_a_method_that_fails_says_why_and_the_others_go_on(monkeypatch):
+    def out_of_memory(method, *_):
+        if method == "mimic":
+            raise MemoryError("no room")
+        return {"median_ms": 1.0}
+
+    monkeypatch.setattr(kernel, "run_jax", out_of_memory)
+    found = kernel.sweep("batch", {1: (None, 1), 2: (None, 2)}, ["mimic", "matrices"], Console(quiet=True))
+    failed = [row for row in found if "failed" in row]
+    assert [row["failed"] for row in failed] == ["MemoryError: no room"] * 3  # one size of each quantity
+    assert sum(row["method"] == "matrices" for row in found) == 4
+
+
+def test_the_reference_is_in_double_precision():
+    arms = kernel.planar_pair(3)
+    value = kernel.reference(arms, kernel.random_motions(arms, 2), "value")
+    assert value.dtype == np.float64
