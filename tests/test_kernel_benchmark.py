@@ -33,7 +33,8 @@ def test_a_method_that_fails_says_why_and_the_others_go_on(monkeypatch):
         return {"median_ms": 1.0}
 
     monkeypatch.setattr(kernel, "run_jax", out_of_memory)
-    found = kernel.sweep("batch", {1: (None, 1), 2: (None, 2)}, ["mimic", "matrices"], Console(quiet=True))
+    arms = kernel.planar_pair(3)
+    found = kernel.sweep("batch", {1: (arms, 1), 2: (arms, 2)}, ["mimic", "matrices"], Console(quiet=True))
     failed = [row for row in found if "failed" in row]
     assert [row["failed"] for row in failed] == ["MemoryError: no room"] * 3  # one size of each quantity
     assert sum(row["method"] == "matrices" for row in found) == 4
