@@ -169,7 +169,7 @@ def train(
       Interrupted: a signal came; a checkpoint is written.
     """
     compat.mend_brax()
-    done_steps, params = restore or (0, None)
+    done_steps = restore[0] if restore else 0
     latest: dict[str, Any] = {}
 
     def on_params(step: int, _: Any, params: Params) -> None:
@@ -195,16 +195,25 @@ def train(
         brax_ppo.train(
             progress_fn=on_metrics,
             policy_params_fn=on_params,
-            **_brax_arguments(env, config, done_steps, on_compiling),
-            restore_params=params,
-            seed=seed + done_steps,
+            **_brax_arguments(env, config, seed, restore, on_compiling),
         )
     return latest["step"], latest["params"]
 
 
+def follow(env: ImitationEnv, config: PPOConfig, *, seed: int, restore: tuple[int, Params] | None = None) -> None:
+    """Trains in step with the first process, where `train` runs; brax calls nothing back here."""
+    compat.mend_brax()
+    brax_ppo.train(**_brax_arguments(env, config, seed, restore, lambda: None))
+
+
 def _brax_arguments(
-    env: ImitationEnv, config: PPOConfig, done_steps: int, on_compiling: Callable[[], None]
+    env: ImitationEnv,
+    config: PPOConfig,
+    seed: int,
+    restore: tuple[int, Params] | None,
+    on_compiling: Callable[[], None],
 ) -> dict[str, Any]:
+    done_steps, params = restore or (0, None)
     unused = _NoEpisodes()
 
     def wrap(env: Env, *how: Any, **more: Any) -> Env:
@@ -219,6 +228,8 @@ def _brax_arguments(
     final_share: float = config.final_learning_rate  # type: ignore[assignment]
     return {
         "environment": env,
+        "restore_params": params,
+        "seed": seed + done_steps,
         "num_timesteps": left,
         "num_envs": config.num_envs,
         "episode_length": env.config.horizon + 1,  # the environment ends first
