@@ -2,6 +2,8 @@
 
 import json
 import os
+import pathlib
+import re
 import signal
 import socket
 import subprocess
@@ -9,8 +11,10 @@ import sys
 import time
 
 import pytest
+from omegaconf import OmegaConf
 
 from mimic.trainers.group import DistributedConfig
+from mimic.trainers.runs import run_schema
 
 TINY = [
     "env=planar4dof",
@@ -27,24 +31,23 @@ TINY = [
 ]
 
 
-def start(tmp_path, *arguments):
+def start(tmp_path, *arguments, slurm=False):
     """Two processes of one training, each with a processor of its own as its device."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    common = [*TINY, f"distributed.coordinator=127.0.0.1:{port}", "distributed.processes=2", *arguments]
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    return [
-        subprocess.Popen(
-            [sys.executable, "-m", "mimic.train", *common, f"distributed.process={index}"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env=environment,
-            cwd=tmp_path,
-        )
-        for index in range(2)
-    ]
+    processes = []
+    for index in range(2):
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+        found = [f"distributed.coordinator=127.0.0.1:{port}", "distributed.processes=2", f"distributed.process={index}"]
+        if slurm:  # what srun tells its tasks; JAX makes the port of the job's number
+            found = ["distributed.coordinator=auto"]
+            environment |= {"SLURM_JOB_ID": str(port), "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2"}
+            environment |= {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index)}
+        command = [sys.executable, "-m", "mimic.train", *TINY, *found, *arguments]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        processes.append(subprocess.Popen(command, text=True, env=environment, cwd=tmp_path, **pipes))
+    return processes
 
 
 def finish(processes):
@@ -75,6 +78,13 @@ def test_two_processes_make_one_run_that_another_number_goes_on_with(tmp_path):
 
 
 @pytest.mark.slow
+def test_slurm_tells_all_that_is_needed(tmp_path):
+    (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run", "trainer.evaluations=1", slurm=True))
+    assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["hardware"]["processes"] == 2
+
+
+@pytest.mark.slow
 def test_the_other_processes_end_with_the_first_where_it_is_good_enough(tmp_path):
     (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run", "trainer.target_gap=100"))
     assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
@@ -101,6 +111,17 @@ def test_a_process_that_is_refused_ends_the_others(tmp_path):
     (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run"))
     assert first == 2 and "'run' exists" in shown
     assert second == 1 and "error: process 0 of the training failed" in silent
+
+
+def test_the_page_shows_settings_that_exist():
+    """Every override on it, with any value, is a key of the command."""
+    page = (pathlib.Path(__file__).parent.parent / "docs" / "scaling.md").read_text()
+    keys = set(re.findall(r"\b((?:trainer|distributed|env)\.\w+)=", page))
+    config = run_schema("ppo")
+    assert {"distributed.coordinator", "trainer.num_envs"} <= keys
+    for key in keys:
+        parent, _, name = key.rpartition(".")
+        assert name in OmegaConf.select(config, parent), key
 
 
 @pytest.mark.parametrize(
