@@ -45,8 +45,11 @@ def start(tmp_path, *arguments, slurm=False):
             environment |= {"SLURM_JOB_ID": str(port), "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2"}
             environment |= {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index)}
         command = [sys.executable, "-m", "mimic.train", *TINY, *found, *arguments]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        processes.append(subprocess.Popen(command, text=True, env=environment, cwd=tmp_path, **pipes))
+        output = subprocess.PIPE
+        process = subprocess.Popen(
+            command, stdout=output, stderr=subprocess.STDOUT, text=True, env=environment, cwd=tmp_path
+        )
+        processes.append(process)
     return processes
 
 
