@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,18 +35,24 @@ def commit_id() -> str:
     return found.stdout.strip() if found.returncode == 0 else "unknown"
 
 
-def train(run_dir: Path, arguments: Sequence[str], cache: Path | None = None) -> dict[str, Any]:
+def train(
+    run_dir: Path,
+    arguments: Sequence[str],
+    cache: Path | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
     """One training run into a new folder: its report, and the wall time of the whole process [s].
 
     Args:
       run_dir: the new folder.
       arguments: of `python -m mimic.train`.
       cache: where compiled programs are kept; the run is cold where None, or where the folder is empty.
+      environment: variables of the process; this one's where None.
     """
     command = [sys.executable, "-m", "mimic.train", *arguments, f"run_dir={run_dir}"]
     command.append(f"compilation_cache={cache or ''}")
     began = time.perf_counter()
-    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    finished = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     wall = time.perf_counter() - began
     if finished.returncode:
         sys.exit(f"error: {' '.join(command)} ended with {finished.returncode}: {finished.stderr[-2000:]}")

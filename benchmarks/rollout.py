@@ -10,7 +10,6 @@ our reward. Times are of the second call on: median and spread (quartiles) of re
 """
 
 import argparse
-import dataclasses
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -25,12 +24,14 @@ import matplotlib.pyplot as plt  # noqa: E402
 import mujoco  # noqa: E402
 import mujoco.rollout  # noqa: E402
 import numpy as np  # noqa: E402
+from brax.envs.base import Wrapper  # noqa: E402
 from mujoco import mjx  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 import mimic  # noqa: E402
+from benchmarks import stock  # noqa: E402
 from benchmarks.record import write_results  # noqa: E402
 from benchmarks.timing import Timing, time_call, time_program  # noqa: E402
 from mimic.envs.imitation import ImitationEnv  # noqa: E402
@@ -110,46 +111,25 @@ def environment(physics: str) -> Case:
 
     def case(env: ImitationEnv, arms: int) -> Timing:
         wrapped = wrap_for_training(_with_physics(env, physics), env.config.horizon + 1)
-        state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), arms))
-        actions = jax.random.uniform(jax.random.PRNGKey(1), (STEPS, arms, env.action_size), minval=-1.0, maxval=1.0)
-
-        def step(state: Any, action: jax.Array) -> Any:
-            state = wrapped.step(state, action)
-            return state, (state.reward, jnp.sum(state.obs, axis=-1))  # all of it is asked for, little is kept
-
-        return time_program(lambda s, a: jax.lax.scan(step, s, a), state, actions)
+        return _steps(wrapped, env.action_size, arms)
 
     return case
 
 
 def stock_environment(env: ImitationEnv, arms: int) -> Timing:
     """The same task as brax environments usually have it: `mjx.Data` is carried, and reset to a stored first one."""
-    model = env.arm.model.__copy__()
-    model.opt.timestep = env.config.control_dt / env.config.substeps
-    mjx_model, blank = mjx.put_model(model), mjx.make_data(model)
-    qpos, qvel, torques = random_motion(env, arms)
-    first = jax.vmap(lambda q, v: mjx.forward(mjx_model, blank.replace(qpos=q, qvel=v)))(qpos, qvel)
-    steps = jnp.arange(arms, dtype=jnp.int32) % env.config.horizon
-    which = jnp.arange(arms, dtype=jnp.int32) % env.demonstrations.count
+    return _steps(stock.wrap(stock.StockEnv(env), env.config.horizon + 1), env.action_size, arms)
 
-    def step(carry: Any, torque: jax.Array) -> Any:
-        first, data, count = carry
-        data = data.replace(qfrc_applied=torque)
-        one = jax.vmap(lambda d: mjx.step(mjx_model, d))
-        data = jax.lax.fori_loop(0, env.config.substeps, lambda _, d: one(d), data)
-        count = count + 1
-        reward = -jax.vmap(env.distance)(data.qpos, data.qvel, which, count)
-        done = count >= env.config.horizon
 
-        def where_done(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
+def _steps(wrapped: Wrapper, action_size: int, arms: int) -> Timing:
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), arms))
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (STEPS, arms, action_size), minval=-1.0, maxval=1.0)
 
-        data, count = jax.tree.map(where_done, first, data), jnp.where(done, 0, count)
-        arm_states = jax.vmap(env.start, (None, 0))(jax.random.PRNGKey(0), which)
-        arm_states = dataclasses.replace(arm_states, qpos=data.qpos, qvel=data.qvel, step=count)
-        return (first, data, count), (reward, jnp.sum(jax.vmap(env.observe)(arm_states), axis=-1))
+    def step(state: Any, action: jax.Array) -> Any:
+        state = wrapped.step(state, action)
+        return state, (state.reward, jnp.sum(state.obs, axis=-1))  # all of it is asked for, little is kept
 
-    return time_program(lambda c, t: jax.lax.scan(step, c, t), (first, first, steps), torques)
+    return time_program(lambda s, a: jax.lax.scan(step, s, a), state, actions)
 
 
 def part(what: str) -> Case:

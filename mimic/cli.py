@@ -16,6 +16,7 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -89,6 +90,11 @@ def _find_devices() -> None:
 def overrides() -> list[str]:
     """The overrides of the command line, of the job that runs now."""
     return list(HydraConfig.get().overrides.task)
+
+
+def is_sweep() -> bool:
+    """Whether the command line asks for several jobs."""
+    return HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def _register_schemas() -> None:

@@ -4,6 +4,7 @@ import time
 
 from mimic import cli
 from mimic.trainers.config import TrainConfig
+from mimic.trainers.group import join
 
 _process_started = [cli.process_started()]  # for the first job; those that follow in a sweep start when they start
 
@@ -11,11 +12,14 @@ _process_started = [cli.process_started()]  # for the first job; those that foll
 def prepare(config: TrainConfig) -> cli.Work:
     """The run that the config describes."""
     began = time.perf_counter()
+    if config.distributed.coordinator and cli.is_sweep():
+        raise ValueError("distributed: expected one run, got a sweep; start each of its runs by itself")
+    group = join(config.distributed)
     cli.start_backend()
     from mimic.trainers import session  # not needed for --help
 
     started = _process_started.pop() if _process_started else began
-    return session.prepare_training(config, started, cli.overrides())
+    return session.prepare_training(config, started, cli.overrides(), group)
 
 
 if __name__ == "__main__":

@@ -14,9 +14,18 @@ FOLDER = "checkpoints"
 def save_checkpoint(run_dir: Path, step: int, params: Any) -> Path:
     """Writes a pytree; the folder has its final name only when it is whole."""
     path = (run_dir / FOLDER / f"{step:012d}").absolute()
-    with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(path, params, force=True)
+    # Orbax refuses the arrays of one process among several, but not NumPy's; plain containers let them be that.
+    plain = jax.tree.map(np.asarray, ocp.tree.serialize_tree(params, keep_empty_nodes=True))
+    with _checkpointer() as checkpointer:
+        checkpointer.save(path, plain, force=True)
     return path
+
+
+def _checkpointer() -> ocp.StandardCheckpointer:
+    """Of this process by itself: orbax would wait for the others that train with it, of which one alone writes."""
+    this = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(primary_host=this, active_processes={this})
+    return ocp.StandardCheckpointer(multiprocessing_options=options)
 
 
 def delete_checkpoint(run_dir: Path, step: int) -> None:
@@ -61,7 +70,7 @@ def load_checkpoint(run_dir: Path, template: Any, step: int | None = None) -> tu
     abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, template)
     expected = _shapes(template)
     try:
-        with ocp.StandardCheckpointer() as checkpointer:
+        with _checkpointer() as checkpointer:
             stored = _shapes(checkpointer.metadata(path).item_metadata.tree)
             if stored == expected:  # else orbax would fail in its threads, which print what they think of it
                 return step, checkpointer.restore(path, abstract)

@@ -8,6 +8,7 @@ from omegaconf import MISSING
 
 from mimic.config import check_choice
 from mimic.envs.config import PHYSICS, EnvConfig
+from mimic.trainers.group import DistributedConfig
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque")
 
@@ -332,6 +333,7 @@ class TrainConfig:
       run_dir: where everything is written; runs/ENV-TRAINER-seedSEED-TIME where empty.
       resume: a run directory to go on from.
       compilation_cache: folder where JAX keeps compiled programs between runs; none where empty.
+      distributed: see `DistributedConfig`.
     """
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
@@ -340,6 +342,7 @@ class TrainConfig:
     run_dir: str = ""
     resume: str = ""
     compilation_cache: str = "~/.cache/mimic/jax"
+    distributed: DistributedConfig = dataclasses.field(default_factory=DistributedConfig)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -197,5 +197,5 @@ def _lower_bound(env: ImitationEnv, qpos: np.ndarray, qvel: np.ndarray) -> np.nd
         )
 
     # On the host's processor in any case: there the program compiles several times faster, and it runs once.
-    with jax.default_device(jax.devices("cpu")[0]):
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
         return np.asarray(jax.jit(jax.vmap(bound))(qpos.astype(np.float32), qvel.astype(np.float32)))

@@ -56,6 +56,11 @@ class Job(abc.ABC):
           Interrupted: a signal came; a checkpoint is written.
         """
 
+    def follow(self, restore: tuple[int, Params] | None) -> None:
+        """Trains in step with the first process, which does all the rest; returns when that has trained to the end."""
+        del restore
+        raise NotImplementedError
+
     @abc.abstractmethod
     def evaluate(self, params: Params) -> Any:
         """What `figures`, `details` and `save_outcome` are made of."""

@@ -97,6 +97,25 @@ def make_networks(config: PPOConfig, observation_size: int, action_size: int) ->
     )
 
 
+def hyperparameters(config: PPOConfig) -> dict[str, Any]:
+    """Of a resolved config, as brax takes them; without the learning rate, whose decay depends on what is done."""
+    return {
+        "num_envs": config.num_envs,
+        "entropy_cost": config.entropy_cost,
+        "discounting": config.discounting,
+        "unroll_length": config.unroll_length,
+        "batch_size": config.batch_size,
+        "num_minibatches": config.num_minibatches,
+        "num_updates_per_batch": config.num_updates_per_batch,
+        "normalize_observations": True,
+        "reward_scaling": config.reward_scaling,
+        "clipping_epsilon": config.clipping_epsilon,
+        "gae_lambda": config.gae_lambda,
+        "max_grad_norm": config.max_grad_norm,
+        "network_factory": _network_factory(config),
+    }
+
+
 def _network_factory(config: PPOConfig) -> Callable[..., ppo_networks.PPONetworks]:
     """Brax's networks, each initialised by one program: flax would compile one for each operation."""
     hidden = tuple(config.hidden_layers or ())
@@ -169,7 +188,7 @@ def train(
       Interrupted: a signal came; a checkpoint is written.
     """
     compat.mend_brax()
-    done_steps, params = restore or (0, None)
+    done_steps = restore[0] if restore else 0
     latest: dict[str, Any] = {}
 
     def on_params(step: int, _: Any, params: Params) -> None:
@@ -195,16 +214,25 @@ def train(
         brax_ppo.train(
             progress_fn=on_metrics,
             policy_params_fn=on_params,
-            **_brax_arguments(env, config, done_steps, on_compiling),
-            restore_params=params,
-            seed=seed + done_steps,
+            **_brax_arguments(env, config, seed, restore, on_compiling),
         )
     return latest["step"], latest["params"]
 
 
+def follow(env: ImitationEnv, config: PPOConfig, *, seed: int, restore: tuple[int, Params] | None = None) -> None:
+    """Trains in step with the first process, where `train` runs; brax calls nothing back here."""
+    compat.mend_brax()
+    brax_ppo.train(**_brax_arguments(env, config, seed, restore, lambda: None))
+
+
 def _brax_arguments(
-    env: ImitationEnv, config: PPOConfig, done_steps: int, on_compiling: Callable[[], None]
+    env: ImitationEnv,
+    config: PPOConfig,
+    seed: int,
+    restore: tuple[int, Params] | None,
+    on_compiling: Callable[[], None],
 ) -> dict[str, Any]:
+    done_steps, params = restore or (0, None)
     unused = _NoEpisodes()
 
     def wrap(env: Env, *how: Any, **more: Any) -> Env:
@@ -219,24 +247,14 @@ def _brax_arguments(
     final_share: float = config.final_learning_rate  # type: ignore[assignment]
     return {
         "environment": env,
+        "restore_params": params,
+        "seed": seed + done_steps,
         "num_timesteps": left,
-        "num_envs": config.num_envs,
         "episode_length": env.config.horizon + 1,  # the environment ends first
         "wrap_env_fn": wrap,
         "eval_env": unused,
         "learning_rate": LearningRate(rate, rate * final_share, updates, done_updates),
-        "entropy_cost": config.entropy_cost,
-        "discounting": config.discounting,
-        "unroll_length": config.unroll_length,
-        "batch_size": config.batch_size,
-        "num_minibatches": config.num_minibatches,
-        "num_updates_per_batch": config.num_updates_per_batch,
-        "normalize_observations": True,
-        "reward_scaling": config.reward_scaling,
-        "clipping_epsilon": config.clipping_epsilon,
-        "gae_lambda": config.gae_lambda,
-        "max_grad_norm": config.max_grad_norm,
-        "network_factory": _network_factory(config),
+        **hyperparameters(config),
         "num_evals": evaluations + 1,
         "num_eval_envs": 1,
         "run_evals": False,  # our evaluator's program is smaller, and it knows the held-out demonstrations

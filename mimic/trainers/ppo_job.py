@@ -91,6 +91,10 @@ class PPOJob(Job):
             on_compiling=self._prepare,
         )
 
+    def follow(self, restore: tuple[int, Params] | None) -> None:
+        """By brax."""
+        ppo.follow(self._env, self.settings, seed=self._seed, restore=restore)
+
     def evaluate(self, params: Params) -> Rollouts:
         """Each demonstration once, without exploration."""
         # From the host: how brax or orbax spread the parameters over devices would each ask for a program of its own.

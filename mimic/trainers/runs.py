@@ -108,6 +108,7 @@ def hardware() -> dict[str, Any]:
         "backend": jax.default_backend(),
         "device": devices[0].device_kind,
         "devices": len(devices),
+        "processes": jax.process_count(),
         "cpu": _cpu_name(),
         "cpu_cores": os.cpu_count(),
     }

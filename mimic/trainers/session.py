@@ -16,18 +16,22 @@ from mimic.envs.demonstrations import load_demonstrations
 from mimic.trainers import runs
 from mimic.trainers.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
+from mimic.trainers.group import Group
 from mimic.trainers.job import Job, Params
 from mimic.trainers.progress import TrainingProgress, report_table
 from mimic.trainers.signals import Interrupted, Signals, noted_signals
 
 
-def prepare_training(config: TrainConfig, started: float, overrides: Sequence[str] = ()) -> Callable[[], int]:
+def prepare_training(
+    config: TrainConfig, started: float, overrides: Sequence[str] = (), group: Group | None = None
+) -> Callable[[], int]:
     """A new run, or one to go on with, ready to start; nothing is written yet.
 
     Args:
       config: of the run; with `resume`, what the run directory says counts, but for the overrides.
       started: `time.perf_counter()` at the start of the process.
       overrides: of the command line, applied to the config of a resumed run.
+      group: of processes that train together; the first of them does all but the training by itself.
 
     Returns:
       What trains, evaluates and reports; it returns the exit code: 0, or 128 plus the number of the signal that
@@ -41,12 +45,17 @@ def prepare_training(config: TrainConfig, started: float, overrides: Sequence[st
     resumed = Path(config.resume).expanduser() if config.resume else None
     if resumed:
         config = _resumed_config(resumed, config, overrides)
-    run_dir = resumed or runs.new_run_dir(config)
+    if group and config.trainer.name != "ppo":
+        raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
+    leads = group is None or group.first
+    run_dir = resumed or (runs.new_run_dir(config) if leads else Path())
     with stopwatch.stage("build"):
         job = make_job(config, resumed)
         restore = load_checkpoint(resumed, job.params_template()) if resumed else None
     config = dataclasses.replace(config, trainer=job.settings)
-    return lambda: _train(config, job, run_dir, restore, stopwatch)
+    if group and not group.first:
+        return lambda: _follow(job, restore, group)
+    return lambda: _train(config, job, run_dir, restore, stopwatch, group)
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
@@ -165,7 +174,7 @@ def use_compilation_cache(folder: str) -> None:
 def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
     config = runs.load_config(run_dir)
     steps = check_checkpoint(run_dir)
-    of_the_process = ("resume=", "compilation_cache=")
+    of_the_process = ("resume=", "compilation_cache=", "distributed.")
     changes = [override for override in overrides if not override.startswith(of_the_process)]
     refused = [c for c in changes if not c.startswith("trainer.") or c.startswith(("trainer.preset=", "trainer.name="))]
     if refused:
@@ -181,15 +190,29 @@ def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str])
             f"resume: {str(run_dir)!r} is trained for {steps} of {total} steps; "
             f"give a larger trainer.{config.trainer.length_key}"
         )
-    return dataclasses.replace(config, compilation_cache=given.compilation_cache)
+    return dataclasses.replace(config, compilation_cache=given.compilation_cache, distributed=given.distributed)
+
+
+def _follow(job: Job, restore: tuple[int, Params] | None, group: Group) -> int:
+    """What a process does that is not the first: it trains in step, until that one ends it."""
+    with noted_signals(group.signals):
+        job.follow(restore)
+        group.wait()
+    return 0
 
 
 def _train(
-    config: TrainConfig, job: Job, run_dir: Path, restore: tuple[int, Params] | None, stopwatch: runs.Stopwatch
+    config: TrainConfig,
+    job: Job,
+    run_dir: Path,
+    restore: tuple[int, Params] | None,
+    stopwatch: runs.Stopwatch,
+    group: Group | None,
 ) -> int:
     console = Console()
     device = runs.hardware()["device"]
-    with noted_signals() as signals:  # also while the report is made: all is done then, and a signal changes nothing
+    signals = group.signals if group else Signals()
+    with noted_signals(signals):  # also while the report is made: all is done then, and a signal changes nothing
         run_dir.mkdir(parents=True, exist_ok=restore is not None)
         runs.save_config(run_dir, config)
         job.save_inputs(run_dir)
@@ -201,8 +224,12 @@ def _train(
         try:
             steps, params = _train_and_log(job, run_dir, signals, restore, stopwatch, console)
         except Interrupted as stop:
+            if group:
+                group.end(stop.exit_code)
             console.print(f"stopped by {stop}; go on with: python -m mimic.train resume={run_dir}", soft_wrap=True)
             return stop.exit_code
+        if group:
+            group.end(0)
         with stopwatch.stage("evaluate"):
             outcome = job.evaluate(params)
             figures = {**job.figures(outcome), **job.details(outcome)}

@@ -35,9 +35,8 @@ class Signals:
 
 
 @contextmanager
-def noted_signals() -> Iterator[Signals]:
+def noted_signals(signals: Signals) -> Iterator[None]:
     """Notes SIGINT and SIGTERM instead of acting on them; a second one of a kind acts at once."""
-    signals = Signals()
     previous: dict[int, Any] = {}
 
     def note(number: int, _: FrameType | None) -> None:
@@ -48,7 +47,7 @@ def noted_signals() -> Iterator[Signals]:
     for number in (signal.SIGINT, signal.SIGTERM):
         previous[number] = signal.signal(number, note)
     try:
-        yield signals
+        yield
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler or signal.SIG_DFL)

@@ -1,0 +1,73 @@
+"""The task as brax and MuJoCo Playground environments usually have it, to compare with: `mjx.Data` is the state."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State, Wrapper
+from brax.envs.wrappers import training
+from mujoco import mjx
+
+from mimic.envs.imitation import ArmState, ImitationEnv
+
+
+class StockEnv(Env):
+    """Carries `mjx.Data` from step to step; reward, observation and torques are the imitation environment's.
+
+    Brax's own wrappers return each arm to its first state, and with that to its first demonstration.
+    """
+
+    def __init__(self, imitation: ImitationEnv):
+        self._imitation = imitation
+        config = imitation.config
+        model = imitation.arm.model.__copy__()
+        model.opt.timestep = config.control_dt / config.substeps
+        self._model, self._blank = mjx.put_model(model), mjx.make_data(model)
+
+    def reset(self, rng: jax.Array) -> State:
+        """At rest in the home pose, on a random demonstration."""
+        start = self._imitation.start(rng)
+        data = mjx.forward(self._model, self._blank.replace(qpos=start.qpos, qvel=start.qvel))
+        zero = jnp.zeros(())
+        info = {"arm_state": dataclasses.replace(start, load=None)}
+        return State(data, self._imitation.observe(start), zero, zero, {"distance": zero}, info)  # type: ignore[arg-type]
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Holds a torque for one control step."""
+        config, before = self._imitation.config, state.info["arm_state"]
+        torque = jnp.clip(action, -1.0, 1.0) * self._imitation.torque_scale
+        data: Any = state.pipeline_state
+        data = data.replace(qfrc_applied=torque)
+        data = jax.lax.fori_loop(0, config.substeps, lambda _, d: mjx.step(self._model, d), data)
+        step = jnp.round(data.time / config.control_dt).astype(jnp.int32)  # the time is reset with the data
+        after: ArmState = dataclasses.replace(before, qpos=data.qpos, qvel=data.qvel, step=step)
+        distance = self._imitation.distance(after.qpos, after.qvel, after.demonstration, step)
+        return state.replace(
+            pipeline_state=data,
+            obs=self._imitation.observe(after),
+            reward=-distance,
+            done=(step >= config.horizon).astype(jnp.float32),
+            metrics={**state.metrics, "distance": distance},
+            info={**state.info, "arm_state": after},
+        )
+
+    @property
+    def observation_size(self) -> int:
+        """Of the imitation environment."""
+        return self._imitation.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """One torque for each joint."""
+        return self._imitation.action_size
+
+    @property
+    def backend(self) -> str:
+        """What simulates."""
+        return "mjx"
+
+
+def wrap(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None) -> Wrapper:
+    """Brax's own wrappers."""
+    return training.wrap(env, episode_length, action_repeat, randomization_fn)

@@ -1,0 +1,147 @@
+"""Training spread over several processes: they find each other, train in step, and end together.
+
+Brax calls back in the first process alone, which writes, evaluates and may stop early, while the others wait in their
+next training program for it. So the end of a training is told to them beside the programs, through JAX's coordination
+service; a failure, or a signal that only one of them got, is told in the same way.
+"""
+
+import atexit
+import contextlib
+import dataclasses
+import os
+import re
+import sys
+import threading
+
+import jax
+
+from mimic import compat
+from mimic.trainers.signals import STOPPED_BY_SIGNAL, Signals
+
+AUTO = "auto"
+_ENDED, _SIGNAL = "mimic/ended", "mimic/signal"  # keys of the coordination service
+_LOOK_S = 0.5
+_LEAVE_S = 60  # the last process to leave is waited for this long
+_FAILED = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class DistributedConfig:
+    """The processes that train together; each is started with the same command, but for its number.
+
+    Attributes:
+      coordinator: HOST:PORT of the first process, where all find each other; "auto" under Slurm and Open MPI, which
+        tell everything; one process alone where empty.
+      processes: how many.
+      process: number of this one; the first, 0, evaluates and writes the run directory.
+    """
+
+    coordinator: str = ""
+    processes: int | None = None
+    process: int | None = None
+
+    def __post_init__(self) -> None:
+        given = {"processes": self.processes, "process": self.process}
+        if self.coordinator in ("", AUTO):
+            for key, value in given.items():
+                if value is not None:
+                    raise ValueError(
+                        f"distributed.{key}: expected with distributed.coordinator=HOST:PORT alone, got {value} with "
+                        f"distributed.coordinator={self.coordinator!r}"
+                    )
+            return
+        if not re.fullmatch(r"\S+:\d+", self.coordinator):
+            raise ValueError(f"distributed.coordinator: expected HOST:PORT or auto, got {self.coordinator!r}")
+        for key, value in given.items():
+            if value is None:
+                raise ValueError(f"distributed.{key}: expected a number besides distributed.coordinator")
+        if self.processes < 1:  # type: ignore[operator]
+            raise ValueError(f"distributed.processes: expected at least 1, got {self.processes}")
+        if not 0 <= self.process < self.processes:  # type: ignore[operator]
+            raise ValueError(f"distributed.process: expected 0 to {self.processes - 1}, got {self.process}")  # type: ignore[operator]
+
+
+class Group:
+    """The processes that train together, as one of them sees them; made by `join`.
+
+    Attributes:
+      index: number of this process.
+      signals: what this process was sent; the first process gets the others' too.
+    """
+
+    def __init__(self, index: int):
+        self.index = index
+        self.signals = Signals()
+        self._client = compat.coordination_client()
+        self._left = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name="group", daemon=True)
+        self._watcher.start()
+        atexit.register(self.end, _FAILED)
+
+    @property
+    def first(self) -> bool:
+        """Whether this process evaluates and writes."""
+        return self.index == 0
+
+    def end(self, exit_code: int) -> None:
+        """Ends the other processes with an exit code, and goes on alone; nothing if that was done before."""
+        if self._left.is_set():
+            return
+        self._left.set()
+        self._watcher.join()
+        with contextlib.suppress(jax.errors.JaxRuntimeError):  # another process was faster
+            self._client.key_value_set(_ENDED, f"{self.index} {exit_code}")
+        _leave()
+
+    def wait(self) -> None:
+        """Until another process ends this one."""
+        self._watcher.join()
+
+    def _watch(self) -> None:
+        told = False
+        while not self._left.wait(_LOOK_S):
+            if self.first and not told and (sent := self._read(_SIGNAL)):
+                self.signals.caught.append(int(sent))
+                told = True
+            elif not self.first and not told and self.signals.caught:
+                with contextlib.suppress(jax.errors.JaxRuntimeError):
+                    self._client.key_value_set(_SIGNAL, str(self.signals.caught[0]))
+                told = True
+            if ended := self._read(_ENDED):
+                process, exit_code = map(int, ended.split())
+                if 0 < exit_code < STOPPED_BY_SIGNAL:
+                    print(f"error: process {process} of the training failed", file=sys.stderr)
+                _leave()
+                for stream in (sys.stdout, sys.stderr):
+                    stream.flush()
+                os._exit(exit_code)  # the main thread may wait in a program that will never end
+
+    def _read(self, key: str) -> str:
+        """What the processes were told; nothing where they were not."""
+        try:
+            return self._client.key_value_try_get(key)
+        except jax.errors.JaxRuntimeError:
+            return ""
+
+
+def join(config: DistributedConfig) -> Group | None:
+    """Waits for the other processes; must run before JAX starts its backend. None where this process is alone.
+
+    Raises:
+      ValueError: they cannot be found.
+    """
+    if not config.coordinator:
+        return None
+    jax.config.update("jax_enable_preemption_service", False)  # would take SIGTERM, which is ours
+    address = None if config.coordinator == AUTO else config.coordinator
+    try:
+        jax.distributed.initialize(address, config.processes, config.process, shutdown_timeout_seconds=_LEAVE_S)
+    except (RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"distributed.coordinator={config.coordinator}: no processes found: {reason}") from error
+    return Group(compat.process_number())
+
+
+def _leave() -> None:
+    with contextlib.suppress(jax.errors.JaxRuntimeError):  # one that is gone already is waited for in vain
+        jax.distributed.shutdown()

@@ -1,0 +1,79 @@
+"""`python -m benchmarks.ppo`."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+import mimic
+from benchmarks import ppo, stock
+from benchmarks.mujoco_task import MujocoTask
+from mimic.trainers.config import PPOConfig
+
+SMALL = PPOConfig(
+    preset="cpu", num_envs=8, unroll_length=5, batch_size=8, num_minibatches=2, num_updates_per_batch=1,
+    hidden_layers=[8],
+).resolve("cpu")  # fmt: skip
+
+
+def test_the_first_stretch_is_not_counted():
+    found = ppo.rates(100, [7.0, 2.0, 2.0, 2.0])
+    assert found == {"compile_s": 5.0, "steps_per_s": 50.0, "spread": 0.0}
+
+
+def test_what_cannot_run_says_why(monkeypatch, tmp_path):
+    def absent(*_):
+        raise ImportError("not here\nand more")
+
+    monkeypatch.setitem(ppo.CASES, "absent", absent)
+    rows = ppo.run("planar4dof", SMALL, ["mimic, fused", "absent"], batches=1)
+    assert rows[0]["steps_per_s"] > 0 and rows[1]["failed"] == "ImportError: not here"
+    Console(file=(tmp_path / "table").open("w")).print(ppo.table(rows))
+    ppo.draw(rows, tmp_path / "ppo.png")
+    assert (tmp_path / "ppo.png").stat().st_size > 5_000
+
+
+@pytest.mark.slow
+def test_the_stock_environment_is_the_same_task():
+    """Rewards and observations of one episode are the imitation environment's, and it begins again after that."""
+    env = mimic.make("planar4dof", physics="mjx", demonstrations={"count": 3, "held_out": 1})
+    wrapped = stock.wrap(stock.StockEnv(env), env.config.horizon + 1)
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)
+    ours, theirs = jax.jit(jax.vmap(env.reset))(keys), jax.jit(wrapped.reset)(keys)
+    our_step, their_step = jax.jit(jax.vmap(env.step)), jax.jit(wrapped.step)
+    action = jnp.full((2, env.action_size), 0.05)
+    for _ in range(env.config.horizon):
+        np.testing.assert_allclose(theirs.obs, ours.obs, atol=1e-3)  # float32, 50 times ten Runge-Kutta steps
+        ours, theirs = our_step(ours, action), their_step(theirs, action)
+        np.testing.assert_allclose(theirs.reward, ours.reward, atol=1e-3)
+    assert theirs.done.all() and not theirs.info["truncation"].any()
+    np.testing.assert_allclose(theirs.obs, theirs.info["first_obs"])
+
+
+def test_the_task_on_mujoco_is_the_same():
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
+    task = MujocoTask(env, seed=0)
+    ours, step = env.begin(env.start(jax.random.PRNGKey(0), 1)), jax.jit(env.step)
+    np.testing.assert_allclose(task.reset(1), ours.obs, atol=1e-6)
+    action = np.full(env.action_size, 0.05)
+    over = False
+    for _ in range(env.config.horizon):
+        ours = step(ours, jnp.asarray(action))
+        observation, reward, over = task.step(action)
+        np.testing.assert_allclose(observation, ours.obs, atol=1e-3)  # float32 against float64, 500 physics steps
+        np.testing.assert_allclose(reward, ours.reward, atol=1e-3)
+    assert over and ours.done
+
+
+@pytest.mark.slow
+def test_ppo_runs_on_mujoco():
+    pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    (row,) = ppo.run("planar4dof", SMALL, [ppo.ON_PROCESSOR], batches=1)
+    assert "failed" not in row and row["steps_per_s"] > 0
+
+
+@pytest.mark.slow
+def test_ppo_learns_on_the_stock_environment():
+    (row,) = ppo.run("planar4dof", SMALL, ["brax, mjx.Data carried"], batches=1)
+    assert "failed" not in row and row["steps_per_s"] > 0

@@ -1,0 +1,64 @@
+"""`python -m benchmarks.scaling`."""
+
+import pytest
+from rich.console import Console
+
+from benchmarks import scaling
+
+OF_ONE = {"num_envs": 16, "batch_size": 16, "num_timesteps": 3000}
+SMALL = (
+    "env=planar4dof", "env.physics=fused", "env.demonstrations.count=2", "env.demonstrations.held_out=1",
+    "trainer.preset=cpu", "trainer.num_minibatches=2", "trainer.num_updates_per_batch=1", "trainer.evaluations=3",
+    "trainer.hidden_layers=[8]",
+)  # fmt: skip
+
+
+def test_weak_scaling_multiplies_and_strong_scaling_does_not():
+    assert scaling.arguments("weak", 4, OF_ONE) == [
+        "trainer.num_envs=64", "trainer.batch_size=64", "trainer.num_timesteps=12000",
+    ]  # fmt: skip
+    assert scaling.arguments("strong", 4, OF_ONE) == scaling.arguments("weak", 1, OF_ONE)
+
+
+def test_a_process_sees_so_many_devices(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--of-the-user")
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert scaling.environment(2, "gpu")["CUDA_VISIBLE_DEVICES"] == "0,1"
+    assert scaling.environment(2, "cpu")["XLA_FLAGS"] == "--of-the-user --xla_force_host_platform_device_count=2"
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5,7")
+    assert scaling.environment(2, "gpu")["CUDA_VISIBLE_DEVICES"] == "3,5"
+
+
+def test_the_speed_leaves_out_what_compiled(tmp_path):
+    (tmp_path / "metrics.csv").write_text("step,training/sps\n1,1\n2,100\n3,110\n4,120\n")
+    assert scaling.speed(tmp_path / "metrics.csv") == {
+        "steps_per_s": 110.0,
+        "spread": pytest.approx(10 / 110, abs=1e-4),
+    }
+
+
+def test_efficiency_is_relative_to_the_fewest_devices(tmp_path):
+    rates = {("weak", 2): 200.0, ("weak", 4): 300.0, ("strong", 2): 100.0}
+    results = [
+        {"scaling": kind, "devices": devices, "seed": seed, "steps_per_s": rate + seed - 1}
+        | {"optimality_gap": {"train": 0.01 * seed}}
+        for (kind, devices), rate in rates.items()
+        for seed in range(3)
+    ]
+    rows = scaling.summary(results)
+    assert [(row["scaling"], row["devices"], row["efficiency"]) for row in rows] == [
+        ("weak", 2, 1.0), ("weak", 4, 0.75), ("strong", 2, 1.0),
+    ]  # fmt: skip
+    assert rows[0]["gap"] == pytest.approx(0.01) and rows[0]["gap_deviation"] == pytest.approx(0.01)
+    Console(file=(tmp_path / "table").open("w")).print(scaling.table(rows))
+    scaling.draw(rows, "made up", tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_two_devices_train_the_same_in_both_ways():
+    alone, _, weak, strong = scaling.run(scaling.KINDS, [1, 2], [0], SMALL, OF_ONE)
+    assert (weak["scaling"], strong["scaling"]) == scaling.KINDS
+    assert min(row["steps_per_s"] for row in (alone, weak, strong)) > 0
+    assert weak["env_steps"] == pytest.approx(2 * alone["env_steps"], rel=0.2)  # whole batches
+    assert strong["env_steps"] == alone["env_steps"]
