@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 _log = logging.getLogger(__name__)
-_SHORTEST_LINK = 1e-6  # m; below this a link has no direction
+SHORTEST_LINK = 1e-6  # m; below this a link has no direction
 
 Locked = str | int | Iterable[str | int] | Mapping[str | int, float]
 
@@ -142,8 +142,8 @@ def drop_zero_length(links: Iterable[Link]) -> tuple[Link, ...]:
       ValueError: no link is left.
     """
     links = tuple(links)
-    kept = tuple(link for link in links if link.length > _SHORTEST_LINK)
-    dropped = [link.name for link in links if link.length <= _SHORTEST_LINK]
+    kept = tuple(link for link in links if link.length > SHORTEST_LINK)
+    dropped = [link.name for link in links if link.length <= SHORTEST_LINK]
     if dropped:
         _log.warning("links of length zero merged into the next link: %s", ", ".join(dropped))
     if not kept:

@@ -25,6 +25,7 @@ from mimic.trainers.config import TRAINERS, EvaluateConfig, FiguresConfig, Rende
 from mimic.trainers.signals import STOPPED_BY_SIGNAL
 
 BAD_INPUT = 2
+ARM_KEYS = "env.expert", "env.learner"  # keys that take an arm by name or file alone
 _CONFIG_ERRORS = (FrozenInstanceError, HydraException, OmegaConfBaseException)  # the first: a key added with "+"
 
 Work = Callable[[], int | None]  # returns the exit code, 0 for None
@@ -39,6 +40,7 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
       config_name: in mimic/conf.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises, and the line below is all that is shown
+    sys.argv[1:] = [_written_out(argument) for argument in sys.argv[1:]]
     _register_schemas()
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
@@ -58,6 +60,13 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(STOPPED_BY_SIGNAL + signal.SIGINT)
+
+
+def _written_out(argument: str) -> str:
+    """An argument as Hydra takes it: env.learner=ARM.xml is short for env.learner.model=ARM.xml."""
+    key, equals, value = argument.partition("=")
+    is_short = equals and key in ARM_KEYS and not value.startswith("{")
+    return f"{key}.model={value}" if is_short else argument
 
 
 def _refuse(error: BaseException) -> NoReturn:

@@ -1,6 +1,7 @@
 """An arm as the environments use it: its embodiment, and a lean MuJoCo model that moves exactly its free joints."""
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
-from mimic.mjcf import read_model
+from mimic.model_files import read_spec
 
 # Planar arms are ours to define: slender rods, whose joints feel about as heavy for their size as the Panda's.
 _PLANAR_MASS = 1.0  # kg/m
@@ -23,16 +24,19 @@ _IGNORED = (
 )
 
 
+BUILT_IN = "panda", "planar"
+
+
 @dataclasses.dataclass(frozen=True)
 class ArmConfig:
     """Which arm.
 
     Attributes:
-      model: "panda", "planar", or the path of an MJCF file.
+      model: "panda", "planar", or the path of an MJCF or URDF file, which is made absolute.
       locked: joint names or numbers, or a mapping from these to angles [rad].
       link_lengths: of a planar arm [m].
-      base: body that the chain starts behind (MJCF file).
-      tip: body or site that the chain ends at (MJCF file).
+      base: body that the chain starts behind (of a file).
+      tip: body or site that the chain ends at (of a file); else see `find_route`.
     """
 
     model: str = "panda"
@@ -40,6 +44,17 @@ class ArmConfig:
     link_lengths: list[float] = dataclasses.field(default_factory=list)
     base: str | None = None
     tip: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.model:
+            raise ValueError(f"model: expected {', '.join(BUILT_IN)} or the path of an MJCF or URDF file, got nothing")
+        if self.is_file:  # so that a run finds it again from any folder
+            object.__setattr__(self, "model", os.path.abspath(os.path.expanduser(self.model)))
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the arm is read from a file."""
+        return self.model not in BUILT_IN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,8 +81,7 @@ def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
     if config.model == "planar":
         return _planar_spec(planar_arm(config.link_lengths))
     path = panda_path() if config.model == "panda" else config.model
-    read_model(path)  # says what is wrong
-    return mujoco.MjSpec.from_file(path)
+    return read_spec(path)
 
 
 def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
@@ -92,10 +106,7 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
         tip=config.tip,
         limits=cast(Limits, limits),
     )
-    model = simulation_model(source, embodiment.joint_names, angles)
-    if model.nq != embodiment.num_joints:
-        raise ValueError(f"model: the hinges of {config.model!r} need names to be simulated; some have none")
-    return Arm(embodiment, model, angles)
+    return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles)
 
 
 def simulation_model(
