@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from mimic.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
 from mimic.model_files import read_spec
+from mimic.set_aside import set_aside
 
 # Planar arms are ours to define: slender rods, whose joints feel about as heavy for their size as the Panda's.
 _PLANAR_MASS = 1.0  # kg/m
@@ -18,6 +19,10 @@ _PLANAR_ARMATURE = 0.02  # kg m^2
 _PLANAR_DAMPING = 0.1  # N m s/rad
 _PLANAR_VELOCITY_LIMIT = 2.5  # rad/s
 _PLANAR_RADIUS, _PLANAR_COLOUR = 0.03, [0.35, 0.55, 0.85, 1.0]  # what is seen of them [m]
+
+# The largest torque takes a joint from rest to this multiple of its rated speed in one step.
+_OFFERED_SPEED_FACTOR = 2.0
+UNKNOWN_SPEED = np.pi  # rad/s, taken for the rated speed of joints that have none
 
 _IGNORED = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
@@ -65,11 +70,13 @@ class Arm:
       embodiment: its free joints and links.
       model: of the free joints alone.
       locked: angle [rad] of the joints that are held, by name.
+      notes: what of its file was set aside, in words.
     """
 
     embodiment: Embodiment
     model: mujoco.MjModel
     locked: Mapping[str, float]
+    notes: tuple[str, ...] = ()
 
 
 def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
@@ -106,7 +113,8 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
         tip=config.tip,
         limits=cast(Limits, limits),
     )
-    return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles)
+    notes = () if is_panda else set_aside(source, config.base, config.tip)
+    return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, notes)
 
 
 def simulation_model(
@@ -163,7 +171,22 @@ def simulation_model(
 
 def rated_speed(arm: Embodiment) -> Float[np.ndarray, " joints"]:
     """Largest speed of each joint [rad/s], pi where none is known."""
-    return np.where(np.isfinite(arm.velocity_limit), arm.velocity_limit, np.pi)
+    return np.where(np.isfinite(arm.velocity_limit), arm.velocity_limit, UNKNOWN_SPEED)
+
+
+def torque_scale(arm: Arm, action_scale: float, control_dt: float) -> Float[np.ndarray, " joints"]:
+    """Largest torque of each joint [N m]: what gets it well beyond its rated speed in one step, at most its limit.
+
+    The full torque of a Panda would take its light joints to tens of rad/s within a step, where nothing can be learned.
+
+    Args:
+      arm: the learner.
+      action_scale: see `EnvConfig`.
+      control_dt: time that a torque is held [s].
+    """
+    inertia = effective_inertia(arm.model, np.asarray(arm.embodiment.home))
+    torque = action_scale * _OFFERED_SPEED_FACTOR * rated_speed(arm.embodiment) * inertia / control_dt
+    return np.minimum(torque, arm.embodiment.torque_limit).astype(np.float32)
 
 
 def effective_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
