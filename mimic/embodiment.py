@@ -127,7 +127,7 @@ def load_mjcf(
 
     Links are the capsule sites named link… where the model has them (`fromto` gives start and end), else the segments
     from each joint's anchor to the next, the last one ending at `tip`. The base frame is that of the body before the
-    first hinge. What else the model has, such as a gripper's joints, stays where it is: see `find_route` in mimic.route.
+    first hinge. A hand's joints stay where they are; where the model branches: see `find_route` in mimic.route.
 
     Args:
       path_or_model: an MJCF or URDF file, or a compiled model.

@@ -87,8 +87,8 @@ def _anchor_links(joints: list[Joint], tip: np.ndarray) -> list[Link]:
 def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, route: Route, tip: str | None) -> np.ndarray:
     """Where the last link ends.
 
-    The named tip, else the farthest of the sites and bodies that the last body carries, else of its geoms' ends, else its
-    centre of mass.
+    The named tip, else the farthest of the sites and bodies that the last body carries, else of its geoms' ends,
+    else its centre of mass.
     """
     if tip is not None:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)

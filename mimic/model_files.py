@@ -28,8 +28,8 @@ _MESH_FORMATS = (".stl", ".obj", ".msh")
 def read_spec(path: str | os.PathLike[str]) -> mujoco.MjSpec:
     """An MJCF or URDF file as a MuJoCo spec that compiles, in which every joint and body has a name.
 
-    A URDF keeps the names of its fixed links and its rated speeds; meshes that cannot be found are left out of it, since
-    its inertias are given without them.
+    A URDF keeps the names of its fixed links and its rated speeds; meshes that cannot be found are left out of it,
+    since its inertias are given without them.
 
     Raises:
       ValueError: no such file, one that is too large, has entities or includes a file outside of its folder, or that
@@ -92,7 +92,8 @@ def _check_text(file: Path) -> None:
         size = part.stat().st_size
         if size > LARGEST_FILE:
             raise ValueError(
-                f"{str(part)!r} has {size / 2**20:.0f} MiB; expected a model of at most {LARGEST_FILE // 2**20} MiB of XML"
+                f"{str(part)!r} has {size / 2**20:.0f} MiB; "
+                f"expected a model of at most {LARGEST_FILE // 2**20} MiB of XML"
             )
         text = _COMMENT.sub("", part.read_text(errors="replace"))
         if _DOCTYPE.search(text):

@@ -26,8 +26,8 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
 
     Args:
       name: one of `environments()`.
-      overrides: fields of `EnvConfig`; a nested config takes a dict, as in `demonstrations={"count": 1}`, and an arm also
-        its name or file alone, as in `learner="arm.xml"`.
+      overrides: fields of `EnvConfig`; a nested config takes a dict, as in `demonstrations={"count": 1}`, an arm
+        also its name or file alone, as in `learner="arm.xml"`.
 
     Raises:
       ValueError: an unknown name or field, or a value of the wrong type or out of range.

@@ -1,6 +1,8 @@
 """An arm as the environments use it: its embodiment, and a lean MuJoCo model that moves exactly its free joints."""
 
+import copy
 import dataclasses
+import math
 import os
 from collections.abc import Mapping
 from typing import Any, cast
@@ -42,6 +44,8 @@ class ArmConfig:
       link_lengths: of a planar arm [m].
       base: body that the chain starts behind (of a file).
       tip: body or site that the chain ends at (of a file); else see `find_route`.
+      armature: least rotor inertia of each joint, as its motor feels it [kg m^2]; many models state none.
+      damping: least damping of each joint [N m s/rad].
     """
 
     model: str = "panda"
@@ -49,10 +53,15 @@ class ArmConfig:
     link_lengths: list[float] = dataclasses.field(default_factory=list)
     base: str | None = None
     tip: str | None = None
+    armature: float = 0.0
+    damping: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.model:
             raise ValueError(f"model: expected {', '.join(BUILT_IN)} or the path of an MJCF or URDF file, got nothing")
+        for name in ("armature", "damping"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
         if self.is_file:  # so that a run finds it again from any folder
             object.__setattr__(self, "model", os.path.abspath(os.path.expanduser(self.model)))
 
@@ -103,7 +112,7 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
         embodiment, source, angles = load_arm(
             source, name=embodiment.name, locked=config.locked, limits=cast(Limits, limits)
         )
-        return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles)
+        return with_rotors(Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config)
     is_panda = config.model == "panda"
     embodiment, source, angles = load_arm(
         panda_path() if is_panda else config.model,
@@ -114,7 +123,15 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
         limits=cast(Limits, limits),
     )
     notes = () if is_panda else set_aside(source, config.base, config.tip)
-    return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, notes)
+    return with_rotors(Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, notes), config)
+
+
+def with_rotors(arm: Arm, config: ArmConfig) -> Arm:
+    """The arm whose joints have at least the rotor inertia and the damping of a config."""
+    model = copy.copy(arm.model)
+    model.dof_armature[:] = np.maximum(model.dof_armature, config.armature)
+    model.dof_damping[:] = np.maximum(model.dof_damping, config.damping)
+    return dataclasses.replace(arm, model=model)
 
 
 def simulation_model(

@@ -12,14 +12,19 @@ from jaxtyping import Float
 
 from mimic.distance import embodiment_distance
 from mimic.embodiment import load_arm
-from mimic.envs.arms import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale
+from mimic.envs.arms import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale, with_rotors
 from mimic.envs.config import EnvConfig
 from mimic.envs.recording import record_demonstrations
 from mimic.imitation import kinematic_bound
 from mimic.kinematics import LinkStates, link_state_table
 
-_TIME = 5.0  # s of random torques, as long as an episode
 _DEMONSTRATIONS, _EVERY = 2, 5  # few, and of them every fifth step: a rough value in seconds
+
+# Rotor inertias [kg m^2] that are tried in turn where an arm runs away; the Panda's joints have 0.1. Damping is in
+# proportion, as there: [1/s].
+_ARMATURES, _DAMPING_SHARE = (0.01, 0.03, 0.1, 0.3), 10.0
+_CERTAIN = 10.0  # times the speed bound: a runaway
+_CALM_SHARE = 0.8  # of the speed bound that random torques may reach
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +51,7 @@ def nearness(expert: Arm, learner: Arm, config: EnvConfig) -> Nearness:
     correspondence, weights = metric.make_correspondence(*pair), metric.make_weights()
     measure = {"rotation": metric.rotation_measure, "reduction": metric.reduction}
     qpos, qvel = (
-        x[:, 1 :: _EVERY].reshape(-1, expert.embodiment.num_joints).astype(np.float32)
+        x[:, 1::_EVERY].reshape(-1, expert.embodiment.num_joints).astype(np.float32)
         for x in (recorded.qpos, recorded.qvel)
     )
 
@@ -61,16 +66,24 @@ def nearness(expert: Arm, learner: Arm, config: EnvConfig) -> Nearness:
 
 
 def random_torque_speed(arm: Arm, config: EnvConfig) -> float:
-    """Largest joint speed [rad/s] in one episode of random torques, as an untrained policy makes them."""
+    """Largest joint speed [rad/s] in an episode of random torques, as an untrained policy makes them; inf beyond all.
+
+    Stops where it is certain that an episode would have ended.
+    """
     model = copy.copy(arm.model)
     model.opt.timestep = config.control_dt / config.substeps
     data = mujoco.MjData(model)
     data.qpos[:] = arm.embodiment.home
     scale, rng, largest = torque_scale(arm, config.action_scale, config.control_dt), np.random.default_rng(0), 0.0
-    for _ in range(round(_TIME / config.control_dt)):
+    for _ in range(config.horizon):
         data.qfrc_applied[:] = scale * rng.uniform(-1, 1, model.nv)
-        mujoco.mj_step(model, data, config.substeps)
-        largest = max(largest, float(np.abs(data.qvel).max()))
+        for _ in range(config.substeps):  # not mj_step, which logs to a file what diverges
+            mujoco.mj_forward(model, data)
+            mujoco.mj_RungeKutta(model, data, 4)
+            speed = float(np.abs(data.qvel).max())
+            if not speed < _CERTAIN * config.speed_bound:  # also where not a number
+                return speed if np.isfinite(speed) else np.inf
+            largest = max(largest, speed)
     return largest
 
 
@@ -105,7 +118,7 @@ def assumptions(config: ArmConfig, arm: Arm) -> Iterator[str]:
             yield f"no <inertial> in {_listed(guessed)}: inertia from the geoms, of MuJoCo's density of water"
 
 
-def doubts(config: ArmConfig, arm: Arm, env: EnvConfig) -> Iterator[str]:
+def doubts(config: ArmConfig, arm: Arm) -> Iterator[str]:
     """What may keep a learner from imitating well."""
     embodiment, names = arm.embodiment, np.array(arm.embodiment.joint_names)
     unseen = names[max(embodiment.link_joint) + 1 :]
@@ -118,12 +131,28 @@ def doubts(config: ArmConfig, arm: Arm, env: EnvConfig) -> Iterator[str]:
     outside = names[(embodiment.home < lower) | (embodiment.home > upper)]
     if outside.size:
         yield f"{_listed(outside)}: the start pose is outside of the joint range; limits=hardware starts within"
-    speed = random_torque_speed(arm, env)
-    if not speed < env.speed_bound:  # also where not a number
-        yield (
-            f"random torques take a joint to {speed:.3g} rad/s, beyond the {env.speed_bound:g} rad/s at which an "
-            "episode ends: try env.action_scale=0.3, or give the light joints armature"
-        )
+
+
+def calmed(config: ArmConfig, arm: Arm, env: EnvConfig) -> tuple[ArmConfig, str]:
+    """The arm with rotor inertia and damping where it needs some not to run away, and why; "" where it needs none.
+
+    Few models state the rotor inertia of their motors, without which random torques whirl the light wrists about, and
+    an episode ends before anything is learned.
+    """
+    speed = alone = random_torque_speed(arm, env)
+    limit, tried = _CALM_SHARE * env.speed_bound, config
+    for armature in _ARMATURES:
+        if speed < limit:
+            break
+        tried = dataclasses.replace(config, armature=armature, damping=_DAMPING_SHARE * armature)
+        speed = random_torque_speed(with_rotors(arm, tried), env)
+    if alone < limit:
+        return config, ""
+    return tried, (
+        f"random torques take a joint to {alone:.3g} rad/s and more, where episodes end at {env.speed_bound:g} rad/s; "
+        f"with a rotor inertia of {tried.armature:g} kg m^2 and a damping of {tried.damping:g} N m s/rad in each joint, "
+        f"as in the command below, to {speed:.3g} rad/s"
+    )
 
 
 def _listed(names: np.ndarray | list[str]) -> str:

@@ -1,5 +1,6 @@
 """What `python -m mimic.inspect` does: says what an arm's file holds, and what would come of training it."""
 
+import dataclasses
 import json
 import os
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from rich.table import Table  # noqa: E402
 
 from mimic.envs.arms import Arm, ArmConfig, build_arm, effective_inertia, rated_speed, torque_scale  # noqa: E402
 from mimic.envs.config import EnvConfig, InspectConfig  # noqa: E402
-from mimic.envs.preflight import assumptions, doubts, joint_ranges, nearness  # noqa: E402
+from mimic.envs.preflight import assumptions, calmed, doubts, joint_ranges, nearness  # noqa: E402
 from mimic.rendering import ArmScene  # noqa: E402
 
 _PICTURE, _FINDINGS = "arms.png", "inspection.json"
@@ -35,9 +36,16 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     expert, learner = build_arm(config.expert, config.limits), build_arm(config.learner, config.limits)
     joints, links = _joints(learner, config.learner, env), _links(expert, learner, env)
     notes = list(learner.notes)
-    assumed, warned = list(assumptions(config.learner, learner)), list(doubts(config.learner, learner, env))
+    assumed, warned = list(assumptions(config.learner, learner)), list(doubts(config.learner, learner))
+    calm, why = calmed(config.learner, learner, env)
+    warned += [why] if why else []
+    command = train_command(dataclasses.replace(config, learner=calm))
     near = nearness(expert, learner, env) if config.bound else None
-    scene = ArmScene([config.expert, config.learner], limits=config.limits, width=_SCENE[0], height=_SCENE[1]) if out else None
+    scene = (
+        ArmScene([config.expert, config.learner], limits=config.limits, width=_SCENE[0], height=_SCENE[1])
+        if out
+        else None
+    )
 
     def run() -> None:
         console = Console()
@@ -52,7 +60,9 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
         if out and scene:
             out.mkdir()
             with scene:
-                _save_picture(out / _PICTURE, scene.image([expert.embodiment.home, learner.embodiment.home]), expert, learner, env)
+                _save_picture(
+                    out / _PICTURE, scene.image([expert.embodiment.home, learner.embodiment.home]), expert, learner, env
+                )
             findings = {
                 "arm": learner.embodiment.name,
                 "expert": expert.embodiment.name,
@@ -63,11 +73,11 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
                 "mind": warned,
                 "bound": near and near.bound,
                 "hold": near and near.hold,
-                "train": train_command(config),
+                "train": command,
             }
             (out / _FINDINGS).write_text(json.dumps(findings, indent=2) + "\n")
             console.print(f"results: {out}", soft_wrap=True, highlight=False)
-        console.print(f"train it: {train_command(config)}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"train it: {command}", soft_wrap=True, highlight=False, markup=False)
 
     return run
 
@@ -84,7 +94,9 @@ def train_command(config: InspectConfig) -> str:
 def _arm_words(key: str, arm: ArmConfig) -> list[str]:
     near = os.path.relpath(arm.model) if arm.is_file else arm.model
     words = [f"{key}={arm.model if near.startswith('..') else near}"]
-    words += [f"{key}.{name}={value}" for name in ("base", "tip") if (value := getattr(arm, name))]
+    words += [
+        f"{key}.{name}={value}" for name in ("base", "tip", "armature", "damping") if (value := getattr(arm, name))
+    ]
     for name in ("locked", "link_lengths"):
         value = getattr(arm, name)
         if value:
@@ -147,8 +159,8 @@ def _table(title: str, rows: list[dict[str, Any]]) -> Table:
     hidden = {"speed is assumed"} | {key for key in ("held at",) if all(row.get(key) is None for row in rows)}
     keys = [key for key in rows[0] if key not in hidden]
     table = Table(title=title, title_justify="left")
-    for key in keys:
-        table.add_column(escape(_HEADERS.get(key, key)))
+    for key in keys:  # names as they are, whatever the width
+        table.add_column(escape(_HEADERS.get(key, key)), no_wrap=key in ("joint", "link", "moved by"))
     for row in rows:
         assumed = {"rated speed"} if row.get("speed is assumed") else set()
         table.add_row(*(escape(_text(row.get(key)) + (" assumed" if key in assumed else "")) for key in keys))
@@ -194,6 +206,6 @@ def _save_picture(path: Path, image: np.ndarray, expert: Arm, learner: Arm, env:
             right.text(column, row, f"{share:.0%}", ha="center", va="center", color="white" if share > 0.6 else "black")
     right.set_xticks(range(shares.shape[1]), learner.embodiment.link_names, rotation=30, ha="right")
     right.set_yticks(range(shares.shape[0]), expert.embodiment.link_names)
-    right.set(xlabel="learner", ylabel="expert", title="share of each expert link in a learner link")
+    right.set(xlabel="learner", ylabel="expert", title="which expert links a learner link is compared with")
     figure.savefig(path, dpi=100)
     plt.close(figure)
