@@ -1,5 +1,6 @@
 """Reads MJCF and URDF files with care: what cannot be meant is refused in one line before MuJoCo sees it."""
 
+import functools
 import logging
 import os
 import re
@@ -146,7 +147,12 @@ def _find_meshes(spec: mujoco.MjSpec, file: Path) -> None:
             spec.delete(geom)
         spec.delete(mesh)
     if missing:
-        _log.warning("%s: left out %d meshes that cannot be read, the first %s", file, len(missing), missing[0])
+        _warn_of_missing(file, len(missing), missing[0])
+
+
+@functools.cache  # a model is read several times in a run; once is enough to be told
+def _warn_of_missing(file: Path, count: int, first: str) -> None:
+    _log.warning("%s: left out %d meshes that cannot be read, the first %s", file, count, first)
 
 
 def _find_mesh(name: str, *folders: Path) -> Path | None:

@@ -74,12 +74,10 @@ def largest_errors(file, original, tip, base=None):
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_an_arm_that_others_wrote_moves_as_its_model_says(x64, name, record_property):
+def test_an_arm_that_others_wrote_moves_as_its_model_says(x64, name):
     file, tip = other(name)
-    if name.endswith("URDF"):  # its meshes are named by ROS package, which MuJoCo does not look up
-        original = read_model(file)
-    else:
-        original = mujoco.MjModel.from_xml_path(str(file))
+    # MuJoCo does not look up the meshes that a URDF names by their ROS package.
+    original = read_model(file) if name.endswith("URDF") else mujoco.MjModel.from_xml_path(str(file))
     kinematic, dynamic = largest_errors(file, original, tip)
     print(f"{name}: link states off by {kinematic:.1e}, dynamics by {dynamic:.1e}")
     assert kinematic < 1e-9 and dynamic < 1e-9
@@ -185,10 +183,14 @@ FILES = {
         '<mujoco><include file="../other.xml"/></mujoco>',
         "'.*arm.xml' includes '../other.xml', which is outside of its folder; expected files in ",
     ),
-    "an absolute include": ('<mujoco><include file="/etc/hosts"/></mujoco>', "'.*arm.xml' includes '/etc/hosts', which"),
+    "an absolute include": (
+        '<mujoco><include file="/etc/hosts"/></mujoco>',
+        "'.*arm.xml' includes '/etc/hosts', which is outside",
+    ),
     "an include of itself": ('<mujoco><include file="arm.xml"/></mujoco>', "'.*arm.xml' is no MJCF or URDF model"),
     "a missing mesh": (
-        '<mujoco><asset><mesh name="a" file="a.stl"/></asset><worldbody><geom type="mesh" mesh="a"/></worldbody></mujoco>',
+        '<mujoco><asset><mesh name="a" file="a.stl"/></asset>'
+        '<worldbody><geom type="mesh" mesh="a"/></worldbody></mujoco>',
         "'.*arm.xml' needs the file 'a.stl', which is not there; expected all its files beside it$",
     ),
     "no inertia": (

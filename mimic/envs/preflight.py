@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +50,7 @@ def nearness(expert: Arm, learner: Arm, config: EnvConfig) -> Nearness:
     recorded = record_demonstrations(expert, _DEMONSTRATIONS, horizon=config.horizon, dt=config.control_dt)
     pair, metric = (expert.embodiment, learner.embodiment), config.metric
     correspondence, weights = metric.make_correspondence(*pair), metric.make_weights()
-    measure = {"rotation": metric.rotation_measure, "reduction": metric.reduction}
+    measure: dict[str, Any] = {"rotation": metric.rotation_measure, "reduction": metric.reduction}
     qpos, qvel = (
         x[:, 1::_EVERY].reshape(-1, expert.embodiment.num_joints).astype(np.float32)
         for x in (recorded.qpos, recorded.qvel)
@@ -61,7 +62,9 @@ def nearness(expert: Arm, learner: Arm, config: EnvConfig) -> Nearness:
     home = np.broadcast_to(np.asarray(learner.embodiment.home), (len(qpos), learner.embodiment.num_joints))
     still = link_state_table(learner.embodiment, home, np.zeros_like(home))
     hold = jax.jit(jax.vmap(distance))(link_state_table(expert.embodiment, qpos, qvel), still)
-    bound = jax.jit(lambda *motion: kinematic_bound(*pair, *motion, correspondence, weights, **measure))(qpos, qvel)
+    bound = jax.jit(lambda qpos, qvel: kinematic_bound(*pair, qpos, qvel, correspondence, weights, **measure))(
+        qpos, qvel
+    )
     return Nearness(float(jnp.mean(bound)), float(jnp.mean(hold)))
 
 
@@ -150,8 +153,8 @@ def calmed(config: ArmConfig, arm: Arm, env: EnvConfig) -> tuple[ArmConfig, str]
         return config, ""
     return tried, (
         f"random torques take a joint to {alone:.3g} rad/s and more, where episodes end at {env.speed_bound:g} rad/s; "
-        f"with a rotor inertia of {tried.armature:g} kg m^2 and a damping of {tried.damping:g} N m s/rad in each joint, "
-        f"as in the command below, to {speed:.3g} rad/s"
+        f"with a rotor inertia of {tried.armature:g} kg m^2 and a damping of {tried.damping:g} N m s/rad in each "
+        f"joint, as in the command below, to {speed:.3g} rad/s"
     )
 
 

@@ -178,11 +178,11 @@ def _text(value: Any) -> str:
 
 
 def _headline(expert: Arm, learner: Arm) -> str:
-    arm = learner.embodiment
+    arm, other = learner.embodiment, expert.embodiment
     return (
         f"{arm.name}: {arm.num_joints} joints, {arm.num_links} links, {arm.chain_length:.3f} m along them, "
-        f"{learner.model.body_mass.sum():.2f} kg that move; expert {expert.embodiment.name}: "
-        f"{expert.embodiment.num_joints} joints, {expert.embodiment.num_links} links, {expert.embodiment.chain_length:.3f} m"
+        f"{learner.model.body_mass.sum():.2f} kg that move; expert {other.name}: "
+        f"{other.num_joints} joints, {other.num_links} links, {other.chain_length:.3f} m"
     )
 
 
