@@ -49,7 +49,7 @@ class ArmConfig:
     """
 
     model: str = "panda"
-    locked: Any = ()
+    locked: Any = None  # not a list, which OmegaConf would let no mapping replace
     link_lengths: list[float] = dataclasses.field(default_factory=list)
     base: str | None = None
     tip: str | None = None
@@ -110,14 +110,14 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
         embodiment = planar_arm(config.link_lengths)
         source = _planar_spec(embodiment).compile()
         embodiment, source, angles = load_arm(
-            source, name=embodiment.name, locked=config.locked, limits=cast(Limits, limits)
+            source, name=embodiment.name, locked=config.locked or (), limits=cast(Limits, limits)
         )
         return with_rotors(Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config)
     is_panda = config.model == "panda"
     embodiment, source, angles = load_arm(
         panda_path() if is_panda else config.model,
         name="panda" if is_panda else None,
-        locked=config.locked,
+        locked=config.locked or (),
         base=config.base,
         tip=config.tip,
         limits=cast(Limits, limits),

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -101,7 +102,7 @@ def _arm_words(key: str, arm: ArmConfig) -> list[str]:
         value = getattr(arm, name)
         if value:
             words.append(f"{key}.{name}={str(value if isinstance(value, dict) else list(value)).replace(' ', '')}")
-    return [word.replace("'", "") for word in words]
+    return [shlex.quote(word) if "{" in word else word for word in (word.replace("'", "") for word in words)]
 
 
 def _new_folder(path: str) -> Path | None:
