@@ -21,11 +21,12 @@ GRIPPER = """<body name="palm" pos="0 0.1 0"><geom size="0.03" mass="0.3"/><site
 def ur_like(*, gripper: str = GRIPPER, actuators: str = "motor", named: bool = True, armature: float = 0.1) -> str:
     """MJCF of a six-joint arm with a gripper, gravity, contacts, a coupling of its fingers and a keyframe."""
     opened = ""
-    for name, offset, axis, mass in _UR_LIKE:
+    ends = [offset for _, offset, _, _ in _UR_LIKE[1:]] + ["0 0.1 0"]
+    for (name, offset, axis, mass), end in zip(_UR_LIKE, ends, strict=True):
         joint = f'name="{name}"' if named else ""
         opened += f"""<body {f'name="{name}_link"' if named else ""} pos="{offset}">
           <joint {joint} axis="{axis}" range="-6.2 6.2" armature="{armature}" damping="{10 * armature}"/>
-          <geom type="capsule" size="0.04" fromto="0 0 0 0 0.05 0.1" mass="{mass}"/>"""
+          <geom type="capsule" size="0.04" fromto="0 0 0 {end}" mass="{mass}"/>"""
     kinds = {
         "motor": '<motor joint="{}" ctrlrange="-150 150"/>',
         "position": '<position joint="{}" kp="2000" kv="400" forcerange="-150 150" ctrlrange="-6 6"/>',

@@ -115,19 +115,24 @@ def test_a_pair_takes_arms_by_file(arm_file):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)  # three commands that compile, on two cores
 def test_a_learner_from_a_file_is_trained_evaluated_and_shown(arm_file, tmp_path):
     run_dir = tmp_path / "run"
 
-    def command(name, *arguments):
+    elsewhere = tmp_path / "elsewhere"  # a run finds its arms from any folder
+    elsewhere.mkdir()
+
+    def command(name, *arguments, folder=elsewhere):
         result = subprocess.run(
             [sys.executable, "-m", f"mimic.{name}", *map(str, arguments)],
-            capture_output=True, text=True, check=False, cwd=arm_file.parent,
+            capture_output=True, text=True, check=False, cwd=folder,
         )  # fmt: skip
         assert result.returncode == 0, result.stderr[-2000:]
 
     sizes = ["num_envs=64", "batch_size=32", "num_minibatches=4", "num_updates_per_batch=1", "num_timesteps=5000"]
     small = [f"trainer.{size}" for size in (*sizes, "hidden_layers=[16]", "evaluations=1", "preset=cpu")]
-    command("train", "env=pair", "env.learner=arm.xml", "env.physics=fused", *FEW, *small, f"run_dir={run_dir}")
+    pair = ["env=pair", "env.learner=arm.xml", "env.physics=fused", *FEW]
+    command("train", *pair, *small, f"run_dir={run_dir}", folder=tmp_path)
     report = json.loads((run_dir / "report.json").read_text())
     assert report["env_steps"] >= 5000 and np.isfinite(report["optimality_gap"]["held_out"])
     command("evaluate", f"run={run_dir}", f"out={tmp_path / 'again'}")
