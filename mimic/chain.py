@@ -1,6 +1,7 @@
 """A serial chain of hinges as plain numbers, and what locking joints makes of it."""
 
 import dataclasses
+import functools
 import logging
 import math
 import operator
@@ -9,7 +10,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 _log = logging.getLogger(__name__)
-_SHORTEST_LINK = 1e-6  # m; below this a link has no direction
+SHORTEST_LINK = 1e-6  # m; below this a link has no direction
 
 Locked = str | int | Iterable[str | int] | Mapping[str | int, float]
 
@@ -142,13 +143,18 @@ def drop_zero_length(links: Iterable[Link]) -> tuple[Link, ...]:
       ValueError: no link is left.
     """
     links = tuple(links)
-    kept = tuple(link for link in links if link.length > _SHORTEST_LINK)
-    dropped = [link.name for link in links if link.length <= _SHORTEST_LINK]
+    kept = tuple(link for link in links if link.length > SHORTEST_LINK)
+    dropped = [link.name for link in links if link.length <= SHORTEST_LINK]
     if dropped:
-        _log.warning("links of length zero merged into the next link: %s", ", ".join(dropped))
+        _warn_of_merged(", ".join(dropped))
     if not kept:
         raise ValueError("the arm has no link of a length above zero")
     return kept
+
+
+@functools.cache  # an arm is built several times in a run; once is enough to be told
+def _warn_of_merged(names: str) -> None:
+    _log.warning("links of length zero merged into the next link: %s", names)
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:

@@ -21,11 +21,16 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic.config import explain, schema
-from mimic.envs.config import EnvConfig, RecordingConfig, RetargetConfig
+from mimic.envs.config import EnvConfig, InspectConfig, RecordingConfig, RetargetConfig
 from mimic.trainers.config import TRAINERS, EvaluateConfig, FiguresConfig, RenderConfig, TrainConfig
 from mimic.trainers.signals import STOPPED_BY_SIGNAL
 
 BAD_INPUT = 2
+ARM_KEYS = {  # of each command: keys that take an arm by name or file alone
+    "train": ("env.expert", "env.learner"),
+    "demonstrations": ("env.expert", "env.learner"),
+    "inspect": ("expert", "learner"),
+}
 _CONFIG_ERRORS = (FrozenInstanceError, HydraException, OmegaConfBaseException)  # the first: a key added with "+"
 
 Work = Callable[[], int | None]  # returns the exit code, 0 for None
@@ -40,6 +45,7 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
       config_name: in mimic/conf.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises, and the line below is all that is shown
+    sys.argv[1:] = [_written_out(argument, config_name) for argument in sys.argv[1:]]
     _register_schemas()
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
@@ -59,6 +65,15 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(STOPPED_BY_SIGNAL + signal.SIGINT)
+
+
+def _written_out(argument: str, command: str) -> str:
+    """An argument as Hydra takes it: env.learner=ARM.xml is short for env.learner.model=ARM.xml."""
+    key, equals, value = argument.partition("=")
+    if command == "inspect" and not equals and not argument.startswith("-"):
+        return f"learner.model={argument}"
+    is_arm = key in ARM_KEYS.get(command, ()) and not value.startswith("{")
+    return f"{key}.model={value}" if equals and is_arm else argument
 
 
 def _refuse(error: BaseException) -> NoReturn:
@@ -104,6 +119,7 @@ def _register_schemas() -> None:
     store.store(name="figures_schema", node=schema(FiguresConfig))
     store.store(name="render_schema", node=schema(RenderConfig))
     store.store(name="demonstrations_schema", node=schema(RecordingConfig))
+    store.store(name="inspect_schema", node=schema(InspectConfig))
     store.store(name="retarget_schema", node=schema(RetargetConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
     for name, config_class in TRAINERS.items():

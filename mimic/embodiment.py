@@ -1,4 +1,4 @@
-"""Embodiments: what the metric knows of an arm. Planar chains, the Panda, a serial chain of hinges from any MJCF."""
+"""Embodiments: what the metric knows of an arm. Planar chains, the Panda, a serial chain of hinges from any model."""
 
 import dataclasses
 import importlib.resources
@@ -13,7 +13,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from mimic.chain import Chain, Joint, Link, Locked, lock, resolve_locked
-from mimic.mjcf import model_name, read_chain, read_model
+from mimic.mjcf import read_chain
+from mimic.model_files import model_name, read_model
 
 Limits = Literal["none", "hardware"]
 LIMITS = ("none", "hardware")
@@ -122,27 +123,27 @@ def load_mjcf(
     tip: str | None = None,
     merge_locked: bool = True,
 ) -> Embodiment:
-    """A serial chain of hinges from any MJCF, with the joint ranges and limits that the model states.
+    """A serial chain of hinges from any MJCF or URDF, with the joint ranges and limits that the model states.
 
     Links are the capsule sites named link… where the model has them (`fromto` gives start and end), else the segments
     from each joint's anchor to the next, the last one ending at `tip`. The base frame is that of the body before the
-    first hinge.
+    first hinge. A hand's joints stay where they are; where the model branches: see `find_route` in mimic.route.
 
     Args:
-      path_or_model: an MJCF file, or a compiled model.
+      path_or_model: an MJCF or URDF file, or a compiled model.
       locked: as for `panda`; locked at 0 where no angle is given.
       base: name of the body that the chain starts behind.
       tip: name of the body or site that the chain ends at.
       merge_locked: as for `panda`.
 
     Raises:
-      ValueError: a file that is missing or no MJCF, no hinge, a branch, a loop, a name that the model lacks, or what
+      ValueError: a file that is missing or no model, no hinge, a branch, a loop, a name that the model lacks, or what
         `panda` refuses.
     """
     model = _model(path_or_model)
     chain = read_chain(model, base, tip)
     angles = resolve_locked(locked, tuple(joint.name for joint in chain.joints))
-    return _locked_embodiment(chain, angles, model_name(model), merge_locked)
+    return _locked_embodiment(chain, angles, _name(path_or_model, model), merge_locked)
 
 
 def load_arm(
@@ -168,7 +169,7 @@ def load_arm(
         chain = Chain(tuple(free), chain.links)
     home = {joint.name: joint.home for joint in chain.joints}
     angles = resolve_locked(locked, tuple(home), home)
-    return _locked_embodiment(chain, angles, name or model_name(model), merge_locked), model, angles
+    return _locked_embodiment(chain, angles, name or _name(path_or_model, model), merge_locked), model, angles
 
 
 def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
@@ -200,6 +201,10 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
 
 def _model(path_or_model: str | os.PathLike[str] | mujoco.MjModel) -> mujoco.MjModel:
     return path_or_model if isinstance(path_or_model, mujoco.MjModel) else read_model(path_or_model)
+
+
+def _name(path_or_model: str | os.PathLike[str] | mujoco.MjModel, model: mujoco.MjModel) -> str:
+    return model_name(model, None if isinstance(path_or_model, mujoco.MjModel) else path_or_model)
 
 
 def _locked_embodiment(chain: Chain, angles: dict[str, float], name: str, merge: bool) -> Embodiment:

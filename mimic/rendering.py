@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mimic.envs.arms import ArmConfig, arm_spec, build_arm
+from mimic.envs.arms import ArmConfig, build_arm
+from mimic.portrait import portrait
 
 _SPACING = 0.9  # chain lengths between two arms
 _LOCKED = (0.85, 0.12, 0.10, 1.0)
@@ -39,13 +40,15 @@ class ArmScene:
         spec = _empty_room(width, height)
         self._joints: list[list[str]] = []
         self._locked: dict[str, float] = {}
+        highest = 0.0
         for index, (config, arm) in enumerate(zip(arms, built, strict=True)):
             prefix = f"arm{index}-"
-            source = arm_spec(config)
+            source, base = portrait(config)
+            highest = max(highest, float(base[2]))
             _share_options(source, spec)
             for name in arm.locked:
                 _mark_locked(source, name, float(free[index].chain_length))
-            place = [0.0, (index - 0.5 * (len(arms) - 1)) * _SPACING * reach, 0.0]
+            place = [0.0, (index - 0.5 * (len(arms) - 1)) * _SPACING * reach, 0.0] - base * [1, 1, 0]
             spec.attach(source, prefix=prefix, frame=spec.worldbody.add_frame(pos=place))
             self._joints.append([prefix + name for name in arm.embodiment.joint_names])
             self._locked |= {prefix + name: angle for name, angle in arm.locked.items()}
@@ -53,8 +56,8 @@ class ArmScene:
         self._data = mujoco.MjData(self._model)
         self._camera = mujoco.MjvCamera()
         is_flat = all(arm.model == "planar" for arm in arms)
-        self._camera.lookat[:] = 0.0, 0.0, 0.0 if is_flat else 0.4 * reach
-        self._camera.distance = (1.4 + 0.7 * (len(arms) - 1) + 1.3 * is_flat) * reach
+        self._camera.lookat[:] = 0.0, 0.0, 0.0 if is_flat else 0.4 * reach + 0.5 * highest
+        self._camera.distance = (1.4 + 0.7 * (len(arms) - 1) + 1.3 * is_flat) * reach + 0.5 * highest
         self._camera.azimuth, self._camera.elevation = (90.0, -89.0) if is_flat else (165.0, -14.0)
         self._renderer = _renderer(self._model, width, height)
 

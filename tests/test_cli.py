@@ -19,7 +19,7 @@ HINGE = '<joint name="{0}" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginer
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["env=panda5dof"], "unknown env 'panda5dof'; valid are panda3dof, panda4dof, panda7dof, planar4dof"),
+        (["env=panda5dof"], "unknown env 'panda5dof'; valid are pair, panda3dof, panda4dof, panda7dof"),
         (["trainer=sac"], "unknown trainer 'sac'; valid are "),
         (["env.previw=1"], "unknown key 'env.previw'; valid are"),
         (["seed=one"], "could not be converted to Integer"),

@@ -5,6 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mimic import chain
 from mimic.embodiment import load_arm, load_mjcf, panda, panda_path
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
@@ -92,6 +93,7 @@ def test_unnamed_joints_get_names():
 
 def test_links_of_length_zero_are_merged_with_a_message(caplog):
     wrist = hinge("c", axis="0 1 0", inner=TIP)  # same anchor as b
+    chain._warn_of_merged.cache_clear()
     with caplog.at_level(logging.WARNING):
         arm = load_mjcf(toy(wrist))
     assert (arm.joint_names, arm.link_names, arm.link_joint) == (("a", "b", "c"), ("link1", "link3"), (0, 2))
@@ -132,15 +134,29 @@ def test_links_of_a_gripper_do_not_close_a_loop():
 # --- bad input --------------------------------------------------------------------------------------------------------
 
 BRANCH = hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B") + hinge("c", pos="0 1 0", body="C"))
-SLIDE = '<body name="S"><joint name="s" type="slide"/><geom size="0.01"/>' + hinge("a", body="A", inner=TIP) + "</body>"
+BETWEEN = (
+    '<body name="S"><joint name="s" type="slide"/><geom size="0.01"/>' + hinge("b", body="B", inner=TIP) + "</body>"
+)
 STATIC = '<body name="hand" pos="0.5 0 0"><geom size="0.01"/><site name="palm"/></body>'
 MODELS = {
     "no joint": (lambda: model('<geom size="1"/>'), {}, "the model has no hinge joint$"),
     "slides only": (lambda: model('<body><joint type="slide"/><geom size="1"/></body>'), {}, "the model has no hinge"),
     "none behind base": (lambda: toy(TIP), {"base": "B"}, "the model has no hinge joint between base and tip"),
-    "branch": (lambda: model(BRANCH), {}, "the model branches: bodies 'B', 'C' have hinges .*; name one with tip="),
-    "two arms": (lambda: model(hinge("a", body="A") + hinge("b", body="B")), {}, "the model branches: bodies 'A', 'B'"),
-    "slide": (lambda: model(SLIDE), {}, "expected hinges only; joint 's' on the chain is none"),
+    "branch": (
+        lambda: model(BRANCH),
+        {},
+        "the model branches: bodies 'B' and 'C' lead to 1 hinges each; name one end with tip=",
+    ),
+    "two arms": (
+        lambda: model(hinge("a", body="A") + hinge("b", body="B")),
+        {},
+        "the model branches: bodies 'A' and 'B'",
+    ),
+    "slide": (
+        lambda: model(hinge("a", body="A", inner=BETWEEN)),
+        {},
+        "expected hinges only; joint 's' on the chain is a slide: start behind it with base=",
+    ),
     "weld": (
         lambda: toy(TIP, '<equality><weld name="tie" body1="B"/></equality>'),
         {},
@@ -192,12 +208,12 @@ def test_an_active_loop_between_sites_is_refused(active):
 
 
 FILES = {
-    "missing": (None, "no MJCF file at '.*arm.xml'$"),
-    "empty": ("", "'.*arm.xml' is not an MJCF model that MuJoCo reads: "),
-    "not xml": ("joint1 = 3", "'.*arm.xml' is not an MJCF model that MuJoCo reads: "),
-    "not mjcf": ("<html><body/></html>", "'.*arm.xml' is not an MJCF model that MuJoCo reads: "),
-    "broken": ("<mujoco><worldbody><body>", "'.*arm.xml' is not an MJCF model that MuJoCo reads: "),
-    "misspelt": ("<mujoco><worldbody><boby/></worldbody></mujoco>", "'.*arm.xml' is not an MJCF model .*boby"),
+    "missing": (None, "no MJCF or URDF file at '.*arm.xml'$"),
+    "empty": ("", "'.*arm.xml' is no MJCF or URDF model that MuJoCo reads: "),
+    "not xml": ("joint1 = 3", "'.*arm.xml' is no MJCF or URDF model that MuJoCo reads: "),
+    "not mjcf": ("<html><body/></html>", "'.*arm.xml' is no MJCF or URDF model that MuJoCo reads: "),
+    "broken": ("<mujoco><worldbody><body>", "'.*arm.xml' is no MJCF or URDF model that MuJoCo reads: "),
+    "misspelt": ("<mujoco><worldbody><boby/></worldbody></mujoco>", "'.*arm.xml' is no MJCF or URDF model .*boby"),
 }
 
 
@@ -213,5 +229,5 @@ def test_bad_files_are_refused(tmp_path, case):
 
 
 def test_a_directory_is_no_file(tmp_path):
-    with pytest.raises(ValueError, match="^no MJCF file at "):
+    with pytest.raises(ValueError, match="^no MJCF or URDF file at "):
         load_mjcf(tmp_path)

@@ -26,7 +26,8 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
 
     Args:
       name: one of `environments()`.
-      overrides: fields of `EnvConfig`; a nested config takes a dict, as in `demonstrations={"count": 1}`.
+      overrides: fields of `EnvConfig`; a nested config takes a dict, as in `demonstrations={"count": 1}`, an arm
+        also its name or file alone, as in `learner="arm.xml"`.
 
     Raises:
       ValueError: an unknown name or field, or a value of the wrong type or out of range.
@@ -36,8 +37,9 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     preset = OmegaConf.load(str(_PRESETS / f"{name}.yaml"))
     assert isinstance(preset, DictConfig)
     del preset["defaults"]  # Hydra's; the schema is merged here
+    arms = {key: {"model": overrides[key]} for key in ("expert", "learner") if isinstance(overrides.get(key), str)}
     try:
-        merged = OmegaConf.merge(schema(EnvConfig), preset, overrides)
+        merged = OmegaConf.merge(schema(EnvConfig), preset, {**overrides, **arms})
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
     except OmegaConfBaseException as error:
         raise ValueError(explain(error)) from error

@@ -1,6 +1,9 @@
 """An arm as the environments use it: its embodiment, and a lean MuJoCo model that moves exactly its free joints."""
 
+import copy
 import dataclasses
+import math
+import os
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -9,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
-from mimic.mjcf import read_model
+from mimic.model_files import read_spec
+from mimic.set_aside import set_aside
 
 # Planar arms are ours to define: slender rods, whose joints feel about as heavy for their size as the Panda's.
 _PLANAR_MASS = 1.0  # kg/m
@@ -18,9 +22,16 @@ _PLANAR_DAMPING = 0.1  # N m s/rad
 _PLANAR_VELOCITY_LIMIT = 2.5  # rad/s
 _PLANAR_RADIUS, _PLANAR_COLOUR = 0.03, [0.35, 0.55, 0.85, 1.0]  # what is seen of them [m]
 
+# The largest torque takes a joint from rest to this multiple of its rated speed in one step.
+_OFFERED_SPEED_FACTOR = 2.0
+UNKNOWN_SPEED = np.pi  # rad/s, taken for the rated speed of joints that have none
+
 _IGNORED = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_GRAVITY
 )
+
+
+BUILT_IN = "panda", "planar"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,18 +39,36 @@ class ArmConfig:
     """Which arm.
 
     Attributes:
-      model: "panda", "planar", or the path of an MJCF file.
+      model: "panda", "planar", or the path of an MJCF or URDF file, which is made absolute.
       locked: joint names or numbers, or a mapping from these to angles [rad].
       link_lengths: of a planar arm [m].
-      base: body that the chain starts behind (MJCF file).
-      tip: body or site that the chain ends at (MJCF file).
+      base: body that the chain starts behind (of a file).
+      tip: body or site that the chain ends at (of a file); else see `find_route`.
+      armature: least rotor inertia of each joint, as its motor feels it [kg m^2]; many models state none.
+      damping: least damping of each joint [N m s/rad].
     """
 
     model: str = "panda"
-    locked: Any = ()
+    locked: Any = None  # not a list, which OmegaConf would let no mapping replace
     link_lengths: list[float] = dataclasses.field(default_factory=list)
     base: str | None = None
     tip: str | None = None
+    armature: float = 0.0
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.model:
+            raise ValueError(f"model: expected {', '.join(BUILT_IN)} or the path of an MJCF or URDF file, got nothing")
+        for name in ("armature", "damping"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
+        if self.is_file:  # so that a run finds it again from any folder
+            object.__setattr__(self, "model", os.path.abspath(os.path.expanduser(self.model)))
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the arm is read from a file."""
+        return self.model not in BUILT_IN
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,11 +79,13 @@ class Arm:
       embodiment: its free joints and links.
       model: of the free joints alone.
       locked: angle [rad] of the joints that are held, by name.
+      notes: what of its file was set aside, in words.
     """
 
     embodiment: Embodiment
     model: mujoco.MjModel
     locked: Mapping[str, float]
+    notes: tuple[str, ...] = ()
 
 
 def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
@@ -66,8 +97,7 @@ def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
     if config.model == "planar":
         return _planar_spec(planar_arm(config.link_lengths))
     path = panda_path() if config.model == "panda" else config.model
-    read_model(path)  # says what is wrong
-    return mujoco.MjSpec.from_file(path)
+    return read_spec(path)
 
 
 def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
@@ -80,22 +110,28 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
         embodiment = planar_arm(config.link_lengths)
         source = _planar_spec(embodiment).compile()
         embodiment, source, angles = load_arm(
-            source, name=embodiment.name, locked=config.locked, limits=cast(Limits, limits)
+            source, name=embodiment.name, locked=config.locked or (), limits=cast(Limits, limits)
         )
-        return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles)
+        return with_rotors(Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config)
     is_panda = config.model == "panda"
     embodiment, source, angles = load_arm(
         panda_path() if is_panda else config.model,
         name="panda" if is_panda else None,
-        locked=config.locked,
+        locked=config.locked or (),
         base=config.base,
         tip=config.tip,
         limits=cast(Limits, limits),
     )
-    model = simulation_model(source, embodiment.joint_names, angles)
-    if model.nq != embodiment.num_joints:
-        raise ValueError(f"model: the hinges of {config.model!r} need names to be simulated; some have none")
-    return Arm(embodiment, model, angles)
+    notes = () if is_panda else set_aside(source, config.base, config.tip)
+    return with_rotors(Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, notes), config)
+
+
+def with_rotors(arm: Arm, config: ArmConfig) -> Arm:
+    """The arm whose joints have at least the rotor inertia and the damping of a config."""
+    model = copy.copy(arm.model)
+    model.dof_armature[:] = np.maximum(model.dof_armature, config.armature)
+    model.dof_damping[:] = np.maximum(model.dof_damping, config.damping)
+    return dataclasses.replace(arm, model=model)
 
 
 def simulation_model(
@@ -152,7 +188,22 @@ def simulation_model(
 
 def rated_speed(arm: Embodiment) -> Float[np.ndarray, " joints"]:
     """Largest speed of each joint [rad/s], pi where none is known."""
-    return np.where(np.isfinite(arm.velocity_limit), arm.velocity_limit, np.pi)
+    return np.where(np.isfinite(arm.velocity_limit), arm.velocity_limit, UNKNOWN_SPEED)
+
+
+def torque_scale(arm: Arm, action_scale: float, control_dt: float) -> Float[np.ndarray, " joints"]:
+    """Largest torque of each joint [N m]: what gets it well beyond its rated speed in one step, at most its limit.
+
+    The full torque of a Panda would take its light joints to tens of rad/s within a step, where nothing can be learned.
+
+    Args:
+      arm: the learner.
+      action_scale: see `EnvConfig`.
+      control_dt: time that a torque is held [s].
+    """
+    inertia = effective_inertia(arm.model, np.asarray(arm.embodiment.home))
+    torque = action_scale * _OFFERED_SPEED_FACTOR * rated_speed(arm.embodiment) * inertia / control_dt
+    return np.minimum(torque, arm.embodiment.torque_limit).astype(np.float32)
 
 
 def effective_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:

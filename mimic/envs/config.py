@@ -211,6 +211,28 @@ class RecordingConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class InspectConfig:
+    """A look at a learner before it is trained.
+
+    Attributes:
+      learner: the arm in question.
+      expert: what it shall imitate.
+      limits: see `EnvConfig`.
+      bound: whether to say how near the learner can come, which takes a minute.
+      out: new folder for a picture of both arms with their correspondence, and for what was found as JSON.
+    """
+
+    learner: ArmConfig = dataclasses.field(default_factory=ArmConfig)
+    expert: ArmConfig = dataclasses.field(default_factory=ArmConfig)
+    limits: str = "none"
+    bound: bool = True
+    out: str = ""
+
+    def __post_init__(self) -> None:
+        check_choice("limits", self.limits, LIMITS)
+
+
+@dataclasses.dataclass(frozen=True)
 class RetargetConfig:
     """A retargeting of demonstrations.
 

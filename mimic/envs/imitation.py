@@ -12,16 +12,13 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from mimic.distance import embodiment_distance
-from mimic.embodiment import Embodiment
-from mimic.envs.arms import Arm, build_arm, effective_inertia, rated_speed
+from mimic.envs.arms import Arm, build_arm, torque_scale
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.envs.physics import Load, make_advance
 from mimic.envs.recording import record_demonstrations
 from mimic.kinematics import LinkStates, link_state_table, link_states
 
-# The largest torque takes a joint from rest to this multiple of its rated speed in one step.
-_OFFERED_SPEED_FACTOR = 2.0
 # Of a limit, in rad or as a share of the rated speed: where nearness begins to cost, and how much further all it can.
 _MARGIN, _FAR = 0.03, 0.1
 # What is folded into an episode's key for its noise, and for the step that it starts at; 0 to 2 would give the keys
@@ -79,7 +76,7 @@ class ImitationEnv(Env):
         self.expert, self.learner = expert.embodiment, learner.embodiment
         self.weights = config.metric.make_weights()
         self.correspondence = config.metric.make_correspondence(self.expert, self.learner)
-        self.torque_scale = jnp.asarray(_torque_scale(learner, config))
+        self.torque_scale = jnp.asarray(torque_scale(learner, config.action_scale, config.control_dt))
         self.arm = learner
         home = np.asarray(self.learner.home)
         self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
@@ -231,18 +228,6 @@ class ImitationEnv(Env):
     def backend(self) -> str:
         """What simulates."""
         return "mjx"
-
-
-def _torque_scale(arm: Arm, config: EnvConfig) -> np.ndarray:
-    """Largest torque of each joint [N m]: what gets it well beyond its rated speed in one step, at most its limit.
-
-    The full torque of a Panda would take its light joints to tens of rad/s within a step, where nothing can be learned.
-    """
-    embodiment: Embodiment = arm.embodiment
-    inertia = effective_inertia(arm.model, np.asarray(embodiment.home))
-    rated = rated_speed(embodiment)
-    torque = config.action_scale * _OFFERED_SPEED_FACTOR * rated * inertia / config.control_dt
-    return np.minimum(torque, embodiment.torque_limit).astype(np.float32)
 
 
 def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple[Demonstrations, Demonstrations]:

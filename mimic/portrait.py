@@ -1,0 +1,66 @@
+"""An arm's model made ready for a picture: alone, with its base in the middle, and something to see."""
+
+import mujoco
+import numpy as np
+
+from mimic.envs.arms import ArmConfig, arm_spec
+from mimic.mjcf import zero_pose
+from mimic.route import Route, ancestors, find_route
+
+_THICKNESS, _COLOUR = 0.03, (0.55, 0.62, 0.70, 1.0)  # of links that the model gives no shape; share of the chain length
+_ABOUT = ("keys", "equalities", "actuators", "sensors", "tendons", "excludes", "pairs", "lights", "cameras")
+
+
+def portrait(config: ArmConfig) -> tuple[mujoco.MjSpec, np.ndarray]:
+    """The model of an arm without the scene around it, and where its base is [m].
+
+    Raises:
+      ValueError: what `arm_spec` and `find_route` refuse.
+    """
+    spec = arm_spec(config)
+    model = spec.compile()
+    route = find_route(model, config.base, config.tip)
+    data = mujoco.MjData(model)
+    data.qpos[:] = zero_pose(model)
+    mujoco.mj_kinematics(model, data)
+    if config.is_file:
+        _remove_scene(spec, model, route)
+    if not any(bool(body.geoms) for body in spec.bodies[1:]):
+        _draw_links(model, data, spec, route)
+    return spec, data.xpos[model.body_parentid[route.bodies[0]]].copy()
+
+
+def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, route: Route) -> None:
+    """Leaves the root body that the arm is in."""
+    for kind in _ABOUT:
+        for item in list(getattr(spec, kind)):
+            spec.delete(item)
+    root = model.body(ancestors(model, route.bodies[0])[-2]).name
+    for item in [*spec.worldbody.geoms, *spec.worldbody.sites]:
+        spec.delete(item)
+    for body in [body for body in spec.worldbody.bodies if body.name != root]:
+        spec.delete(body)
+    shown = [geom for geom in spec.geoms if not (geom.contype or geom.conaffinity)]
+    if shown:  # the model has shapes to look at, so that those to collide with are hidden
+        for geom in spec.geoms:
+            if geom not in shown:
+                geom.material, geom.rgba = "", [0, 0, 0, 0]
+
+
+def _draw_links(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec, route: Route) -> None:
+    """Capsules from each joint to the next, for models without any shape."""
+    points = [data.xanchor[joint] for joint in route.joints]
+    carried = [body for body in range(model.nbody) if route.bodies[-1] in ancestors(model, body)]
+    points.append(
+        max((data.xpos[body] for body in carried), key=lambda point: float(np.linalg.norm(point - points[-1])))
+    )
+    lengths = [float(np.linalg.norm(end - start)) for start, end in zip(points[:-1], points[1:], strict=True)]
+    for joint, start, end, length in zip(route.joints, points[:-1], points[1:], lengths, strict=True):
+        body = int(model.jnt_bodyid[joint])
+        R_body_world = data.xmat[body].reshape(3, 3).T
+        if length > _THICKNESS * sum(lengths) / 10:
+            spec.body(model.body(body).name).add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+                fromto=np.concatenate([R_body_world @ (point - data.xpos[body]) for point in (start, end)]),
+                size=[_THICKNESS * sum(lengths), 0, 0], rgba=_COLOUR, contype=0, conaffinity=0, mass=0,
+            )  # fmt: skip
