@@ -39,6 +39,7 @@ from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: 
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
+    from mimic.trainers.exporting import export_run
     from mimic.trainers.pose_mapper import PoseMapper
 
 __version__ = "0.1.0"
@@ -66,6 +67,7 @@ __all__ = [
     "embodiment_distance",
     "env_config",
     "environments",
+    "export_run",
     "forward_kinematics",
     "hard_correspondence",
     "imitate_pose",
@@ -96,4 +98,9 @@ def __getattr__(name: str) -> Any:
         from mimic.trainers.pose_mapper import PoseMapper
 
         return PoseMapper
+    if name == "export_run":  # all of these
+        compat.import_mjx()
+        from mimic.trainers.exporting import export_run
+
+        return export_run
     raise AttributeError(f"module 'mimic' has no attribute {name!r}")

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -79,7 +80,7 @@ class ImitationEnv(Env):
         self.expert, self.learner = expert.embodiment, learner.embodiment
         self.weights = config.metric.make_weights()
         self.correspondence = config.metric.make_correspondence(self.expert, self.learner)
-        self.torque_scale = jnp.asarray(_torque_scale(learner, config))
+        self.torque_scale = jnp.asarray(torque_scale(learner, config))
         self.arm = learner
         home = np.asarray(self.learner.home)
         self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
@@ -233,7 +234,7 @@ class ImitationEnv(Env):
         return "mjx"
 
 
-def _torque_scale(arm: Arm, config: EnvConfig) -> np.ndarray:
+def torque_scale(arm: Arm, config: EnvConfig) -> np.ndarray:
     """Largest torque of each joint [N m]: what gets it well beyond its rated speed in one step, at most its limit.
 
     The full torque of a Panda would take its light joints to tens of rad/s within a step, where nothing can be learned.
@@ -243,6 +244,26 @@ def _torque_scale(arm: Arm, config: EnvConfig) -> np.ndarray:
     rated = rated_speed(embodiment)
     torque = config.action_scale * _OFFERED_SPEED_FACTOR * rated * inertia / config.control_dt
     return np.minimum(torque, embodiment.torque_limit).astype(np.float32)
+
+
+def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
+    """What the numbers of an observation are: name, shape, unit, and where they start and stop."""
+    units = {
+        "position": "chain lengths",
+        "direction": "1",
+        "linear_velocity": "chain lengths/s",
+        "angular_velocity": "rad/s",
+    }
+    seen = [("learner", learner), ("expert", expert)]
+    seen += [(f"expert {ahead} steps ahead", expert) for ahead in range(1, preview + 1)]
+    layout, start = [], 0
+    for whose, arm in seen:
+        for name, unit in units.items():
+            stop = start + 3 * arm.num_links
+            shape = [arm.num_links, 3]
+            layout.append({"name": f"{whose}: {name}", "shape": shape, "unit": unit, "start": start, "stop": stop})
+            start = stop
+    return layout
 
 
 def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple[Demonstrations, Demonstrations]:

@@ -10,6 +10,7 @@ from mimic.config import check_choice
 from mimic.envs.config import PHYSICS, EnvConfig
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque")
+EXPORT_FORMATS = ("onnx", "jax")
 
 PRESETS: dict[str, dict[str, Any]] = {
     # Two cores: few environments, many gradient steps on each sample, since the physics is what costs.
@@ -418,3 +419,25 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         check_choice("split", self.split, ("held_out", "train"))
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportConfig:
+    """A trained policy or pose mapper as a file for other programs.
+
+    Attributes:
+      run: the run directory.
+      out: the file; must not exist.
+      format: "onnx" or "jax".
+      learner: name of the environment whose arms it is meant for; any where empty.
+      checkpoint: steps of the checkpoint; the last one where None.
+    """
+
+    run: str = ""
+    out: str = ""
+    format: str = "onnx"
+    learner: str = ""
+    checkpoint: int | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("format", self.format, EXPORT_FORMATS)
