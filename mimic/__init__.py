@@ -23,6 +23,7 @@ from mimic.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E
 from mimic.envs import env_config, environments, make  # noqa: E402
 from mimic.envs.arms import ArmConfig, build_arm  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
+from mimic.envs.importing import import_demonstrations  # noqa: E402
 from mimic.envs.recording import record_demonstrations  # noqa: E402
 from mimic.imitation import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
 from mimic.kinematics import (  # noqa: E402
@@ -72,6 +73,7 @@ __all__ = [
     "hard_correspondence",
     "imitate_pose",
     "imitate_trajectory",
+    "import_demonstrations",
     "kinematic_bound",
     "link_distances",
     "link_states",
