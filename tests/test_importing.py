@@ -126,7 +126,7 @@ NUMBERED = [f"q_{i}" for i in range(1, 8)]
     ("make", "arguments", "message"),
     [
         (None, [], "no file at"),
-        (lambda path: table(path, names=NUMBERED[:6] + ["q_9"]), [], "lacks joint7; expected time and the joints joint1"),
+        (lambda path: table(path, names=NUMBERED[:6] + ["q_9"]), [], "lacks joint7; expected time and the"),
         (lambda path: write_csv(path, ["time", "q_1"], [TIME, TIME]), [], "got the columns time, q_1"),
         (lambda path: table(path, names=NUMBERED, factor=57.3), [], "expected rad in [-3.14"),
         (lambda path: table(path, names=NUMBERED, time=TIME[:100]), [], "lasts 1.98 s, but an episode 5 s"),

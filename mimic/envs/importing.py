@@ -129,7 +129,8 @@ def _read_csv(path: Path, names: Sequence[str]) -> list[Motion]:
     parts = [table[which == number] for number in np.unique(which)]
     if not parts:
         raise ValueError(f"source: {str(path)!r} has no rows")
-    return [Motion(part[:, times[0]], part[:, angles], part[:, known] if known else None) for part in parts]
+    at = np.array(angles, int)
+    return [Motion(part[:, times[0]], part[:, at], part[:, known] if known else None) for part in parts]
 
 
 def _columns(header: Sequence[str], names: Sequence[str], prefixes: Sequence[str]) -> list[int | None]:
