@@ -11,6 +11,7 @@ from mimic.envs.config import PHYSICS, EnvConfig
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque")
 EXPORT_FORMATS = ("onnx", "jax")
+LOGGERS = ("local", "wandb", "mlflow")
 
 PRESETS: dict[str, dict[str, Any]] = {
     # Two cores: few environments, many gradient steps on each sample, since the physics is what costs.
@@ -332,6 +333,8 @@ class TrainConfig:
       seed: of networks, exploration and resets.
       run_dir: where everything is written; runs/ENV-TRAINER-seedSEED-TIME where empty.
       resume: a run directory to go on from.
+      logger: "local", "wandb", "mlflow", or a list of these: where metrics go beside the run directory, which has them
+        in any case.
       compilation_cache: folder where JAX keeps compiled programs between runs; none where empty.
     """
 
@@ -340,7 +343,17 @@ class TrainConfig:
     seed: int = 0
     run_dir: str = ""
     resume: str = ""
+    logger: Any = "local"
     compilation_cache: str = "~/.cache/mimic/jax"
+
+    def __post_init__(self) -> None:
+        for name in self.loggers:
+            check_choice("logger", name, LOGGERS)
+
+    @property
+    def loggers(self) -> list[str]:
+        """The services, as a list."""
+        return [self.logger] if isinstance(self.logger, str) else list(map(str, self.logger or ()))
 
 
 @dataclasses.dataclass(frozen=True)
