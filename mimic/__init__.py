@@ -23,6 +23,7 @@ from mimic.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E
 from mimic.envs import env_config, environments, make  # noqa: E402
 from mimic.envs.arms import ArmConfig, build_arm  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
+from mimic.envs.importing import import_demonstrations  # noqa: E402
 from mimic.envs.recording import record_demonstrations  # noqa: E402
 from mimic.imitation import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
 from mimic.kinematics import (  # noqa: E402
@@ -39,6 +40,7 @@ from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: 
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
+    from mimic.trainers.exporting import export_run
     from mimic.trainers.pose_mapper import PoseMapper
 
 __version__ = "0.1.0"
@@ -66,10 +68,12 @@ __all__ = [
     "embodiment_distance",
     "env_config",
     "environments",
+    "export_run",
     "forward_kinematics",
     "hard_correspondence",
     "imitate_pose",
     "imitate_trajectory",
+    "import_demonstrations",
     "kinematic_bound",
     "link_distances",
     "link_states",
@@ -96,4 +100,9 @@ def __getattr__(name: str) -> Any:
         from mimic.trainers.pose_mapper import PoseMapper
 
         return PoseMapper
+    if name == "export_run":  # all of these
+        compat.import_mjx()
+        from mimic.trainers.exporting import export_run
+
+        return export_run
     raise AttributeError(f"module 'mimic' has no attribute {name!r}")

@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, InspectConfig, RecordingConfig, RetargetConfig
-from mimic.trainers.config import TRAINERS, EvaluateConfig, FiguresConfig, RenderConfig, TrainConfig
+from mimic.trainers.config import TRAINERS, EvaluateConfig, ExportConfig, FiguresConfig, RenderConfig, TrainConfig
 from mimic.trainers.signals import STOPPED_BY_SIGNAL
 
 BAD_INPUT = 2
@@ -116,6 +116,7 @@ def _register_schemas() -> None:
     store = ConfigStore.instance()
     store.store(name="train_schema", node=schema(TrainConfig))
     store.store(name="evaluate_schema", node=schema(EvaluateConfig))
+    store.store(name="export_schema", node=schema(ExportConfig))
     store.store(name="figures_schema", node=schema(FiguresConfig))
     store.store(name="render_schema", node=schema(RenderConfig))
     store.store(name="demonstrations_schema", node=schema(RecordingConfig))

@@ -187,6 +187,8 @@ class RecordingConfig:
       env: the environment whose expert is recorded, in its time steps.
       kind, count, seed: see `DemonstrationConfig`; those of the environment where None.
       limits: see `EnvConfig`; those of the environment where None.
+      source: file of motions to read instead of recording: see `import_demonstrations`.
+      joints: what that file calls the expert's joints, base to tip; by the expert's own names where empty.
       out: the file, which ends in .npz; must not exist.
       plot: picture of what was recorded; `out` with .png instead where empty. Must not exist.
     """
@@ -196,6 +198,8 @@ class RecordingConfig:
     count: int | None = None
     seed: int | None = None
     limits: str | None = None
+    source: str = ""
+    joints: list[str] = dataclasses.field(default_factory=list)
     out: str = ""
     plot: str = ""
 

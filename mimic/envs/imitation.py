@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -228,6 +229,26 @@ class ImitationEnv(Env):
     def backend(self) -> str:
         """What simulates."""
         return "mjx"
+
+
+def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
+    """What the numbers of an observation are: name, shape, unit, and where they start and stop."""
+    units = {
+        "position": "chain lengths",
+        "direction": "1",
+        "linear_velocity": "chain lengths/s",
+        "angular_velocity": "rad/s",
+    }
+    seen = [("learner", learner), ("expert", expert)]
+    seen += [(f"expert {ahead} steps ahead", expert) for ahead in range(1, preview + 1)]
+    layout, start = [], 0
+    for whose, arm in seen:
+        for name, unit in units.items():
+            stop = start + 3 * arm.num_links
+            shape = [arm.num_links, 3]
+            layout.append({"name": f"{whose}: {name}", "shape": shape, "unit": unit, "start": start, "stop": stop})
+            start = stop
+    return layout
 
 
 def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple[Demonstrations, Demonstrations]:

@@ -11,6 +11,8 @@ from mimic.envs.config import PHYSICS, EnvConfig
 from mimic.trainers.group import DistributedConfig
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque")
+EXPORT_FORMATS = ("onnx", "jax")
+LOGGERS = ("local", "wandb", "mlflow")
 
 PRESETS: dict[str, dict[str, Any]] = {
     # Two cores: few environments, many gradient steps on each sample, since the physics is what costs.
@@ -332,6 +334,8 @@ class TrainConfig:
       seed: of networks, exploration and resets.
       run_dir: where everything is written; runs/ENV-TRAINER-seedSEED-TIME where empty.
       resume: a run directory to go on from.
+      logger: "local", "wandb", "mlflow", or a list of these: where metrics go beside the run directory, which has them
+        in any case.
       compilation_cache: folder where JAX keeps compiled programs between runs; none where empty.
       distributed: see `DistributedConfig`.
     """
@@ -341,8 +345,18 @@ class TrainConfig:
     seed: int = 0
     run_dir: str = ""
     resume: str = ""
+    logger: Any = "local"
     compilation_cache: str = "~/.cache/mimic/jax"
     distributed: DistributedConfig = dataclasses.field(default_factory=DistributedConfig)
+
+    def __post_init__(self) -> None:
+        for name in self.loggers:
+            check_choice("logger", name, LOGGERS)
+
+    @property
+    def loggers(self) -> list[str]:
+        """The services, as a list."""
+        return [self.logger] if isinstance(self.logger, str) else list(map(str, self.logger or ()))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -421,3 +435,25 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         check_choice("split", self.split, ("held_out", "train"))
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportConfig:
+    """A trained policy or pose mapper as a file for other programs.
+
+    Attributes:
+      run: the run directory.
+      out: the file; must not exist.
+      format: "onnx" or "jax".
+      learner: name of the environment whose arms it is meant for; any where empty.
+      checkpoint: steps of the checkpoint; the last one where None.
+    """
+
+    run: str = ""
+    out: str = ""
+    format: str = "onnx"
+    learner: str = ""
+    checkpoint: int | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("format", self.format, EXPORT_FORMATS)

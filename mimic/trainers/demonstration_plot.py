@@ -29,7 +29,9 @@ def peak(values: Float[np.ndarray, "demonstrations time joints"]) -> Float[np.nd
 
 
 def with_share(value: float, limit: float) -> str:
-    """A value, and its share of a limit where there is one."""
+    """A value, and its share of a limit where there is one; a dash where nobody knows it."""
+    if np.isnan(value):
+        return "-"
     return f"{value:.2f} ({value / limit:.0%})" if np.isfinite(limit) else f"{value:.2f}"
 
 
@@ -49,7 +51,7 @@ def plot_demonstrations(demonstrations: Demonstrations, arm: Embodiment, out: Pa
     """Small multiples over time, a column for each joint, beside the hand's paths in two views; limits are dashed.
 
     Args:
-      demonstrations: of the arm, with torques.
+      demonstrations: of the arm; a row for their torques where these are known.
       arm: whose limits count.
       out: the picture.
       title: what these demonstrations are.
@@ -59,14 +61,16 @@ def plot_demonstrations(demonstrations: Demonstrations, arm: Embodiment, out: Pa
     parts: Any = figure.subfigures(1, 2, width_ratios=(_PANEL * joints, _HAND_WIDTH))
     left, right = parts
     figure.suptitle(f"{title} (limits dashed)")
-    rows = left.subplots(3, joints, sharex=True, squeeze=False)
+    known = demonstrations.torque is not None
+    rows = left.subplots(2 + known, joints, sharex=True, squeeze=False)
     _plot_angles(rows[0], demonstrations, arm)
     _plot_speeds(rows[1], demonstrations, arm)
-    _plot_torques(rows[2], demonstrations, arm)
+    if known:
+        _plot_torques(rows[2], demonstrations, arm)
     for axes in rows.flat:
         axes.grid(alpha=0.3)
         axes.margins(x=0)
-    for axes in rows[2]:
+    for axes in rows[-1]:
         axes.set_xlabel("time [s]")
     _plot_hand(right, hand_paths(arm, demonstrations.qpos))
     figure.savefig(out, dpi=150)

@@ -1,4 +1,4 @@
-"""What `python -m mimic.demonstrations` does: records an expert, writes and plots its motions, says what they take."""
+"""What `python -m mimic.demonstrations` does: records an expert or reads motions, plots them, says what they take."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +14,7 @@ from mimic.embodiment import Embodiment
 from mimic.envs.arms import Arm, build_arm
 from mimic.envs.config import EnvConfig, RecordingConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort
+from mimic.envs.importing import import_demonstrations
 from mimic.envs.recording import record_demonstrations
 from mimic.trainers.demonstration_plot import peak, plot_demonstrations, with_share
 
@@ -31,6 +32,10 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
     out, plot = _files(config)
     env, console = config.resolve(), Console()
     arm = build_arm(env.expert, env.limits)
+    if config.source:
+        return _prepare_import(config, env, arm, out, plot)
+    if config.joints:
+        raise ValueError("joints: expected only with source=FILE, whose joints they are")
     recorded, redrawn = _record(arm, env, console)
     check_effort(recorded, arm.embodiment)  # what the recorder promises, of what is written
 
@@ -42,6 +47,30 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
         console.print(_table(recorded, arm.embodiment))
         console.print(_verdict(recorded, arm.embodiment), soft_wrap=True, highlight=False)
         console.print(f"goals drawn anew because a limit was broken: {redrawn}", highlight=False)
+        console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
+        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+
+    return run
+
+
+def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path, plot: Path) -> Callable[[], None]:
+    """Reads motions, and gives what writes and shows them."""
+    if given := [key for key in ("kind", "count", "seed") if getattr(config, key) is not None]:
+        raise ValueError(f"{given[0]}: expected none with source=FILE, whose motions are taken as they are")
+    source = Path(config.source).expanduser()
+    imported, differentiated = import_demonstrations(
+        source, arm.embodiment, dt=env.control_dt, horizon=env.horizon, joints=config.joints
+    )
+
+    def run() -> None:
+        console = Console()
+        imported.save(out)
+        plot_demonstrations(imported, arm.embodiment, plot, title=f"{arm.embodiment.name}, {source.name}")
+        console.print(_table(imported, arm.embodiment))
+        said = "differentiated, since the file has none" if differentiated else "as in the file"
+        length = f"{imported.horizon} steps of {imported.dt:g} s"
+        console.print(f"{source.name}: {imported.count} demonstrations, {length}; velocities: {said}", soft_wrap=True)
+        console.print(f"all stay within the rated speeds of {arm.embodiment.name}; torques are not known")
         console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
@@ -90,15 +119,15 @@ def _table(recorded: Demonstrations, arm: Embodiment) -> Table:
     table.add_column("joint")
     for header in ("angles\n[rad]", "peak speed\n[rad/s]", "peak torque\n[N m]", "RMS torque\n[N m]"):
         table.add_column(escape(header), justify="right")  # a unit in brackets is no style
-    assert recorded.torque is not None
+    torque = np.full((1, 1, arm.num_joints), np.nan) if recorded.torque is None else recorded.torque
     least, most = recorded.qpos.min(axis=(0, 1)), recorded.qpos.max(axis=(0, 1))
-    rms_torque = np.sqrt(np.mean(recorded.torque**2, axis=(0, 1)))
+    rms_torque = np.sqrt(np.mean(torque**2, axis=(0, 1)))
     for joint, name in enumerate(arm.joint_names):
         table.add_row(
             name,
             f"{least[joint]:.2f} to {most[joint]:.2f} ({(most - least)[joint] / np.ptp(arm.joint_range[joint]):.0%})",
             with_share(peak(recorded.qvel)[joint], arm.velocity_limit[joint]),
-            with_share(peak(recorded.torque)[joint], arm.torque_limit[joint]),
+            with_share(peak(torque)[joint], arm.torque_limit[joint]),
             with_share(rms_torque[joint], arm.torque_limit[joint]),
         )
     return table

@@ -1,5 +1,6 @@
 """One run from config to report: what `python -m mimic.train` and `python -m mimic.evaluate` do."""
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +19,7 @@ from mimic.trainers.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.group import Group
 from mimic.trainers.job import Job, Params
+from mimic.trainers.loggers import check_loggers, make_loggers
 from mimic.trainers.progress import TrainingProgress, report_table
 from mimic.trainers.signals import Interrupted, Signals, noted_signals
 
@@ -48,6 +50,7 @@ def prepare_training(
     if group and config.trainer.name != "ppo":
         raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
     leads = group is None or group.first
+    check_loggers(config.loggers)
     run_dir = resumed or (runs.new_run_dir(config) if leads else Path())
     with stopwatch.stage("build"):
         job = make_job(config, resumed)
@@ -174,8 +177,9 @@ def use_compilation_cache(folder: str) -> None:
 def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
     config = runs.load_config(run_dir)
     steps = check_checkpoint(run_dir)
-    of_the_process = ("resume=", "compilation_cache=", "distributed.")
+    of_the_process = ("resume=", "compilation_cache=", "distributed.", "logger=")
     changes = [override for override in overrides if not override.startswith(of_the_process)]
+    logger = {"logger": given.logger} if any(override.startswith("logger=") for override in overrides) else {}
     refused = [c for c in changes if not c.startswith("trainer.") or c.startswith(("trainer.preset=", "trainer.name="))]
     if refused:
         raise ValueError(
@@ -190,7 +194,9 @@ def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str])
             f"resume: {str(run_dir)!r} is trained for {steps} of {total} steps; "
             f"give a larger trainer.{config.trainer.length_key}"
         )
-    return dataclasses.replace(config, compilation_cache=given.compilation_cache, distributed=given.distributed)
+    return dataclasses.replace(
+        config, compilation_cache=given.compilation_cache, distributed=given.distributed, **logger
+    )
 
 
 def _follow(job: Job, restore: tuple[int, Params] | None, group: Group) -> int:
@@ -222,7 +228,7 @@ def _train(
             soft_wrap=True,
         )
         try:
-            steps, params = _train_and_log(job, run_dir, signals, restore, stopwatch, console)
+            steps, params = _train_and_log(config, job, run_dir, signals, restore, stopwatch, console)
         except Interrupted as stop:
             if group:
                 group.end(stop.exit_code)
@@ -243,6 +249,7 @@ def _train(
 
 
 def _train_and_log(
+    config: TrainConfig,
     job: Job,
     run_dir: Path,
     signals: Signals,
@@ -251,8 +258,13 @@ def _train_and_log(
     console: Console,
 ) -> tuple[int, Params]:
     """Trains; evaluates, logs and shows the result after each stretch. Steps and parameters of the result."""
-    log = runs.MetricsLog(run_dir)
-    with TrainingProgress(console, job.total_steps, restore[0] if restore else 0) as progress, stopwatch.stage("train"):
+    done_before = restore[0] if restore else 0
+    with contextlib.ExitStack() as stack:
+        loggers = [runs.MetricsLog(run_dir), *make_loggers(config.loggers, run_dir, config)]
+        for logger in loggers:
+            stack.callback(logger.close)  # also where training is interrupted
+        progress = stack.enter_context(TrainingProgress(console, job.total_steps, done_before))
+        stack.enter_context(stopwatch.stage("train"))
 
         def on_evaluation(step: int, params: Params, metrics: Mapping[str, float]) -> bool:
             with stopwatch.stage("evaluate"):
@@ -260,13 +272,13 @@ def _train_and_log(
                 if metrics:
                     row = {f"quality/{key}": value for key, value in _flat(figures).items()}
                     row |= {f"training/{key}": value for key, value in metrics.items()}
-                    log.write(step, {**row, "wall_time_s": time.perf_counter() - stopwatch.started})
+                    row["wall_time_s"] = time.perf_counter() - stopwatch.started
+                    for logger in loggers:
+                        logger.write(step, row)
                 progress.update(step, job.status(figures), metrics.get("sps"))
             return job.good_enough(figures)
 
-        result = job.train(run_dir, on_evaluation, signals, restore)
-    log.close()
-    return result
+        return job.train(run_dir, on_evaluation, signals, restore)
 
 
 def _flat(figures: Mapping[str, Any]) -> dict[str, float]:

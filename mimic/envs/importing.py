@@ -1,0 +1,198 @@
+"""Motions from elsewhere as demonstrations: CSV tables, and npz files as LocoMuJoCo writes them."""
+
+import csv
+import os
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.embodiment import Embodiment
+from mimic.envs.demonstrations import Demonstrations, check_effort
+
+SOURCES = (".csv", ".npz")
+_TIME, _DEMONSTRATION = ("time", "t"), "demonstration"  # columns of a table
+_ANGLE_PREFIXES, _VELOCITY_PREFIXES = ("", "q_", "q", "qpos_"), ("qdot_", "qdot", "qvel_", "dq_")
+_SIZES = {0: (7, 6), 2: (1, 1), 3: (1, 1)}  # columns of qpos and qvel by MuJoCo's joint type: free, slide, hinge
+_ROUNDING = 1e-6  # share of a step that an episode may be short of, rad that a float32 may be beyond a range of pi
+
+
+class Motion(NamedTuple):
+    """One motion, at the times it came with; `qvel` is None where nobody measured it."""
+
+    time: Float[np.ndarray, " samples"]
+    qpos: Float[np.ndarray, "samples joints"]
+    qvel: Float[np.ndarray, "samples joints"] | None
+
+
+def import_demonstrations(
+    path: str | os.PathLike[str], arm: Embodiment, *, dt: float = 0.1, horizon: int = 50, joints: Sequence[str] = ()
+) -> tuple[Demonstrations, bool]:
+    """Reads motions, resamples them to control steps, and checks that the arm can do them.
+
+    A CSV table has a header: `time` [s], and for each joint its angle [rad], as its name or `q_NAME` or `q_1`, `q_2`,
+    ... by its number; optionally its velocity [rad/s], as `qdot_NAME` or `qdot_1`, ...; and optionally `demonstration`,
+    a number that tells several motions apart. An npz file has `qpos`, `joint_names` and `frequency` [1/s] (or `dt`),
+    and optionally `qvel`, `jnt_type` and `split_points`, where motions begin, as LocoMuJoCo writes them.
+
+    Between samples the angles are cubic in time, with the velocities of the file, or with central differences where it
+    has none. Every demonstration is cut to the horizon.
+
+    Args:
+      path: the file; its ending tells which kind.
+      arm: the expert.
+      dt: control step [s].
+      horizon: steps of a demonstration.
+      joints: what the file calls the arm's joints, base to tip; the arm's own names where empty.
+
+    Returns:
+      The demonstrations, and whether their velocities were differentiated.
+
+    Raises:
+      ValueError: a file that is missing or of another kind, without the joints, shorter than the horizon, not in rad,
+        or faster than the arm's rated speeds.
+    """
+    source = Path(path)
+    if not source.is_file():
+        raise ValueError(f"source: no file at {str(source)!r}")
+    if source.suffix not in SOURCES:
+        raise ValueError(f"source: expected a file that ends in {', '.join(SOURCES)}, got {str(source)!r}")
+    names = tuple(joints) or arm.joint_names
+    if len(names) != arm.num_joints:
+        raise ValueError(f"joints: expected {arm.num_joints} names, of {', '.join(arm.joint_names)}, got {len(names)}")
+    motions = (_read_csv if source.suffix == ".csv" else _read_npz)(source, names)
+    for index, motion in enumerate(motions):
+        _check(motion, f"demonstration {index} in {str(source)!r}", arm, dt * horizon)
+    resampled = [_resampled(motion, dt, horizon) for motion in motions]
+    qpos, qvel = (np.stack(column) for column in zip(*resampled, strict=True))
+    imported = Demonstrations(qpos, qvel, qpos[:, -1], float(dt), arm.name, arm.joint_names)
+    check_effort(imported, arm)
+    return imported, any(motion.qvel is None for motion in motions)
+
+
+def _check(motion: Motion, name: str, arm: Embodiment, duration: float) -> None:
+    for values in filter(lambda values: values is not None, motion):
+        if not np.all(np.isfinite(values)):  # type: ignore[arg-type]
+            raise ValueError(f"source: {name} has values that are not finite")
+    if len(motion.time) < 2 or np.any(np.diff(motion.time) <= 0):
+        raise ValueError(f"source: {name} needs two or more samples at times that increase")
+    lasts = motion.time[-1] - motion.time[0]
+    if lasts < duration * (1 - _ROUNDING):
+        raise ValueError(
+            f"source: {name} lasts {lasts:g} s, but an episode {duration:g} s; a smaller env.horizon makes it shorter"
+        )
+    lower, upper = np.asarray(arm.joint_range).T
+    beyond = np.argwhere((motion.qpos < lower - _ROUNDING) | (motion.qpos > upper + _ROUNDING))
+    if len(beyond):
+        sample, joint = beyond[0]
+        raise ValueError(
+            f"source: {arm.joint_names[joint]} of {name} is at {motion.qpos[sample, joint]:.4g}, "
+            f"expected rad in [{lower[joint]:.4f}, {upper[joint]:.4f}]"
+        )
+
+
+def _resampled(motion: Motion, dt: float, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+    """Angles and velocities at control steps."""
+    from scipy.interpolate import CubicHermiteSpline  # half a second, and few need it
+
+    time = motion.time - motion.time[0]
+    qvel = np.gradient(motion.qpos, time, axis=0) if motion.qvel is None else motion.qvel
+    spline = CubicHermiteSpline(time, motion.qpos, qvel)
+    steps = np.minimum(dt * np.arange(horizon + 1), time[-1])  # rounding must not ask for what comes after the end
+    return spline(steps), spline(steps, 1)
+
+
+def _read_csv(path: Path, names: Sequence[str]) -> list[Motion]:
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        try:
+            header, *rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
+            table = np.array(rows, float).reshape(len(rows), len(header))
+        except (ValueError, UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"source: {str(path)!r} is no table of numbers below a header: {error}") from error
+    times = [header.index(name) for name in _TIME if name in header]
+    angles = _columns(header, names, _ANGLE_PREFIXES)
+    lacking = [name for name, column in zip(names, angles, strict=True) if column is None]
+    if not times or lacking:
+        raise ValueError(
+            f"source: {str(path)!r} lacks {', '.join([*([] if times else ['time']), *lacking])}; expected time and the "
+            f"joints {', '.join(names)}, by name or as q_1, q_2, ..., got the columns {', '.join(header)}"
+        )
+    velocities = _columns(header, names, _VELOCITY_PREFIXES)
+    known = [column for column in velocities if column is not None]
+    if known and len(known) < len(names):
+        missing = [name for name, column in zip(names, velocities, strict=True) if column is None]
+        raise ValueError(f"source: {str(path)!r} has velocities of some joints, but none of {', '.join(missing)}")
+    which = table[:, header.index(_DEMONSTRATION)] if _DEMONSTRATION in header else np.zeros(len(table))
+    parts = [table[which == number] for number in np.unique(which)]
+    if not parts:
+        raise ValueError(f"source: {str(path)!r} has no rows")
+    at = np.array(angles, int)
+    return [Motion(part[:, times[0]], part[:, at], part[:, known] if known else None) for part in parts]
+
+
+def _columns(header: Sequence[str], names: Sequence[str], prefixes: Sequence[str]) -> list[int | None]:
+    """Where the value of each joint stands, by its name or its number from 1."""
+    found: list[int | None] = []
+    for number, name in enumerate(names, start=1):
+        spellings = [prefix + key for key in (name, str(number)) for prefix in prefixes if prefix or key == name]
+        found.append(next((header.index(spelling) for spelling in spellings if spelling in header), None))
+    return found
+
+
+def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:  # of what is pickled, as LocoMuJoCo's metadata, we read none
+            wanted = ("qpos", "qvel", "joint_names", "frequency", "dt", "jnt_type", "split_points")
+            content: dict[str, Any] = {key: archive[key] for key in wanted if key in archive.files}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        raise ValueError(f"source: {str(path)!r} cannot be read as an npz file of motions: {error}") from error
+    lacking = [key for key in ("qpos", "joint_names") if key not in content]
+    if not {"frequency", "dt"} & set(content):
+        lacking.append("frequency")
+    if lacking:
+        raise ValueError(
+            f"source: {str(path)!r} lacks {', '.join(lacking)}; expected qpos, joint_names, frequency or dt, and "
+            "optionally qvel, jnt_type, split_points"
+        )
+    qpos, qvel = content["qpos"], content.get("qvel")
+    present = list(map(str, np.atleast_1d(content["joint_names"])))
+    if missing := [name for name in names if name not in present]:
+        raise ValueError(
+            f"source: {str(path)!r} lacks the joints {', '.join(missing)}; it has {', '.join(present)}; "
+            "joints=[...] says which of these are the arm's"
+        )
+    angle_at, velocity_at = _addresses(content.get("jnt_type"), present)
+    for key, values, width in (("qpos", qpos, angle_at[-1]), ("qvel", qvel, velocity_at[-1])):
+        if values is not None and (values.ndim != 2 or values.shape != (len(qpos), width)):
+            raise ValueError(
+                f"source: {key} in {str(path)!r} must be {[len(qpos), width]} for its joints, got {list(values.shape)}"
+            )
+    rate = content["dt"] if "dt" in content else content["frequency"]
+    if rate.shape != () or not 0 < float(rate) < np.inf:
+        raise ValueError(f"source: frequency or dt in {str(path)!r} must be one number above 0, got {rate}")
+    step = float(rate) if "dt" in content else 1 / float(rate)
+    which = [present.index(name) for name in names]
+    qpos = np.asarray(qpos, float)[:, angle_at[which]]
+    qvel = None if qvel is None else np.asarray(qvel, float)[:, velocity_at[which]]
+    bounds = [int(point) for point in np.atleast_1d(content.get("split_points", (0, len(qpos))))]
+    if len(bounds) < 2 or bounds[0] != 0 or bounds[-1] != len(qpos) or np.any(np.diff(bounds) <= 0):
+        raise ValueError(
+            f"source: split_points in {str(path)!r} must increase from 0 to {len(qpos)}, the samples, got {bounds[:8]}"
+        )
+    return [
+        Motion(step * np.arange(end - start), qpos[start:end], None if qvel is None else qvel[start:end])
+        for start, end in zip(bounds[:-1], bounds[1:], strict=True)
+    ]
+
+
+def _addresses(types: np.ndarray | None, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """First column of each joint in qpos and in qvel, and last how many columns there are."""
+    kinds = [3] * len(names) if types is None else [int(kind) for kind in types]
+    if len(kinds) != len(names) or any(kind not in _SIZES for kind in kinds):
+        raise ValueError(f"source: jnt_type: expected 0, 2 or 3 for each of {', '.join(names)}, got {kinds}")
+    sizes = np.array([_SIZES[kind] for kind in kinds])
+    angle_at, velocity_at = np.concatenate([[[0, 0]], np.cumsum(sizes, axis=0)]).T
+    return angle_at, velocity_at

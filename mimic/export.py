@@ -1,0 +1,16 @@
+"""`python -m mimic.export run=DIR out=FILE`: a trained policy or pose mapper as ONNX, or as StableHLO for JAX."""
+
+from mimic import cli, compat
+from mimic.trainers.config import ExportConfig
+
+
+def prepare(config: ExportConfig) -> cli.Work:
+    """The export that the config describes."""
+    compat.import_mjx()
+    from mimic.trainers import exporting  # not needed for --help
+
+    return exporting.prepare_export(config)
+
+
+if __name__ == "__main__":
+    cli.run(prepare, "export")

@@ -1,0 +1,145 @@
+"""The environments behind Gymnasium's interface: its own checks, and the same numbers as the brax environment."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+
+gymnasium = pytest.importorskip("gymnasium")
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.vector import AutoresetMode  # noqa: E402
+
+from mimic.gymnasium import Env, VectorEnv  # noqa: E402
+
+SMALL = {"demonstrations": {"count": 3, "held_out": 1}, "physics": "fused"}
+
+
+@pytest.fixture(scope="module")
+def imitation():
+    return mimic.make("planar4dof", horizon=6, **SMALL)
+
+
+@pytest.fixture(scope="module")
+def vector(imitation):
+    return VectorEnv(imitation, num_envs=5)
+
+
+def test_gymnasium_finds_nothing_wrong():
+    env = gymnasium.make("mimic/planar4dof-v0", **SMALL)
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+def test_all_environments_are_registered():
+    for name in mimic.environments():
+        assert gymnasium.spec(f"mimic/{name}-v0").vector_entry_point == "mimic.gymnasium:VectorEnv"
+    env = gymnasium.make_vec("mimic/planar4dof-v0", num_envs=2, **SMALL)
+    assert isinstance(env.unwrapped, VectorEnv) and env.num_envs == 2
+
+
+def test_it_is_the_brax_environment(imitation):
+    env = Env(imitation)
+    obs, _ = env.reset(seed=3, options={"demonstration": 2})
+    state = imitation.begin(imitation.start(jax.random.PRNGKey(0), 2))
+    np.testing.assert_allclose(obs, state.obs, atol=1e-6)
+    step, actions = jax.jit(imitation.step), np.random.default_rng(0).uniform(-1, 1, (6, 4)).astype(np.float32)
+    for index, action in enumerate(actions):
+        obs, reward, terminated, truncated, infos = env.step(action)
+        state = step(state, jnp.asarray(action))
+        np.testing.assert_allclose(obs, state.obs, atol=1e-6)
+        assert reward == pytest.approx(float(state.reward), abs=1e-6)
+        assert infos["distance"] == pytest.approx(float(state.metrics["distance"]), abs=1e-6)
+        assert (terminated, truncated) == (index == 5, False)
+
+
+def test_arms_start_anew_in_the_step_that_ends_an_episode(imitation, vector):
+    assert vector.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    obs, _ = vector.reset(seed=0)
+    assert obs.shape == (5, imitation.observation_size) and vector.observation_space.contains(obs)
+    own = 12 * imitation.learner.num_links
+    at_home = obs[0, :own]
+    for index in range(13):
+        action = vector.action_space.sample()
+        obs, reward, terminated, truncated, infos = vector.step(action)
+        ends = index % 6 == 5
+        assert terminated.tolist() == [ends] * 5 and not truncated.any() and reward.dtype == float
+        assert infos["distance"].shape == (5,) and infos["_distance"].all()
+        assert ("final_obs" in infos) == ends
+        np.testing.assert_array_equal(np.all(obs[:, :own] == at_home, axis=1), ends)
+        if ends:
+            assert infos["_final_obs"].all() and not np.any(np.all(infos["final_obs"][:, :own] == at_home, axis=1))
+
+
+def test_a_seed_repeats_everything(vector):
+    actions = np.random.default_rng(1).uniform(-1, 1, (8, *vector.action_space.shape))
+
+    def play(seed):
+        obs = [vector.reset(seed=seed)[0]]
+        return np.stack(obs + [vector.step(action)[0] for action in actions])
+
+    np.testing.assert_array_equal(play(4), play(4))
+    assert np.any(play(4) != play(5))
+    assert len(np.unique(play(4)[0], axis=0)) > 1  # arms do not all imitate the same demonstration
+
+
+def test_pictures(imitation):
+    env = Env(imitation, render_mode="rgb_array")
+    env.reset(seed=0)
+    try:
+        first = env.render()
+    except ValueError as error:
+        pytest.skip(str(error))
+    assert first is not None
+    for _ in range(4):
+        env.step(np.ones(4))
+    assert first.shape == (480, 640, 3) and first.dtype == np.uint8 and np.any(first != env.render())
+    env.close()
+    many = VectorEnv(imitation, num_envs=2, render_mode="rgb_array")
+    many.reset(seed=0)
+    pictures = many.render()
+    assert pictures is not None and len(pictures) == 2
+    many.close()
+    assert Env(imitation).render() is None
+
+
+def test_bad_input(imitation, vector):
+    with pytest.raises(ValueError, match="num_envs: expected at least 1"):
+        VectorEnv(imitation, num_envs=0)
+    with pytest.raises(ValueError, match="render_mode: expected one of rgb_array, got 'human'"):
+        Env(imitation, render_mode="human")
+    with pytest.raises(ValueError, match="unknown environment 'panda9dof'"):
+        Env("panda9dof")
+    with pytest.raises(ValueError, match="preview: expected the name of an environment"):
+        Env(imitation, preview=2)
+    with pytest.raises(ValueError, match="expected reset before"):
+        Env(imitation).step(np.zeros(4))
+    with pytest.raises(ValueError, match="demonstration: expected a number from 0 to 2, got 3"):
+        Env(imitation).reset(options={"demonstration": 3})
+    vector.reset()
+    with pytest.raises(ValueError, match=r"action: expected shape \(5, 4\), got \(4,\)"):
+        vector.step(np.zeros(4))
+
+
+@pytest.mark.slow
+def test_stable_baselines_learns_on_it():
+    """Better than before by a third, on a fixed seed."""
+    algorithms = pytest.importorskip("stable_baselines3")
+    env = Env("planar4dof", demonstrations={"count": 1, "held_out": 1}, physics="fused")
+
+    def mean_return(model):
+        total = 0.0
+        obs, _ = env.reset(seed=0)
+        terminated = False
+        while not terminated:
+            obs, reward, terminated, _, _ = env.step(model.predict(obs, deterministic=True)[0])
+            total += reward
+        return total
+
+    model = algorithms.PPO("MlpPolicy", env, n_steps=1000, batch_size=250, gamma=0.8, seed=0, device="cpu")
+    before = mean_return(model)
+    model.learn(30_000)
+    after = mean_return(model)
+    print(before, after)
+    assert after > 0.67 * before

@@ -1,0 +1,105 @@
+"""Metrics at Weights & Biases and MLflow, beside the files of a run: by modules that only pretend to be them."""
+
+import csv
+import sys
+import types
+
+import pytest
+
+import mimic
+from mimic.trainers import session
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from mimic.trainers.loggers import make_loggers
+
+
+class FakeWandb(types.ModuleType):
+    def __init__(self):
+        super().__init__("wandb")
+        self.begun, self.rows, self.finished = [], {}, 0
+
+    def init(self, **settings):
+        self.begun.append(settings)
+        return types.SimpleNamespace(log=self._log, finish=self._finish)
+
+    def _log(self, metrics, step):
+        self.rows[step] = metrics
+
+    def _finish(self):
+        self.finished += 1
+
+
+class FakeMlflow(types.ModuleType):
+    def __init__(self):
+        super().__init__("mlflow")
+        self.calls, self.rows = [], {}
+
+    def __getattr__(self, name):
+        return lambda *arguments, **settings: self.calls.append((name, arguments, settings))
+
+    def active_run(self):
+        return types.SimpleNamespace(info=types.SimpleNamespace(run_id="run-7"))
+
+    def log_metrics(self, metrics, step):
+        self.rows[step] = metrics
+
+    def named(self, name):
+        return [settings for called, _, settings in self.calls if called == name]
+
+
+@pytest.fixture
+def services(monkeypatch):
+    for variable in ("WANDB_PROJECT", "MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"):
+        monkeypatch.delenv(variable, raising=False)
+    fakes = {"wandb": FakeWandb(), "mlflow": FakeMlflow()}
+    for name, fake in fakes.items():
+        monkeypatch.setitem(sys.modules, name, fake)
+    return fakes["wandb"], fakes["mlflow"]
+
+
+def short_run(run_dir, logger):
+    settings = {"samples": 256, "batch_size": 128, "epochs": 2, "hidden_layers": [8], "held_out_poses": 32}
+    trainer = PoseMapperConfig(**settings, evaluations=2, validation_poses=32)
+    return TrainConfig(
+        mimic.env_config("planar4dof"), trainer, run_dir=str(run_dir), logger=logger, compilation_cache=""
+    )
+
+
+def test_a_run_logs_what_its_own_files_hold(tmp_path, services):
+    wandb, mlflow = services
+    config = short_run(tmp_path / "run", ["local", "wandb", "mlflow"])
+    assert session.prepare_training(config, 0.0)() == 0
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        rows = {int(row.pop("step")): {key: float(value) for key, value in row.items()} for row in csv.DictReader(file)}
+    assert len(rows) == 2 and list((tmp_path / "run" / "tensorboard").iterdir())
+    assert wandb.rows == mlflow.rows == rows
+    assert wandb.finished == len(mlflow.named("end_run")) == 1
+    (begun,) = wandb.begun
+    assert begun["project"] == "mimic" and begun["dir"] == str(tmp_path / "run") and begun["id"] == "run"
+    assert begun["config"]["env"]["name"] == "planar4dof" and begun["config"]["trainer"]["samples"] == 256
+    (uri,) = mlflow.named("set_tracking_uri")
+    assert uri["uri"].endswith("run/mlruns")
+
+
+def test_a_resumed_run_goes_on_in_the_same_mlflow_run(tmp_path, services, monkeypatch):
+    _, mlflow = services
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://localhost:5000")
+    for _ in range(2):
+        for logger in make_loggers(["mlflow", "mlflow"], tmp_path, short_run(tmp_path, "mlflow")):
+            logger.write(1, {"gap": 0.5, "diverged": float("nan")})
+            logger.close()
+    assert [settings["run_id"] for settings in mlflow.named("start_run")] == [None, "run-7"]
+    assert mlflow.rows == {1: {"gap": 0.5}} and not mlflow.named("set_tracking_uri")
+
+
+@pytest.mark.parametrize(
+    ("argument", "missing", "message"),
+    [
+        ("logger=wandb", "wandb", "logger=wandb needs the package wandb: pip install 'mimic-mjx[wandb]'"),
+        ("logger=[local,mlflow]", "mlflow", "logger=mlflow needs the package mlflow: pip install 'mimic-mjx[mlflow]'"),
+        ("logger=comet", None, "logger: expected one of local, wandb, mlflow, got 'comet'"),
+    ],
+)
+def test_what_cannot_log_is_refused(refused, monkeypatch, argument, missing, message):
+    if missing:
+        monkeypatch.setitem(sys.modules, missing, None)
+    assert message in refused("train", "env=planar4dof", argument)
