@@ -23,6 +23,7 @@ from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, RecordingConfig, RetargetConfig
 from mimic.trainers.config import TRAINERS, EvaluateConfig, FiguresConfig, RenderConfig, TrainConfig
 from mimic.trainers.signals import STOPPED_BY_SIGNAL
+from mimic.viewing.config import ViewConfig
 
 BAD_INPUT = 2
 _CONFIG_ERRORS = (FrozenInstanceError, HydraException, OmegaConfBaseException)  # the first: a key added with "+"
@@ -99,6 +100,7 @@ def _register_schemas() -> None:
     store.store(name="render_schema", node=schema(RenderConfig))
     store.store(name="demonstrations_schema", node=schema(RecordingConfig))
     store.store(name="retarget_schema", node=schema(RetargetConfig))
+    store.store(name="view_schema", node=schema(ViewConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
     for name, config_class in TRAINERS.items():
         store.store(group="trainer", name=f"{name}_schema", node=schema(config_class))
