@@ -42,8 +42,7 @@ def demonstration_index(evaluator: Evaluator, split: str, demonstration: int) ->
     which = range(evaluator.env.demonstrations.count)[part]
     if not 0 <= demonstration < len(which):
         raise ValueError(
-            f"demonstration: expected 0 to {len(which) - 1}, the {split} ones of the run, "
-            f"got {demonstration}"
+            f"demonstration: expected 0 to {len(which) - 1}, the {split} ones of the run, got {demonstration}"
         )
     return which[demonstration]
 

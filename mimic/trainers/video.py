@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import imageio_ffmpeg
-import jax
-import jax.numpy as jnp
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
-from jaxtyping import Float, UInt8  # noqa: E402
+from jaxtyping import UInt8  # noqa: E402
 from PIL import Image  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402

@@ -134,7 +134,9 @@ def chart(
         at = float(x(np.array(now)))
         parts.append(f'<line x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP}" y2="{_HEIGHT - _BOTTOM}" stroke="#d62728"/>')
     for index, (label, _, colour) in enumerate(curves):
-        parts.append(f'<text x="{_LEFT + 6 + 78 * index}" y="{_HEIGHT - 3}" fill="{colour}">{html.escape(label)}</text>')
+        parts.append(
+            f'<text x="{_LEFT + 6 + 78 * index}" y="{_HEIGHT - 3}" fill="{colour}">{html.escape(label)}</text>'
+        )
     parts.append(f'<text x="{_WIDTH - 6}" y="{_HEIGHT - 3}" text-anchor="end">{last:.1f} s</text>')
     return (
         f'<svg id="mimic-chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" style="width:100%;padding:0 8px" '

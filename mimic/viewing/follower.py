@@ -197,6 +197,11 @@ class ProgramCache:
             raise made
         return made
 
+    def is_complete(self, settings: Settings) -> bool:
+        """Whether all programs are there, or there will be none."""
+        made = self._made.get(settings.program_key)
+        return isinstance(made, Exception) or (made is not None and made.best is not None)
+
     def wait(self, settings: Settings) -> Programs:
         """All programs; waits for them."""
         while (programs := self.get(settings)) is None or programs.best is None:

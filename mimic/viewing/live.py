@@ -73,6 +73,7 @@ class LiveSession:
         self._still = 0.0  # s since the expert moved
         self._goal: np.ndarray | None = None  # the learner's pose to go to, past the optimiser
         self._solved: tuple[Any, np.ndarray, float] | None = None  # for what; best pose and bound
+        self._working = self.settings  # the last ones whose programs were there
         self._shown: Any = None  # what the last frame was made of
 
     @property
@@ -119,8 +120,8 @@ class LiveSession:
 
     @property
     def is_compiling(self) -> bool:
-        """Whether what is asked for is still being compiled."""
-        return self._programs.get(self.settings) is None
+        """Whether what is asked for is still being compiled, the lower bound included."""
+        return not self._programs.is_complete(self.settings)
 
     def compile(self) -> Programs:
         """The programs of the settings, waiting for them."""
@@ -138,9 +139,14 @@ class LiveSession:
         """
         with self._lock:
             settings = self.settings
-            programs = self._programs.get(settings)
+            try:
+                programs = self._programs.get(settings)
+            except ValueError:
+                self.settings = self._working
+                raise
             if programs is None:
                 return None
+            self._working = settings
             self._go_on(dt)
             arm, expert = programs.learner.embodiment, self._pose
             present = np.array([self._angles[name] for name in arm.joint_names], np.float32)
@@ -151,7 +157,8 @@ class LiveSession:
             best, bound = self._best(programs, asked)
             pose = self._step(programs, present, best, bound, dt)
             shown = programs.measure(expert, pose, settings.weights)
-            self._angles |= dict(zip(arm.joint_names, map(float, pose), strict=True)) | programs.learner.locked
+            self._angles |= dict(zip(arm.joint_names, map(float, pose), strict=True))
+            self._angles |= programs.learner.locked
             self._shown = asked, pose.tobytes(), self._goal is None, programs.best is None
         distance = float(shown.distance)
         return Frame(

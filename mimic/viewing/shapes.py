@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -82,7 +83,7 @@ def places(shapes: Sequence[ArmShape]) -> list[Float[np.ndarray, "3"]]:
 
 def _drawn(model: mujoco.MjModel) -> list[Part]:
     """The visible shapes, those of one body and colour as one."""
-    groups: dict[tuple[int, tuple[float, ...]], list[trimesh.Trimesh]] = {}
+    groups: dict[tuple[int, tuple[float, ...]], list[Any]] = {}  # of meshes
     for geom in range(model.ngeom):
         mesh = _triangles(model, geom)
         material = int(model.geom_matid[geom])
@@ -95,7 +96,7 @@ def _drawn(model: mujoco.MjModel) -> list[Part]:
     return [_part(body, trimesh.util.concatenate(meshes), rgba) for (body, rgba), meshes in groups.items()]
 
 
-def _part(body: int, mesh: trimesh.Trimesh, rgba: tuple[float, ...], locked_joint: str | None = None) -> Part:
+def _part(body: int, mesh: Any, rgba: tuple[float, ...], locked_joint: str | None = None) -> Part:
     vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
     return Part(body, vertices, faces, rgba, locked_joint)
 
