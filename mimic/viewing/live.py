@@ -16,6 +16,7 @@ from mimic.viewing.follower import Mapper, ProgramCache, Programs, Settings, hom
 
 _GLIDE = 1.0  # s, that the expert takes to a pose that a button gives
 _STILL = 0.25  # s without a new pose of the expert, after which the learner may leave a local minimum
+_RESTS = 1e-4  # rad: a joint that moves less is at rest
 _WORTH_IT = 1e-3  # of the distance that another minimum must save
 
 
@@ -74,7 +75,7 @@ class LiveSession:
         self._goal: np.ndarray | None = None  # the learner's pose to go to, past the optimiser
         self._solved: tuple[Any, np.ndarray, float] | None = None  # for what; best pose and bound
         self._working = self.settings  # the last ones whose programs were there
-        self._shown: Any = None  # what the last frame was made of
+        self._rested: Any = None  # for what the learner came to rest
 
     @property
     def pose(self) -> Float[np.ndarray, " joints"]:
@@ -151,15 +152,15 @@ class LiveSession:
             arm, expert = programs.learner.embodiment, self._pose
             present = np.array([self._angles[name] for name in arm.joint_names], np.float32)
             asked = expert.tobytes(), settings
-            state = asked, present.tobytes(), self._goal is None, programs.best is None
-            if self._shown == state and self._still > 2 * _STILL:
+            if self._rested == (asked, programs.best is None):
                 return None
             best, bound = self._best(programs, asked)
             pose = self._step(programs, present, best, bound, dt)
             shown = programs.measure(expert, pose, settings.weights)
             self._angles |= dict(zip(arm.joint_names, map(float, pose), strict=True))
             self._angles |= programs.learner.locked
-            self._shown = asked, pose.tobytes(), self._goal is None, programs.best is None
+            rests = self._goal is None and self._still > 2 * _STILL and bool(np.all(np.abs(pose - present) < _RESTS))
+            self._rested = (asked, programs.best is None) if rests else None
         distance = float(shown.distance)
         return Frame(
             expert=dict(zip(self.expert.joint_names, map(float, expert), strict=True)),

@@ -1,6 +1,8 @@
 """What `python -m mimic.view` does: serves a live view, or a policy's playback, until it is interrupted."""
 
+import contextlib
 import importlib.util
+import io
 import socket
 import time
 from collections import deque
@@ -33,7 +35,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     Raises:
       ValueError: no viser, a port that is taken, arms or runs that cannot be shown.
     """
-    if importlib.util.find_spec("viser") is None:
+    if not is_installed():
         raise ValueError(
             "view: expected the package viser, which is not installed; it comes with the extra 'view': "
             "pip install 'mimic-mjx[view]'"
@@ -58,6 +60,11 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         env = runs.load_config(Path(config.mapper).expanduser()).env
     live = LiveSession(env, mapper)
     return lambda: _serve(config, env, lambda page: _follow(page, live, env, mapper is None), None, live.finish)
+
+
+def is_installed() -> bool:
+    """Whether viser is there."""
+    return importlib.util.find_spec("viser") is not None
 
 
 def check_port(host: str, port: int) -> None:
@@ -94,7 +101,8 @@ def _serve(
     try:
         if before is not None:
             before()
-        server = viser.ViserServer(host=config.host, port=config.port, label="mimic", verbose=False)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner, which `verbose` does not turn off
+            server = viser.ViserServer(host=config.host, port=config.port, label="mimic", verbose=False)
         shapes = [ArmShape(arm, env.limits) for arm in (env.expert, env.learner)]
         names = [build_arm(arm, env.limits).embodiment.name.partition("-")[0] for arm in (env.expert, env.learner)]
         is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
@@ -106,7 +114,8 @@ def _serve(
         print("\nview: ended", flush=True)
     finally:
         if server is not None:
-            server.stop()
+            with contextlib.redirect_stdout(io.StringIO()):
+                server.stop()
         if after is not None:
             after()
     return 0
@@ -121,13 +130,12 @@ def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> 
     from mimic.viewing.controls import LiveControls
 
     controls = LiveControls(page.server, live, env, can_lock)
-    history: deque[tuple[float, float, float]] = deque(maxlen=int(_HISTORY * _RATE))
+    history: deque[tuple[float, float, float]] = deque()
     began, was_compiling, frame = time.perf_counter(), True, None
     for dt in _ticks():
         try:
             frame_now = live.advance(dt)
         except ValueError as error:
-            page.server.get_clients()  # all of them share the page, and are told
             for client in page.server.get_clients().values():
                 client.add_notification("not possible", str(error), color="red", auto_close_seconds=6.0)
             frame_now = None
@@ -137,7 +145,10 @@ def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> 
             continue
         frame, was_compiling = frame_now or frame, compiling
         assert frame is not None
-        history.append((time.perf_counter() - began, frame.distance, frame.bound))
+        now = time.perf_counter() - began
+        history.append((now, frame.distance, frame.bound))
+        while history[0][0] < now - _HISTORY:
+            history.popleft()
         page.show(frame, _chart(history), _note(frame, compiling, can_lock))
         controls.update()
 
