@@ -116,6 +116,20 @@ def test_weights_change_without_compiling_and_the_distance_scales(live):
     assert frame is not None and frame.distance == pytest.approx(2 * before, rel=1e-3)  # the minimum stays in its place
 
 
+def test_the_view_goes_on_while_another_correspondence_is_compiled():
+    session = LiveSession(env_config("planar4dof"))
+    session.compile()
+    first = settle(session)
+    session.change(correspondence="hard")
+    session.move(0, 0.5)
+    during = session.advance(TICK)
+    assert during is not None and session.is_compiling
+    np.testing.assert_array_equal(during.matrix, first.matrix)
+    session.compile()
+    after = session.advance(TICK)
+    assert after is not None and set(np.unique(after.matrix)) <= {0, 1, 2} and np.any(after.matrix != first.matrix)
+
+
 def test_locked_joints_switch_the_learner(env):
     fewer = learner_arm(env, ("joint3",))
     assert fewer.embodiment.num_joints == 6 and fewer.locked == {"joint3": 0.0}

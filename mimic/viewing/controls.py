@@ -32,6 +32,7 @@ class LiveControls:
         self._server, self._session, self._env = server, session, env
         self._random = np.random.default_rng()
         self._demonstrations: Demonstrations | None = None
+        self._moved = False  # by itself, at the last update
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Expert"):
             self._add_buttons()
@@ -42,14 +43,20 @@ class LiveControls:
             self._add_learner(can_lock)
 
     def update(self) -> None:
-        """Shows in the widgets what moved or changed without them."""
-        for slider, angle in zip(self._sliders, self._session.pose, strict=True):
-            shown = round(float(np.clip(angle, slider.min, slider.max)), 3)
-            if abs(slider.value - shown) > _ANGLE_STEP / 2:
-                slider.value = shown
+        """Lets the sliders go with an expert that moves by itself.
+
+        Else they are left alone: what the user drags is ahead of the session, and setting it would pull it back.
+        """
+        moving = self._session.moves_by_itself
+        if moving or self._moved:
+            for slider, angle in zip(self._sliders, self._session.pose, strict=True):
+                slider.value = round(float(np.clip(angle, slider.min, slider.max)), 2)
+        self._moved = moving
+
+    def undo_locks(self) -> None:
+        """Shows again which joints are locked, after a choice that was refused."""
         for name, box in self._locks.items():
-            if box.value != (name in self._session.settings.locked):
-                box.value = not box.value
+            box.value = name in self._session.settings.locked
 
     def _add_buttons(self) -> None:
         gui, session = self._server.gui, self._session

@@ -55,7 +55,6 @@ class LiveSession:
     Attributes:
       expert: the arm.
       settings: what is asked for; shown as soon as its programs are compiled.
-      escape: whether a learner that rests in a local minimum goes on to the best pose.
 
     Raises:
       ValueError: arms that cannot be built.
@@ -64,7 +63,7 @@ class LiveSession:
     def __init__(self, env: EnvConfig, mapper: Mapper | None = None):
         self.expert: Embodiment = build_arm(env.expert, env.limits).embodiment
         self.settings: Settings = initial_settings(env)
-        self.escape = mapper is None
+        self._escape = mapper is None
         self._programs = ProgramCache(env, mapper)
         self._lock = threading.RLock()
         self._angles = dict(home_angles(env))  # of the learner, all joints
@@ -109,6 +108,16 @@ class LiveSession:
         with self._lock:
             self._motion = None
 
+    @property
+    def escape(self) -> bool:
+        """Whether a learner that rests in a local minimum goes on to the best pose."""
+        return self._escape
+
+    @escape.setter
+    def escape(self, value: bool) -> None:
+        with self._lock:
+            self._escape, self._rested = value, None
+
     def change(self, **settings: Any) -> None:
         """Switches some of the `Settings`.
 
@@ -133,7 +142,7 @@ class LiveSession:
         self._programs.finish()
 
     def advance(self, dt: float) -> Frame | None:
-        """The next moment, a time [s] later; None where nothing changed, or while programs are compiled.
+        """The next moment, a time [s] later; None where nothing changed, or before the first programs are compiled.
 
         Raises:
           ValueError: settings that the arms cannot have; those before are back.
@@ -145,6 +154,9 @@ class LiveSession:
             except ValueError:
                 self.settings = self._working
                 raise
+            if programs is None:  # the view goes on as it was
+                settings = self._working
+                programs = self._programs.get(settings)
             if programs is None:
                 return None
             self._working = settings
@@ -155,7 +167,7 @@ class LiveSession:
             if self._rested == (asked, programs.best is None):
                 return None
             best, bound = self._best(programs, asked)
-            pose = self._step(programs, present, best, bound, dt)
+            pose = self._step(programs, present, best, bound, settings.weights, dt)
             shown = programs.measure(expert, pose, settings.weights)
             self._angles |= dict(zip(arm.joint_names, map(float, pose), strict=True))
             self._angles |= programs.learner.locked
@@ -194,9 +206,17 @@ class LiveSession:
             self._solved = asked, np.asarray(qpos), float(distance)
         return self._solved[1:]
 
-    def _step(self, programs: Programs, present: np.ndarray, best: np.ndarray, bound: float, dt: float) -> np.ndarray:
+    def _step(
+        self,
+        programs: Programs,
+        present: np.ndarray,
+        best: np.ndarray,
+        bound: float,
+        weights: np.ndarray,
+        dt: float,
+    ) -> np.ndarray:
         """The learner's next pose: no joint goes faster than its rated speed."""
-        arm, weights = programs.learner.embodiment, self.settings.weights
+        arm = programs.learner.embodiment
         jump = rated_speed(arm).astype(np.float32) * dt
         goal = self._goal
         if goal is None or goal.shape != present.shape:
@@ -205,7 +225,7 @@ class LiveSession:
         pose, is_there = step_towards(arm, present, goal, jump)
         if self._goal is not None:
             self._goal = None if is_there else self._goal
-        elif is_there and self.escape and self._still > _STILL:
+        elif is_there and self._escape and self._still > _STILL:
             left = float(programs.measure(self._pose, pose, weights).distance)
             if left - bound > _WORTH_IT * max(left, _WORTH_IT):
                 self._goal = best

@@ -23,10 +23,30 @@ from mimic.viewing.live import Frame, LiveSession
 if TYPE_CHECKING:
     from mimic.viewing.page import Page
 
-_RATE = 30.0  # updates a second, as many as a video has
+RATE = 30.0  # updates a second, as many as a video has
 _LONGEST_STEP = 0.1  # s: after a pause of the process, arms go on instead of jumping
 _HISTORY = 15.0  # s of the chart
 _NEAR = 1e-3  # of the distance: what counts as the bound itself
+
+
+class History:
+    """Distance and bound of the last seconds, for the chart."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self._moments: deque[tuple[float, float, float]] = deque()
+
+    def add(self, frame: Frame) -> None:
+        """Appends what is shown now."""
+        now = time.perf_counter() - self._began
+        self._moments.append((now, frame.distance, frame.bound))
+        while self._moments[0][0] < now - _HISTORY:
+            self._moments.popleft()
+
+    def chart(self) -> str:
+        """Both as curves."""
+        times, distance, bound = np.array(self._moments).T
+        return drawing.chart(times, [("distance", distance, drawing.LEARNER), ("bound", bound, drawing.BOUND)])
 
 
 def prepare_view(config: ViewConfig) -> Callable[[], int]:
@@ -130,8 +150,7 @@ def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> 
     from mimic.viewing.controls import LiveControls
 
     controls = LiveControls(page.server, live, env, can_lock)
-    history: deque[tuple[float, float, float]] = deque()
-    began, was_compiling, frame = time.perf_counter(), True, None
+    history, frame, was_compiling = History(), None, True
     for dt in _ticks():
         try:
             frame_now = live.advance(dt)
@@ -139,17 +158,14 @@ def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> 
             for client in page.server.get_clients().values():
                 client.add_notification("not possible", str(error), color="red", auto_close_seconds=6.0)
             frame_now = None
-            controls.update()
+            controls.undo_locks()
         compiling = live.is_compiling
         if frame_now is None and (compiling == was_compiling or frame is None):
             continue
         frame, was_compiling = frame_now or frame, compiling
         assert frame is not None
-        now = time.perf_counter() - began
-        history.append((now, frame.distance, frame.bound))
-        while history[0][0] < now - _HISTORY:
-            history.popleft()
-        page.show(frame, _chart(history), _note(frame, compiling, can_lock))
+        history.add(frame)
+        page.show(frame, history.chart(), _note(frame, compiling, can_lock))
         controls.update()
 
 
@@ -165,18 +181,13 @@ def _play(page: "Page", playback: Any, split: str) -> None:
 
 
 def _ticks() -> Any:
-    """Time since the last tick [s], `_RATE` times a second where there is the time."""
+    """Time since the last tick [s], `RATE` times a second where there is the time."""
     last = time.perf_counter()
     while True:
-        time.sleep(max(0.0, last + 1 / _RATE - time.perf_counter()))
+        time.sleep(max(0.0, last + 1 / RATE - time.perf_counter()))
         now = time.perf_counter()
         yield min(now - last, _LONGEST_STEP)
         last = now
-
-
-def _chart(history: "deque[tuple[float, float, float]]") -> str:
-    times, distance, bound = np.array(history).T
-    return drawing.chart(times, [("distance", distance, drawing.LEARNER), ("bound", bound, drawing.BOUND)])
 
 
 def _note(frame: Frame, compiling: bool, by_optimiser: bool) -> str:
