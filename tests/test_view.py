@@ -51,6 +51,7 @@ def settle(session, seconds=6.0):
     for _ in range(int(seconds / TICK)):
         after = session.advance(TICK)
         if after is None:
+            assert frame is not None
             return frame
         frame = after
     raise AssertionError("the learner does not come to rest")
@@ -70,12 +71,12 @@ def test_what_is_shown_is_the_metric(live, env):
     live.move(0, 0.5)
     frame = settle(live)
     expert, learner = (build_arm(arm, "none").embodiment for arm in (env.expert, env.learner))
-    states = [
+    expert_states, learner_states = (
         mimic.link_states(arm, np.array([angles[name] for name in arm.joint_names], np.float32))
         for arm, angles in ((expert, frame.expert), (learner, frame.learner))
-    ]
+    )
     matrix = mimic.overlap_correspondence(expert, learner)
-    distance = mimic.embodiment_distance(*states, matrix, mimic.DistanceWeights())
+    distance = mimic.embodiment_distance(expert_states, learner_states, matrix, mimic.DistanceWeights())
     np.testing.assert_allclose(frame.distance, distance, atol=1e-5)  # float32 of two programs
     np.testing.assert_allclose(frame.matrix, matrix, atol=1e-6)
     np.testing.assert_allclose((frame.matrix * frame.links).mean(), distance, atol=1e-5)
@@ -174,7 +175,9 @@ def test_an_update_is_quick(live):
         live.move(1, 0.01 * (step + 1))
         began = time.perf_counter()
         frame = live.advance(TICK)
-        shape.bodies(frame.expert), shape.bodies(frame.learner)
+        assert frame is not None
+        for angles in (frame.expert, frame.learner):
+            shape.bodies(angles)
         drawing.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
         seconds.append(time.perf_counter() - began)
     print(f"update of the view: {1e3 * np.median(seconds):.1f} ms in the median")
@@ -286,6 +289,7 @@ def free_port():
 def test_ctrl_c_ends_it_cleanly():
     command = [sys.executable, "-m", "mimic.view", "env=planar4dof", f"port={free_port()}"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
     assert "view: http://127.0.0.1:" in process.stdout.readline()
     process.send_signal(signal.SIGINT)  # most likely while it compiles
     out, error = process.communicate(timeout=120)

@@ -22,9 +22,8 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 MISSING = [name for name in ("viser", "playwright") if importlib.util.find_spec(name) is None]
 MISSING += [] if BROWSER else ["chromium"]
 SOFTWARE_GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-SIZE = {"width": 1360, "height": 850}
 LEARNER = (500, 250, 960, 650)  # pixels of the page where it stands
-LATEST = 120_000  # ms until the lower bound is compiled, on a busy machine
+LATEST = 120_000  # ms for anything, on a busy machine: the lower bound has to be compiled
 
 pytestmark = [
     pytest.mark.slow,
@@ -40,7 +39,8 @@ def page():
     complaints = []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=BROWSER, args=SOFTWARE_GL)
-        page = browser.new_page(viewport=SIZE)
+        page = browser.new_page(viewport={"width": 1360, "height": 850})
+        page.set_default_timeout(LATEST)  # a screenshot waits for a frame, which takes seconds without a GPU
         page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         yield page, complaints
@@ -59,10 +59,9 @@ def serve():
         command = [sys.executable, "-m", "mimic.view", f"port={port}", *arguments]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         started.append(process)
-        line = process.stdout.readline()
-        while line and "http" not in line:
-            line = process.stdout.readline()
-        return re.search(r"http://\S+", line).group()
+        assert process.stdout is not None
+        addresses = (re.search(r"http://\S+", line) for line in process.stdout)
+        return next(address.group() for address in addresses if address)
 
     yield start
     for process in started:
