@@ -13,7 +13,7 @@ from mimic.viewing.shapes import ArmShape, Part, places
 
 _ROLES = ("expert", "learner")
 _GRID = 0.1, 0.5  # m, of a cell and of a section
-_STANCE = np.array([2.0, -0.08, 0.6])  # of the camera from what it looks at, in lengths of the arms
+_STANCE = np.array([2.5, -0.1, 0.75])  # of the camera from what it looks at, in lengths of the arms
 _FROM_ABOVE = np.array([0.55, -0.01, 2.9])
 _FIELD_OF_VIEW = 0.75  # rad
 
