@@ -24,6 +24,7 @@ from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, InspectConfig, RecordingConfig, RetargetConfig
 from mimic.trainers.config import TRAINERS, EvaluateConfig, ExportConfig, FiguresConfig, RenderConfig, TrainConfig
 from mimic.trainers.signals import STOPPED_BY_SIGNAL
+from mimic.viewing.config import ViewConfig
 
 BAD_INPUT = 2
 ARM_KEYS = {  # of each command: keys that take an arm by name or file alone
@@ -122,6 +123,7 @@ def _register_schemas() -> None:
     store.store(name="demonstrations_schema", node=schema(RecordingConfig))
     store.store(name="inspect_schema", node=schema(InspectConfig))
     store.store(name="retarget_schema", node=schema(RetargetConfig))
+    store.store(name="view_schema", node=schema(ViewConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
     for name, config_class in TRAINERS.items():
         store.store(group="trainer", name=f"{name}_schema", node=schema(config_class))

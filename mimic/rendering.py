@@ -14,10 +14,10 @@ from jaxtyping import Float, UInt8
 from mimic.envs.arms import ArmConfig, build_arm
 from mimic.portrait import portrait
 
-_SPACING = 0.9  # chain lengths between two arms
-_LOCKED = (0.85, 0.12, 0.10, 1.0)
+SPACING = 0.9  # chain lengths between two arms
+LOCKED = (0.85, 0.12, 0.10, 1.0)
 _FLOOR, _GRID = (0.94, 0.95, 0.96), (0.88, 0.89, 0.91)
-_MARK = 0.05, 0.019  # radius and half width of a locked joint's disc, as shares of the chain length
+MARK = 0.05, 0.019  # radius and half width of a locked joint's disc, as shares of the chain length
 
 
 class ArmScene:
@@ -48,7 +48,7 @@ class ArmScene:
             _share_options(source, spec)
             for name in arm.locked:
                 _mark_locked(source, name, float(free[index].chain_length))
-            place = [0.0, (index - 0.5 * (len(arms) - 1)) * _SPACING * reach, 0.0] - base * [1, 1, 0]
+            place = [0.0, (index - 0.5 * (len(arms) - 1)) * SPACING * reach, 0.0] - base * [1, 1, 0]
             spec.attach(source, prefix=prefix, frame=spec.worldbody.add_frame(pos=place))
             self._joints.append([prefix + name for name in arm.embodiment.joint_names])
             self._locked |= {prefix + name: angle for name, angle in arm.locked.items()}
@@ -119,10 +119,10 @@ def _mark_locked(spec: mujoco.MjSpec, joint_name: str, chain_length: float) -> N
     """A red disc about the joint's axis."""
     joint = spec.joint(joint_name)
     axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
-    radius, half_width = _MARK[0] * chain_length, _MARK[1] * chain_length
+    radius, half_width = MARK[0] * chain_length, MARK[1] * chain_length
     ends = np.concatenate([joint.pos - half_width * axis, joint.pos + half_width * axis])
     joint.parent.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=ends, size=[radius, 0, 0], rgba=_LOCKED,
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=ends, size=[radius, 0, 0], rgba=LOCKED,
         contype=0, conaffinity=0, mass=0,
     )  # fmt: skip
 

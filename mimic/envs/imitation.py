@@ -13,6 +13,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from mimic.distance import embodiment_distance
+from mimic.embodiment import Embodiment
 from mimic.envs.arms import Arm, build_arm, torque_scale
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations

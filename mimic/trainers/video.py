@@ -7,26 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import imageio_ffmpeg
-import jax
-import jax.numpy as jnp
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
-from jaxtyping import Float, UInt8  # noqa: E402
+from jaxtyping import UInt8  # noqa: E402
 from PIL import Image  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
-from mimic.distance import link_distances  # noqa: E402
-from mimic.kinematics import link_states  # noqa: E402
 from mimic.rendering import ArmScene  # noqa: E402
-from mimic.trainers import runs, session  # noqa: E402
-from mimic.trainers.checkpoints import check_checkpoint, load_checkpoint  # noqa: E402
-from mimic.trainers.config import PPOConfig, RenderConfig  # noqa: E402
-from mimic.trainers.evaluation import Evaluator, Rollouts  # noqa: E402
+from mimic.trainers import session  # noqa: E402
+from mimic.trainers.checkpoints import load_checkpoint  # noqa: E402
+from mimic.trainers.config import RenderConfig  # noqa: E402
 from mimic.trainers.ppo_job import PPOJob  # noqa: E402
+from mimic.trainers.story import Story, demonstration_index, policy_run  # noqa: E402
 
 _FRAMES_PER_SECOND = 30
 _SIZE, _DPI = (1280, 640), 100  # pixels
@@ -41,13 +37,7 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
       ValueError: no run directory of PPO, no such checkpoint or demonstration, an `out` that exists, or no OpenGL.
     """
     session.use_compilation_cache(config.compilation_cache)
-    if not config.run:
-        raise ValueError("run: expected the run directory to show, as in run=runs/NAME")
-    run_dir = Path(config.run).expanduser()
-    trained = runs.load_config(run_dir)
-    check_checkpoint(run_dir, config.checkpoint)
-    if not isinstance(trained.trainer, PPOConfig):
-        raise ValueError(f"run: expected a run of trainer=ppo, got one of {trained.trainer.name}")
+    run_dir, trained = policy_run(config.run, config.checkpoint)
     name = f"{config.split}-{config.demonstration}.mp4"
     out = Path(config.out).expanduser() if config.out else run_dir / "videos" / name
     if out.suffix != ".mp4":
@@ -61,14 +51,14 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
     scene = ArmScene([env.expert, env.learner], limits=env.limits, width=_SCENE, height=_SIZE[1])
     job = session.make_job(trained, run_dir)
     assert isinstance(job, PPOJob)
-    index = _index(job.evaluator, config)
+    index = demonstration_index(job.evaluator, config.split, config.demonstration)
     _, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
 
     def run() -> None:
         console = Console()
         with console.status("running the policy"):
             rollouts = job.evaluate(params)
-            story = _Story(job.evaluator, rollouts, index)
+            story = Story(job.evaluator, rollouts, index, _FRAMES_PER_SECOND)
         out.parent.mkdir(exist_ok=True)
         with scene:
             frames = _frames(
@@ -82,73 +72,7 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
     return run
 
 
-def _index(evaluator: Evaluator, config: RenderConfig) -> int:
-    part = evaluator.parts[config.split]
-    which = range(evaluator.env.demonstrations.count)[part]
-    if not 0 <= config.demonstration < len(which):
-        raise ValueError(
-            f"demonstration: expected 0 to {len(which) - 1}, the {config.split} ones of the run, "
-            f"got {config.demonstration}"
-        )
-    return which[config.demonstration]
-
-
-class _Story:
-    """One rollout, resampled for a video.
-
-    Attributes:
-      time: [frames] [s].
-      expert, learner: [frames, joints] [rad].
-      distance, bound, hold: [T] after each control step.
-      by_link: [T, links] share of each learner link in the distance.
-    """
-
-    def __init__(self, evaluator: Evaluator, rollouts: Rollouts, index: int):
-        env, demonstrations = evaluator.env, evaluator.env.demonstrations
-        horizon, dt = env.config.horizon, env.config.control_dt
-        home = np.asarray(env.learner.home)[None]
-        qpos = np.concatenate([home, np.asarray(rollouts.qpos[index])])
-        qvel = np.concatenate([0 * home, np.asarray(rollouts.qvel[index])])
-        span = slice(0, horizon + 1)
-        self.dt = dt
-        self.time = np.arange(0, horizon * dt + 1e-9, 1 / _FRAMES_PER_SECOND)
-        self.expert = _between(demonstrations.qpos[index, span], demonstrations.qvel[index, span], dt, self.time)
-        self.learner = _between(qpos, qvel, dt, self.time)
-        self.distance = np.asarray(rollouts.distance[index])
-        self.bound, self.hold = evaluator.lower_bound[index], evaluator.hold_distance[index]
-        self.by_link = _by_link(evaluator, index, qpos[1:], qvel[1:])
-        self.link_names = env.learner.link_names
-        self.num_frames = len(self.time)
-
-
-def _between(
-    qpos: Float[np.ndarray, "samples joints"], qvel: Float[np.ndarray, "samples joints"], dt: float, time: np.ndarray
-) -> Float[np.ndarray, "frames joints"]:
-    """Angles at any time: cubics through angles and velocities."""
-    step = np.minimum((time / dt).astype(int), len(qpos) - 2)
-    s = (time / dt - step)[:, None]
-    start, end, out, into = qpos[step], qpos[step + 1], dt * qvel[step], dt * qvel[step + 1]
-    return (
-        (2 * s**3 - 3 * s**2 + 1) * start + (3 * s**2 - 2 * s**3) * end + (s**3 - 2 * s**2 + s) * out
-        + (s**3 - s**2) * into
-    )  # fmt: skip
-
-
-def _by_link(evaluator: Evaluator, index: int, qpos: np.ndarray, qvel: np.ndarray) -> Float[np.ndarray, "time links"]:
-    """What each learner link adds to the distance: the sums of the columns of W o D', over all entries."""
-    env = evaluator.env
-
-    def one(qpos: jax.Array, qvel: jax.Array, step: jax.Array) -> jax.Array:
-        learner = link_states(env.learner, qpos, qvel)
-        measure: Any = env.config.metric.rotation_measure
-        distances = link_distances(env.expert_at(jnp.asarray(index), step), learner, env.weights, rotation=measure)
-        matrix = env.correspondence(distances) if callable(env.correspondence) else jnp.asarray(env.correspondence)
-        return (matrix * distances).sum(axis=0) / distances.size
-
-    return np.asarray(jax.jit(jax.vmap(one))(qpos, qvel, jnp.arange(1, len(qpos) + 1)))
-
-
-def _frames(scene: ArmScene, story: _Story, title: str) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def _frames(scene: ArmScene, story: Story, title: str) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """The pictures of a video."""
     figure = plt.figure(figsize=(_SIZE[0] / _DPI, _SIZE[1] / _DPI), dpi=_DPI)
     share = _SCENE / _SIZE[0]

@@ -1,0 +1,15 @@
+"""`python -m mimic.view`: expert and learner live in the browser."""
+
+from mimic import cli
+from mimic.viewing.config import ViewConfig
+
+
+def prepare(config: ViewConfig) -> cli.Work:
+    """The viewer that the config describes."""
+    from mimic.viewing import viewer  # not needed for --help
+
+    return viewer.prepare_view(config)
+
+
+if __name__ == "__main__":
+    cli.run(prepare, "view")

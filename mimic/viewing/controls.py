@@ -1,0 +1,138 @@
+"""The controls of a live view: sliders, buttons and switches that act on a `LiveSession`."""
+
+import functools
+from typing import Any
+
+import numpy as np
+import viser
+
+from mimic.envs.arms import build_arm
+from mimic.envs.config import CORRESPONDENCES, EnvConfig
+from mimic.envs.demonstrations import Demonstrations
+from mimic.envs.recording import record_demonstrations
+from mimic.viewing.follower import home_angles
+from mimic.viewing.live import LiveSession
+
+_DEMONSTRATIONS = 8  # to choose from; recorded when the first is asked for
+_HEAVIEST, _WEIGHT_STEP = 2.0, 0.05
+_ANGLE_STEP = 0.01  # rad
+
+
+class LiveControls:
+    """Widgets of a live view.
+
+    Args:
+      server: where they are added.
+      session: what they act on.
+      env: the arms.
+      can_lock: whether the learner's joints can be locked; a trained mapper has the joints that it has.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: LiveSession, env: EnvConfig, can_lock: bool):
+        self._server, self._session, self._env = server, session, env
+        self._random = np.random.default_rng()
+        self._demonstrations: Demonstrations | None = None
+        self._moved = False  # by itself, at the last update
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Expert"):
+            self._add_buttons()
+            self._add_sliders()
+        with tabs.add_tab("Metric"):
+            self._add_metric()
+        with tabs.add_tab("Learner"):
+            self._add_learner(can_lock)
+
+    def update(self) -> None:
+        """Lets the sliders go with an expert that moves by itself.
+
+        Else they are left alone: what the user drags is ahead of the session, and setting it would pull it back.
+        """
+        moving = self._session.moves_by_itself
+        if moving or self._moved:
+            for slider, angle in zip(self._sliders, self._session.pose, strict=True):
+                slider.value = round(float(np.clip(angle, slider.min, slider.max)), 2)
+        self._moved = moving
+
+    def undo_locks(self) -> None:
+        """Shows again which joints are locked, after a choice that was refused."""
+        for name, box in self._locks.items():
+            box.value = name in self._session.settings.locked
+
+    def _add_buttons(self) -> None:
+        gui, session = self._server.gui, self._session
+        buttons = gui.add_button_group("go to", ("random pose", "home pose"))
+        self._which = gui.add_dropdown("demonstration", [str(i + 1) for i in range(_DEMONSTRATIONS)])
+        playing = gui.add_button_group("motion", ("play", "stop"))
+
+        @buttons.on_click
+        def _(event: viser.GuiEvent) -> None:
+            lower, upper = session.expert.joint_range.T
+            home = event.target.value == "home pose"
+            session.glide(session.expert.home if home else self._random.uniform(lower, upper))
+
+        @playing.on_click
+        def _(event: viser.GuiEvent) -> None:
+            session.stop()
+            if event.target.value == "play":
+                self._play(int(self._which.value) - 1)
+
+    def _play(self, index: int) -> None:
+        if self._demonstrations is None:
+            expert = build_arm(self._env.expert, self._env.limits)
+            self._demonstrations = record_demonstrations(
+                expert, _DEMONSTRATIONS, horizon=self._env.horizon, dt=self._env.control_dt
+            )
+        poses = self._demonstrations.qpos[index]
+        self._session.play(self._demonstrations.dt * np.arange(len(poses)), poses)
+
+    def _add_sliders(self) -> None:
+        session, arm = self._session, self._session.expert
+        self._sliders = []
+        for joint, (name, (lower, upper)) in enumerate(zip(arm.joint_names, arm.joint_range, strict=True)):
+            bounds = round(float(lower), 2), round(float(upper), 2)
+            start = round(float(np.clip(session.pose[joint], *bounds)), 3)
+            slider = self._server.gui.add_slider(name, *bounds, _ANGLE_STEP, start, hint="rad")
+            slider.on_update(_by_user(functools.partial(session.move, joint)))
+            self._sliders.append(slider)
+
+    def _add_metric(self) -> None:
+        gui, session, settings = self._server.gui, self._session, self._session.settings
+        kind = gui.add_dropdown("correspondence", CORRESPONDENCES, initial_value=settings.correspondence)
+        kind.on_update(_by_user(lambda value: session.change(correspondence=value)))
+        for part in ("rotation", "translation"):
+            initial = getattr(settings, part)
+            weight = gui.add_slider(
+                part, 0.0, max(_HEAVIEST, initial), _WEIGHT_STEP, initial,
+                disabled=self._env.metric.adaptive, hint="weight of this part of the distance",
+            )  # fmt: skip
+            weight.on_update(_by_user(lambda value, part=part: session.change(**{part: float(value)})))
+        gui.add_markdown("Another correspondence, and a first weight on translation, are compiled for some seconds.")
+
+    def _add_learner(self, can_lock: bool) -> None:
+        gui, session = self._server.gui, self._session
+        escape = gui.add_checkbox(
+            "leave local minima", session.escape, disabled=not can_lock,
+            hint="once the expert rests, go on to the best pose of many starts",
+        )  # fmt: skip
+        escape.on_update(_by_user(lambda value: setattr(session, "escape", value)))
+        self._locks = {
+            name: gui.add_checkbox(
+                f"lock {name}", name in session.settings.locked, disabled=not can_lock, hint=f"at {angle:.2f} rad"
+            )
+            for name, angle in home_angles(self._env).items()
+        }
+        for box in self._locks.values():
+            box.on_update(_by_user(self._lock))
+
+    def _lock(self, _: Any) -> None:
+        self._session.change(locked=tuple(name for name, box in self._locks.items() if box.value))
+
+
+def _by_user(act: Any) -> Any:
+    """A callback with the new value, for what the user changes, not the program."""
+
+    def on_update(event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            act(event.target.value)
+
+    return on_update

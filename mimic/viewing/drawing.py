@@ -1,0 +1,144 @@
+"""Numbers, heat maps and curves as HTML and SVG: small, sharp, and quick to replace many times a second."""
+
+import html
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
+_BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 120, 34, 18, 8  # pixels of a chart and its margins
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Link names without what they all begin with: link1, link2+link3 -> 1, 2+3."""
+    return [name.replace("link", "") or name for name in names]
+
+
+def heat_map(
+    values: Float[np.ndarray, "rows columns"],
+    rows: Sequence[str],
+    columns: Sequence[str],
+    title: str,
+    *,
+    name: str,
+    largest: float | None = None,
+    colour: tuple[int, int, int] = _BLUES,
+) -> str:
+    """A matrix as a table of coloured cells.
+
+    Args:
+      values: at least 0.
+      rows: names, of the expert's links.
+      columns: names, of the learner's links.
+      title: above it.
+      name: id of the element.
+      largest: value of the full colour; the largest one where None.
+      colour: full colour, red, green, blue up to 255.
+    """
+    scale = max(float(values.max()) if largest is None else largest, 1e-9)
+    head = "".join(f"<th>{html.escape(column)}</th>" for column in columns)
+    body = "".join(
+        f"<tr><th>{html.escape(row)}</th>{''.join(_cell(float(value), scale, colour) for value in line)}</tr>"
+        for row, line in zip(rows, values, strict=True)
+    )
+    style = "border-collapse:separate;border-spacing:1px;font-size:10px;line-height:15px;width:100%;table-layout:fixed"
+    return (
+        f'<div style="flex:1 1 0;min-width:0"><div style="font-size:11px">{html.escape(title)}</div>'
+        f'<table id="{name}" style="{style}"><tr><th></th>{head}</tr>{body}</table></div>'
+    )
+
+
+def _cell(value: float, scale: float, colour: tuple[int, int, int]) -> str:
+    share = min(max(value / scale, 0.0), 1.0)
+    mixed = ",".join(str(round(255 + share * (channel - 255))) for channel in colour)
+    ink = "#fff" if share > 0.55 else "#333"
+    text = f"{value:.2f}" if value >= 0.005 else ""
+    return f'<td style="background:rgb({mixed});color:{ink};text-align:center;height:15px">{text}</td>'
+
+
+def heat_maps(
+    matrix: Float[np.ndarray, "expert learner"],
+    links: Float[np.ndarray, "expert learner"],
+    expert_links: Sequence[str],
+    learner_links: Sequence[str],
+) -> str:
+    """Correspondence and distances of all pairs of links, beside each other."""
+    names = short_names(expert_links), short_names(learner_links)
+    return (
+        '<div style="display:flex;gap:10px;padding:0 12px">'
+        + heat_map(matrix, *names, "correspondence W", name="mimic-correspondence", largest=2.0)
+        + heat_map(links, *names, "link distances", name="mimic-links", colour=_ORANGES)
+        + '</div><div style="font-size:10px;color:#777;padding:2px 12px">rows: links of the expert, columns: of the '
+        "learner</div>"
+    )
+
+
+def numbers(distance: float, bound: float, note: str = "") -> str:
+    """Distance and bound, large; and what there is to say."""
+
+    def one(name: str, label: str, value: float, colour: str) -> str:
+        return (
+            f'<div><div style="font-size:11px;color:#777">{label}</div>'
+            f'<div id="{name}" style="font-size:22px;font-variant-numeric:tabular-nums;color:{colour}">'
+            f"{'…' if math.isnan(value) else f'{value:.4f}'}</div></div>"
+        )
+
+    return (
+        '<div style="display:flex;gap:22px;padding:4px 12px">'
+        + one("mimic-distance", "embodiment distance", distance, LEARNER)
+        + one("mimic-bound", "lower bound", bound, BOUND)
+        + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px">'
+        f"{html.escape(note)}</div>"
+    )
+
+
+def chart(
+    time: Float[np.ndarray, " samples"],
+    curves: Sequence[tuple[str, Float[np.ndarray, " samples"], str]],
+    *,
+    now: float | None = None,
+) -> str:
+    """Curves over time, as SVG.
+
+    Args:
+      time: [s], ascending.
+      curves: label, values of at least 0, colour; all but the first are dashed.
+      now: time to mark.
+    """
+    first, last = (float(time[0]), float(time[-1])) if len(time) else (0.0, 1.0)
+    span = max(last - first, 1e-6)
+    top = max([float(np.nanmax(values)) for _, values, _ in curves if np.isfinite(values).any()] + [1e-3]) * 1.08
+    inner = _WIDTH - _LEFT - 6, _HEIGHT - _BOTTOM - _TOP
+
+    def x(t: np.ndarray) -> np.ndarray:
+        return _LEFT + (t - first) / span * inner[0]
+
+    def y(value: np.ndarray) -> np.ndarray:
+        return _TOP + (1 - value / top) * inner[1]
+
+    parts = []
+    for share in (0.0, 0.5, 1.0):
+        height = float(y(np.array(share * top / 1.08)))
+        parts.append(
+            f'<line x1="{_LEFT}" x2="{_WIDTH - 6}" y1="{height:.1f}" y2="{height:.1f}" stroke="#e4e4e4"/>'
+            f'<text x="{_LEFT - 4}" y="{height + 3:.1f}" text-anchor="end">{share * top / 1.08:.3f}</text>'
+        )
+    for label, values, colour in curves:
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x(time), y(values), strict=True) if b == b)
+        dashes = ' stroke-dasharray="4 3"' if label != curves[0][0] else ""
+        parts.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.6"{dashes}/>')
+    if now is not None:
+        at = float(x(np.array(now)))
+        parts.append(f'<line x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP}" y2="{_HEIGHT - _BOTTOM}" stroke="#d62728"/>')
+    for index, (label, _, colour) in enumerate(curves):
+        parts.append(
+            f'<text x="{_LEFT + 6 + 78 * index}" y="{_HEIGHT - 3}" fill="{colour}">{html.escape(label)}</text>'
+        )
+    parts.append(f'<text x="{_WIDTH - 6}" y="{_HEIGHT - 3}" text-anchor="end">{last:.1f} s</text>')
+    return (
+        f'<svg id="mimic-chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" style="width:100%;padding:0 8px" '
+        f'font-size="9" fill="#666" font-family="sans-serif">{"".join(parts)}</svg>'
+    )

@@ -1,0 +1,111 @@
+"""What every view shows in the browser, by viser: two arms in 3-D, numbers, heat maps, a chart."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Float
+
+from mimic.viewing import drawing
+from mimic.viewing.live import Frame
+from mimic.viewing.shapes import ArmShape, Part, places
+
+_ROLES = ("expert", "learner")
+_GRID = 0.1, 0.5  # m, of a cell and of a section
+_STANCE = np.array([2.5, -0.1, 0.75])  # of the camera from what it looks at, in lengths of the arms
+_FROM_ABOVE = np.array([0.55, -0.01, 2.9])
+_FIELD_OF_VIEW = 0.75  # rad
+
+
+class Page:
+    """The parts of the page that change with each `Frame`.
+
+    Args:
+      server: a fresh one.
+      shapes: expert and learner.
+      names: what they are called.
+      title: of the page.
+      is_flat: whether to look from above.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, shapes: Sequence[ArmShape], names: Sequence[str], title: str, is_flat: bool
+    ):
+        self.server = server
+        _set_stage(server, max(shape.reach for shape in shapes), is_flat)
+        self._arms = [
+            _DrawnArm(server, f"/{role}", shape, place, f"{role}: {name}")
+            for role, shape, place, name in zip(_ROLES, shapes, places(shapes), names, strict=True)
+        ]
+        server.gui.add_markdown(f"**{title}**")
+        self._numbers = server.gui.add_html(drawing.numbers(float("nan"), float("nan"), "compiling …"))
+        self._chart = server.gui.add_html("")
+        self._maps = server.gui.add_html("")
+
+    def show(self, frame: Frame, chart: str, note: str) -> None:
+        """Shows a moment, all of it at once."""
+        with self.server.atomic():
+            self._arms[0].put(frame.expert, ())
+            self._arms[1].put(frame.learner, frame.locked)
+            self._numbers.content = drawing.numbers(frame.distance, frame.bound, note)
+            self._maps.content = drawing.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
+            self._chart.content = chart
+
+
+class _DrawnArm:
+    """The shapes of an arm in the scene."""
+
+    def __init__(self, server: viser.ViserServer, path: str, shape: ArmShape, place: np.ndarray, label: str):
+        self._shape = shape
+        scene = server.scene
+        scene.add_frame(path, show_axes=False, position=place)
+        scene.add_label(
+            f"{path}/label", label, position=(0.3 * shape.reach, 0.0, 0.0), anchor="top-center", font_screen_scale=1.1
+        )
+        moving = sorted({part.body for part in shape.parts})
+        self._frames = {body: scene.add_frame(f"{path}/body{body}", show_axes=False) for body in moving}
+        self._marks: dict[str, Any] = {}
+        for index, part in enumerate(shape.parts):
+            mesh = _mesh(scene, f"{path}/body{part.body}/part{index}", part)
+            if part.locked_joint is not None:
+                self._marks[part.locked_joint] = mesh
+
+    def put(self, angles: Mapping[str, float], locked: Sequence[str]) -> None:
+        positions, quaternions = self._shape.bodies(angles)
+        for body, frame in self._frames.items():
+            frame.position, frame.wxyz = positions[body], quaternions[body]
+        for name, mark in self._marks.items():
+            if mark.visible != (name in locked):
+                mark.visible = name in locked
+
+
+def _mesh(scene: viser.SceneApi, path: str, part: Part) -> Any:
+    red, green, blue, alpha = part.rgba
+    return scene.add_mesh_simple(
+        path,
+        part.vertices,
+        part.faces,
+        color=(red, green, blue),
+        opacity=alpha if alpha < 1 else None,
+        visible=part.locked_joint is None,
+        side="double",
+    )
+
+
+def _set_stage(server: viser.ViserServer, reach: float, is_flat: bool) -> None:
+    server.gui.configure_theme(
+        control_layout="collapsible", control_width="large", show_logo=False, show_share_button=False
+    )
+    server.scene.set_up_direction("+z")
+    server.scene.configure_default_lights(True, cast_shadow=True)
+    server.scene.add_grid(
+        "/ground", width=8.0, height=8.0, cell_size=_GRID[0], section_size=_GRID[1],
+        cell_color=(225, 228, 232), section_color=(196, 201, 208), plane_color=(246, 247, 249), plane_opacity=1.0,
+        position=(0.0, 0.0, -0.002),
+    )  # fmt: skip
+    middle: Float[np.ndarray, "3"] = np.array([0.0, 0.0, 0.0 if is_flat else 0.38 * reach])
+    camera = server.initial_camera
+    camera.look_at = middle
+    camera.position = middle + reach * (_FROM_ABOVE if is_flat else _STANCE)
+    camera.fov = _FIELD_OF_VIEW

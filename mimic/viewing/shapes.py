@@ -1,0 +1,141 @@
+"""The shapes of an arm's MuJoCo model as triangles, and where its bodies are in a pose."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+
+from mimic.envs.arms import ArmConfig, arm_spec, build_arm
+from mimic.rendering import LOCKED, MARK, SPACING
+
+_VISIBLE_GROUPS = 3  # MuJoCo draws groups 0, 1 and 2; shapes for collisions are in those above
+_SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
+_CAPSULE, _ELLIPSOID = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
+_CYLINDER, _BOX = int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_BOX)
+_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One shape, in the frame of its body.
+
+    Attributes:
+      body: index of the body.
+      vertices: [m].
+      faces: triangles.
+      rgba: colour and opacity, each up to 1.
+      locked_joint: the joint that it marks as locked; it is hidden while the joint is free.
+    """
+
+    body: int
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    rgba: tuple[float, ...]
+    locked_joint: str | None = None
+
+
+class ArmShape:
+    """What is drawn of an arm.
+
+    Args:
+      config: of the arm; all its joints can be moved, whatever is locked.
+      limits: see `EnvConfig`.
+
+    Attributes:
+      joint_names: of the chain, base to tip.
+      parts: its shapes.
+      num_bodies: of the model, the world included.
+      reach: length of the chain [m].
+
+    Raises:
+      ValueError: an arm that cannot be built.
+    """
+
+    def __init__(self, config: ArmConfig, limits: str = "none"):
+        free = build_arm(dataclasses.replace(config, locked=()), limits).embodiment
+        self._model = arm_spec(config).compile()
+        self._data = mujoco.MjData(self._model)
+        self.joint_names = free.joint_names
+        self.num_bodies = int(self._model.nbody)
+        self.reach = float(free.chain_length)
+        marks = [_mark(self._model, name, self.reach) for name in free.joint_names]
+        self.parts: list[Part] = [*_drawn(self._model), *marks]
+
+    def bodies(
+        self, angles: Mapping[str, float]
+    ) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 4"]]:
+        """Positions [m] and quaternions (w, x, y, z) of all bodies, for angles [rad] by joint."""
+        for name, angle in angles.items():
+            self._data.joint(name).qpos[0] = angle
+        mujoco.mj_kinematics(self._model, self._data)
+        return self._data.xpos.copy(), self._data.xquat.copy()
+
+
+def places(shapes: Sequence[ArmShape]) -> list[Float[np.ndarray, "3"]]:
+    """Where the bases of arms stand, side by side as in a video [m]."""
+    reach = max(shape.reach for shape in shapes)
+    return [np.array([0.0, (index - 0.5 * (len(shapes) - 1)) * SPACING * reach, 0.0]) for index in range(len(shapes))]
+
+
+def _drawn(model: mujoco.MjModel) -> list[Part]:
+    """The visible shapes, those of one body and colour as one."""
+    groups: dict[tuple[int, tuple[float, ...]], list[Any]] = {}  # of meshes
+    for geom in range(model.ngeom):
+        mesh = _triangles(model, geom)
+        material = int(model.geom_matid[geom])
+        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
+        if mesh is None or model.geom_group[geom] >= _VISIBLE_GROUPS or rgba[3] == 0:
+            continue
+        mesh.apply_transform(_transform(model.geom_pos[geom], model.geom_quat[geom]))
+        key = int(model.geom_bodyid[geom]), tuple(float(x) for x in rgba)
+        groups.setdefault(key, []).append(mesh)
+    return [_part(body, trimesh.util.concatenate(meshes), rgba) for (body, rgba), meshes in groups.items()]
+
+
+def _part(body: int, mesh: Any, rgba: tuple[float, ...], locked_joint: str | None = None) -> Part:
+    vertices, faces = np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
+    return Part(body, vertices, faces, rgba, locked_joint)
+
+
+def _triangles(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+    """A shape in its own frame; None for what has no extent, as the ground."""
+    kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+    if kind == _SPHERE:
+        return trimesh.creation.icosphere(3, float(size[0]))
+    if kind == _ELLIPSOID:
+        mesh = trimesh.creation.icosphere(3, 1.0)
+        mesh.apply_scale(size)
+        return mesh
+    if kind == _CAPSULE:  # its frame is in the middle
+        return trimesh.creation.capsule(2 * float(size[1]), float(size[0]), count=[24, 24])
+    if kind == _CYLINDER:
+        return trimesh.creation.cylinder(float(size[0]), 2 * float(size[1]), sections=40)
+    if kind == _BOX:
+        return trimesh.creation.box(2 * size)
+    if kind == _MESH:
+        mesh = model.mesh(int(model.geom_dataid[geom]))
+        vertices = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+        faces = model.mesh_face[mesh.faceadr[0] : mesh.faceadr[0] + mesh.facenum[0]]
+        return trimesh.Trimesh(vertices.copy(), faces.copy(), process=False)
+    return None
+
+
+def _mark(model: mujoco.MjModel, joint_name: str, reach: float) -> Part:
+    """A red disc about a joint's axis."""
+    joint = model.joint(joint_name)
+    disc = trimesh.creation.cylinder(MARK[0] * reach, 2 * MARK[1] * reach, sections=40)
+    quaternion = np.zeros(4)
+    mujoco.mju_quatZ2Vec(quaternion, joint.axis)
+    disc.apply_transform(_transform(joint.pos, quaternion))
+    return _part(int(joint.bodyid[0]), disc, LOCKED, joint_name)
+
+
+def _transform(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    rotation, transform = np.zeros(9), np.eye(4)
+    mujoco.mju_quat2Mat(rotation, quaternion)
+    transform[:3, :3], transform[:3, 3] = rotation.reshape(3, 3), position
+    return transform

@@ -1,0 +1,199 @@
+"""What `python -m mimic.view` does: serves a live view, or a policy's playback, until it is interrupted."""
+
+import contextlib
+import importlib.util
+import io
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mimic import compat
+from mimic.envs.arms import build_arm
+from mimic.envs.config import EnvConfig
+from mimic.trainers import runs
+from mimic.viewing import drawing
+from mimic.viewing.config import ViewConfig
+from mimic.viewing.live import Frame, LiveSession
+
+if TYPE_CHECKING:
+    from mimic.viewing.page import Page
+
+RATE = 30.0  # updates a second, as many as a video has
+_LONGEST_STEP = 0.1  # s: after a pause of the process, arms go on instead of jumping
+_HISTORY = 15.0  # s of the chart
+_NEAR = 1e-3  # of the distance: what counts as the bound itself
+
+
+class History:
+    """Distance and bound of the last seconds, for the chart."""
+
+    def __init__(self) -> None:
+        self._began = time.perf_counter()
+        self._moments: deque[tuple[float, float, float]] = deque()
+
+    def add(self, frame: Frame) -> None:
+        """Appends what is shown now."""
+        now = time.perf_counter() - self._began
+        self._moments.append((now, frame.distance, frame.bound))
+        while self._moments[0][0] < now - _HISTORY:
+            self._moments.popleft()
+
+    def chart(self) -> str:
+        """Both as curves."""
+        times, distance, bound = np.array(self._moments).T
+        return drawing.chart(times, [("distance", distance, drawing.LEARNER), ("bound", bound, drawing.BOUND)])
+
+
+def prepare_view(config: ViewConfig) -> Callable[[], int]:
+    """What serves the view that a config describes.
+
+    Raises:
+      ValueError: no viser, a port that is taken, arms or runs that cannot be shown.
+    """
+    if not is_installed():
+        raise ValueError(
+            "view: expected the package viser, which is not installed; it comes with the extra 'view': "
+            "pip install 'mimic-mjx[view]'"
+        )
+    check_port(config.host, config.port)
+    from mimic.trainers.session import use_compilation_cache
+
+    use_compilation_cache(config.compilation_cache)
+    if config.run:
+        compat.import_mjx()
+        from mimic.trainers.story import policy_run
+        from mimic.viewing.playback import Playback
+
+        run_dir, trained = policy_run(config.run, config.checkpoint)
+        playback = Playback(trained, run_dir, config.checkpoint)
+        return lambda: _serve(config, trained.env, lambda page: _play(page, playback, config.split), playback.run)
+    mapper, env = None, config.resolve_env()
+    if config.mapper:
+        from mimic.trainers.pose_mapper import PoseMapper
+
+        mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
+        env = runs.load_config(Path(config.mapper).expanduser()).env
+    live = LiveSession(env, mapper)
+    return lambda: _serve(config, env, lambda page: _follow(page, live, env, mapper is None), None, live.finish)
+
+
+def is_installed() -> bool:
+    """Whether viser is there."""
+    return importlib.util.find_spec("viser") is not None
+
+
+def check_port(host: str, port: int) -> None:
+    """Raises a `ValueError` unless a server can be bound there."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except OSError as error:
+        raise ValueError(f"host: expected an address of this machine, as 127.0.0.1, got {host!r}: {error}") from None
+    with socket.socket(family, kind, protocol) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a server that just ended does not count
+        try:
+            probe.bind(address)
+        except OSError as error:
+            raise ValueError(
+                f"port: expected one that is free at {host}, got {port}: {error.strerror}; "
+                f"name another, as in port={port + 1}"
+            ) from None
+
+
+def _serve(
+    config: ViewConfig,
+    env: EnvConfig,
+    show: "Callable[[Page], None]",
+    before: Callable[[], None] | None = None,
+    after: Callable[[], None] | None = None,
+) -> int:
+    """Shows a page until Ctrl-C."""
+    import viser
+
+    from mimic.viewing.page import Page
+    from mimic.viewing.shapes import ArmShape
+
+    server = None
+    try:
+        if before is not None:
+            before()
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner, which `verbose` does not turn off
+            server = viser.ViserServer(host=config.host, port=config.port, label="mimic", verbose=False)
+        shapes = [ArmShape(arm, env.limits) for arm in (env.expert, env.learner)]
+        names = [build_arm(arm, env.limits).embodiment.name.partition("-")[0] for arm in (env.expert, env.learner)]
+        is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
+        page = Page(server, shapes, names, _title(config, env), is_flat)
+        host = "127.0.0.1" if config.host in ("0.0.0.0", "::") else config.host
+        print(f"view: http://{host}:{server.get_port()}   (Ctrl-C ends it)", flush=True)
+        show(page)
+    except KeyboardInterrupt:
+        print("\nview: ended", flush=True)
+    finally:
+        if server is not None:
+            with contextlib.redirect_stdout(io.StringIO()):
+                server.stop()
+        if after is not None:
+            after()
+    return 0
+
+
+def _title(config: ViewConfig, env: EnvConfig) -> str:
+    by = f"policy of {Path(config.run).name}" if config.run else "pose mapper" if config.mapper else "optimiser"
+    return f"{env.name or 'mimic'}: the learner is moved by the {by}"
+
+
+def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
+    from mimic.viewing.controls import LiveControls
+
+    controls = LiveControls(page.server, live, env, can_lock)
+    history, frame, was_compiling = History(), None, True
+    for dt in _ticks():
+        try:
+            frame_now = live.advance(dt)
+        except ValueError as error:
+            for client in page.server.get_clients().values():
+                client.add_notification("not possible", str(error), color="red", auto_close_seconds=6.0)
+            frame_now = None
+            controls.undo_locks()
+        compiling = live.is_compiling
+        if frame_now is None and (compiling == was_compiling or frame is None):
+            continue
+        frame, was_compiling = frame_now or frame, compiling
+        assert frame is not None
+        history.add(frame)
+        page.show(frame, history.chart(), _note(frame, compiling, can_lock))
+        controls.update()
+
+
+def _play(page: "Page", playback: Any, split: str) -> None:
+    from mimic.viewing.player import Player
+
+    player = Player(page.server, playback, split)
+    for dt in _ticks():
+        if player.advance(dt):
+            which = player.split, player.demonstration
+            frame = playback.frame(*which, player.time)
+            page.show(frame, playback.chart(*which, player.time), playback.note(*which))
+
+
+def _ticks() -> Any:
+    """Time since the last tick [s], `RATE` times a second where there is the time."""
+    last = time.perf_counter()
+    while True:
+        time.sleep(max(0.0, last + 1 / RATE - time.perf_counter()))
+        now = time.perf_counter()
+        yield min(now - last, _LONGEST_STEP)
+        last = now
+
+
+def _note(frame: Frame, compiling: bool, by_optimiser: bool) -> str:
+    if compiling:
+        return "compiling …"
+    above = frame.distance - frame.bound
+    if above <= _NEAR * max(frame.distance, _NEAR):
+        return "as near as this learner can be"
+    return f"{above:.4f} above the bound: " + ("on its way, or in a local minimum" if by_optimiser else "as mapped")

@@ -1,0 +1,296 @@
+"""The live view without a browser: what moves, what is shown of it, and what is refused."""
+
+import dataclasses
+import importlib.util
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import mujoco
+import numpy as np
+import pytest
+
+import mimic
+from mimic.envs import env_config
+from mimic.envs.arms import ArmConfig, build_arm, rated_speed
+from mimic.viewing import drawing, viewer
+from mimic.viewing.config import ViewConfig
+from mimic.viewing.follower import Settings, initial_settings, learner_arm, step_towards
+from mimic.viewing.live import LiveSession
+from mimic.viewing.shapes import ArmShape, places
+
+TICK = 1 / 30
+ENOUGH = 20  # updates a second that feel live
+
+
+@pytest.fixture(scope="module")
+def env():
+    return env_config("panda4dof")
+
+
+@pytest.fixture
+def live(env, compiled):
+    """A fresh session that shares compiled programs with the others."""
+    session = LiveSession(env)
+    session._programs = compiled
+    return session
+
+
+@pytest.fixture(scope="module")
+def compiled(env):
+    session = LiveSession(env)
+    session.compile()
+    return session._programs
+
+
+def settle(session, seconds=6.0):
+    """The last frame before everything rests."""
+    frame = None
+    for _ in range(int(seconds / TICK)):
+        after = session.advance(TICK)
+        if after is None:
+            assert frame is not None
+            return frame
+        frame = after
+    raise AssertionError("the learner does not come to rest")
+
+
+def test_the_learner_follows_and_rests_at_the_bound(live):
+    start = settle(live)
+    assert start.bound <= start.distance < start.bound * 1.01  # the tolerance at which it stops searching, ten times
+    live.move(1, 0.8)
+    frame = settle(live)
+    assert frame.expert["joint2"] == pytest.approx(0.8) and frame.learner != start.learner
+    assert frame.bound <= frame.distance < frame.bound * 1.01
+    assert live.advance(TICK) is None  # nothing is computed while nothing moves
+
+
+def test_what_is_shown_is_the_metric(live, env):
+    live.move(0, 0.5)
+    frame = settle(live)
+    expert, learner = (build_arm(arm, "none").embodiment for arm in (env.expert, env.learner))
+    expert_states, learner_states = (
+        mimic.link_states(arm, np.array([angles[name] for name in arm.joint_names], np.float32))
+        for arm, angles in ((expert, frame.expert), (learner, frame.learner))
+    )
+    matrix = mimic.overlap_correspondence(expert, learner)
+    distance = mimic.embodiment_distance(expert_states, learner_states, matrix, mimic.DistanceWeights())
+    np.testing.assert_allclose(frame.distance, distance, atol=1e-5)  # float32 of two programs
+    np.testing.assert_allclose(frame.matrix, matrix, atol=1e-6)
+    np.testing.assert_allclose((frame.matrix * frame.links).mean(), distance, atol=1e-5)
+    assert frame.expert_links == expert.link_names and frame.learner_links == learner.link_names
+
+
+def test_no_joint_of_the_learner_jumps(live, env):
+    arm = learner_arm(env, live.settings.locked).embodiment
+    frame = settle(live)
+    rng = np.random.default_rng(1)
+    for step in range(90):
+        if step % 30 == 0:
+            live.glide(rng.uniform(-2, 2, 7))
+        after = live.advance(TICK)
+        assert after is not None
+        change = [after.learner[name] - frame.learner[name] for name in arm.joint_names]
+        change = np.abs(np.angle(np.exp(1j * np.array(change))))
+        assert np.all(change <= rated_speed(arm) * TICK + 1e-5)  # rounding of angles near pi
+        frame = after
+
+
+def test_the_expert_plays_a_motion_and_a_slider_ends_it(live):
+    times, poses = np.array([0.0, 0.2, 0.4]), np.zeros((3, 7))
+    poses[:, 3] = 0.0, -0.4, -1.0
+    live.play(times, poses)
+    assert live.moves_by_itself
+    for _ in range(6):
+        live.advance(TICK)
+    assert live.pose[3] == pytest.approx(-0.4, abs=1e-5)
+    live.move(0, 9.0)
+    assert not live.moves_by_itself and live.pose[0] == pytest.approx(np.pi)  # within the joint's range
+
+
+def test_weights_change_without_compiling_and_the_distance_scales(live):
+    before = settle(live).distance
+    live.change(rotation=2.0)
+    frame = live.advance(TICK)
+    assert frame is not None and frame.distance == pytest.approx(2 * before, rel=1e-3)  # the minimum stays in its place
+
+
+def test_the_view_goes_on_while_another_correspondence_is_compiled():
+    session = LiveSession(env_config("planar4dof"))
+    session.compile()
+    first = settle(session)
+    session.change(correspondence="hard")
+    session.move(0, 0.5)
+    during = session.advance(TICK)
+    assert during is not None and session.is_compiling
+    np.testing.assert_array_equal(during.matrix, first.matrix)
+    session.compile()
+    after = session.advance(TICK)
+    assert after is not None and set(np.unique(after.matrix)) <= {0, 1, 2} and np.any(after.matrix != first.matrix)
+
+
+def test_locked_joints_switch_the_learner(env):
+    fewer = learner_arm(env, ("joint3",))
+    assert fewer.embodiment.num_joints == 6 and fewer.locked == {"joint3": 0.0}
+    angled = dataclasses.replace(env, learner=ArmConfig(locked={"joint3": 0.4}))
+    assert learner_arm(angled, ("joint6", "joint3")).locked == {"joint3": 0.4, "joint6": 0.0}
+    with pytest.raises(ValueError, match="joint9"):
+        learner_arm(env, ("joint9",))
+
+
+def test_locking_the_last_joint_is_refused_and_undone():
+    session = LiveSession(env_config("planar4dof"))
+    before = session.settings
+    session.change(locked=("joint1", "joint2", "joint3", "joint4"))
+    with pytest.raises(ValueError, match="all 4 joints are locked"):
+        while session.advance(TICK) is None:
+            time.sleep(0.01)
+    assert session.settings == before
+
+
+def test_settings_that_differ_in_weights_alone_share_programs(env):
+    settings = initial_settings(env)
+    assert settings.locked == ("joint3", "joint6", "joint7") and settings.correspondence == "overlap"
+    assert dataclasses.replace(settings, rotation=0.3).program_key == settings.program_key
+    assert dataclasses.replace(settings, correspondence="hard").program_key != settings.program_key
+    with pytest.raises(ValueError, match="expected one of overlap, hard, soft"):
+        Settings((), "none", 0.0, 1.0)
+
+
+def test_a_joint_goes_the_short_way_round():
+    arm = mimic.panda()
+    pose, is_there = step_towards(arm, np.full(7, 3.1), np.full(7, -3.1), np.full(7, 0.05))
+    np.testing.assert_allclose(pose, 3.15 - 2 * np.pi)
+    assert is_there is False
+    assert step_towards(arm, np.zeros(7), np.full(7, 0.01), np.full(7, 0.05))[1]
+
+
+def test_an_update_is_quick(live):
+    """Twenty a second are needed; on two CPU cores it takes 2 ms, so that the bound holds on a busy machine too."""
+    shape, seconds = ArmShape(ArmConfig()), []
+    settle(live)
+    for step in range(60):
+        live.move(1, 0.01 * (step + 1))
+        began = time.perf_counter()
+        frame = live.advance(TICK)
+        assert frame is not None
+        for angles in (frame.expert, frame.learner):
+            shape.bodies(angles)
+        drawing.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
+        seconds.append(time.perf_counter() - began)
+    print(f"update of the view: {1e3 * np.median(seconds):.1f} ms in the median")
+    assert np.median(seconds) < 1 / ENOUGH
+
+
+def test_shapes_stand_where_mujoco_puts_them(env):
+    shape = ArmShape(env.learner)
+    angles = dict.fromkeys(shape.joint_names, 0.0) | {"joint2": 0.7, "joint4": -1.2}
+    model = mujoco.MjModel.from_xml_path(str(mimic.embodiment.panda_path()))
+    data = mujoco.MjData(model)
+    for name, angle in angles.items():
+        data.joint(name).qpos[0] = angle
+    mujoco.mj_forward(model, data)
+    positions, quaternions = shape.bodies(angles)
+    np.testing.assert_allclose(positions, data.xpos)
+    np.testing.assert_allclose(quaternions, data.xquat)
+    marked = [part.locked_joint for part in shape.parts if part.locked_joint]
+    assert marked == list(shape.joint_names)
+    left, right = places([shape, shape])
+    assert left[1] < 0 < right[1]
+
+
+def test_every_kind_of_geom_has_triangles_of_its_size(tmp_path):
+    geoms = {
+        "sphere": ('size=".2"', (0.4, 0.4, 0.4)),
+        "capsule": ('size=".1 .2"', (0.2, 0.2, 0.6)),
+        "cylinder": ('size=".1 .2"', (0.2, 0.2, 0.4)),
+        "box": ('size=".1 .2 .3"', (0.2, 0.4, 0.6)),
+        "ellipsoid": ('size=".1 .2 .3"', (0.2, 0.4, 0.6)),
+        "mesh": ('mesh="cube"', (0.2, 0.2, 0.2)),
+    }
+    corners = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1))
+    for kind, (attributes, extent) in geoms.items():
+        path = tmp_path / f"{kind}.xml"
+        path.write_text(
+            f'<mujoco><asset><mesh name="cube" vertex="{corners}"/></asset><worldbody><body name="b">'
+            '<joint name="a" axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+            f'<geom type="{kind}" {attributes} rgba="1 0 0 1"/><geom type="sphere" size="9" group="3"/>'
+            '<site name="tip" pos="0 0 .5"/></body></worldbody></mujoco>'
+        )
+        part = ArmShape(ArmConfig(model=str(path), tip="tip")).parts[0]
+        assert part.rgba == (1, 0, 0, 1)
+        np.testing.assert_allclose(np.ptp(part.vertices, axis=0), extent, rtol=0.02)  # facets of round shapes
+
+
+def test_drawings_hold_their_numbers():
+    table = drawing.heat_maps(np.eye(2), np.array([[0.25, 3.0], [0, 1]]), ["link1", "<b>"], ["link1+link2", "tip"])
+    assert all(text in table for text in (">1.00<", ">0.25<", ">3.00<", ">1+2<", "&lt;b&gt;")) and "<b>" not in table
+    assert ">0.1235<" in drawing.numbers(0.12345, 0.1) and "…" in drawing.numbers(0.1, float("nan"))
+    time_s, unknown = np.linspace(0, 1, 5), np.array([np.nan, np.nan, 0.1, 0.1, 0.1])
+    svg = drawing.chart(time_s, [("distance", time_s, "red"), ("bound", unknown, "black")], now=0.5)
+    assert svg.count("<polyline") == 2 and "nan" not in svg
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["port=0"], "port: expected 1 to 65535, got 0"),
+        (["host=nowhere.invalid"], "host: expected an address of this machine"),
+        (["env=panda5dof"], "unknown env 'panda5dof'; valid are"),
+        (["learner=missing.xml"], "learner: expected panda, an MJCF file, or an environment (panda3dof,"),
+        (["run=missing"], "not a run directory"),
+        (["mapper=missing"], "not a run directory"),
+        (["run=a", "mapper=b"], "expected one of them"),
+        (["run=a", "expert=panda"], "a run brings its own arms"),
+        (["split=test"], "expected one of held_out, train, got 'test'"),
+    ],
+)
+def test_bad_input(refused, arguments, message, monkeypatch):
+    monkeypatch.setattr(viewer, "is_installed", lambda: True)
+    assert message in refused("view", *arguments, *([] if "port=0" in arguments else [f"port={free_port()}"]))
+
+
+def test_a_port_that_is_taken_is_refused(refused, monkeypatch):
+    monkeypatch.setattr(viewer, "is_installed", lambda: True)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert f"port: expected one that is free at 127.0.0.1, got {port}" in refused("view", f"port={port}")
+
+
+def test_without_viser_the_extra_is_named(refused, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "viser" else find(name, *more))
+    assert "pip install 'mimic-mjx[view]'" in refused("view")
+
+
+def test_nothing_of_the_view_but_its_page_needs_viser():
+    modules = ", ".join(f"mimic.viewing.{name}" for name in ("drawing", "live", "playback", "shapes", "viewer"))
+    code = f"import sys; sys.modules['viser'] = None; import {modules}"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_arms_by_name():
+    arms = ViewConfig(expert="planar4dof", learner="planar4dof").resolve_env()
+    assert len(arms.expert.link_lengths) == 7 and len(arms.learner.link_lengths) == 4
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-mjx[view]'")
+def test_ctrl_c_ends_it_cleanly():
+    command = [sys.executable, "-m", "mimic.view", "env=planar4dof", f"port={free_port()}"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert "view: http://127.0.0.1:" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)  # most likely while it compiles
+    out, error = process.communicate(timeout=120)
+    assert process.returncode == 0 and "Traceback" not in error and "view: ended" in out
