@@ -15,6 +15,8 @@ import pytest
 import mimic
 from mimic.envs import env_config
 from mimic.envs.arms import ArmConfig, build_arm, rated_speed
+from mimic.trainers import session as training
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.viewing import drawing, viewer
 from mimic.viewing.config import ViewConfig
 from mimic.viewing.follower import Settings, initial_settings, learner_arm, step_towards
@@ -138,6 +140,21 @@ def test_locked_joints_switch_the_learner(env):
     assert learner_arm(angled, ("joint6", "joint3")).locked == {"joint3": 0.4, "joint6": 0.0}
     with pytest.raises(ValueError, match="joint9"):
         learner_arm(env, ("joint9",))
+
+
+def test_a_trained_mapper_moves_the_learner(tmp_path):
+    tiny = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}
+    trainer = PoseMapperConfig(**tiny, evaluations=1, validation_poses=32)
+    env = env_config("planar4dof")
+    config = TrainConfig(env, trainer, run_dir=str(tmp_path / "run"), compilation_cache="")
+    assert training.prepare_training(config, 0.0)() == 0
+    mapper = mimic.PoseMapper.load(tmp_path / "run")
+    session = LiveSession(env, mapper)
+    session.compile()
+    session.move(2, 0.7)
+    frame = settle(session)
+    np.testing.assert_allclose(list(frame.learner.values()), mapper(session.pose), atol=1e-4)  # float32, two programs
+    assert frame.bound < frame.distance  # it has hardly learned anything
 
 
 def test_locking_the_last_joint_is_refused_and_undone():
