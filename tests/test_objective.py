@@ -18,7 +18,7 @@ DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.7)
 def learners():
     yield panda(locked=(3, 6, 7))
     yield planar_arm([0.3, 0.5, 0.2])
-    for seed in range(4):
+    for seed in range(2):
         yield load_mjcf(random_arm(seed))
 
 

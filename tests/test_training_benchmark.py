@@ -22,6 +22,7 @@ def test_the_goal_is_reached_when_it_is_held(gaps, reached, tmp_path):
     assert training.time_to_goal(tmp_path / "metrics.csv", 0.02) == reached
 
 
+@pytest.mark.slow  # two runs as processes of their own
 def test_a_case_runs_cold_and_warm(monkeypatch, tmp_path):
     small = (
         "env=planar4dof", "env.physics=fused", "env.demonstrations.count=2", "env.demonstrations.held_out=1",
