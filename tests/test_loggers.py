@@ -48,8 +48,9 @@ class FakeMlflow(types.ModuleType):
 
 @pytest.fixture
 def services(monkeypatch):
-    for variable in ("WANDB_PROJECT", "MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"):
+    for variable in ("WANDB_PROJECT", "MLFLOW_EXPERIMENT_NAME"):
         monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://localhost:5000")
     fakes = {"wandb": FakeWandb(), "mlflow": FakeMlflow()}
     for name, fake in fakes.items():
         monkeypatch.setitem(sys.modules, name, fake)
@@ -76,19 +77,17 @@ def test_a_run_logs_what_its_own_files_hold(tmp_path, services):
     (begun,) = wandb.begun
     assert begun["project"] == "mimic" and begun["dir"] == str(tmp_path / "run") and begun["id"] == "run"
     assert begun["config"]["env"]["name"] == "planar4dof" and begun["config"]["trainer"]["samples"] == 256
-    (uri,) = mlflow.named("set_tracking_uri")
-    assert uri["uri"].endswith("run/mlruns")
+    assert mlflow.named("set_experiment") == [{"experiment_name": "mimic"}]
 
 
-def test_a_resumed_run_goes_on_in_the_same_mlflow_run(tmp_path, services, monkeypatch):
+def test_a_resumed_run_goes_on_in_the_same_mlflow_run(tmp_path, services):
     _, mlflow = services
-    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://localhost:5000")
     for _ in range(2):
         for logger in make_loggers(["mlflow", "mlflow"], tmp_path, short_run(tmp_path, "mlflow")):
             logger.write(1, {"gap": 0.5, "diverged": float("nan")})
             logger.close()
     assert [settings["run_id"] for settings in mlflow.named("start_run")] == [None, "run-7"]
-    assert mlflow.rows == {1: {"gap": 0.5}} and not mlflow.named("set_tracking_uri")
+    assert mlflow.rows == {1: {"gap": 0.5}}
 
 
 @pytest.mark.parametrize(
@@ -103,3 +102,9 @@ def test_what_cannot_log_is_refused(refused, monkeypatch, argument, missing, mes
     if missing:
         monkeypatch.setitem(sys.modules, missing, None)
     assert message in refused("train", "env=planar4dof", argument)
+
+
+def test_mlflow_must_be_told_where_to_write(refused, services, monkeypatch):
+    monkeypatch.delenv("MLFLOW_TRACKING_URI")
+    message = refused("train", "env=planar4dof", "logger=mlflow")
+    assert "expected MLFLOW_TRACKING_URI in the environment" in message

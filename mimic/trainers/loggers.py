@@ -44,12 +44,10 @@ class _WandbLogger:
 
 
 class _MlflowLogger:
-    """MLflow; its own environment variables say where its server is. Without one it writes into the run directory."""
+    """MLflow; where to, is what its own environment variables say."""
 
     def __init__(self, run_dir: Path, config: TrainConfig):
         self._mlflow = _package("mlflow")
-        if folder := _unless_set("MLFLOW_TRACKING_URI", uri=(run_dir / "mlruns").absolute().as_uri()):
-            self._mlflow.set_tracking_uri(**folder)
         if wanted := _unless_set("MLFLOW_EXPERIMENT_NAME", experiment_name="mimic"):
             self._mlflow.set_experiment(**wanted)
         known = run_dir / "mlflow_run_id"
@@ -70,10 +68,13 @@ _SERVICES: dict[str, type[_WandbLogger] | type[_MlflowLogger]] = {"wandb": _Wand
 
 
 def check_loggers(names: Sequence[str]) -> None:
-    """Raises a ValueError that names the extra, where a package is missing."""
+    """Raises a ValueError where a package is missing, or nobody says where MLflow shall write."""
     for name in names:
         if name in _SERVICES:
             _package(name)
+    # MLflow's own default lies beside the run directory, and needs a database that its client does not bring.
+    if "mlflow" in names and not os.environ.get("MLFLOW_TRACKING_URI"):
+        raise ValueError("logger=mlflow: expected MLFLOW_TRACKING_URI in the environment, as in http://localhost:5000")
 
 
 def make_loggers(names: Sequence[str], run_dir: Path, config: TrainConfig) -> list[Logger]:
