@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -21,7 +20,7 @@ from mimic.viewing import drawing, viewer
 from mimic.viewing.config import ViewConfig
 from mimic.viewing.follower import Settings, initial_settings, learner_arm, step_towards
 from mimic.viewing.live import LiveSession
-from mimic.viewing.shapes import ArmShape, places
+from mimic.viewing.shapes import ArmShape
 
 TICK = 1 / 30
 ENOUGH = 20  # updates a second that feel live
@@ -199,55 +198,6 @@ def test_an_update_is_quick(live):
         seconds.append(time.perf_counter() - began)
     print(f"update of the view: {1e3 * np.median(seconds):.1f} ms in the median")
     assert np.median(seconds) < 1 / ENOUGH
-
-
-def test_shapes_stand_where_mujoco_puts_them(env):
-    shape = ArmShape(env.learner)
-    angles = dict.fromkeys(shape.joint_names, 0.0) | {"joint2": 0.7, "joint4": -1.2}
-    model = mujoco.MjModel.from_xml_path(str(mimic.embodiment.panda_path()))
-    data = mujoco.MjData(model)
-    for name, angle in angles.items():
-        data.joint(name).qpos[0] = angle
-    mujoco.mj_forward(model, data)
-    positions, quaternions = shape.bodies(angles)
-    np.testing.assert_allclose(positions, data.xpos)
-    np.testing.assert_allclose(quaternions, data.xquat)
-    marked = [part.locked_joint for part in shape.parts if part.locked_joint]
-    assert marked == list(shape.joint_names)
-    left, right = places([shape, shape])
-    assert left[1] < 0 < right[1]
-
-
-def test_every_kind_of_geom_has_triangles_of_its_size(tmp_path):
-    geoms = {
-        "sphere": ('size=".2"', (0.4, 0.4, 0.4)),
-        "capsule": ('size=".1 .2"', (0.2, 0.2, 0.6)),
-        "cylinder": ('size=".1 .2"', (0.2, 0.2, 0.4)),
-        "box": ('size=".1 .2 .3"', (0.2, 0.4, 0.6)),
-        "ellipsoid": ('size=".1 .2 .3"', (0.2, 0.4, 0.6)),
-        "mesh": ('mesh="cube"', (0.2, 0.2, 0.2)),
-    }
-    corners = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1))
-    for kind, (attributes, extent) in geoms.items():
-        path = tmp_path / f"{kind}.xml"
-        path.write_text(
-            f'<mujoco><asset><mesh name="cube" vertex="{corners}"/></asset><worldbody><body name="b">'
-            '<joint name="a" axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-            f'<geom type="{kind}" {attributes} rgba="1 0 0 1"/><geom type="sphere" size="9" group="3"/>'
-            '<site name="tip" pos="0 0 .5"/></body></worldbody></mujoco>'
-        )
-        part = ArmShape(ArmConfig(model=str(path), tip="tip")).parts[0]
-        assert part.rgba == (1, 0, 0, 1)
-        np.testing.assert_allclose(np.ptp(part.vertices, axis=0), extent, rtol=0.02)  # facets of round shapes
-
-
-def test_drawings_hold_their_numbers():
-    table = drawing.heat_maps(np.eye(2), np.array([[0.25, 3.0], [0, 1]]), ["link1", "<b>"], ["link1+link2", "tip"])
-    assert all(text in table for text in (">1.00<", ">0.25<", ">3.00<", ">1+2<", "&lt;b&gt;")) and "<b>" not in table
-    assert ">0.1235<" in drawing.numbers(0.12345, 0.1) and "…" in drawing.numbers(0.1, float("nan"))
-    time_s, unknown = np.linspace(0, 1, 5), np.array([np.nan, np.nan, 0.1, 0.1, 0.1])
-    svg = drawing.chart(time_s, [("distance", time_s, "red"), ("bound", unknown, "black")], now=0.5)
-    assert svg.count("<polyline") == 2 and "nan" not in svg
 
 
 @pytest.mark.parametrize(

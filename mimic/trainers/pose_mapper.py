@@ -70,7 +70,8 @@ class MapperModel:
     @functools.cached_property
     def distance(self) -> PoseDistance:
         """Embodiment distance between a pose of the expert and one of the learner."""
-        correspondence = self.metric.make_correspondence(self.expert, self.learner)
+        with jax.ensure_compile_time_eval():  # kept: it must not belong to the first program that asks for it
+            correspondence = self.metric.make_correspondence(self.expert, self.learner)
         weights = self.metric.make_weights()
 
         def distance(qpos: Array, learner_qpos: Array) -> Array:
