@@ -141,7 +141,7 @@ def test_what_cannot_be_exported_is_refused(refused, tmp_path):
             ["out=new.onnx", run, "learner=panda3dof"],
             "but the run's is panda-joint3-joint6-joint7 with joints",
         ),
-        (["out=new.onnx", run, "learner=panda9dof"], "unknown environment 'panda9dof'; valid are panda3dof"),
+        (["out=new.onnx", run, "learner=panda9dof"], "unknown environment 'panda9dof'; valid are pair, panda3dof"),
     ]
     for arguments, message in cases:
         assert message in refused("export", *arguments)

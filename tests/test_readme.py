@@ -53,6 +53,7 @@ def test_the_readme_names_every_environment_and_only_what_exists():
 def test_links_lead_somewhere(page):
     for link in re.findall(r"\]\(((?!http)[^)]+)\)", page.read_text()):
         path, _, heading = link.partition("#")
-        assert (page.parent / path).exists(), link
-        headings = re.findall(r"^#+ (.*)$", (page.parent / path).read_text(), re.MULTILINE) if heading else []
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        headings = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE) if heading else []
         assert not heading or heading in [text.lower().replace(" ", "-") for text in headings], link

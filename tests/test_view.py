@@ -206,7 +206,7 @@ def test_an_update_is_quick(live):
         (["port=0"], "port: expected 1 to 65535, got 0"),
         (["host=nowhere.invalid"], "host: expected an address of this machine"),
         (["env=panda5dof"], "unknown env 'panda5dof'; valid are"),
-        (["learner=missing.xml"], "learner: expected panda, an MJCF file, or an environment (panda3dof,"),
+        (["learner=missing.xml"], "learner: expected panda, an MJCF file, or an environment (pair, panda3dof,"),
         (["run=missing"], "not a run directory"),
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),
