@@ -12,23 +12,12 @@ import time
 
 import pytest
 from omegaconf import OmegaConf
+from tiny import TINY
 
 from mimic.trainers.group import DistributedConfig
 from mimic.trainers.runs import run_schema
 
-TINY = [
-    "env=planar4dof",
-    "env.physics=fused",
-    "env.demonstrations.count=4",
-    "env.demonstrations.held_out=2",
-    "trainer.num_envs=64",
-    "trainer.batch_size=32",
-    "trainer.num_minibatches=4",
-    "trainer.num_updates_per_batch=1",
-    "trainer.hidden_layers=[16]",
-    "trainer.num_timesteps=5000",
-    "trainer.evaluations=4",
-]
+FUSED = [*TINY, "env.physics=fused"]
 
 
 def start(tmp_path, *arguments, slurm=False):
@@ -44,7 +33,7 @@ def start(tmp_path, *arguments, slurm=False):
             found = ["distributed.coordinator=auto"]
             environment |= {"SLURM_JOB_ID": str(port), "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2"}
             environment |= {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index)}
-        command = [sys.executable, "-m", "mimic.train", *TINY, *found, *arguments]
+        command = [sys.executable, "-m", "mimic.train", *FUSED, *found, *arguments]
         output = subprocess.PIPE
         process = subprocess.Popen(
             command, stdout=output, stderr=subprocess.STDOUT, text=True, env=environment, cwd=tmp_path

@@ -14,22 +14,11 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
+from tiny import TINY
 
 import mimic
 from mimic import compat
 
-TINY = [
-    "env=planar4dof",
-    "env.demonstrations.count=4",
-    "env.demonstrations.held_out=2",
-    "trainer.num_envs=64",
-    "trainer.batch_size=32",
-    "trainer.num_minibatches=4",
-    "trainer.num_updates_per_batch=1",
-    "trainer.hidden_layers=[16]",
-    "trainer.num_timesteps=5000",
-    "trainer.evaluations=4",
-]
 BY_SPLIT = {
     "optimality_gap", "mean_distance", "lower_bound", "hold_distance", "link_angle_error_deg", "angular_velocity_error",
     "torque_rms", "torque_change", "torque_saturation", "position_violations", "speed_violations", "torque_violations",

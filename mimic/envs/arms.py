@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
-from mimic.model_files import read_spec
+from mimic.model_files import VELOCITY_LIMIT, read_spec
 from mimic.set_aside import set_aside
 
 # Planar arms are ours to define: slender rods, whose joints feel about as heavy for their size as the Panda's.
@@ -167,14 +167,14 @@ def simulation_model(
                 angle = locked.get(joint.name, 0.0) - float(source.qpos0[joint.qposadr[0]])
                 position, quaternion = _turned(position, quaternion, joint, angle)
                 kept = [(other, *_turned_back(*line, joint, angle)) for other, *line in kept]
-        copy = bodies[int(source.body_parentid[body_id])].add_body(pos=position, quat=quaternion)
-        bodies[body_id] = copy
+        bare = bodies[int(source.body_parentid[body_id])].add_body(pos=position, quat=quaternion)
+        bodies[body_id] = bare
         if source.body_mass[body_id] > 0:
-            copy.explicitinertial = True
-            copy.mass, copy.ipos, copy.iquat = float(body.mass[0]), body.ipos, body.iquat
-            copy.inertia = body.inertia
+            bare.explicitinertial = True
+            bare.mass, bare.ipos, bare.iquat = float(body.mass[0]), body.ipos, body.iquat
+            bare.inertia = body.inertia
         for joint, anchor, axis in kept:
-            copy.add_joint(
+            bare.add_joint(
                 name=joint.name,
                 type=mujoco.mjtJoint.mjJNT_HINGE,
                 axis=axis,
@@ -252,6 +252,6 @@ def _planar_spec(arm: Embodiment) -> mujoco.MjSpec:
         body.explicitinertial = True
         body.mass, body.ipos, body.inertia = mass, [length / 2, 0, 0], [inertia / 100, inertia, inertia]
         parent, start = body, float(length)
-    numeric = spec.add_numeric(name="velocity_limit", size=arm.num_joints)
+    numeric = spec.add_numeric(name=VELOCITY_LIMIT, size=arm.num_joints)
     numeric.data = [_PLANAR_VELOCITY_LIMIT] * arm.num_joints
     return spec
