@@ -66,6 +66,7 @@ class ImitationEnv(Env):
       arm: the learner with the model that simulates it.
       correspondence, weights: of the reward.
       demonstrations: what is imitated.
+      expert_states: link states of the demonstrations, [demonstrations, time, links, 3] each.
       torque_scale: [joints] largest torque [N m].
 
     Raises:
@@ -92,6 +93,15 @@ class ImitationEnv(Env):
         """The same environment on other demonstrations."""
         env = copy.copy(self)
         env._set_demonstrations(demonstrations)
+        return env
+
+    def with_expert_states(self, states: LinkStates) -> "ImitationEnv":
+        """The same environment on another copy of `expert_states`: inside a program, on what the program is given.
+
+        What a program only finds here becomes a part of it, to compile and to keep with it.
+        """
+        env = copy.copy(self)
+        env.expert_states = states
         return env
 
     def _set_demonstrations(self, demonstrations: Demonstrations) -> None:

@@ -33,8 +33,8 @@ class FreshEpisodeWrapper(Wrapper):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Batched step."""
-        steps = jnp.where(state.done, 0, state.info["steps"])
-        state = state.replace(done=jnp.zeros_like(state.done), info={**state.info, "steps": steps})
+        counted = {key: jnp.where(state.done, 0, steps) for key, steps in state.info.items() if key == "steps"}
+        state = state.replace(done=jnp.zeros_like(state.done), info={**state.info, **counted})
         state = self.env.step(state, action)
         arm_state: ArmState = state.pipeline_state  # type: ignore[assignment]
         fresh, fresh_obs = jax.vmap(self._begin)(arm_state.key)
@@ -49,6 +49,11 @@ class FreshEpisodeWrapper(Wrapper):
     def _begin(self, key: jax.Array) -> tuple[ArmState, jax.Array]:
         arm_state = self._imitation.start(key)
         return arm_state, self._imitation.observe_home(arm_state)
+
+
+def fresh_episodes(env: ImitationEnv) -> Wrapper:
+    """Many arms at once, without end; all that `mimic.trainers.learning` needs."""
+    return FreshEpisodeWrapper(VmapWrapper(env), env)
 
 
 def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn=None) -> Wrapper:

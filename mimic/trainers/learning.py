@@ -1,0 +1,222 @@
+"""PPO as two programs, one that begins and one that collects and learns, on all devices at once.
+
+Networks, loss, running statistics and action distribution are brax's. Brax's own loop compiles its programs one after
+the other, each before it knows of the next; here all that they need is known from shapes, so that they compile side by
+side, with whatever else there is to compile or to import.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from brax.envs.base import State
+from brax.training import gradients
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import losses
+from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.types import Transition
+from flax import struct
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int
+
+from mimic.envs.imitation import ImitationEnv
+from mimic.envs.wrappers import fresh_episodes
+from mimic.kinematics import LinkStates
+from mimic.trainers.config import PPOConfig
+from mimic.trainers.prepared import Prepared
+
+Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, value parameters
+Metrics = dict[str, Array]
+
+_AXIS = "devices"
+# XLA would try each matrix product in a dozen forms, which takes longer than it saves in a training.
+_GPU_COMPILER_OPTIONS = {"xla_gpu_enable_triton_gemm": False}
+
+
+@struct.dataclass
+class Learning:
+    """What goes from one call of `Programs.learn` to the next.
+
+    Attributes:
+      networks: parameters of policy and value.
+      statistics: running mean and deviation of the observations.
+      optimizer: state of optax.
+      episodes: of the environments, shared out among the devices.
+      expert_states: of the environment.
+      key: for exploration and shuffling.
+    """
+
+    networks: losses.PPONetworkParams
+    statistics: running_statistics.RunningStatisticsState
+    optimizer: optax.OptState
+    episodes: State
+    expert_states: LinkStates
+    key: Array
+
+    @property
+    def params(self) -> Params:
+        """What a policy is made of, and what is saved."""
+        return self.statistics, self.networks.policy, self.networks.value
+
+
+def compiler_options() -> dict[str, Any]:
+    """For programs with large matrix products, on the present backend."""
+    return _GPU_COMPILER_OPTIONS if jax.default_backend() == "gpu" else {}
+
+
+def make_programs(
+    env: ImitationEnv,
+    config: PPOConfig,
+    networks: ppo_networks.PPONetworks,
+    batches: int,
+    learning_rate: optax.Schedule,
+    restored: Params | None,
+) -> tuple[Prepared[Callable[[int], Learning]], Prepared[Callable[[Learning], tuple[Learning, Metrics]]]]:
+    """The programs of a training, being compiled in the background.
+
+    Args:
+      env: the environment with its training demonstrations.
+      config: resolved.
+      networks: of the config.
+      batches: that one call of the second program collects and learns from.
+      learning_rate: of Adam, at each update from 0 on.
+      restored: parameters to go on from.
+
+    Returns:
+      What begins, of a seed; and what learns, which gives the means of the loss's metrics too.
+    """
+    mesh = Mesh(np.array(jax.devices()), (_AXIS,))
+    optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(learning_rate))
+    same, shared = PartitionSpec(), PartitionSpec(_AXIS)
+    learning = Learning(same, same, same, shared, same, same)  # type: ignore[arg-type]
+
+    def program(function: Any, inputs: Any, outputs: Any, **how: Any) -> Any:
+        spread = jax.shard_map(function, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
+        placed = [jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs) for specs in (inputs, outputs)]
+        return jax.jit(
+            spread, in_shardings=placed[0], out_shardings=placed[1], compiler_options=compiler_options(), **how
+        )
+
+    training = env, config, networks, optimizer, mesh.size
+    begin = program(functools.partial(_begin, *training), (same, same, same), learning)
+    learn = program(functools.partial(_learn, *training, batches), (learning,), (learning, same), donate_argnums=0)
+    expert_states = jax.device_get(env.expert_states)
+    start = jax.eval_shape(begin, 0, restored, expert_states)
+    lowered = learn.lower(start)
+    learns = Prepared(lowered.compile)
+    learns.start()
+
+    def compile_begin() -> Callable[[int], Learning]:
+        compiled = begin.lower(0, restored, expert_states).compile()
+        return lambda seed: compiled(seed, restored, expert_states)
+
+    begins = Prepared(compile_begin)
+    begins.start()
+    return begins, learns
+
+
+def initial_params(networks: ppo_networks.PPONetworks, observation_size: int, key: Array) -> Params:
+    """What an untrained policy is made of."""
+    key_policy, key_value = jax.random.split(key)
+    statistics = running_statistics.init_state(specs.Array((observation_size,), jnp.dtype("float32")))
+    return statistics, networks.policy_network.init(key_policy), networks.value_network.init(key_value)
+
+
+def _begin(
+    env: ImitationEnv,
+    config: PPOConfig,
+    networks: ppo_networks.PPONetworks,
+    optimizer: optax.GradientTransformation,
+    devices: int,
+    seed: Int[Array, ""],
+    restored: Params | None,
+    expert_states: LinkStates,
+) -> Learning:
+    key_networks, key_episodes, key = jax.random.split(jax.random.PRNGKey(seed), 3)
+    statistics, policy, value = restored or initial_params(networks, env.observation_size, key_networks)
+    params = losses.PPONetworkParams(policy=policy, value=value)
+    keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), config.num_envs // devices)  # type: ignore[operator]
+    episodes = fresh_episodes(env.with_expert_states(expert_states)).reset(keys)
+    return Learning(params, statistics, optimizer.init(params), episodes, expert_states, key)  # type: ignore[arg-type]
+
+
+def _learn(
+    env: ImitationEnv,
+    config: PPOConfig,
+    networks: ppo_networks.PPONetworks,
+    optimizer: optax.GradientTransformation,
+    devices: int,
+    batches: int,
+    learning: Learning,
+) -> tuple[Learning, Metrics]:
+    episodes_env = fresh_episodes(env.with_expert_states(learning.expert_states))
+    make_policy = ppo_networks.make_inference_fn(networks)
+    unrolls = config.batch_size * config.num_minibatches // config.num_envs  # type: ignore[operator]
+    batch_size = config.batch_size // devices  # type: ignore[operator]
+    loss_and_gradient = gradients.loss_and_pgrad(
+        functools.partial(
+            losses.compute_ppo_loss,
+            ppo_network=networks,
+            entropy_cost=config.entropy_cost,  # type: ignore[arg-type]
+            discounting=config.discounting,  # type: ignore[arg-type]
+            reward_scaling=config.reward_scaling,
+            gae_lambda=config.gae_lambda,
+            clipping_epsilon=config.clipping_epsilon,
+        ),
+        _AXIS,
+        has_aux=True,
+    )
+
+    def unroll(learning: Learning, key: Array) -> tuple[Learning, tuple[Transition, Array]]:
+        """Steps of all arms, and what they see after the last one."""
+        policy = make_policy(learning.params)
+
+        def step(state: State, key: Array) -> tuple[State, Transition]:
+            action, extras = policy(state.obs, key)
+            after = episodes_env.step(state, action)
+            extras = {"policy_extras": extras, "state_extras": {"truncation": jnp.zeros_like(after.done)}}
+            return after, Transition(state.obs, action, after.reward, 1 - after.done, (), extras)  # type: ignore[arg-type]
+
+        keys = jax.random.split(key, config.unroll_length)  # type: ignore[arg-type]
+        episodes, transitions = jax.lax.scan(step, learning.episodes, keys)
+        return learning.replace(episodes=episodes), (transitions, episodes.obs)  # type: ignore[attr-defined]
+
+    def batch(learning: Learning, _: None) -> tuple[Learning, Metrics]:
+        """Collects transitions, and learns from them."""
+        key, key_unroll, key_order, key_loss = jax.random.split(learning.key, 4)
+        key_unroll, key_order, key_loss = (
+            jax.random.fold_in(k, jax.lax.axis_index(_AXIS)) for k in (key_unroll, key_order, key_loss)
+        )
+        learning, (transitions, last_seen) = jax.lax.scan(unroll, learning, jax.random.split(key_unroll, unrolls))
+        statistics = running_statistics.update(
+            learning.statistics, transitions.observation, pmap_axis_name=_AXIS
+        )  # of [unrolls, time, arms] observations
+
+        def update(carry: Any, inputs: Any) -> Any:
+            params, optimizer_state = carry
+            chosen, key = inputs
+            row, arm = chosen // last_seen.shape[1], chosen % last_seen.shape[1]
+            data: Transition = jax.tree.map(lambda x: x[row, :, arm], transitions)
+            data = data._replace(next_observation=last_seen[row, arm][:, None])  # the loss reads the last one alone
+            (_, metrics), gradient = loss_and_gradient(params, statistics, data, key)
+            change, optimizer_state = optimizer.update(gradient, optimizer_state)
+            return (optax.apply_updates(params, change), optimizer_state), metrics
+
+        passes = jax.random.split(key_order, config.num_updates_per_batch)  # type: ignore[arg-type]
+        samples = unrolls * last_seen.shape[1]
+        order = jax.vmap(lambda key: jax.random.permutation(key, samples))(passes).reshape(-1, batch_size)
+        keys = jax.random.split(key_loss, len(order))
+        (params, optimizer_state), metrics = jax.lax.scan(
+            update, (learning.networks, learning.optimizer), (order, keys)
+        )
+        learning = learning.replace(  # type: ignore[attr-defined]
+            networks=params, statistics=statistics, optimizer=optimizer_state, key=key
+        )
+        return learning, jax.tree.map(jnp.mean, metrics)
+
+    learning, metrics = jax.lax.scan(batch, learning, None, length=batches)
+    return learning, jax.lax.pmean(jax.tree.map(jnp.mean, metrics), _AXIS)
