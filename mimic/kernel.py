@@ -16,7 +16,14 @@ BLOCK, WARPS = 128, 4  # samples, and groups of 32 threads, in a block of the GP
 Program = Callable[..., Sequence[Sequence[Scalar]]]
 
 
-def fused(program: Program, widths: Sequence[int]) -> Callable[..., tuple[Array, ...]]:
+def fused(
+    program: Program,
+    widths: Sequence[int],
+    *,
+    plain: Callable[..., tuple[Array, ...]] | None = None,
+    block: int = BLOCK,
+    warps: int = WARPS,
+) -> Callable[..., tuple[Array, ...]]:
     """A function of vectors whose `jax.vmap` is one kernel on NVIDIA GPUs.
 
     A sample stays in the registers of one thread from start to end. XLA would split a long program into many kernels,
@@ -26,18 +33,22 @@ def fused(program: Program, widths: Sequence[int]) -> Callable[..., tuple[Array,
       program: of one sequence of scalars for each vector; gives sequences of scalars. It must be elementwise, as what
         `mimic.spatial` does: in the kernel a scalar is a block of samples.
       widths: length of each sequence that the program gives.
+      plain: the same on vectors, for where there is no such GPU; the program itself where None.
+      block: see `gpu_kernel`.
+      warps: see `gpu_kernel`.
 
     Returns:
       The function, of vectors of one floating dtype. Its derivatives are those of the program, as XLA compiles it.
     """
 
-    def plain(*vectors: Array) -> tuple[Array, ...]:
+    def by_program(*vectors: Array) -> tuple[Array, ...]:
         outputs = program(*([vector[k] for k in range(vector.shape[0])] for vector in vectors))
         return tuple(stack([scalars], vectors[0].dtype)[0] for scalars in outputs)
 
+    plain = plain or by_program
     function = jax.custom_jvp(jax.custom_batching.custom_vmap(plain))
     function.defjvp(lambda primals, tangents: jax.jvp(plain, primals, tangents))
-    kernel = gpu_kernel(program, widths)
+    kernel = gpu_kernel(program, widths, block, warps)
 
     @function.fun.def_vmap
     def many(size: int, batched: Any, *vectors: Array) -> Any:

@@ -10,6 +10,7 @@ import pytest
 from random_arms import SEEDS, random_arm
 
 import mimic
+from mimic import kernel
 from mimic.envs import dynamics, physics
 from mimic.envs.arms import ArmConfig, build_arm, simulation_model
 from mimic.envs.physics import Load, make_advance
@@ -179,11 +180,11 @@ def test_the_kernel_computes_what_the_plain_program_does(planar, monkeypatch):
     """The GPU kernel, interpreted on the CPU, for a batch that is no multiple of its block."""
     count = physics._BLOCK + 1
     model, states, loads = planar
-    interpreted = partial(physics.pl.pallas_call, interpret=True)
-    monkeypatch.setattr(physics.pl, "pallas_call", interpreted)
-    kernel = physics._kernel(dynamics.segments(model), 0.01, 2)
+    monkeypatch.setattr(kernel.pl, "pallas_call", partial(kernel.pl.pallas_call, interpret=True))
+    step = physics._scalar_step(dynamics.segments(model), 0.01, 2)
+    on_gpu = kernel.gpu_kernel(step, (3, 3), physics._BLOCK, physics._WARPS)
     rows = [jnp.resize(x, (count, *x.shape[1:])) for x in (*states, *loads)]
-    found = jax.jit(kernel)(*rows)
+    found = jax.jit(lambda *rows: on_gpu(*rows[:3], jnp.stack(rows[3:], axis=1)))(*rows)
     expected = jax.jit(jax.vmap(make_advance(model, 0.01, 2, "fused")))(*rows[:3], Load(*rows[3:]))
     for values, reference in zip(found, expected, strict=True):
         assert values.shape == (count, 3)
