@@ -2,14 +2,16 @@
 
     python -m benchmarks.ppo --out FILE [--env panda4dof] [--only CASE ...] [--num-envs N]
 
-Brax PPO, with the settings of the preset, on the environment with the physics `fused` and `mjx`, and on the same task
-as brax and MuJoCo Playground environments usually have it: `mjx.Data` carried, brax's own wrappers. Beside them PPO of
-stable-baselines3 on C MuJoCo on the processor, where it is installed: the same networks and as many minibatches and
-passes, with an arm for each core. A training goes on for some stretches; the speed is the median of all but the first,
-which compiles, with the quartiles as spread.
+PPO as `mimic.train` runs it, with the settings of the preset, on the environment with the physics `fused` and `mjx`;
+brax's own training loop on the same environment, and on the same task as brax and MuJoCo Playground environments
+usually have it: `mjx.Data` carried, brax's own wrappers. Beside them PPO of stable-baselines3 on C MuJoCo on the
+processor, where it is installed: the same networks and as many minibatches and passes, with an arm for each core. A
+training goes on for some stretches; the speed is the median of all but the first, which compiles, with the quartiles as
+spread.
 """
 
 import argparse
+import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,8 +23,10 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+import optax  # noqa: E402
 from brax.envs.base import Env  # noqa: E402
 from brax.training.agents.ppo import train as brax_ppo  # noqa: E402
+from brax.training.agents.ppo.networks import make_ppo_networks  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
@@ -30,9 +34,11 @@ import mimic  # noqa: E402
 from benchmarks import stock  # noqa: E402
 from benchmarks.record import write_results  # noqa: E402
 from mimic import compat  # noqa: E402
+from mimic.envs.imitation import ImitationEnv  # noqa: E402
 from mimic.envs.wrappers import wrap_for_training  # noqa: E402
 from mimic.trainers import ppo  # noqa: E402
 from mimic.trainers.config import PPOConfig  # noqa: E402
+from mimic.trainers.learning import make_programs  # noqa: E402
 
 ON_PROCESSOR = "stable-baselines3, C MuJoCo"
 _STRETCHES = 6  # the first compiles
@@ -51,37 +57,86 @@ def rates(steps: int, seconds: Sequence[float]) -> dict[str, float]:
     }
 
 
-def learn(env: Env, wrap: Callable[..., Env], horizon: int, config: PPOConfig, batches: int) -> dict[str, float]:
-    """Brax PPO, in stretches of so many batches."""
+def learn(env: ImitationEnv, config: PPOConfig, batches: int) -> dict[str, float]:
+    """PPO as `mimic.train` runs it, in stretches of so many batches."""
+    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    schedule = optax.constant_schedule(config.learning_rate)  # type: ignore[arg-type]
+    seconds: list[float] = []
+    began = time.perf_counter()
+    begin, program = make_programs(env, config, networks, batches, schedule, None)
+    learning = begin()(0)
+    for _ in range(_STRETCHES):
+        learning, metrics = program()(learning)
+        jax.block_until_ready(metrics)
+        seconds.append(time.perf_counter() - began)
+        began = time.perf_counter()
+    return rates(batches * config.steps_per_batch, seconds)
+
+
+def learn_by_brax(
+    env: Env, wrap: Callable[..., Env], horizon: int, config: PPOConfig, batches: int
+) -> dict[str, float]:
+    """Brax's own training loop, in stretches of so many batches."""
     compat.mend_brax()
     seconds: list[float] = []
     steps = batches * config.steps_per_batch
+    began = [time.perf_counter()]
+
+    def on_stretch(*_: Any) -> None:
+        seconds.append(time.perf_counter() - began[0])
+        began[0] = time.perf_counter()
+
     brax_ppo.train(
         environment=env,
         num_timesteps=_STRETCHES * steps,
         episode_length=horizon + 1,
         wrap_env_fn=wrap,
-        learning_rate=config.learning_rate,  # type: ignore[arg-type]
-        num_evals=_STRETCHES + 1,
         num_eval_envs=1,
+        num_evals=_STRETCHES + 1,
         run_evals=False,
-        progress_fn=lambda _, metrics: seconds.append(steps / float(metrics["training/sps"])),
-        **ppo.hyperparameters(config),
+        normalize_observations=True,
+        progress_fn=on_stretch,
+        network_factory=_brax_networks(config),
+        **settings(config),
     )
     return rates(steps, seconds)
 
 
-def own(physics: str) -> Case:
-    def case(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
-        env = mimic.make(name, physics=physics)
-        return learn(env, wrap_for_training, env.config.horizon, config, batches)
+def settings(config: PPOConfig) -> dict[str, Any]:
+    """Of a resolved config, under brax's names."""
+    return {
+        "num_envs": config.num_envs,
+        "learning_rate": config.learning_rate,
+        "entropy_cost": config.entropy_cost,
+        "discounting": config.discounting,
+        "unroll_length": config.unroll_length,
+        "batch_size": config.batch_size,
+        "num_minibatches": config.num_minibatches,
+        "num_updates_per_batch": config.num_updates_per_batch,
+        "reward_scaling": config.reward_scaling,
+        "clipping_epsilon": config.clipping_epsilon,
+        "gae_lambda": config.gae_lambda,
+        "max_grad_norm": config.max_grad_norm,
+    }
 
-    return case
+
+def _brax_networks(config: PPOConfig) -> Callable[..., Any]:
+    hidden = tuple(config.hidden_layers or ())
+    return functools.partial(make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden)
+
+
+def own(physics: str) -> Case:
+    return lambda name, config, batches: learn(mimic.make(name, physics=physics), config, batches)
+
+
+def in_brax_loop(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+    env = mimic.make(name, physics="fused")
+    return learn_by_brax(env, wrap_for_training, env.config.horizon, config, batches)
 
 
 def carried(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
     env = mimic.make(name, physics="mjx")
-    return learn(stock.StockEnv(env), stock.wrap, env.config.horizon, config, batches)
+    return learn_by_brax(stock.StockEnv(env), stock.wrap, env.config.horizon, config, batches)
 
 
 def one_at_a_time(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
@@ -93,7 +148,8 @@ def one_at_a_time(name: str, config: PPOConfig, batches: int) -> dict[str, float
 CASES: dict[str, Case] = {
     "mimic, fused": own("fused"),
     "mimic, mjx": own("mjx"),
-    "brax, mjx.Data carried": carried,
+    "brax's loop, fused": in_brax_loop,
+    "brax's loop, mjx.Data carried": carried,
     ON_PROCESSOR: one_at_a_time,
 }
 
@@ -158,8 +214,9 @@ def main() -> None:
     rows = run(options.env, config, options.only, batches)
     Console().print(table(rows))
     if options.out:
-        settings = {key: value for key, value in ppo.hyperparameters(config).items() if key != "network_factory"}
-        write_results(options.out, "ppo", options.commit, settings=settings, layers=config.hidden_layers, rows=rows)
+        write_results(
+            options.out, "ppo", options.commit, settings=settings(config), layers=config.hidden_layers, rows=rows
+        )
         draw(rows, options.out.with_suffix(".png"))
 
 

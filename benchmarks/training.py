@@ -1,10 +1,11 @@
 """Trains as a user does, each run a process of its own: how good, how fast, and how long until it is good.
 
-    python -m benchmarks.training --out FILE [--case NAME ...] [--seeds 0 1]
+    python -m benchmarks.training --out FILE [--case NAME ...] [--seeds 0 1] [--cold]
 
-Each run is made twice: cold, with nothing compiled before, and warm, with what the first has compiled. "To the goal" is
-the time from the start of the process until the gap on the training demonstrations is at the case's goal for the first
-of three evaluations on end (of all that are left, if the training ends before). The file holds each run's report.
+Each run is made twice: cold, with nothing compiled before, and warm, with what the first has compiled; or cold alone.
+"To the goal" is the time from the start of the process until the gap on the training demonstrations is at the case's
+goal for the first of three evaluations on end (of all that are left, if the training ends before). The file holds each
+run's report.
 """
 
 import argparse
@@ -63,13 +64,13 @@ def time_to_goal(metrics: Path, goal: float) -> float | None:
     return next(reached, None)
 
 
-def run_case(name: str, seed: int) -> list[dict[str, Any]]:
-    """The run, cold and warm."""
+def run_case(name: str, seed: int, starts: Sequence[str] = ("cold", "warm")) -> list[dict[str, Any]]:
+    """The run, from each start."""
     case = CASES[name]
     arguments = (*case.arguments, *case.on.get(jax.default_backend(), ()), f"seed={seed}")
     results = []
     with tempfile.TemporaryDirectory() as folder:
-        for start in ("cold", "warm"):
+        for start in starts:
             run_dir = Path(folder) / start
             result = train(run_dir, arguments, cache=Path(folder) / "cache")
             to_goal = time_to_goal(run_dir / runs.METRICS, case.goal)
@@ -104,6 +105,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, metavar="FILE", help="file of results; printed only where none is given")
     parser.add_argument("--case", choices=CASES, nargs="+", default=list(CASES), metavar="NAME", help=", ".join(CASES))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N")
+    parser.add_argument("--cold", action="store_true", help="no run with what was compiled before")
     parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
     return parser.parse_args()
 
@@ -114,7 +116,7 @@ def main() -> None:
     results: list[dict[str, Any]] = []
     for name in options.case:
         for seed in options.seeds:
-            results += run_case(name, seed)
+            results += run_case(name, seed, ("cold",) if options.cold else ("cold", "warm"))
             if options.out:
                 write_results(options.out, "training", options.commit, runs=results)
     Console().print(table(results))

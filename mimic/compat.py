@@ -45,6 +45,17 @@ def import_mjx() -> None:
         importlib.import_module("mujoco.mjx")
 
 
+def import_tensorboard() -> Any:
+    """Imports tensorboardX, but not torch with it: where that is installed it takes seconds, for a type's name."""
+    if "torch" not in sys.modules:
+        sys.modules["torch"] = None  # type: ignore[assignment]  # an import fails, as where it is not installed
+    try:
+        return importlib.import_module("tensorboardX")
+    finally:
+        if sys.modules["torch"] is None:
+            del sys.modules["torch"]
+
+
 def computed_once(scalars: list[Any]) -> list[Any]:
     """The scalars, to be computed before they are stacked where XLA would else compute each of them from scratch.
 
@@ -84,7 +95,7 @@ def process_number() -> int:
 
 
 def mend_brax() -> None:
-    """Gives brax the function that it calls and JAX no longer has."""
+    """Gives brax's training loop the function that it calls and JAX no longer has."""
     import jax
 
     if not hasattr(jax, "device_put_replicated"):

@@ -1,5 +1,6 @@
 """What happens before the first training step: nothing heavy is imported, compiled or computed that is not needed."""
 
+import os
 import subprocess
 import sys
 
@@ -101,3 +102,11 @@ def test_a_run_with_a_target_looks_more_often():
     assert usual and targeted
     assert usual == PRESETS["cpu"]["evaluations"] and targeted > usual
     assert PPOConfig(target_gap=0.02, evaluations=3).resolve("cpu").evaluations == 3
+
+
+def test_tensorboard_does_not_bring_torch(tmp_path):
+    (tmp_path / "torch.py").write_text("raise SystemExit('torch was imported')")
+    code = "import sys\nfrom mimic import compat\ncompat.import_tensorboard().SummaryWriter"
+    code += "\nassert 'torch' not in sys.modules"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)

@@ -5,7 +5,9 @@ same.
 """
 
 import copy
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
 import numpy as np
@@ -67,11 +69,15 @@ def record_demonstrations(
             raise ValueError(f"{name}: expected at least {least}, got {value}")
     if not dt > 0:
         raise ValueError(f"dt: expected a time above 0 s, got {dt}")
+
+    def record(index: int) -> tuple[tuple[np.ndarray, ...], int]:
+        return _record_one(arm, kind, np.random.default_rng([seed, index]), horizon, dt, substeps)
+
     recordings = []
-    for index in range(count):
-        recording, redrawn = _record_one(arm, kind, np.random.default_rng([seed, index]), horizon, dt, substeps)
-        recordings.append(recording)
-        on_recorded(redrawn)
+    with ThreadPoolExecutor(os.cpu_count()) as executor:  # MuJoCo leaves Python to the others while it steps
+        for recording, redrawn in executor.map(record, range(count)):
+            recordings.append(recording)
+            on_recorded(redrawn)
     qpos, qvel, torque, goals = (np.stack(column) for column in zip(*recordings, strict=True))
     embodiment = arm.embodiment
     return Demonstrations(qpos, qvel, goals, float(dt), embodiment.name, embodiment.joint_names, seed, torque)
@@ -79,7 +85,7 @@ def record_demonstrations(
 
 def _record_one(
     arm: Arm, kind: str, rng: np.random.Generator, horizon: int, dt: float, substeps: int
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]:
+) -> tuple[tuple[np.ndarray, ...], int]:
     """Angles, velocities, torques and goal of a demonstration, and how many goals before it broke limits."""
     embodiment = arm.embodiment
     home = np.asarray(embodiment.home)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
+from mimic import compat
 from mimic.envs.imitation import FIRST_STEP, ArmState, ImitationEnv
 
 
@@ -67,5 +68,6 @@ def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, ran
         raise TypeError(f"expected an ImitationEnv, got {type(imitation).__name__}")
     if randomization_fn is not None:
         raise ValueError("randomization_fn is not supported")
+    compat.mend_brax()  # whose training calls this first
     wrapped = EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat)
     return FreshEpisodeWrapper(wrapped, imitation)

@@ -89,7 +89,7 @@ def train(
         if result.metrics:  # the start is looked at with the first result: until then the evaluation compiles
             enough = [on_evaluation(*seen) for seen in results][-1]
             results.clear()
-        if result.step < config.num_timesteps:  # else all is done, and there is nothing to resume
+        if result.step < config.total_steps:  # else all is done, and there is nothing to resume
             signals.check()
         if enough:
             break

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import tensorboardX
 from omegaconf import DictConfig, OmegaConf
 
+from mimic import compat
 from mimic.config import explain, schema, to_dict
 from mimic.trainers.config import TRAINERS, TrainConfig
 from mimic.trainers.prepared import WAITED
@@ -127,7 +127,7 @@ class MetricsLog:
 
     def __init__(self, run_dir: Path):
         self._path = run_dir / METRICS
-        self._writer = tensorboardX.SummaryWriter(str(run_dir / "tensorboard"))
+        self._writer = compat.import_tensorboard().SummaryWriter(str(run_dir / "tensorboard"))
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Appends one row; every row of a run has the same columns."""
