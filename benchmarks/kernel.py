@@ -15,7 +15,7 @@ import argparse
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,31 +40,35 @@ PATIENCE = 1.0  # s a call; the next case is about ten times as large
 JUDGED = 1000  # pairs that are compared with double precision
 TWO_TO = {"copy": 26, "multiply_add": 22}  # numbers that the limits are measured with
 
-Arms = tuple[mimic.Embodiment, mimic.Embodiment]
 Function = Callable[..., Any]
 
 
+@dataclasses.dataclass(frozen=True, eq=False)  # itself alone, for what is cached of it
+class Arms:
+    expert: mimic.Embodiment
+    learner: mimic.Embodiment
+
+
 def panda_pair() -> Arms:
-    return mimic.panda(), mimic.panda(locked=(3, 6, 7))
+    return Arms(mimic.panda(), mimic.panda(locked=(3, 6, 7)))
 
 
 def planar_pair(links: int) -> Arms:
     """Two arms of different proportions."""
     rng = np.random.default_rng(links)
-    expert, learner = (mimic.planar_arm(rng.uniform(0.5, 1.5, links) / links) for _ in range(2))
-    return expert, learner
+    return Arms(*(mimic.planar_arm(rng.uniform(0.5, 1.5, links) / links) for _ in range(2)))
 
 
 def jax_distance(method: str, arms: Arms) -> Function:
     """Of one sample."""
-    correspondence = mimic.overlap_correspondence(*arms)
+    correspondence = mimic.overlap_correspondence(arms.expert, arms.learner)
     if method == "mimic":
-        return mimic.motion_distance(*arms, correspondence, WEIGHTS)
+        return mimic.motion_distance(arms.expert, arms.learner, correspondence, WEIGHTS)
     if method == "matrices":
-        return kernel_peers.matrix_distance(*arms, np.asarray(correspondence), WEIGHTS)
+        return kernel_peers.matrix_distance(arms.expert, arms.learner, np.asarray(correspondence), WEIGHTS)
 
     def composition(*motion: jax.Array) -> jax.Array:
-        states = mimic.link_states(arms[0], *motion[:2]), mimic.link_states(arms[1], *motion[2:])
+        states = mimic.link_states(arms.expert, *motion[:2]), mimic.link_states(arms.learner, *motion[2:])
         return mimic.embodiment_distance(*states, correspondence, WEIGHTS)
 
     return composition
@@ -77,7 +81,7 @@ def batched(distance: Function, quantity: str) -> Function:
 
 def random_motions(arms: Arms, batch: int) -> list[jax.Array]:
     """qpos in [-pi, pi] and qvel in [-2, 2] of both arms, on the device."""
-    widths = [arm.num_joints for arm in arms for _ in range(2)]
+    widths = [arm.num_joints for arm in (arms.expert, arms.learner) for _ in range(2)]
 
     @jax.jit
     def draw() -> list[jax.Array]:
@@ -89,11 +93,16 @@ def random_motions(arms: Arms, batch: int) -> list[jax.Array]:
     return draw()
 
 
+@functools.cache
+def reference_program(arms: Arms, quantity: str) -> Function:
+    return jax.jit(batched(jax_distance("composition", arms), quantity))
+
+
 def reference(arms: Arms, motions: Sequence[jax.Array], quantity: str) -> Any:
     """Value and gradients of the first pairs in double precision, on the CPU."""
     numbers = [np.asarray(x[:JUDGED], np.float64) for x in motions]
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        return jax.tree.map(np.asarray, jax.jit(batched(jax_distance("composition", arms), quantity))(*numbers))
+        return jax.tree.map(np.asarray, reference_program(arms, quantity)(*numbers))
 
 
 def run_jax(method: str, arms: Arms, batch: int, quantity: str) -> dict[str, Any]:
@@ -119,8 +128,8 @@ def run_torch(method: str, arms: Arms, batch: int, quantity: str) -> dict[str, A
     by = QUANTITIES[quantity]
     for index in by:
         inputs[index].requires_grad_()
-    matrix = np.asarray(mimic.overlap_correspondence(*arms))
-    distance = kernel_peers.torch_distance(*arms, matrix, WEIGHTS, device)
+    matrix = np.asarray(mimic.overlap_correspondence(arms.expert, arms.learner))
+    distance = kernel_peers.torch_distance(arms.expert, arms.learner, matrix, WEIGHTS, device)
     if method == "torch.compile":
         distance = torch.compile(distance)
 
@@ -162,9 +171,8 @@ def available(methods: Sequence[str]) -> dict[str, str | None]:
 
 def sweep(
     name: str, cases: dict[int, tuple[Arms, int]], methods: Sequence[str], console: Console
-) -> list[dict[str, Any]]:
+) -> Iterator[dict[str, Any]]:
     """All methods on cases that grow; one that was too large for a method is its last."""
-    results = []
     for method in methods:
         run = run_torch if method.startswith("torch") else run_jax
         for quantity in QUANTITIES if method == "mimic" else ("value", "gradient"):
@@ -174,13 +182,12 @@ def sweep(
                 try:
                     row |= run(method, arms, batch, quantity)
                 except Exception as error:  # the kinds for memory differ by backend; the message is in the file
-                    results.append(row | {"failed": f"{type(error).__name__}: {error}"[:200]})
+                    yield row | {"failed": f"{type(error).__name__}: {error}"[:200]}
                     console.print(f"{name} {size:g}, {method}, {quantity}: {type(error).__name__}", markup=False)
                     break
-                results.append(row)
+                yield row
                 if row["median_ms"] > 1e3 * PATIENCE:
                     break
-    return results
 
 
 def limits() -> dict[str, float]:
@@ -223,7 +230,7 @@ def print_table(results: Sequence[dict[str, Any]], device: dict[str, float], con
 
 
 def main() -> None:
-    """Runs both sweeps, and writes the file after each."""
+    """Runs both sweeps, and writes the file after each case."""
     on_gpu = jax.default_backend() == "gpu"
     parser = argparse.ArgumentParser(prog="python -m benchmarks.kernel", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--out", type=Path, help="file of results, with a plot beside it; printed only where not given")
@@ -242,13 +249,15 @@ def main() -> None:
     }
     console = Console(width=120)  # also where there is no terminal
     device, results = limits(), []
+    absentees = {method: missing for method, missing in absent.items() if missing}
     for name, cases in sweeps.items():
-        results += sweep(name, cases, methods, console)
-        if options.out:
-            absentees = {method: missing for method, missing in absent.items() if missing}
-            content = {"limits": device, "absent": absentees, "results": results}
-            write_results(options.out, "kernel", options.commit, **content)
-            plot(results, device, options.out.with_suffix(".png"))
+        for row in sweep(name, cases, methods, console):
+            results.append(row)
+            if options.out:
+                content = {"limits": device, "absent": absentees, "results": results}
+                write_results(options.out, "kernel", options.commit, **content)
+    if options.out:
+        plot(results, device, options.out.with_suffix(".png"))
     print_table(results, device, console)
 
 

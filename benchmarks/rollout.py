@@ -1,6 +1,6 @@
 """How fast arms are simulated, and the environment steps: steps per second, and where the time of a step goes.
 
-    python -m benchmarks.rollout --out FILE [--envs panda7dof ...] [--arms 64 512 ...] [--no-peers]
+    python -m benchmarks.rollout --out FILE [--envs panda7dof ...] [--arms 64 512 ...] [--peer-arms 512 ...]
 
 Every program makes control steps of 0.1 s under random torques: 10 Runge-Kutta steps of 10 ms, the environment's own.
 Physics is that of the environments, `fused` and `mjx`, against a loop that carries `mjx.Data` as is usual, MJX-Warp
@@ -11,7 +11,7 @@ our reward. Times are of the second call on: median and spread (quartiles) of re
 
 import argparse
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -179,15 +179,16 @@ def _with_physics(env: ImitationEnv, physics: str) -> ImitationEnv:
     return mimic.make(env.config.name, physics=physics) if physics != env.config.physics else env
 
 
-def run(envs: list[str], sizes: list[int], peers: bool) -> list[dict[str, Any]]:
-    """A row for each measurement; what fails is a row that says why."""
+def run(
+    envs: Sequence[str], sizes: Sequence[int], peer_sizes: Sequence[int], save: Callable[[list[dict[str, Any]]], None]
+) -> list[dict[str, Any]]:
+    """A row for each measurement, saved as they come; what fails is a row that says why."""
     jobs = [
         (name, group, case, arms)
         for name in envs
         for group, cases in CASES.items()
         for case in cases
-        for arms in sizes
-        if (group, case) in OWN or (peers and arms in PEER_ARMS)
+        for arms in sorted({*peer_sizes, *(sizes if (group, case) in OWN else ())})
     ]
     made = {name: mimic.make(name, physics="fused") for name in envs}
     rows = []
@@ -197,10 +198,12 @@ def run(envs: list[str], sizes: list[int], peers: bool) -> list[dict[str, Any]]:
             timing = CASES[group][case](made[name], arms)
         except Exception as error:  # a peer that is not installed or out of memory: the others go on
             rows.append({**row, "failed": str(error).split("\n")[0][:200]})
+            save(rows)
             continue
         substeps = made[name].config.substeps if group == "physics" else 1
         rate = arms * STEPS * substeps / timing.median
         rows.append({**row, **timing.summary(), "steps_per_s": rate, "bytes_per_arm": timing.bytes / arms})
+        save(rows)
     return rows
 
 
@@ -241,13 +244,17 @@ def main() -> None:
     parser.add_argument("--out", type=Path, metavar="FILE", help="file of results; the figure goes beside it")
     parser.add_argument("--envs", nargs="+", choices=ENVS, default=list(ENVS), metavar="NAME", help=", ".join(ENVS))
     parser.add_argument("--arms", nargs="+", type=int, default=list(ARMS), metavar="N")
-    parser.add_argument("--no-peers", action="store_true", help="fused physics alone")
+    parser.add_argument("--peer-arms", nargs="*", type=int, default=list(PEER_ARMS), metavar="N", help="of the others")
     parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
     options = parser.parse_args()
-    rows = run(options.envs, options.arms, not options.no_peers)
+
+    def save(rows: list[dict[str, Any]]) -> None:
+        if options.out:
+            write_results(options.out, "rollout", options.commit, control_steps=STEPS, rows=rows)
+
+    rows = run(options.envs, options.arms, options.peer_arms, save)
     show(rows, Console())
     if options.out:
-        write_results(options.out, "rollout", options.commit, control_steps=STEPS, rows=rows)
         draw(rows, options.out.with_suffix(".png"))
 
 

@@ -92,7 +92,7 @@ def process_started() -> float:
 
 
 def start_backend() -> None:
-    """Lets JAX find its devices while this thread goes on to import: CUDA alone takes seconds."""
+    """Lets JAX find its devices, and take their memory, while this thread goes on to import: CUDA needs seconds."""
     threading.Thread(target=_find_devices, name="backend").start()
 
 
@@ -100,7 +100,7 @@ def _find_devices() -> None:
     import jax
 
     with contextlib.suppress(RuntimeError):  # said by whoever asks for them next
-        jax.devices()
+        jax.device_put(0).block_until_ready()
 
 
 def overrides() -> list[str]:

@@ -11,7 +11,7 @@ from benchmarks.kernel_figure import plot
 @pytest.fixture(scope="module")
 def rows():
     arms = kernel.planar_pair(3)
-    return kernel.sweep("links", {3: (arms, 8)}, ["mimic", "composition", "matrices"], Console(quiet=True))
+    return list(kernel.sweep("links", {3: (arms, 8)}, ["mimic", "composition", "matrices"], Console(quiet=True)))
 
 
 def test_all_methods_compute_the_same(rows):
@@ -34,7 +34,7 @@ def test_a_method_that_fails_says_why_and_the_others_go_on(monkeypatch):
 
     monkeypatch.setattr(kernel, "run_jax", out_of_memory)
     arms = kernel.planar_pair(3)
-    found = kernel.sweep("batch", {1: (arms, 1), 2: (arms, 2)}, ["mimic", "matrices"], Console(quiet=True))
+    found = list(kernel.sweep("batch", {1: (arms, 1), 2: (arms, 2)}, ["mimic", "matrices"], Console(quiet=True)))
     failed = [row for row in found if "failed" in row]
     assert [row["failed"] for row in failed] == ["MemoryError: no room"] * 3  # one size of each quantity
     assert sum(row["method"] == "matrices" for row in found) == 4

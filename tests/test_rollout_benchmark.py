@@ -24,7 +24,9 @@ def test_compilation_is_apart_and_memory_is_known():
 
 
 def test_own_programs_are_measured(tmp_path):
-    rows = rollout.run(["panda4dof"], [16], peers=False)
+    saved = []
+    rows = rollout.run(["panda4dof"], [16], [], lambda rows: saved.append(len(rows)))
+    assert saved == [1, 2, 3]
     assert {(row["group"], row["case"]) for row in rows} == rollout.OWN
     assert all(row["steps_per_s"] > 0 and row["bytes_per_arm"] > 0 for row in rows)
     rollout.draw(rows, tmp_path / "rollout.png")
@@ -37,7 +39,7 @@ def test_a_peer_that_cannot_run_says_why(monkeypatch):
 
     monkeypatch.setitem(rollout.CASES["physics"], "fused", out_of_memory)
     monkeypatch.setattr(rollout, "OWN", {("physics", "fused")})
-    (row,) = rollout.run(["panda4dof"], [16], peers=False)
+    (row,) = rollout.run(["panda4dof"], [16], [], lambda _: None)
     assert row["failed"] == "no room"
 
 
