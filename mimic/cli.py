@@ -25,7 +25,15 @@ from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, InspectConfig, RecordingConfig, RetargetConfig
 from mimic.sweeping.services import check_launcher, register_launchers
 from mimic.sweeping.sweeper import FAILED, Outcome, register_sweeper
-from mimic.trainers.config import TRAINERS, EvaluateConfig, ExportConfig, FiguresConfig, RenderConfig, TrainConfig
+from mimic.trainers.config import (
+    TRAINERS,
+    CollectConfig,
+    EvaluateConfig,
+    ExportConfig,
+    FiguresConfig,
+    RenderConfig,
+    TrainConfig,
+)
 from mimic.trainers.signals import STOPPED_BY_SIGNAL
 from mimic.viewing.config import ViewConfig
 
@@ -35,6 +43,7 @@ ARM_KEYS = {  # of each command: keys that take an arm by name or file alone
     "demonstrations": ("env.expert", "env.learner"),
     "inspect": ("expert", "learner"),
 }
+FIRST_KEY = {"inspect": "learner.model", "collect": "folder"}  # of each command: the key that needs no name
 _CONFIG_ERRORS = (FrozenInstanceError, HydraException, OmegaConfBaseException)  # the first: a key added with "+"
 _BAD_INPUT = (ValueError, OSError, *_CONFIG_ERRORS)
 
@@ -99,8 +108,8 @@ def _run_of_a_sweep(prepare: Callable[[Any], Work], config: DictConfig) -> Outco
 def _written_out(argument: str, command: str) -> str:
     """An argument as Hydra takes it: env.learner=ARM.xml is short for env.learner.model=ARM.xml."""
     key, equals, value = argument.partition("=")
-    if command == "inspect" and not equals and not argument.startswith("-"):
-        return f"learner.model={argument}"
+    if command in FIRST_KEY and not equals and not argument.startswith("-"):
+        return f"{FIRST_KEY[command]}={argument}"
     is_arm = key in ARM_KEYS.get(command, ()) and not value.startswith("{")
     return f"{key}.model={value}" if equals and is_arm else argument
 
@@ -144,6 +153,7 @@ def is_sweep() -> bool:
 def _register_schemas() -> None:
     store = ConfigStore.instance()
     store.store(name="train_schema", node=schema(TrainConfig))
+    store.store(name="collect_schema", node=schema(CollectConfig))
     store.store(name="evaluate_schema", node=schema(EvaluateConfig))
     store.store(name="export_schema", node=schema(ExportConfig))
     store.store(name="figures_schema", node=schema(FiguresConfig))

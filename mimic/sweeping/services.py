@@ -9,6 +9,7 @@ import dataclasses
 import os
 import shutil
 import signal
+import socket
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from mimic.sweeping.sweeper import Outcome
 
 _GPUS = "CUDA_VISIBLE_DEVICES"
 _NO_TIMEOUT_MIN = 365 * 24 * 60  # submitit wants one
+_ANSWER_S = 10
 
 
 @dataclasses.dataclass
@@ -194,8 +196,9 @@ class RayLauncher(CommandLauncher):
         """Joins the cluster, or starts Ray on this machine."""
         started = {} if self._address else {"include_dashboard": False}
         try:
+            _check_port(self._address or "")
             self._package.init(self._address, log_to_driver=False, logging_level="ERROR", **started)
-        except (ConnectionError, ValueError, RuntimeError) as error:
+        except (OSError, ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())[:200]
             raise HydraException(f"hydra.launcher.address={self._address}: no Ray found: {reason}") from error
 
@@ -221,6 +224,13 @@ class RayLauncher(CommandLauncher):
     def name(self, job: Any) -> str:
         """By Ray's number."""
         return f"task {job.task_id().hex()}"
+
+
+def _check_port(address: str) -> None:
+    """Raises an OSError where nobody listens at HOST:PORT; Ray would go on trying for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host, int(port)), timeout=_ANSWER_S).close()
 
 
 def _call(command: RunCommand) -> Outcome:
