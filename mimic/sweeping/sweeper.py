@@ -137,7 +137,7 @@ def _run_dir(config: DictConfig, folder: Path, number: str) -> tuple[str, list[s
 
 def path_override(key: str, path: str) -> str:
     """KEY=PATH as Hydra reads it, whatever is in the path."""
-    quoted = path if re.fullmatch(r"[\w./~-]+", path) else "'" + path.replace("'", r"\'") + "'"
+    quoted = path if re.fullmatch(r"[\w./-]+", path) else "'" + path.replace("'", r"\'") + "'"
     return f"{key}={quoted}"
 
 
