@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 from mimic.envs import env_config
 from mimic.trainers import runs
@@ -18,7 +19,7 @@ def write_run(
     trainer: str = "ppo",
     version: str | None = None,
     report: bool = True,
-    **settings: float,
+    **settings: Any,
 ) -> Path:
     """A run whose gap on training data was `gaps`, one for each evaluation, and twice that on held-out data."""
     settings_of = {"ppo": lambda: PPOConfig(**settings).resolve("cpu"), "pose_mapper": PoseMapperConfig().resolve}

@@ -228,6 +228,8 @@ def test_a_sweep_of_2_x_3_runs_is_collected(launcher, tmp_path):
         ("planar7dof", [0, 1, 2]),
     ]
     assert found["groups"][0]["runs"][1] == "1-planar4dof-ppo-seed1"
+    imports = [group["numbers"]["wall_time_s.import"]["max"] for group in found["groups"]]
+    assert max(imports) < 60  # from the start of each run, not of the sweep
     gap = found["groups"][1]["numbers"]["optimality_gap.held_out"]
     assert gap["low"] < gap["min"] < gap["mean"] < gap["max"] < gap["high"]  # of three, t / sqrt(3) is 2.5
     for name in ("collected.csv", "collected.png"):

@@ -63,7 +63,7 @@ class RunCommand:
                 process.terminate()
                 process.wait()
             signal.signal(signal.SIGTERM, previous or signal.SIG_DFL)
-        return self._outcome(process.returncode)
+        return self._outcome(process.wait())
 
     def checkpoint(self) -> Any:
         """What submitit asks for when Slurm's time is up: the run stops, and is queued again to go on."""

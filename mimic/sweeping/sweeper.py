@@ -82,6 +82,7 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
           HydraException: a run that cannot be composed, or a folder that has a sweep already; nothing is written.
           SystemExit: with 1 where a run failed.
         """
+        assert self.config is not None
         folder = Path(self.config.hydra.sweep.dir)
         if (folder / SWEEP).exists():
             raise HydraException(f"hydra.sweep.dir: {str(folder)!r} has a sweep already; name another folder")
@@ -99,6 +100,7 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         self._report(folder, planned, outcomes)
 
     def _plan(self, arguments: list[str], folder: Path) -> list[PlannedRun]:
+        assert self.config is not None and self.hydra_context is not None
         loader = self.hydra_context.config_loader
         parsed = OverridesParser.create(config_loader=loader).parse_overrides(arguments)
         (combinations,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
