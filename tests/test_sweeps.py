@@ -11,12 +11,14 @@ import time
 
 import pytest
 from hydra.errors import HydraException
+from omegaconf import OmegaConf
 from run_directories import write_run
 from tiny import TINY
 
+from mimic import cli
 from mimic.sweeping.command import RunCommand
 from mimic.sweeping.services import gpus_of
-from mimic.sweeping.sweeper import path_of, path_override
+from mimic.sweeping.sweeper import Outcome, path_of, path_override
 
 # What Slurm would do, by the same commands: an array of jobs, each of which starts its step.
 SBATCH = """#!/bin/bash
@@ -206,6 +208,21 @@ def test_each_slot_has_gpus_of_its_own():
     assert gpus_of(3, None, "4") == "4" and gpus_of(3, None, None) is None
     with pytest.raises(HydraException, match="3 runs with 1 GPUs each need 3, got 2"):
         gpus_of(2, 1, "0,1")
+
+
+def test_in_one_process_an_error_ends_its_run_and_a_signal_the_sweep(capsys):
+    def broken():
+        raise ZeroDivisionError("no arms")
+
+    def outcome(work):
+        return cli._run_of_a_sweep(lambda _: work, OmegaConf.create())
+
+    assert outcome(broken) == Outcome(1, "ZeroDivisionError: no arms")
+    assert "Traceback" in capsys.readouterr().err
+    assert outcome(lambda: None) == Outcome() and outcome(lambda: 3) == Outcome(3, "exit code 3")
+    with pytest.raises(SystemExit) as stop:
+        outcome(lambda: 143)
+    assert stop.value.code == 143
 
 
 SHORT = [*TINY, "env.physics=fused", "trainer.num_timesteps=2000", "trainer.evaluations=1"]
