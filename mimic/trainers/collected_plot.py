@@ -52,7 +52,7 @@ def plot_collected(groups: Sequence[Group], figure: Figure, out: Path) -> None:
 
 
 def _tick(group: Group) -> str:
-    return textwrap.fill(f"{group.label} ({len(group.runs)} seeds)", _TICK_WIDTH)
+    return f"{textwrap.fill(group.label, _TICK_WIDTH)}\n{len(group.runs)} seed{'s' * (len(group.runs) > 1)}"
 
 
 def _fill(split: str, colour: Any) -> Any:
