@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
 from pathlib import Path
@@ -22,7 +23,17 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, InspectConfig, RecordingConfig, RetargetConfig
-from mimic.trainers.config import TRAINERS, EvaluateConfig, ExportConfig, FiguresConfig, RenderConfig, TrainConfig
+from mimic.sweeping.services import check_launcher, register_launchers
+from mimic.sweeping.sweeper import FAILED, Outcome, register_sweeper
+from mimic.trainers.config import (
+    TRAINERS,
+    CollectConfig,
+    EvaluateConfig,
+    ExportConfig,
+    FiguresConfig,
+    RenderConfig,
+    TrainConfig,
+)
 from mimic.trainers.signals import STOPPED_BY_SIGNAL
 from mimic.viewing.config import ViewConfig
 
@@ -32,7 +43,9 @@ ARM_KEYS = {  # of each command: keys that take an arm by name or file alone
     "demonstrations": ("env.expert", "env.learner"),
     "inspect": ("expert", "learner"),
 }
+FIRST_KEY = {"inspect": "learner.model", "collect": "folder"}  # of each command: the key that needs no name
 _CONFIG_ERRORS = (FrozenInstanceError, HydraException, OmegaConfBaseException)  # the first: a key added with "+"
+_BAD_INPUT = (ValueError, OSError, *_CONFIG_ERRORS)
 
 Work = Callable[[], int | None]  # returns the exit code, 0 for None
 
@@ -48,16 +61,22 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises, and the line below is all that is shown
     sys.argv[1:] = [_written_out(argument, config_name) for argument in sys.argv[1:]]
     _register_schemas()
+    register_sweeper()
+    register_launchers()
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
-    def command(config: DictConfig) -> None:
+    def command(config: DictConfig) -> Outcome:
+        if is_sweep():
+            return _run_of_a_sweep(prepare, config)
         try:
+            check_launcher(HydraConfig.get().runtime.choices["hydra/launcher"])
             work = prepare(OmegaConf.to_object(config))
-        except (ValueError, OSError, *_CONFIG_ERRORS) as error:
+        except _BAD_INPUT as error:
             _refuse(error)
         exit_code = work()
         if exit_code:
             sys.exit(exit_code)
+        return Outcome()
 
     try:
         command()
@@ -68,11 +87,29 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         sys.exit(STOPPED_BY_SIGNAL + signal.SIGINT)
 
 
+def _run_of_a_sweep(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
+    """One run among several in this process: where it fails the others still run, but a signal ends them all."""
+    try:
+        work = prepare(OmegaConf.to_object(config))
+    except _BAD_INPUT as error:
+        reason = _one_line(error)
+        print(f"error: {reason}", file=sys.stderr)
+        return Outcome(BAD_INPUT, reason)
+    try:
+        exit_code = work() or 0
+    except Exception as error:
+        traceback.print_exc()
+        return Outcome(FAILED, " ".join(f"{type(error).__name__}: {error}".split()))
+    if exit_code > STOPPED_BY_SIGNAL:
+        sys.exit(exit_code)
+    return Outcome(exit_code, f"exit code {exit_code}" if exit_code else "")
+
+
 def _written_out(argument: str, command: str) -> str:
     """An argument as Hydra takes it: env.learner=ARM.xml is short for env.learner.model=ARM.xml."""
     key, equals, value = argument.partition("=")
-    if command == "inspect" and not equals and not argument.startswith("-"):
-        return f"learner.model={argument}"
+    if command in FIRST_KEY and not equals and not argument.startswith("-"):
+        return f"{FIRST_KEY[command]}={argument}"
     is_arm = key in ARM_KEYS.get(command, ()) and not value.startswith("{")
     return f"{key}.model={value}" if equals and is_arm else argument
 
@@ -116,6 +153,7 @@ def is_sweep() -> bool:
 def _register_schemas() -> None:
     store = ConfigStore.instance()
     store.store(name="train_schema", node=schema(TrainConfig))
+    store.store(name="collect_schema", node=schema(CollectConfig))
     store.store(name="evaluate_schema", node=schema(EvaluateConfig))
     store.store(name="export_schema", node=schema(ExportConfig))
     store.store(name="figures_schema", node=schema(FiguresConfig))
@@ -140,7 +178,7 @@ def _one_line(error: BaseException) -> str:
     if isinstance(error, FrozenInstanceError):
         return f"a key that does not exist cannot be added: {error}"
     message = str(error)
-    choice = re.search(r"Could not find '(\w+)/([^']*)'\s+Available options in '\w+':((?:\n\t\S+)*)", message)
+    choice = re.search(r"Could not find '([\w/]+)/([^'/]*)'\s+Available options in '[\w/]+':((?:\n\t\S+)*)", message)
     if choice:
         group, name, options = choice.groups()
         valid = ", ".join(sorted(option for option in set(options.split()) if not option.endswith("schema")))

@@ -5,6 +5,7 @@ import time
 from mimic import cli
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.group import join
+from mimic.trainers.signals import Signals
 
 _process_started = [cli.process_started()]  # for the first job; those that follow in a sweep start when they start
 
@@ -19,7 +20,10 @@ def prepare(config: TrainConfig) -> cli.Work:
     from mimic.trainers import session  # not needed for --help
 
     started = _process_started.pop() if _process_started else began
-    return session.prepare_training(config, started, cli.overrides(), group)
+    signals = group.signals if group else Signals()
+    work = session.prepare_training(config, started, cli.overrides(), group, signals)
+    # One that came while the report was made changed nothing for this run, but a sweep ends by it.
+    return (lambda: work() or signals.exit_code) if cli.is_sweep() else work
 
 
 if __name__ == "__main__":

@@ -143,17 +143,6 @@ def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
     assert list((run_dir / "checkpoints").iterdir())
 
 
-@pytest.mark.slow
-def test_a_sweep_trains_each_of_its_runs(tmp_path):
-    result = command(
-        "train", "-m", *TINY, "seed=0,1", "trainer.num_timesteps=2000", "trainer.evaluations=1", cwd=tmp_path
-    )
-    assert result.returncode == 0, result.stderr[-2000:]
-    reports = [json.loads(path.read_text()) for path in tmp_path.glob("runs/*/report.json")]
-    assert sorted(report["seed"] for report in reports) == [0, 1]
-    assert max(report["wall_time_s"]["import"] for report in reports[1:]) < 60
-
-
 @pytest.mark.parametrize(("version", "needed"), [("0.10.2", True), ("0.11.0", False), ("0.12.0.1", False)])
 def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
     assert compat.needs_cpu_flag(version) is needed

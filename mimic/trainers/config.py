@@ -457,3 +457,22 @@ class ExportConfig:
 
     def __post_init__(self) -> None:
         check_choice("format", self.format, EXPORT_FORMATS)
+
+
+@dataclasses.dataclass(frozen=True)
+class CollectConfig:
+    """A collection of runs.
+
+    Attributes:
+      folder: that they lie in, at any depth.
+      out: folder for table, figure and numbers; `folder` where empty.
+      only: trainer whose runs alone are collected; where empty all runs must be of the same.
+    """
+
+    folder: str = ""
+    out: str = ""
+    only: str = ""
+
+    def __post_init__(self) -> None:
+        if self.only:
+            check_choice("only", self.only, tuple(TRAINERS))

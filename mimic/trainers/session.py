@@ -25,7 +25,11 @@ from mimic.trainers.signals import Interrupted, Signals, noted_signals
 
 
 def prepare_training(
-    config: TrainConfig, started: float, overrides: Sequence[str] = (), group: Group | None = None
+    config: TrainConfig,
+    started: float,
+    overrides: Sequence[str] = (),
+    group: Group | None = None,
+    signals: Signals | None = None,
 ) -> Callable[[], int]:
     """A new run, or one to go on with, ready to start; nothing is written yet.
 
@@ -34,6 +38,7 @@ def prepare_training(
       started: `time.perf_counter()` at the start of the process.
       overrides: of the command line, applied to the config of a resumed run.
       group: of processes that train together; the first of them does all but the training by itself.
+      signals: where those that come are noted; the group's, where there is one.
 
     Returns:
       What trains, evaluates and reports; it returns the exit code: 0, or 128 plus the number of the signal that
@@ -58,7 +63,8 @@ def prepare_training(
     config = dataclasses.replace(config, trainer=job.settings)
     if group and not group.first:
         return lambda: _follow(job, restore, group)
-    return lambda: _train(config, job, run_dir, restore, stopwatch, group)
+    noted = group.signals if group else signals or Signals()
+    return lambda: _train(config, job, run_dir, restore, stopwatch, group, noted)
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
@@ -214,10 +220,10 @@ def _train(
     restore: tuple[int, Params] | None,
     stopwatch: runs.Stopwatch,
     group: Group | None,
+    signals: Signals,
 ) -> int:
     console = Console()
     device = runs.hardware()["device"]
-    signals = group.signals if group else Signals()
     with noted_signals(signals):  # also while the report is made: all is done then, and a signal changes nothing
         run_dir.mkdir(parents=True, exist_ok=restore is not None)
         runs.save_config(run_dir, config)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM while a run goes on: noted, and acted on after the next checkpoint."""
+"""Ctrl-C, SIGTERM and SIGUSR2 while a run goes on: noted, and acted on after the next checkpoint."""
 
 import signal
 import sys
@@ -8,6 +8,8 @@ from types import FrameType
 from typing import Any
 
 STOPPED_BY_SIGNAL = 128  # plus the signal's number: the exit code by convention
+NOTED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)  # the last is how submitit has Slurm warn of a time limit
+_NOTICE = "stopping at the next checkpoint; again to stop at once"
 
 
 class Interrupted(Exception):
@@ -28,6 +30,11 @@ class Signals:
     def __init__(self) -> None:
         self.caught: list[int] = []
 
+    @property
+    def exit_code(self) -> int:
+        """Of a process that the first of them ended; 0 if none came."""
+        return STOPPED_BY_SIGNAL + self.caught[0] if self.caught else 0
+
     def check(self) -> None:
         """Raises `Interrupted` if one came."""
         if self.caught:
@@ -35,16 +42,16 @@ class Signals:
 
 
 @contextmanager
-def noted_signals(signals: Signals) -> Iterator[None]:
-    """Notes SIGINT and SIGTERM instead of acting on them; a second one of a kind acts at once."""
+def noted_signals(signals: Signals, notice: str = _NOTICE) -> Iterator[None]:
+    """Notes signals instead of acting on them, and prints what follows; a second one of a kind acts at once."""
     previous: dict[int, Any] = {}
 
     def note(number: int, _: FrameType | None) -> None:
         signals.caught.append(number)
-        print("stopping at the next checkpoint; again to stop at once", file=sys.stderr, flush=True)
+        print(notice, file=sys.stderr, flush=True)
         signal.signal(number, previous[number] or signal.SIG_DFL)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in NOTED:
         previous[number] = signal.signal(number, note)
     try:
         yield

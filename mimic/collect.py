@@ -1,0 +1,15 @@
+"""`python -m mimic.collect DIR`: the runs below a folder as one table and figure, with confidence intervals."""
+
+from mimic import cli
+from mimic.trainers.config import CollectConfig
+
+
+def prepare(config: CollectConfig) -> cli.Work:
+    """The collection that the config describes."""
+    from mimic.trainers import collecting  # not needed for --help
+
+    return collecting.prepare_collection(config)
+
+
+if __name__ == "__main__":
+    cli.run(prepare, "collect")

@@ -1,0 +1,165 @@
+"""Sweeps: which runs they are made of, where each of them goes, and what became of it.
+
+Hydra's own sweeper stops at the first run that fails, and writes before it knows that all runs can be composed.
+"""
+
+import dataclasses
+import json
+import os
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra.plugins.sweeper
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf
+
+from mimic.sweeping.plugins import register, target
+
+SWEEP, LOGS = "sweep.json", "logs"
+FAILED = 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What became of a run: its exit code, and where that is not 0 the reason in one line."""
+
+    exit_code: int = 0
+    reason: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedRun:
+    """A run of a sweep.
+
+    Attributes:
+      label: the overrides that tell it from the others.
+      overrides: all of them, its run directory included.
+      run_dir: empty where the command has none.
+    """
+
+    label: str
+    overrides: list[str]
+    run_dir: str
+
+
+@dataclasses.dataclass
+class SweeperConf:
+    """The default sweeper.
+
+    Attributes:
+      params: overrides with several values, beside those of the command line.
+    """
+
+    _target_: str = target("Sweeper")
+    params: dict[str, str] | None = None
+
+
+class Sweeper(hydra.plugins.sweeper.Sweeper):
+    """Every combination of the values; ends with exit code 1 and the failed runs in one line each."""
+
+    def __init__(self, params: Mapping[str, str] | None = None):
+        self._params = [f"{key}={values}" for key, values in (params or {}).items()]
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """See Hydra's Sweeper."""
+        self.hydra_context, self.config = hydra_context, config
+        self.launcher: Launcher = Plugins.instance().instantiate_launcher(
+            hydra_context=hydra_context, task_function=task_function, config=config
+        )
+
+    def sweep(self, arguments: list[str]) -> None:
+        """Composes all runs, writes `SWEEP` into the folder of the sweep, launches, and says what became of each.
+
+        Raises:
+          HydraException: a run that cannot be composed, or a folder that has a sweep already; nothing is written.
+          SystemExit: with 1 where a run failed.
+        """
+        assert self.config is not None
+        folder = Path(self.config.hydra.sweep.dir)
+        if (folder / SWEEP).exists():
+            raise HydraException(f"hydra.sweep.dir: {str(folder)!r} has a sweep already; name another folder")
+        planned = self._plan([*self._params, *arguments], folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self.config, folder / "multirun.yaml")
+        _write_sweep(folder, planned, [])
+        try:
+            returned = self.launcher.launch([run.overrides for run in planned], initial_job_idx=0)
+        except (SystemExit, KeyboardInterrupt):
+            print(f"the sweep was stopped; what there is of it: {folder}", file=sys.stderr)
+            raise
+        outcomes = [job.return_value for job in returned]
+        _write_sweep(folder, planned, outcomes)
+        self._report(folder, planned, outcomes)
+
+    def _plan(self, arguments: list[str], folder: Path) -> list[PlannedRun]:
+        assert self.config is not None and self.hydra_context is not None
+        loader = self.hydra_context.config_loader
+        parsed = OverridesParser.create(config_loader=loader).parse_overrides(arguments)
+        (combinations,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+        shared = set(combinations[0]).intersection(*combinations)
+        width = len(str(len(combinations) - 1))
+        runs = []
+        for number, overrides in enumerate(combinations):
+            config = loader.load_sweep_config(self.config, overrides)
+            run_dir, added = _run_dir(config, folder, f"{number:0{width}d}")
+            label = " ".join(override for override in overrides if override not in shared)
+            runs.append(PlannedRun(label or f"run {number}", [*overrides, *added], run_dir))
+        return runs
+
+    def _report(self, folder: Path, planned: Sequence[PlannedRun], outcomes: Sequence[Outcome]) -> None:
+        failed = [(run, outcome) for run, outcome in zip(planned, outcomes, strict=True) if outcome.exit_code]
+        print(f"sweep: {len(planned) - len(failed)} of {len(planned)} runs done; results: {folder}")
+        if any(run.run_dir for run in planned) and len(failed) < len(planned):
+            print(f"one table and figure of them: python -m mimic.collect {folder}")
+        for run, outcome in failed:
+            print(f"failed: {run.label}: {outcome.reason}", file=sys.stderr)
+        if failed:
+            sys.exit(FAILED)
+
+
+def _run_dir(config: DictConfig, folder: Path, number: str) -> tuple[str, list[str]]:
+    """Where a run of a sweep writes, and the override that says so: none where the run says so itself."""
+    if OmegaConf.select(config, "run_dir") is None:
+        return "", []
+    for key in ("resume", "run_dir"):
+        if config[key]:
+            return config[key], []
+    env, trainer = (OmegaConf.select(config, f"{group}.name") for group in ("env", "trainer"))
+    path = str(folder / f"{number}-{env}-{trainer}-seed{config.seed}")
+    return path, [path_override("run_dir", path)]
+
+
+def path_override(key: str, path: str) -> str:
+    """KEY=PATH as Hydra reads it, whatever is in the path."""
+    quoted = path if re.fullmatch(r"[\w./-]+", path) else "'" + path.replace("'", r"\'") + "'"
+    return f"{key}={quoted}"
+
+
+def path_of(override: str) -> str:
+    """The path of such an override."""
+    value = override.partition("=")[2]
+    return value[1:-1].replace(r"\'", "'") if value.startswith("'") else value
+
+
+def _write_sweep(folder: Path, planned: Sequence[PlannedRun], outcomes: Sequence[Outcome]) -> None:
+    """Writes the runs of a sweep, and what became of each where that is known."""
+    runs = []
+    for number, run in enumerate(planned):
+        known = dataclasses.asdict(outcomes[number]) if number < len(outcomes) else {}
+        entry: dict[str, Any] = {"label": run.label, "overrides": run.overrides}
+        # Relative, so that the folder can be taken elsewhere.
+        runs.append({**entry, "run_dir": run.run_dir and os.path.relpath(run.run_dir, folder), **known})
+    (folder / SWEEP).write_text(json.dumps({"runs": runs}, indent=2) + "\n")
+
+
+def register_sweeper() -> None:
+    """Puts our sweeper in the place of Hydra's default."""
+    register(Sweeper, SweeperConf, "hydra/sweeper", "basic")

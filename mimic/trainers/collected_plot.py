@@ -1,0 +1,87 @@
+"""The figure of collected runs: how their groups learned, and where they ended."""
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.ticker  # noqa: E402
+import numpy as np  # noqa: E402
+from matplotlib.lines import Line2D  # noqa: E402
+
+from mimic.trainers.finished_runs import SPLITS, Figure  # noqa: E402
+from mimic.trainers.run_groups import Group, mean_interval  # noqa: E402
+
+_LABELS = {"train": "training data", "held_out": "held-out data"}
+_MARKERS = {"train": "s", "held_out": "o"}
+_TICK_WIDTH = 26  # letters
+_SMALL = 1e-6  # [%], for a logarithmic axis
+_TABLEAU = 10  # colours that tell groups apart; beyond, a colour map
+
+
+def plot_collected(groups: Sequence[Group], figure: Figure, out: Path) -> None:
+    """Learning curves on held-out data, and the final figure of each group, with confidence intervals; in percent."""
+    height = max(4.0, 1.6 + 0.42 * len(groups))
+    drawing, (curves, final) = plt.subplots(1, 2, figsize=(11, height), layout="constrained")
+    colours = [_colour(number, len(groups)) for number in range(len(groups))]
+    for group, colour in zip(groups, colours, strict=True):
+        _draw_curves(curves, group, colour)
+    percent = matplotlib.ticker.FormatStrFormatter("%g")
+    curves.set(xlabel=figure.unit.replace("_", " "), ylabel=f"{figure.label} [%]", yscale="log")
+    curves.set_title("held-out data while training: seeds, mean, 95 % interval", fontsize="medium")
+    curves.yaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
+    curves.yaxis.set_major_formatter(percent)
+    curves.yaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
+    seen = [100 * x for group in groups for run in group.runs for x in run.curves["held_out"].values() if x > 0]
+    curves.set_ylim(bottom=0.7 * min(seen) if seen else None)  # where a band goes below 0 it is cut off there
+    for row, (group, colour) in enumerate(zip(groups, colours, strict=True)):
+        _draw_final(final, group, figure, row, colour)
+    final.set_yticks(range(len(groups)), [_tick(group) for group in groups])
+    final.set(xlabel=f"{figure.label} [%]", xlim=(min(0, final.get_xlim()[0]), None), ylim=(len(groups) - 0.5, -0.5))
+    final.set_title("at the end: seeds (ticks), mean, 95 % interval", fontsize="medium")
+    marks = [Line2D([], [], color="grey", marker=_MARKERS[split], mfc=_fill(split, "grey"), ls="") for split in SPLITS]
+    drawing.legend(marks, [_LABELS[split] for split in SPLITS], fontsize="small", loc="outside lower right", ncols=2)
+    for axes in (curves, final):
+        axes.grid(alpha=0.3, which="major")
+    drawing.savefig(out, dpi=150)
+    plt.close(drawing)
+
+
+def _tick(group: Group) -> str:
+    return f"{textwrap.fill(group.label, _TICK_WIDTH)}\n{len(group.runs)} seed{'s' * (len(group.runs) > 1)}"
+
+
+def _fill(split: str, colour: Any) -> Any:
+    return "white" if split == "train" else colour
+
+
+def _colour(number: int, count: int) -> Any:
+    return plt.get_cmap("tab10")(number) if count <= _TABLEAU else plt.get_cmap("turbo")(number / (count - 1))
+
+
+def _draw_curves(axes: Any, group: Group, colour: Any) -> None:
+    """Each seed as a faint line; mean and band where all seeds have been, as some may end earlier."""
+    by_seed = [run.curves["held_out"] for run in group.runs]
+    for curve in by_seed:
+        axes.plot(list(curve), [100 * value for value in curve.values()], color=colour, alpha=0.3, lw=0.8)
+    steps = sorted(set(by_seed[0]).intersection(*by_seed))
+    intervals = [mean_interval([100 * curve[step] for curve in by_seed]) for step in steps]
+    axes.plot(steps, [interval.mean for interval in intervals], color=colour, lw=1.8, label=group.label)
+    if steps and intervals[0].low is not None:
+        low, high = ([getattr(interval, end) for interval in intervals] for end in ("low", "high"))
+        axes.fill_between(steps, np.maximum(low, _SMALL), high, color=colour, alpha=0.15, lw=0)
+
+
+def _draw_final(axes: Any, group: Group, figure: Figure, row: int, colour: Any) -> None:
+    for split, shift in zip(SPLITS, (-0.15, 0.15), strict=True):
+        key = f"{figure.key}.{split}"
+        interval = group.interval(key)
+        half = [0.0 if interval.high is None else 100 * (interval.high - interval.mean)]
+        seeds = [100 * run.numbers[key] for run in group.runs]
+        axes.plot(seeds, [row + shift] * len(seeds), "|", color="black", markersize=9, zorder=3)
+        axes.errorbar([100 * interval.mean], [row + shift], xerr=[half, half], color=colour, marker=_MARKERS[split],
+                      mfc=_fill(split, colour), capsize=3, markersize=6, lw=1.5)  # fmt: skip

@@ -1,0 +1,134 @@
+"""What `python -m mimic.collect` does: finds the runs, and writes and shows what they say together."""
+
+import csv
+import dataclasses
+import io
+import json
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from mimic.trainers import runs
+from mimic.trainers.config import CollectConfig
+from mimic.trainers.finished_runs import FIGURES, SPLITS, Figure, FinishedRun, LeftOut, find_runs
+from mimic.trainers.run_groups import CONFIDENCE, HOW, Group, Interval, drop_repeated, group_runs, telling_keys
+
+NAME = "collected"
+SOME_LEFT_OUT = 1
+
+
+def prepare_collection(config: CollectConfig) -> Callable[[], int]:
+    """What writes the collection and shows it; returns 0, or 1 where runs were left out.
+
+    Raises:
+      ValueError: no folder, no finished runs in it, runs of several trainers, or an `out` that is a file.
+    """
+    if not config.folder:
+        raise ValueError("expected a folder with runs in it, as in python -m mimic.collect runs")
+    folder = Path(config.folder).expanduser()
+    if not folder.is_dir():
+        raise ValueError(f"{str(folder)!r}: there is no such folder; expected one with runs in it")
+    out = Path(config.out).expanduser() if config.out else folder
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"out: {str(out)!r} is a file; expected a folder")
+    finished, left_out = find_runs(folder)
+    finished = [run for run in finished if config.only in ("", run.trainer)]
+    if not finished:
+        wanted = f" of trainer={config.only}" if config.only else ""
+        why = f"; {len(left_out)} without: {left_out[0].name}: {left_out[0].reason}" if left_out else ""
+        raise ValueError(f"{str(folder)!r}: expected runs{wanted} with a {runs.REPORT}, found none{why}")
+    trainers = sorted({run.trainer for run in finished})
+    if len(trainers) > 1:
+        raise ValueError(
+            f"{str(folder)!r}: the runs are of {' and '.join(trainers)}, which have no figure in common; "
+            f"choose by only={trainers[0]}"
+        )
+    finished, repeated = drop_repeated(finished)
+    return lambda: _collect(finished, [*left_out, *repeated], out, FIGURES[trainers[0]])
+
+
+def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path, figure: Figure) -> int:
+    from mimic.trainers.collected_plot import plot_collected  # matplotlib, a second
+
+    groups = group_runs(finished)
+    out.mkdir(parents=True, exist_ok=True)
+    runs.write_atomically(out / f"{NAME}.csv", _csv(groups))
+    content = json.dumps(_summary(groups, left_out, figure), indent=2, default=str)
+    runs.write_atomically(out / f"{NAME}.json", content + "\n")
+    plot_collected(groups, figure, out / f"{NAME}.png")
+    console = Console()
+    console.print(_table(groups, figure))
+    versions = Counter(run.version for run in finished)
+    if len(versions) > 1:
+        named = ", ".join(f"{version} ({count})" for version, count in sorted(versions.items()))
+        print(f"note: the runs are of several versions of mimic: {named}", file=sys.stderr)
+    for run in left_out:
+        print(f"left out: {run.name}: {run.reason}", file=sys.stderr)
+    console.print(f"results: {out}/{NAME}.csv, .json, .png", soft_wrap=True, highlight=False)
+    return SOME_LEFT_OUT if left_out else 0
+
+
+def _csv(groups: Sequence[Group]) -> str:
+    """One row a run: what differs between the groups, then the numbers of its report."""
+    numbers = list(dict.fromkeys(key for group in groups for run in group.runs for key in run.numbers))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["run", *groups[0].settings, "seed", "mimic_version", *numbers])
+    for group in groups:
+        for run in group.runs:
+            row = [run.numbers.get(key, "") for key in numbers]
+            writer.writerow([run.name, *group.settings.values(), run.seed, run.version, *row])
+    return text.getvalue()
+
+
+def _summary(groups: Sequence[Group], left_out: Sequence[LeftOut], figure: Figure) -> dict[str, Any]:
+    return {
+        "how": HOW,
+        "confidence": CONFIDENCE,
+        "figure": figure.key,
+        "groups": [
+            {
+                "label": group.label,
+                "settings": group.settings,
+                "seeds": [run.seed for run in group.runs],
+                "runs": [run.name for run in group.runs],
+                "numbers": {key: dataclasses.asdict(group.interval(key)) for key in _shared_numbers(group)},
+            }
+            for group in groups
+        ],
+        "left_out": [dataclasses.asdict(run) for run in left_out],
+    }
+
+
+def _shared_numbers(group: Group) -> list[str]:
+    return [key for key in group.runs[0].numbers if all(key in run.numbers for run in group.runs)]
+
+
+def _table(groups: Sequence[Group], figure: Figure) -> Table:
+    keys = telling_keys(groups)
+    table = Table(title=figure.label, title_justify="left")
+    for key in keys:
+        table.add_column(key, overflow="fold")
+    for name in ("seeds", "training", "held out", figure.unit.replace("_", " ")):
+        table.add_column(name, justify="right", no_wrap=True)
+    for group in groups:
+        table.add_row(
+            *(str(group.settings[key]) for key in keys),
+            str(len(group.runs)),
+            *(percent(group.interval(f"{figure.key}.{split}")) for split in SPLITS),
+            f"{group.interval(figure.unit).mean:,.0f}",
+        )
+    table.caption = "mean ± half of its 95 % confidence interval (Student's t over seeds)"
+    table.caption_justify = "left"
+    return table
+
+
+def percent(interval: Interval) -> str:
+    """Mean, and half of the interval where there is one."""
+    text = f"{100 * interval.mean:.2f}"
+    return f"{text} %" if interval.high is None else f"{text} ± {100 * (interval.high - interval.mean):.2f} %"

@@ -1,0 +1,197 @@
+"""The runs below a folder: what those that finished say of themselves, and why others are left out."""
+
+import csv
+import dataclasses
+import json
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from mimic.config import to_dict
+from mimic.sweeping.sweeper import LOGS, SWEEP
+from mimic.trainers import runs
+from mimic.trainers.config import TrainConfig
+
+SPLITS = ("train", "held_out")
+_OF_THE_PROCESS = (
+    "run_dir",
+    "resume",
+    "logger",
+    "compilation_cache",
+    "distributed",
+)  # nothing that a result depends on
+
+
+@dataclasses.dataclass(frozen=True)
+class Figure:
+    """The figure that runs of a trainer are compared by: 0 is the best, as a share.
+
+    Attributes:
+      key: in the report.
+      label: for people.
+      unit: key of the steps in the report.
+    """
+
+    key: str
+    label: str
+    unit: str
+
+
+FIGURES = {
+    "ppo": Figure("optimality_gap", "optimality gap", "env_steps"),
+    "pose_mapper": Figure("quality", "distance above the optimum", "training_poses"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class FinishedRun:
+    """A run with a report.
+
+    Attributes:
+      name: its folder, below the one that is collected.
+      trainer: its name.
+      seed: of the run.
+      settings: its config by dotted keys, without seed and what no result depends on.
+      numbers: of its report by dotted keys, as optimality_gap.train.
+      version: of mimic.
+      curves: the trainer's figure over the steps, by split.
+      finished: when its report was written [s since the epoch].
+    """
+
+    name: str
+    trainer: str
+    seed: int
+    settings: dict[str, Any]
+    numbers: dict[str, float]
+    version: str
+    curves: dict[str, dict[int, float]]
+    finished: float
+
+
+@dataclasses.dataclass(frozen=True)
+class LeftOut:
+    """A run that is not collected, and why, in one line."""
+
+    name: str
+    reason: str
+
+
+def find_runs(folder: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
+    """The runs at any depth below a folder, in the order of their names."""
+    found: dict[Path, FinishedRun | LeftOut] = {}
+    planned: dict[Path, tuple[str, str]] = {}
+    for path in _folders(folder):
+        if (path / SWEEP).is_file():
+            planned |= _planned(path)
+        if (path / runs.CONFIG).is_file():
+            found[path] = _read(path, _name(path, folder))
+    for path, (label, reason) in planned.items():
+        known = found.get(path)
+        if known is None:
+            found[path] = LeftOut(_name(path, folder), f"{label}: {reason or 'not begun'}")
+        elif isinstance(known, LeftOut) and reason:
+            found[path] = LeftOut(known.name, reason)
+    ordered = [found[path] for path in sorted(found)]
+    return [r for r in ordered if isinstance(r, FinishedRun)], [r for r in ordered if isinstance(r, LeftOut)]
+
+
+def _folders(folder: Path) -> Iterator[Path]:
+    """All of them, but what lies in run directories: services keep a config.yaml of their own there."""
+    for name, below, files in os.walk(folder):
+        below[:] = [] if runs.CONFIG in files else sorted(entry for entry in below if not entry.startswith("."))
+        yield Path(name)
+
+
+def _name(path: Path, folder: Path) -> str:
+    return os.path.relpath(path, folder) if path != folder else folder.resolve().name
+
+
+def _planned(folder: Path) -> dict[Path, tuple[str, str]]:
+    """Of a sweep's runs, by their folders: what tells each from the others, and why it failed where that is known."""
+    try:
+        entries = json.loads((folder / SWEEP).read_text())["runs"]
+        return {
+            Path(os.path.normpath(folder / entry["run_dir"])): (entry["label"], _reason(folder, entry))
+            for entry in entries
+            if entry["run_dir"]
+        }
+    except (ValueError, KeyError, TypeError):
+        return {}  # a sweep of another version; its runs speak for themselves
+
+
+def _reason(folder: Path, entry: Mapping[str, Any]) -> str:
+    if entry.get("exit_code"):
+        return f"failed: {entry['reason']}"
+    log = folder / LOGS / f"{Path(entry['run_dir']).name}.log"
+    if "exit_code" in entry or not log.is_file():
+        return ""
+    last = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()][-1:]
+    return f"not finished; its log ends with: {last[0]}" if last else ""
+
+
+def _read(path: Path, name: str) -> FinishedRun | LeftOut:
+    try:
+        report = json.loads((path / runs.REPORT).read_text())
+    except FileNotFoundError:
+        report = None
+    except (ValueError, OSError) as error:
+        return LeftOut(name, f"{runs.REPORT} cannot be read: {error}")
+    version = str((report or {}).get("versions", {}).get("mimic-mjx", "unknown"))
+    try:
+        config = runs.load_config(path)
+    except ValueError as error:
+        this = runs.versions()["mimic-mjx"]
+        written = f"of mimic {version}, and this is {this}: " if report and version != this else ""
+        return LeftOut(name, f"{written}{error}")
+    history = _history(path / runs.METRICS)
+    if report is None:
+        return LeftOut(name, _progress(path, config, history))
+    figure = FIGURES[config.trainer.name]
+    numbers = _numbers(report)
+    missing = [key for split in SPLITS if (key := f"{figure.key}.{split}") not in numbers]
+    if missing:
+        return LeftOut(name, f"diverged, or of another version ({version}): {runs.REPORT} has no number {missing[0]}")
+    settings = _flat(to_dict(config))
+    return FinishedRun(
+        name=name,
+        trainer=config.trainer.name,
+        seed=config.seed,
+        settings={key: x for key, x in settings.items() if key.split(".")[0] not in (*_OF_THE_PROCESS, "seed")},
+        numbers=numbers,
+        version=version,
+        curves={split: history.get(f"quality/{figure.key}.{split}", {}) for split in SPLITS},
+        finished=(path / runs.REPORT).stat().st_mtime,
+    )
+
+
+def _progress(path: Path, config: TrainConfig, history: Mapping[str, Mapping[int, float]]) -> str:
+    step = max((step for column in history.values() for step in column), default=0)
+    total = config.trainer.total_steps
+    return f"no {runs.REPORT}: stopped or still running, at {step:,} of {total:,} steps; resume={path} goes on with it"
+
+
+def _history(path: Path) -> dict[str, dict[int, float]]:
+    """Columns of metrics.csv by step; where a run was resumed the later row counts."""
+    columns: dict[str, dict[int, float]] = {}
+    if path.is_file():
+        with path.open(newline="") as file:
+            for row in csv.DictReader(file):
+                step = int(row.pop("step"))
+                for key, value in row.items():
+                    columns.setdefault(key, {})[step] = float(value)
+    return columns
+
+
+def _numbers(report: Mapping[str, Any]) -> dict[str, float]:
+    """Those for all data, or by split; null, which stands for what is not finite, is none."""
+    flat = _flat({key: report[key] for key in report if key not in ("worst_demonstrations", "seed")})
+    return {key: x for key, x in flat.items() if isinstance(x, int | float) and not key.startswith("hardware")}
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested values by dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) and value else {f"{prefix}{key}": value}
+    return flat

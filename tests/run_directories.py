@@ -1,0 +1,43 @@
+"""Run directories as training leaves them, without training."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+from mimic.envs import env_config
+from mimic.trainers import runs
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+
+
+def write_run(
+    run_dir: Path,
+    gaps: list[float | None],
+    env: str = "planar4dof",
+    seed: int = 0,
+    *,
+    trainer: str = "ppo",
+    version: str | None = None,
+    report: bool = True,
+    **settings: Any,
+) -> Path:
+    """A run whose gap on training data was `gaps`, one for each evaluation, and twice that on held-out data."""
+    settings_of = {"ppo": lambda: PPOConfig(**settings).resolve("cpu"), "pose_mapper": PoseMapperConfig().resolve}
+    figure, unit = {"ppo": ("optimality_gap", "env_steps"), "pose_mapper": ("quality", "training_poses")}[trainer]
+    config = TrainConfig(env=env_config(env), trainer=settings_of[trainer](), seed=seed, run_dir=str(run_dir))
+    run_dir.mkdir(parents=True)
+    runs.save_config(run_dir, config)
+    rows = [{"step": 1000 * (i + 1), **_by_split(f"quality/{figure}.", gap)} for i, gap in enumerate(gaps)]
+    with (run_dir / runs.METRICS).open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows({key: "nan" if x is None else x for key, x in row.items()} for row in rows)
+    if report:
+        versions = {**runs.versions(), **({"mimic-mjx": version} if version else {})}
+        content = {"seed": seed, figure: _by_split("", gaps[-1]), unit: 1000 * len(gaps), "versions": versions}
+        (run_dir / runs.REPORT).write_text(json.dumps(content))
+    return run_dir
+
+
+def _by_split(prefix: str, gap: float | None) -> dict[str, float | None]:
+    return {f"{prefix}train": gap, f"{prefix}held_out": None if gap is None else 2 * gap}
