@@ -1,0 +1,84 @@
+"""What the README and the pages in docs show, works: see tests/pages.py for how blocks are marked, checked and run."""
+
+import re
+
+import pytest
+from pages import PAGES, REPOSITORY, Block, check, commands, module, read_blocks, run_page
+
+import mimic
+
+README = (REPOSITORY / "README.md").read_text()
+QUICK = ("install.md", "metric.md", "own_arm.md")  # run by `make test`; all by `make test-all`
+
+
+def named(page):
+    return page.name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_commands_and_code_are_valid(page, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for block in read_blocks(page.read_text()):
+        assert block.kind in ("bash", "python", "xml", "text"), block
+        assert block.title or block.kind != "xml", block
+        if block.kind == "python":
+            compile(block.text, str(page), "exec")
+        elif block.kind == "bash":
+            for words in commands(block):
+                check(words, monkeypatch)
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=() if page.name in QUICK else pytest.mark.slow) for page in PAGES],
+    ids=named,
+)
+def test_pages_run(page, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    run_page(page, tmp_path)
+
+
+def test_every_page_is_read_as_it_is_written():
+    """What the reader would not recognise as a block must not go unnoticed."""
+    page = 'a\n\n    b=1 srun python -m m  # c\n    make x\n\n<!-- not run: no -->\n```python\n  d\n```\n```xml title="e.xml"\n<f/>\n```'
+    assert read_blocks(page) == [
+        Block("bash", "b=1 srun python -m m  # c\nmake x", None, True),
+        Block("python", "  d", None, False),
+        Block("xml", "<f/>", "e.xml", True),
+    ]
+    for path in PAGES:
+        text = path.read_text()
+        blocks = read_blocks(text)
+        shown = [words for block in blocks if block.kind == "bash" for words in commands(block)]
+        written = re.findall(r"^\s*(?:srun )?(?:[A-Z_]+=\S+ )*(?:python -m|make|pip) ", text, re.MULTILINE)
+        assert len(written) == len([words for words in shown if module(words) != "."]), path
+        assert text.count("```python\n") == len([block for block in blocks if block.kind == "python"]), path
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["python -m mimic.train env=panda5dof", "python -m benchmarks.pose --pair x", "make nothing", "rm -r runs"],
+)
+def test_bad_commands_are_found(command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((SystemExit, AssertionError, pytest.fail.Exception)):
+        check(commands(Block("bash", command, None, True))[0], monkeypatch)
+
+
+def test_the_readme_names_every_environment_and_only_what_exists():
+    for name in mimic.environments():
+        assert f"`{name}`" in README
+    table = README.split("| to | call |")[1].split("\n\n")[0]
+    for name in re.findall(r"`(\w+)`", table):
+        assert hasattr(mimic, name), name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_links_lead_somewhere(page):
+    for link in re.findall(r"\]\(((?!http)[^)]+)\)", page.read_text()):
+        path, _, heading = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        headings = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE) if heading else []
+        assert not heading or heading in [text.lower().replace(" ", "-") for text in headings], link
