@@ -4,8 +4,8 @@ Fences say what a block is. `bash`, or an indented block: commands. `python`: co
 names. A `title="FILE"` after the language: a file that the reader saves. Anything else (`text`): to be read.
 
 Every command is checked: Hydra composes its config, argparse parses its arguments, make and pip know its targets and
-extras. And a page is run, from top to bottom in an empty folder, but for what `NOT_RUN` names and for blocks right below an
-invisible comment, the only mark there is:
+extras. And a page is run, from top to bottom in an empty folder, but for what `NOT_RUN` names and for the block below an invisible
+comment, the only mark there is:
 
     <!-- not run: needs two GPUs -->
 
@@ -76,12 +76,12 @@ def read_blocks(text: str) -> list[Block]:
         if fence:
             inside = list(iter(lambda: next(lines), "```"))
             blocks.append(Block(fence[1], "\n".join(inside), fence[2], not is_marked))
-        elif line.startswith("    ") and (not before or before.startswith("<!--")):
+        elif line.startswith("    ") and not before:
             inside = [line[4:]]
             while (line := next(lines)).startswith("    "):
                 inside.append(line[4:])
             blocks.append(Block("bash", "\n".join(inside), None, not is_marked))
-        before, is_marked = line, line.startswith("<!-- not run: ")
+        before, is_marked = line, line.startswith("<!-- not run: ") or (is_marked and not line)
     return blocks
 
 
@@ -179,7 +179,13 @@ def _run(words: list[str], folder: pathlib.Path) -> None:
         arguments = [*SMALL.get(name, []), *arguments, *SHORT.get(name, [])]
     home = REPOSITORY / ".jax_cache" / "home"  # where mimic keeps compiled programs
     home.mkdir(parents=True, exist_ok=True)
-    settings = {"HOME": str(home), "PYTHONPATH": str(REPOSITORY), "JAX_PLATFORMS": "cpu"}
+    quickly_compiled = "--xla_backend_optimization_level=0"  # most of a small run is compilation
+    settings = {
+        "HOME": str(home),
+        "PYTHONPATH": str(REPOSITORY),
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {quickly_compiled}".strip(),
+    }
     ended = subprocess.run(
         [sys.executable, "-m", program, *arguments],
         cwd=folder,

@@ -6,6 +6,8 @@ import pytest
 from pages import PAGES, REPOSITORY, Block, check, commands, module, read_blocks, run_page
 
 import mimic
+from mimic.trainers import session
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 README = (REPOSITORY / "README.md").read_text()
 QUICK = ("install.md", "metric.md", "own_arm.md")  # run by `make test`; all by `make test-all`
@@ -13,6 +15,29 @@ QUICK = ("install.md", "metric.md", "own_arm.md")  # run by `make test`; all by 
 
 def named(page):
     return page.name
+
+
+def python(page):
+    return [block.text for block in read_blocks(page.read_text()) if block.kind == "python"]
+
+
+def test_the_first_example_of_the_readme_runs():
+    scope: dict = {}
+    exec(python(REPOSITORY / "README.md")[0], scope)  # noqa: S102 - our own text
+    assert scope["bound"].shape == (scope["demonstrations"].horizon + 1,)
+    assert scope["gradient"].shape == (4,)
+
+
+def test_the_examples_on_poses_run(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    settings = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}
+    trainer = PoseMapperConfig(**settings, evaluations=1, validation_poses=32)
+    config = TrainConfig(mimic.env_config("panda4dof"), trainer, run_dir="runs/panda4dof", compilation_cache="")
+    assert session.prepare_training(config, 0.0)() == 0
+    scope: dict = {}
+    exec("\n".join(python(REPOSITORY / "docs" / "static_pose_imitation.md")), scope)  # noqa: S102 - our own text
+    assert scope["found"].qpos.shape == (100, 4) and scope["learner_poses"].shape == (10, 4)
+    assert scope["followed"].qpos.shape == (50, 4)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
