@@ -1,11 +1,11 @@
 """What README.md and the pages in docs show: their blocks, and how each is checked and run.
 
-Fences say what a block is. `bash`, or an indented block: commands. `python`: code, where all blocks of a page share their
-names. A `title="FILE"` after the language: a file that the reader saves. Anything else (`text`): to be read.
+Fences say what a block is. `bash`, or an indented block: commands. `python`: code, where all blocks of a page share
+their names. A `title="FILE"` after the language: a file that the reader saves. Anything else (`text`): to be read.
 
 Every command is checked: Hydra composes its config, argparse parses its arguments, make and pip know its targets and
-extras. And a page is run, from top to bottom in an empty folder, but for what `NOT_RUN` names and for the block below an invisible
-comment, the only mark there is:
+extras. And a page is run, from top to bottom in an empty folder, but for what `NOT_RUN` names and for the block below
+an invisible comment, the only mark there is:
 
     <!-- not run: needs two GPUs -->
 
@@ -32,10 +32,17 @@ from mimic import cli
 REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("**/*.md"))]
 
-NOT_RUN = "make", "pip", ".", "mimic.view", "benchmarks."  # installs, serves until it is stopped, measures for hours
+NOT_RUN = (
+    "make",
+    "pip",
+    ".",
+    "http.server",
+    "mimic.view",
+    "benchmarks.",
+)  # installs, serves until it is stopped, measures for hours
 SMALL = {
     "ppo": [
-        *("env.horizon=10", "env.demonstrations.count=4", "env.demonstrations.held_out=2"),
+        *("env.horizon=5", "env.demonstrations.count=4", "env.demonstrations.held_out=2"),
         *("trainer.num_envs=64", "trainer.batch_size=32", "trainer.num_minibatches=4"),
         *("trainer.num_updates_per_batch=1", "trainer.hidden_layers=[16]", "trainer.evaluations=1"),
     ],
@@ -43,7 +50,7 @@ SMALL = {
         *("trainer.samples=256", "trainer.batch_size=128", "trainer.epochs=1", "trainer.hidden_layers=[8]"),
         *("trainer.held_out_poses=32", "trainer.evaluations=1", "trainer.validation_poses=32"),
     ],
-    "demonstrations": ["env.horizon=10"],
+    "demonstrations": ["env.horizon=5"],
     "figures": ["only=[links,weights]"],
 }
 SHORT = {"ppo": ["trainer.num_timesteps=5000"]}
@@ -110,13 +117,17 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         for word in words[1:]:
             name, equals, value = word.partition("=")
             source = (REPOSITORY / "Makefile").read_text()
-            assert re.search(rf"^{re.escape(name)} \?=" if equals else rf"^{re.escape(word)}:", source, re.MULTILINE), word
+            assert re.search(rf"^{re.escape(name)} \?=" if equals else rf"^{re.escape(word)}:", source, re.MULTILINE), (
+                word
+            )
             if name == "ARGS":
                 check(["python", "-m", "mimic.train", *shlex.split(value)], monkeypatch)
     elif program == "pip":
         assert words[:4] == ["pip", "install", "-c", "constraints.txt"] and words[4] == "-e", words
         extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
         assert set(re.findall(r"\w+", words[5])) <= set(extras), words
+    elif program == "http.server":
+        assert words[3] == "--directory", words
     elif program == ".":
         assert words == [".", ".venv/bin/activate"]
     elif program.startswith("mimic."):

@@ -66,9 +66,10 @@ def test_pages_run(page, monkeypatch, tmp_path):
 
 def test_every_page_is_read_as_it_is_written():
     """What the reader would not recognise as a block must not go unnoticed."""
-    page = 'a\n\n    b=1 srun python -m m  # c\n    make x\n\n<!-- not run: no -->\n```python\n  d\n```\n```xml title="e.xml"\n<f/>\n```'
+    page = "a\n\n    B=1 srun python -m m  # c\n    make x\n\n<!-- not run: no -->\n\n```python\n  d\n```\n"
+    page += '```xml title="e.xml"\n<f/>\n```'
     assert read_blocks(page) == [
-        Block("bash", "b=1 srun python -m m  # c\nmake x", None, True),
+        Block("bash", "B=1 srun python -m m  # c\nmake x", None, True),
         Block("python", "  d", None, False),
         Block("xml", "<f/>", "e.xml", True),
     ]

@@ -83,7 +83,11 @@ def _draw_angle(axes: Any, corner: np.ndarray, first: np.ndarray, second: np.nda
     axes.plot(*np.transpose([corner, corner + 1.4 * _ARROW * first]), ":", color="black", lw=1)
     angles = np.degrees([np.arctan2(*direction[::-1]) for direction in (first, second)])
     low, high = sorted(angles)
-    axes.add_patch(matplotlib.patches.Arc(corner, 1.4 * _ARROW, 1.4 * _ARROW, theta1=low, theta2=high, lw=1))
+    axes.add_patch(
+        matplotlib.patches.Arc(
+            (float(corner[0]), float(corner[1])), 1.4 * _ARROW, 1.4 * _ARROW, theta1=low, theta2=high, lw=1
+        )
+    )
     middle = np.radians((low + high) / 2)
     axes.text(*(corner + 1.05 * _ARROW * np.array([np.cos(middle), np.sin(middle)])), r"$\beta$", va="center")
 
