@@ -54,7 +54,7 @@ SMALL = {
     "figures": ["only=[links,weights]"],
 }
 SHORT = {"ppo": ["trainer.num_timesteps=5000"]}
-_LONGEST = 300  # seconds a command
+_LONGEST = 900  # seconds a command
 
 
 class Block(NamedTuple):
@@ -187,7 +187,13 @@ def _run(words: list[str], folder: pathlib.Path) -> None:
     if name == "train":
         name = "pose_mapper" if "trainer=pose_mapper" in arguments else "ppo"
     if not any(word.startswith("resume=") for word in arguments):
-        arguments = [*SMALL.get(name, []), *arguments, *SHORT.get(name, [])]
+        flags = [word for word in arguments if word.startswith("-")]  # Hydra takes them before all others
+        arguments = [
+            *flags,
+            *SMALL.get(name, []),
+            *(word for word in arguments if word not in flags),
+            *SHORT.get(name, []),
+        ]
     home = REPOSITORY / ".jax_cache" / "home"  # where mimic keeps compiled programs
     home.mkdir(parents=True, exist_ok=True)
     quickly_compiled = "--xla_backend_optimization_level=0"  # most of a small run is compilation
