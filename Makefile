@@ -52,7 +52,7 @@ static: $(STAMP_TEST)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 docs: $(STAMP_TEST) ## the documentation site, in build/site
-	$(BIN)/python -m mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 	@echo 'results: build/site/index.html'
 
 format: $(STAMP_TEST) ## format the code, mend what ruff can mend

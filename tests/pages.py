@@ -54,6 +54,7 @@ SMALL = {
     "figures": ["only=[links,weights]"],
 }
 SHORT = {"ppo": ["trainer.num_timesteps=5000"]}
+RESUMED = ["trainer.num_timesteps=10000"]  # what a page resumes has not been interrupted
 _LONGEST = 900  # seconds a command
 
 
@@ -186,14 +187,12 @@ def _run(words: list[str], folder: pathlib.Path) -> None:
     name = program.removeprefix("mimic.")
     if name == "train":
         name = "pose_mapper" if "trainer=pose_mapper" in arguments else "ppo"
-    if not any(word.startswith("resume=") for word in arguments):
+    if any(word.startswith("resume=") for word in arguments):
+        arguments += RESUMED
+    else:
         flags = [word for word in arguments if word.startswith("-")]  # Hydra takes them before all others
-        arguments = [
-            *flags,
-            *SMALL.get(name, []),
-            *(word for word in arguments if word not in flags),
-            *SHORT.get(name, []),
-        ]
+        others = [word for word in arguments if word not in flags]
+        arguments = [*flags, *SMALL.get(name, []), *others, *SHORT.get(name, [])]
     home = REPOSITORY / ".jax_cache" / "home"  # where mimic keeps compiled programs
     home.mkdir(parents=True, exist_ok=True)
     quickly_compiled = "--xla_backend_optimization_level=0"  # most of a small run is compilation
