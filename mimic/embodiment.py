@@ -33,9 +33,9 @@ class Embodiment:
       joint_anchor: [num_joints, 3] a point on each axis in the zero pose [m].
       link_position: [num_links, 3] origins of the link frames in the zero pose [m].
       link_rotation: [num_links, 3, 3] link frames in the zero pose; the x-axis points along the link.
-      link_lengths: [num_links] [m].
-      joint_range: [num_joints, 2] [rad]; -pi to pi where nothing limits the joint.
-      torque_limit: [num_joints] [N m], inf where nothing limits it.
+      link_lengths: [num_links] lengths [m].
+      joint_range: [num_joints, 2] least and largest angle [rad]; -pi to pi where nothing limits the joint.
+      torque_limit: [num_joints] largest torque [N m], inf where nothing limits it.
       velocity_limit: [num_joints] rated speed [rad/s], inf where nothing limits it.
       home: [num_joints] the pose that episodes start from [rad].
       name: what the arm is, locked joints included.

@@ -1,4 +1,4 @@
-"""`python -m mimic.figures out=DIR`: the paper's figures on static pose imitation, from our own runs."""
+"""`python -m mimic.figures out=DIR`: figures of the metric and of static pose imitation, from our own runs."""
 
 from mimic import cli
 from mimic.trainers.config import FiguresConfig

@@ -28,8 +28,8 @@ class ClosestMotion(NamedTuple):
     """The learner's joint state that is nearest to the expert's, and how far it still is.
 
     Attributes:
-      qpos: [T, joints] [rad].
-      qvel: [T, joints] [rad/s].
+      qpos: [T, joints] angles [rad].
+      qvel: [T, joints] velocities [rad/s].
       distance: [T].
     """
 

@@ -32,7 +32,7 @@ class PoseImitation(NamedTuple):
     """The learner's nearest poses.
 
     Attributes:
-      qpos: [*batch, learner_joints] [rad].
+      qpos: [*batch, learner_joints] angles [rad].
       distance: [*batch] embodiment distance that is left.
       converged: [*batch] whether the gradient vanishes there, but for joints that are held at a limit.
     """

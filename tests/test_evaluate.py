@@ -5,14 +5,16 @@ import dataclasses
 import json
 import shutil
 
+import jax
 import numpy as np
 import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
-from mimic.trainers import runs, session
+from mimic.trainers import ppo, runs, session
 from mimic.trainers.checkpoints import save_checkpoint
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.learning import initial_params
 from mimic.trainers.ppo_job import PPOJob
 
 COUNT, HELD_OUT, HORIZON = 4, 2, 20
@@ -30,14 +32,16 @@ def environment(learner=(0.5, 0.5)):
 
 
 def untrained_run(folder, **settings):
-    """What a training run leaves, but with the parameters that it starts from: nothing of brax is compiled."""
+    """What a training run leaves, but with the parameters that it starts from: no training is compiled."""
     trainer = PPOConfig(hidden_layers=[8], preset="cpu")
     config = TrainConfig(environment(**settings), trainer, compilation_cache="")
     job = session.make_job(config, None)
     folder.mkdir()
     runs.save_config(folder, dataclasses.replace(config, trainer=job.settings))
     job.save_inputs(folder)
-    save_checkpoint(folder, 0, job.params_template())
+    env = job.evaluator.env
+    networks = ppo.make_networks(job.settings, env.observation_size, env.action_size)
+    save_checkpoint(folder, 0, initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
     return folder
 
 

@@ -13,6 +13,7 @@ from mimic.envs.config import MetricConfig
 from mimic.trainers import ppo, runs
 from mimic.trainers.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.learning import initial_params
 from mimic.trainers.pose_mapper import PoseMapper, make_model
 
 pytest.importorskip("onnx")
@@ -24,7 +25,8 @@ def policy_run(run_dir, name="panda4dof"):
     """A run whose policy has random weights, and statistics that are not those of the start."""
     env = mimic.make(name, demonstrations={"count": 1, "held_out": 1}, physics="fused")
     config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
-    statistics, *networks = ppo.params_template(config, env.observation_size, env.action_size)
+    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    statistics, *networks = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
     rng = np.random.default_rng(0)
     statistics = statistics.replace(
         mean=jnp.asarray(rng.normal(size=env.observation_size), jnp.float32),

@@ -34,8 +34,9 @@ def test_planar_arms_are_seen_from_above():
 
 
 def test_figures_without_a_mapper(tmp_path):
-    assert prepare_figures(FiguresConfig(out=str(tmp_path), only=["weights", "contours"]))() == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"weights.png", "weights.pdf", "contours.png", "contours.pdf"}
+    names = ["links", "correspondence", "weights", "contours"]
+    assert prepare_figures(FiguresConfig(out=str(tmp_path), only=names))() == 0
+    assert {path.name for path in tmp_path.iterdir()} == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
     with pytest.raises(ValueError, match="exists; name another folder"):
         prepare_figures(FiguresConfig(out=str(tmp_path)))
 
@@ -44,7 +45,10 @@ def test_figures_without_a_mapper(tmp_path):
     ("config", "message"),
     [
         (FiguresConfig(), "out: expected a folder"),
-        (FiguresConfig(out="new", only=["contour"]), "expected some of weights, contours, planar, panda"),
+        (
+            FiguresConfig(out="new", only=["contour"]),
+            "expected some of links, correspondence, weights, contours, planar, panda",
+        ),
         (FiguresConfig(out=__file__), "is a file"),
     ],
 )

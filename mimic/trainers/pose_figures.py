@@ -1,4 +1,4 @@
-"""The figures of the paper's section on static pose imitation, each from our own computation."""
+"""The figures of the metric and of static pose imitation (paper), each from our own computation."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -16,17 +16,17 @@ import numpy as np  # noqa: E402
 
 from mimic.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
 from mimic.distance import DistanceWeights, adaptive_weights  # noqa: E402
-from mimic.embodiment import Embodiment, planar_arm  # noqa: E402
+from mimic.embodiment import planar_arm  # noqa: E402
 from mimic.envs import env_config  # noqa: E402
-from mimic.kinematics import forward_kinematics  # noqa: E402
 from mimic.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.pose import imitate_pose  # noqa: E402
 from mimic.rendering import ArmScene  # noqa: E402
+from mimic.trainers import metric_figures  # noqa: E402
+from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 from mimic.trainers.pose_mapper import PoseMapper  # noqa: E402
 
 LoadMapper = Callable[[str], PoseMapper]  # by the name of the environment
 
-EXPERT_COLOUR, LEARNER_COLOUR = "tab:blue", "tab:orange"
 _TWO_LINKS = planar_arm([0.5, 0.5])
 _CONTOUR_POSE = np.array([1.5, -1.5])  # the expert's in the paper's figure 2 d-f
 _WEIGHTS_POSE = np.array([2.3, -2.0])
@@ -50,8 +50,8 @@ def draw_weights(load_mapper: LoadMapper) -> Any:
     for letter, axes, (translation, rotation) in zip("abc", all_axes, ((0.5, 1), (3, 1), (1, 1)), strict=True):
         weights = DistanceWeights(float(translation), float(rotation))
         found = imitate_pose(_TWO_LINKS, _OTHER_TWO_LINKS, _WEIGHTS_POSE, hard_correspondence, weights)
-        _draw_arm(axes, _TWO_LINKS, _WEIGHTS_POSE, EXPERT_COLOUR, "expert")
-        _draw_arm(axes, _OTHER_TWO_LINKS, found.qpos, LEARNER_COLOUR, "learner")
+        draw_arm(axes, _TWO_LINKS, _WEIGHTS_POSE, EXPERT_COLOUR, "expert")
+        draw_arm(axes, _OTHER_TWO_LINKS, found.qpos, LEARNER_COLOUR, "learner")
         axes.set_title(rf"({letter})  $\alpha_{{tr}}={translation}$, $\alpha_{{rot}}={rotation}$", fontsize="medium")
         axes.set(xlim=(-0.75, 0.65), ylim=(-0.15, 0.85), aspect="equal")
         axes.grid(alpha=0.3)
@@ -95,9 +95,9 @@ def draw_planar(load_mapper: LoadMapper) -> Any:
         poses = rng.uniform(-0.5 * np.pi, 0.5 * np.pi, (columns, expert.num_joints)).astype(np.float32)
         mapped, optimal, excess = _mapped_and_optimal(mapper, poses)
         for axes, pose, own, best, percent in zip(row, poses, mapped, optimal, excess, strict=True):
-            _draw_arm(axes, expert, pose, EXPERT_COLOUR, "expert", width=5, alpha=0.55)
-            _draw_arm(axes, learner, own, LEARNER_COLOUR, "learner, mapper", width=3)
-            _draw_arm(axes, learner, best, "black", "learner, optimum", width=0.8)
+            draw_arm(axes, expert, pose, EXPERT_COLOUR, "expert", width=5, alpha=0.55)
+            draw_arm(axes, learner, own, LEARNER_COLOUR, "learner, mapper", width=3)
+            draw_arm(axes, learner, best, "black", "learner, optimum", width=0.8)
             axes.set_title(f"{percent:.2f} % above the optimum", fontsize="small")
             axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
             axes.grid(alpha=0.3)
@@ -124,6 +124,8 @@ def draw_panda(load_mapper: LoadMapper) -> Any:
 
 
 FIGURES: dict[str, Callable[[LoadMapper], Any]] = {
+    "links": lambda _: metric_figures.draw_links(),
+    "correspondence": lambda _: metric_figures.draw_correspondence(),
     "weights": draw_weights,
     "contours": draw_contours,
     "planar": draw_planar,
@@ -157,18 +159,6 @@ def _mapped_and_optimal(mapper: PoseMapper, poses: np.ndarray) -> tuple[np.ndarr
 
 def _distances(mapper: PoseMapper, poses: np.ndarray, learner_poses: Any) -> np.ndarray:
     return np.asarray(jax.jit(jax.vmap(mapper.model.distance))(poses, jnp.asarray(learner_poses, jnp.float32)))
-
-
-def _draw_arm(
-    axes: Any, arm: Embodiment, qpos: Any, colour: str, label: str, *, width: float = 3, alpha: float = 1
-) -> None:
-    """A planar arm, of chain length 1."""
-    frames = forward_kinematics(arm, jnp.asarray(qpos))
-    middle, direction = np.asarray(frames.position)[:, :2], np.asarray(frames.rotation)[:, :2, 0]
-    ends = middle + direction * np.asarray(arm.link_lengths)[:, None] / 2
-    joints = np.concatenate([np.zeros((1, 2)), ends]) / float(arm.chain_length)
-    style: dict[str, Any] = {"color": colour, "lw": width, "ms": width + 2, "alpha": alpha, "solid_capstyle": "round"}
-    axes.plot(*joints.T, "-o", label=label, **style)
 
 
 def _show_row(row: Sequence[Any], images: Sequence[np.ndarray], label: str) -> None:

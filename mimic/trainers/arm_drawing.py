@@ -1,0 +1,28 @@
+"""A planar arm as lines, as all figures draw it."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mimic.embodiment import Embodiment
+from mimic.kinematics import forward_kinematics
+
+EXPERT_COLOUR, LEARNER_COLOUR = "tab:blue", "tab:orange"
+
+
+def joint_points(arm: Embodiment, qpos: Any) -> Float[np.ndarray, "points 2"]:
+    """Base, joints and tip of a planar arm, of chain length 1."""
+    frames = forward_kinematics(arm, jnp.asarray(qpos))
+    middle, direction = np.asarray(frames.position)[:, :2], np.asarray(frames.rotation)[:, :2, 0]
+    ends = middle + direction * np.asarray(arm.link_lengths)[:, None] / 2
+    return np.concatenate([np.zeros((1, 2)), ends]) / float(arm.chain_length)
+
+
+def draw_arm(
+    axes: Any, arm: Embodiment, qpos: Any, colour: str, label: str, *, width: float = 3, alpha: float = 1
+) -> None:
+    """A planar arm, of chain length 1."""
+    style: dict[str, Any] = {"color": colour, "lw": width, "ms": width + 2, "alpha": alpha, "solid_capstyle": "round"}
+    axes.plot(*joint_points(arm, qpos).T, "-o", label=label, **style)
