@@ -44,8 +44,12 @@ def motions(count):
     return [jnp.asarray(rng.uniform(-np.pi, np.pi, (count, joints)), jnp.float32) for joints in (7, 7, 4, 4)]
 
 
+# `jax.jit` compiles a function when it is first called. Without it each of the hundreds of small operations inside is a
+# call of its own.
+
+one = jax.jit(distance)
 sample = [values[0] for values in motions(1)]
-print(f"one sample: {jax.jit(distance)(*sample):.6f}; composed of its parts: {jax.jit(composed)(*sample):.6f}")
+print(f"one sample: {one(*sample):.6f}; composed of its parts: {jax.jit(composed)(*sample):.6f}")
 
 # ---- Gradients -------------------------------------------------------------------------------------------------------
 #
@@ -58,7 +62,7 @@ step = 0.01  # rad
 differences = []
 for joint in range(learner.num_joints):
     ahead, behind = ([*sample[:2], sample[2].at[joint].add(sign * step), sample[3]] for sign in (1, -1))
-    differences.append((distance(*ahead) - distance(*behind)) / (2 * step))
+    differences.append((one(*ahead) - one(*behind)) / (2 * step))
 print("gradient [1/rad]:     ", np.asarray(gradient).round(4))
 print("central differences:  ", np.asarray(differences).round(4))
 
@@ -66,11 +70,9 @@ print("central differences:  ", np.asarray(differences).round(4))
 # gradient is defined there all the same. It is 0, and not NaN.
 
 twin = mimic.motion_distance(expert, expert, mimic.overlap_correspondence(expert, expert), mimic.PAPER_WEIGHTS)
-at_match = jax.grad(twin, argnums=(2, 3))(sample[0], sample[1], sample[0], sample[1])
-print(
-    f"two equal arms in the same motion: distance {twin(sample[0], sample[1], sample[0], sample[1]):.1e}, "
-    f"gradient {max(float(jnp.abs(part).max()) for part in at_match):.1e}"
-)
+value, slopes = jax.jit(jax.value_and_grad(twin, argnums=(2, 3)))(sample[0], sample[1], sample[0], sample[1])
+steepest = max(float(jnp.abs(slope).max()) for slope in slopes)
+print(f"two equal arms in the same motion: distance {value:.1e}, gradient {steepest:.1e}")
 
 # ---- Batches ---------------------------------------------------------------------------------------------------------
 #
@@ -78,7 +80,7 @@ print(
 
 few = motions(5)
 batched = jax.jit(jax.vmap(distance))(*few)
-looped = [distance(*(values[i] for values in few)) for i in range(5)]
+looped = [one(*(values[i] for values in few)) for i in range(5)]
 print(f"five at once and one by one differ by {np.abs(np.asarray(batched) - np.asarray(looped)).max():.1e}")
 
 # ---- Times -----------------------------------------------------------------------------------------------------------
