@@ -39,7 +39,7 @@ class Stage:
     report: str = ""
 
 
-INSTALL = Stage("install", ("make", f"PYTHON={sys.executable}", "install"))
+INSTALL = Stage("install", ("make", "install"))
 DEFAULT = Stage("first policy, by default", ("make", "train", "ARGS=env.physics=fused run_dir=default"), "default")
 STAGES = (
     INSTALL,
@@ -59,7 +59,9 @@ def run_stage(stage: Stage, clone: Path, home: Path) -> dict[str, Any]:
     own = {"PIP_NO_CACHE_DIR": "1"} if stage is INSTALL else {"HOME": str(home)}
     environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")} | own
     load, began = os.getloadavg()[0], time.perf_counter()
-    finished = subprocess.run(stage.command, cwd=clone, env=environment, capture_output=True, text=True, check=False)
+    # Not every python3 is new enough; this one is.
+    command = [*stage.command, f"PYTHON={sys.executable}"] if stage.command[0] == "make" else stage.command
+    finished = subprocess.run(command, cwd=clone, env=environment, capture_output=True, text=True, check=False)
     wall = time.perf_counter() - began
     if finished.returncode:
         sys.exit(f"error: {' '.join(stage.command)} ended with {finished.returncode}: {finished.stderr[-2000:]}")
