@@ -40,6 +40,7 @@ from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: 
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
+    from mimic.rendering import ArmScene
     from mimic.trainers.exporting import export_run
     from mimic.trainers.pose_mapper import PoseMapper
 
@@ -48,6 +49,7 @@ __version__ = "0.1.0"
 __all__ = [
     "PAPER_WEIGHTS",
     "ArmConfig",
+    "ArmScene",
     "ClosestMotion",
     "Demonstrations",
     "DistanceWeights",
@@ -96,6 +98,10 @@ def __getattr__(name: str) -> Any:
         from mimic.envs.imitation import ImitationEnv
 
         return ImitationEnv
+    if name == "ArmScene":  # pictures, which few need
+        from mimic.rendering import ArmScene
+
+        return ArmScene
     if name == "PoseMapper":  # checkpoints and metrics, likewise
         from mimic.trainers.pose_mapper import PoseMapper
 

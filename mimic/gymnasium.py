@@ -10,15 +10,20 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import State
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from mimic import compat
 from mimic.config import check_choice
 from mimic.envs import environments, make
-from mimic.envs.imitation import ArmState, ImitationEnv
 from mimic.rendering import ArmScene
+
+compat.import_mjx()  # quietly; brax would import it too
+
+from brax.envs.base import State  # noqa: E402
+
+from mimic.envs.imitation import ArmState, ImitationEnv  # noqa: E402
 
 RENDER_MODES = ("rgb_array",)
 

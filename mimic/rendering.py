@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from mimic.envs.arms import ArmConfig, build_arm
 from mimic.portrait import portrait
 
-SPACING = 0.9  # chain lengths between two arms
+SPACING, FLAT_SPACING = 0.9, 1.5  # chain lengths between two arms; flat ones are seen from above, and reach aside
 LOCKED = (0.85, 0.12, 0.10, 1.0)
 _FLOOR, _GRID = (0.94, 0.95, 0.96), (0.88, 0.89, 0.91)
 MARK = 0.05, 0.019  # radius and half width of a locked joint's disc, as shares of the chain length
@@ -37,6 +37,8 @@ class ArmScene:
         built = [build_arm(arm, limits) for arm in arms]
         free = [build_arm(dataclasses.replace(arm, locked=()), limits).embodiment for arm in arms]
         reach = max(float(arm.chain_length) for arm in free)  # whatever is locked, arms look their size
+        is_flat = all(arm.model == "planar" for arm in arms)
+        apart = reach * (-FLAT_SPACING if is_flat else SPACING)  # along y, which points left where x points up
         spec = _empty_room(width, height)
         self._joints: list[list[str]] = []
         self._locked: dict[str, float] = {}
@@ -48,17 +50,16 @@ class ArmScene:
             _share_options(source, spec)
             for name in arm.locked:
                 _mark_locked(source, name, float(free[index].chain_length))
-            place = [0.0, (index - 0.5 * (len(arms) - 1)) * SPACING * reach, 0.0] - base * [1, 1, 0]
+            place = [0.0, (index - 0.5 * (len(arms) - 1)) * apart, 0.0] - base * [1, 1, 0]
             spec.attach(source, prefix=prefix, frame=spec.worldbody.add_frame(pos=place))
             self._joints.append([prefix + name for name in arm.embodiment.joint_names])
             self._locked |= {prefix + name: angle for name, angle in arm.locked.items()}
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._camera = mujoco.MjvCamera()
-        is_flat = all(arm.model == "planar" for arm in arms)
         self._camera.lookat[:] = 0.0, 0.0, 0.0 if is_flat else 0.4 * reach + 0.5 * highest
-        self._camera.distance = (1.4 + 0.7 * (len(arms) - 1) + 1.3 * is_flat) * reach + 0.5 * highest
-        self._camera.azimuth, self._camera.elevation = (90.0, -89.0) if is_flat else (165.0, -14.0)
+        self._camera.distance = (1.4 + 0.7 * (len(arms) - 1) + 1.6 * is_flat) * reach + 0.5 * highest
+        self._camera.azimuth, self._camera.elevation = (0.0, -89.0) if is_flat else (165.0, -14.0)
         self._renderer = _renderer(self._model, width, height)
 
     def image(self, poses: Sequence[Float[np.ndarray, " joints"]]) -> UInt8[np.ndarray, "height width 3"]:

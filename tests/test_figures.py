@@ -31,6 +31,10 @@ def test_planar_arms_are_seen_from_above():
     with ArmScene([arm], width=160, height=120) as scene:
         straight, bent = (scene.image([np.array(pose)]) for pose in ([0.0, 0.0], [1.5, 0.0]))
     assert np.mean(np.any(straight != bent, axis=-1)) > 0.005
+    with ArmScene([arm, arm], width=160, height=120) as scene:
+        straight, bent = (scene.image([np.array(pose), np.zeros(2)]) for pose in ([0.0, 0.0], [0.8, 0.0]))
+    changed = np.any(straight != bent, axis=-1)
+    assert changed[:, :80].any() and not changed[:, 80:].any()  # the expert stands on the left here too
 
 
 def test_figures_without_a_mapper(tmp_path):

@@ -1,5 +1,8 @@
 """The environments behind Gymnasium's interface: its own checks, and the same numbers as the brax environment."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +33,12 @@ def test_gymnasium_finds_nothing_wrong():
     env = gymnasium.make("mimic/planar4dof-v0", **SMALL)
     check_env(env.unwrapped, skip_render_check=True)
     env.close()
+
+
+def test_the_import_is_silent():
+    code = "import mimic.gymnasium"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout + result.stderr == ""
 
 
 def test_all_environments_are_registered():

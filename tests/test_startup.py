@@ -40,6 +40,13 @@ def test_what_is_heavy_is_imported_when_it_is_needed(code):
     assert not imported.intersection(HEAVY)
 
 
+def test_pose_mappers_need_no_simulator():
+    code = "import sys\nfrom mimic.trainers import mapper_job, plots, retargeting, session\nprint(*sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    imported = set(result.stdout.splitlines()[-1].split())
+    assert "mimic.trainers.pose_mapper" in imported and not imported.intersection({"brax", "mujoco.mjx"})
+
+
 def test_the_process_started_before_now():
     code = "import time\nfrom mimic import cli\nprint(time.perf_counter() - cli.process_started())"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -118,7 +118,10 @@ def assumptions(config: ArmConfig, arm: Arm) -> Iterator[str]:
         moving = {joint.name: joint.parent for joint in spec.joints}
         guessed = [moving[name].name for name in names if not moving[name].explicitinertial]
         if guessed:
-            yield f"no <inertial> in {_listed(guessed)}: inertia from the geoms, of MuJoCo's density of water"
+            yield (
+                f"no <inertial> in {_listed(guessed)}: inertia from the geoms, at the density of water where they "
+                "state neither mass nor density"
+            )
 
 
 def doubts(config: ArmConfig, arm: Arm) -> Iterator[str]:

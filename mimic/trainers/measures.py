@@ -1,13 +1,15 @@
 """What is measured on each demonstration: how near, how smooth, and within which limits a controller moves."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from mimic.envs.imitation import ImitationEnv
 from mimic.kinematics import LinkStates
 from mimic.pose import pose_limits
+
+if TYPE_CHECKING:  # brax and MJX, which pose mappers need not
+    from mimic.envs.imitation import ImitationEnv
 
 Table = dict[str, Float[np.ndarray, " demonstrations"]]
 WORST = 3  # demonstrations of each split that are named
@@ -15,7 +17,7 @@ _ROUNDING = 1e-5  # what float32 leaves of a torque at its limit, or of a joint 
 
 
 def measure(
-    env: ImitationEnv,
+    env: "ImitationEnv",
     learner: LinkStates,
     qpos: Float[np.ndarray, "demonstrations time joints"],
     qvel: Float[np.ndarray, "demonstrations time joints"],

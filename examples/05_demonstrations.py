@@ -1,0 +1,117 @@
+"""5. What the expert shows: record demonstrations, bring your own, see what they ask for.
+
+    python examples/05_demonstrations.py [FOLDER]
+
+Writes what it records and imports, and pictures of it, into FOLDER (a new one in examples_out by default).
+"""
+
+import csv
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import mimic
+
+out = Path(sys.argv[1] if len(sys.argv) > 1 else time.strftime("examples_out/05_demonstrations-%Y%m%d-%H%M%S"))
+out.mkdir(parents=True, exist_ok=True)
+
+# ---- Recording -------------------------------------------------------------------------------------------------------
+#
+# The expert is simulated by C MuJoCo and driven to random goals: by joint-space control ("pd", as in the paper), or the
+# hand goes straight to its goal by inverse kinematics ("reach"). Goals that would take it beyond a torque, speed or
+# joint limit are drawn anew. A demonstration has 51 samples, 0.1 s apart, and the torque that was held between any two.
+
+panda = mimic.build_arm(mimic.ArmConfig())  # an embodiment, and a MuJoCo model to simulate it
+expert = panda.embodiment
+for kind in ("pd", "reach"):
+    recorded = mimic.record_demonstrations(panda, 20, kind=kind, seed=0)
+    assert recorded.torque is not None  # as in demonstrations from elsewhere, see below
+    speed = np.abs(recorded.qvel).max(axis=(0, 1)) / expert.velocity_limit
+    torque = np.abs(recorded.torque).max(axis=(0, 1)) / expert.torque_limit
+    print(f"{kind}: angles {recorded.qpos.shape}, torques {recorded.torque.shape}")
+    print(f"  largest speed of each joint, as a share of its rated one: {' '.join(f'{share:.0%}' for share in speed)}")
+    print(f"  largest torque, as a share of its limit:                 {' '.join(f'{share:.0%}' for share in torque)}")
+
+# One file holds them, without pickle, and says of which arm they are. `python -m mimic.demonstrations out=FILE` does
+# the same, with a plot; `python -m mimic.train env.demonstrations.path=FILE` trains on it.
+
+recorded.save(out / "recorded.npz")
+print(f"read back: {mimic.load_demonstrations(out / 'recorded.npz').count} demonstrations of {recorded.arm!r}")
+
+# ---- Your own --------------------------------------------------------------------------------------------------------
+#
+# A CSV table will do: a column `time`, and the angle of each joint by its name. Here two of them, one after the other
+# in one table, at 50 samples a second: a wave of the whole arm, and the same at half the speed.
+
+time_s = np.arange(0, 5.01, 0.02)
+amplitude, frequency = np.array([0.6, 0.4, 0.5, 0.4, 0.6, 0.4, 0.6]), np.array([1.5, 1.0, 1.2, 1.4, 1.8, 1.6, 2.0])
+with (out / "waves.csv").open("w", newline="") as file:
+    table = csv.writer(file)
+    table.writerow(["demonstration", "time", *expert.joint_names])
+    for number, tempo in enumerate((1.0, 0.5)):
+        for t in time_s:
+            table.writerow([number, f"{t:.2f}", *(amplitude * np.sin(frequency * tempo * t) ** 2)])
+
+# Importing resamples to control steps and checks that the expert could do it. There are no velocities in the table, so
+# they are differentiated, and it says so. Torques nobody knows.
+
+waves, differentiated = mimic.import_demonstrations(out / "waves.csv", expert)
+print(f"\nwaves.csv: {waves.count} demonstrations, {waves.horizon} steps of {waves.dt} s; velocities differentiated: "
+      f"{differentiated}")  # fmt: skip
+
+# The same as a command, which writes the file and a picture of it:
+
+words = [f"source={out / 'waves.csv'}", f"out={out / 'waves.npz'}"]
+print(f"\n$ python -m mimic.demonstrations {' '.join(words)}", flush=True)
+subprocess.run([sys.executable, "-m", "mimic.demonstrations", *words], check=True)
+
+# ---- What is refused -------------------------------------------------------------------------------------------------
+#
+# Most mistakes in such files are silent ones: degrees, a wrong column, another rate. So a file must be within the arm's
+# range and its rated speeds. The second of these is the wave again, with a clock that runs eight times too fast.
+
+lines = (out / "waves.csv").read_text().splitlines()
+rows = [line.split(",") for line in lines[1:]]
+broken = {
+    "degrees.csv": [[*row[:2], *(str(np.degrees(float(x))) for x in row[2:])] for row in rows],
+    "clock.csv": [[row[0], str(float(row[1]) / 8), *row[2:]] for row in rows],
+}
+print()
+for name, changed in broken.items():
+    (out / name).write_text("\n".join([lines[0], *map(",".join, changed)]))
+    try:
+        mimic.import_demonstrations(out / name, expert, horizon=6)  # the fast clock leaves 0.6 s
+    except ValueError as error:
+        print(f"{name} is refused: {error}")
+
+# ---- How much of it can the learner do? ------------------------------------------------------------------------------
+#
+# Before anything is trained, the lower bound tells what the learner's joints allow. Four joints against seven: what
+# lies below the line is out of reach, whatever controls the arm. It is a bound for each moment by itself: a motion
+# through all of these poses need not exist.
+
+learner = mimic.panda(locked=(3, 6, 7))
+correspondence = mimic.overlap_correspondence(expert, learner)
+bound = mimic.kinematic_bound(expert, learner, waves.qpos[0], waves.qvel[0], correspondence, mimic.PAPER_WEIGHTS)
+print(f"\nmean lower bound over the first wave: {np.mean(bound):.4f}")
+
+figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+steps = waves.dt * np.arange(waves.horizon + 1)
+for joint in range(3):
+    (line,) = axes[0].plot(time_s, amplitude[joint] * np.sin(frequency[joint] * time_s) ** 2, alpha=0.5)
+    axes[0].plot(steps, waves.qpos[0, :, joint], ".", color=line.get_color(), label=expert.joint_names[joint])
+axes[0].set(xlabel="time [s]", ylabel="angle [rad]", title="the table (lines), and what was taken from it")
+axes[0].legend(fontsize=8)
+axes[1].plot(steps, np.asarray(bound))
+axes[1].set(xlabel="time [s]", ylabel="embodiment distance", title="lower bound of a learner with four joints")
+axes[1].set_ylim(bottom=0)
+figure.savefig(out / "waves_and_bound.png", dpi=100)
+print(f"results: {out}")
