@@ -35,7 +35,7 @@ def untrained_run(folder, **settings):
     """What a training run leaves, but with the parameters that it starts from: no training is compiled."""
     trainer = PPOConfig(hidden_layers=[8], preset="cpu")
     config = TrainConfig(environment(**settings), trainer, compilation_cache="")
-    job = session.make_job(config, None)
+    job = PPOJob(config, None)
     folder.mkdir()
     runs.save_config(folder, dataclasses.replace(config, trainer=job.settings))
     job.save_inputs(folder)

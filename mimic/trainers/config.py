@@ -73,7 +73,7 @@ class TrainerConfig:
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig(TrainerConfig):
-    """Brax PPO. A field that is None takes its value from the preset.
+    """PPO, of brax's networks and loss. A field that is None takes its value from the preset.
 
     Attributes:
       name: "ppo".

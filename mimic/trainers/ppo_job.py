@@ -79,7 +79,7 @@ class PPOJob(Job):
     def train(
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
     ) -> tuple[int, Params]:
-        """By brax."""
+        """See `ppo.train`."""
         return ppo.train(
             self._env,
             self.settings,
@@ -92,7 +92,7 @@ class PPOJob(Job):
         )
 
     def follow(self, restore: tuple[int, Params] | None) -> None:
-        """By brax."""
+        """See `ppo.train`."""
         ppo.follow(self._env, self.settings, seed=self._seed, restore=restore)
 
     def evaluate(self, params: Params) -> Rollouts:
