@@ -78,7 +78,7 @@ class PPOConfig(TrainerConfig):
     Attributes:
       name: "ppo".
       preset: "cpu", "gpu", or "auto": by the backend that JAX found.
-      num_timesteps: environment steps to train for.
+      num_timesteps: environment steps to train for; rounded up to whole stretches between two evaluations.
       num_envs: arms at once.
       unroll_length: steps of an arm in a batch.
       batch_size: unrolls in a minibatch.
@@ -96,7 +96,8 @@ class PPOConfig(TrainerConfig):
       crossovers: demonstrations to train on beyond the given ones, mixed from them joint by joint: see `crossovers` in
         mimic/envs/demonstrations.py.
       target_gap: training ends early once the optimality gap on the training demonstrations is no larger; 0 never.
-      evaluations: how often the policy is evaluated and saved; with a target gap the preset's number times five.
+      evaluations: how often the policy is evaluated and saved, as far as whole batches allow; with a target gap the
+        preset's number times five.
     """
 
     length_key: ClassVar[str] = "num_timesteps"

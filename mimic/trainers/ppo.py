@@ -127,14 +127,15 @@ def _stretches(
     step, restored = jax.device_get(restore) if restore else (0, None)
     left = max(config.num_timesteps - step, 1)  # type: ignore[operator]
     evaluations = max(round(config.evaluations * left / config.num_timesteps), 1)  # type: ignore[operator]
-    batches = -(-left // (evaluations * config.steps_per_batch))
+    all_batches = -(-left // config.steps_per_batch)
+    batches = max(round(all_batches / evaluations), 1)
     networks = make_networks(config, env.observation_size, env.action_size)
     begin, learn = make_programs(env, config, networks, batches, _learning_rate(config, step), restored)
     on_compiling()
     learning = begin()(seed + step)
     yield _Stretch(step, jax.device_get(learning.params), {})
     walltime = 0.0
-    for _ in range(evaluations):
+    for _ in range(-(-all_batches // batches)):
         program = learn()
         began = time.perf_counter()
         learning, means = program(learning)
