@@ -61,6 +61,15 @@ def plus(x: Scalar, y: Scalar) -> Scalar:
     return x + y
 
 
+def minus(x: Scalar, y: Scalar) -> Scalar:
+    """The difference; nothing to compute where y is known to be 0."""
+    if isinstance(x, float) and x == 0:
+        return times(-1.0, y)
+    if isinstance(y, float) and y == 0:
+        return x
+    return x - y
+
+
 def add(a: Vector, b: Vector) -> Vector:
     """The sum a + b."""
     return plus(a[0], b[0]), plus(a[1], b[1]), plus(a[2], b[2])
@@ -68,7 +77,7 @@ def add(a: Vector, b: Vector) -> Vector:
 
 def subtract(a: Vector, b: Vector) -> Vector:
     """The difference a - b."""
-    return add(a, scale(-1.0, b))
+    return minus(a[0], b[0]), minus(a[1], b[1]), minus(a[2], b[2])
 
 
 def scale(factor: Scalar, a: Vector) -> Vector:
@@ -85,7 +94,7 @@ def cross(a: Vector, b: Vector) -> Vector:
     """The cross product a x b."""
 
     def minor(i: int, j: int) -> Scalar:
-        return plus(times(a[i], b[j]), times(-1.0, times(a[j], b[i])))
+        return minus(times(a[i], b[j]), times(a[j], b[i]))
 
     return minor(1, 2), minor(2, 0), minor(0, 1)
 

@@ -3,10 +3,13 @@
 The composite rigid body algorithm gives the mass matrix, the recursive Newton-Euler algorithm the forces of the motion
 (Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 6 and 5), in frames that sit on the joints with their z
 along the axis. No gravity, contacts or constraints.
+
+The time that a GPU's compiler takes grows with the square of the number of operations. So a body's mass is here as its
+sums of m r and m r r^T, which take fewer operations than a centre and an inertia tensor.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -18,11 +21,11 @@ from mimic.spatial import (
     Scalar,
     Vector,
     add,
-    add_outer,
     axis_rotation,
     compose,
     cross,
     dot,
+    minus,
     plus,
     rotate,
     rotation,
@@ -39,17 +42,18 @@ _ROUNDING = 1e-12  # what rotations to and fro leave of a zero
 
 @dataclasses.dataclass(frozen=True)
 class Inertia:
-    """What a rigid body weighs about the origin of its frame.
+    """How the mass of a rigid body lies about the origin of a joint's frame.
+
+    Mass on the axis of a joint moves alike whether it belongs to the body that the joint moves or to the one before. It
+    is counted to the one before, and that goes on to the base: no body has a total mass, nor z and zz of its own.
 
     Attributes:
-      mass: [kg].
-      moment: mass times centre of mass [kg m].
-      tensor: rows of the inertia tensor about the origin [kg m^2].
+      first: sum of m r over the points of the body [kg m].
+      second: rows of the sum of m r r^T, symmetric [kg m^2].
     """
 
-    mass: Scalar
-    moment: Vector
-    tensor: Rotation
+    first: Vector
+    second: Rotation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +62,7 @@ class Segment:
 
     Attributes:
       placement: maps this joint's frame into the one before, at `reference`.
-      offset: where this joint is in the frame before [m].
+      offset: the point of this joint's axis nearest to the origin before, its own origin, in the frame before [m].
       reference: joint angle at which that holds [rad].
       inertia: of the body.
       armature: [kg m^2].
@@ -84,24 +88,35 @@ def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
     mujoco.mj_kinematics(model, data)
     assert model.nq == model.njnt and list(model.jnt_bodyid) == sorted(model.jnt_bodyid)
     last_joint = {int(body): joint for joint, body in enumerate(model.jnt_bodyid)}
-    frame, origin = np.eye(3), np.zeros(3)
-    result = []
-    for joint in range(model.njnt):
+    frame, origin = _frame(data.xaxis[0], np.eye(3)), data.xanchor[0]
+    poses, masses = [], []
+    for joint, (axis, anchor) in enumerate(zip(data.xaxis, data.xanchor, strict=True)):
         previous_frame, previous_origin = frame, origin
-        frame, origin = _frame(data.xaxis[joint], previous_frame), data.xanchor[joint]
+        frame, origin = _frame(axis, previous_frame), anchor + axis @ (previous_origin - anchor) * axis
+        pose = np.eye(4)
+        pose[:3, :3] = _rounded(previous_frame.T @ frame)
+        pose[:3, 3] = _rounded(previous_frame.T @ (origin - previous_origin))
         body = int(model.jnt_bodyid[joint])
         carries = last_joint[body] == joint  # of several joints in one body, the last one moves it
-        result.append(
-            Segment(
-                placement=rotation(_rounded(previous_frame.T @ frame)),
-                offset=vector(_rounded(previous_frame.T @ (origin - previous_origin))),
-                reference=float(model.qpos0[joint]),
-                inertia=_inertia(model, data, body, frame, origin) if carries else Inertia(0.0, ZERO, _NONE),
-                armature=float(model.dof_armature[joint]),
-                damping=float(model.dof_damping[joint]),
-            )
+        poses.append(pose)
+        masses.append(_mass(model, data, body, frame, origin) if carries else np.zeros((4, 4)))
+    for joint in reversed(range(model.njnt)):  # see `Inertia`
+        on_axis = np.zeros((4, 4))
+        on_axis[2:, 2:] = masses[joint][2:, 2:]
+        masses[joint] -= on_axis
+        if joint:
+            masses[joint - 1] += poses[joint] @ on_axis @ poses[joint].T
+    return tuple(
+        Segment(
+            placement=rotation(pose[:3, :3]),
+            offset=vector(pose[:3, 3]),
+            reference=float(model.qpos0[joint]),
+            inertia=Inertia(vector(mass[:3, 3]), rotation(mass[:3, :3])),
+            armature=float(model.dof_armature[joint]),
+            damping=float(model.dof_damping[joint]),
         )
-    return tuple(result)
+        for joint, (pose, mass) in enumerate(zip(poses, masses, strict=True))
+    )
 
 
 def acceleration(
@@ -125,10 +140,10 @@ def acceleration(
     turns = _turns(arm, qpos)
     matrix = mass_matrix(arm, turns)
     forces = bias_forces(arm, turns, qvel)
+    lightness = 1.0 / mass  # all else divided by the mass is cheaper than the matrix times it
     for i, segment in enumerate(arm):
-        matrix[i] = [times(mass, entry) for entry in matrix[i]]
-        matrix[i][i] = plus(matrix[i][i], segment.armature)
-        forces[i] = torque[i] - times(mass, forces[i]) - times(damping, segment.damping) * qvel[i]
+        matrix[i][i] = plus(matrix[i][i], times(segment.armature, lightness))
+        forces[i] = times(torque[i] - times(damping, segment.damping) * qvel[i], lightness) - forces[i]
     return _solve(matrix, forces)
 
 
@@ -147,10 +162,10 @@ def inverse(
 
 
 def _turns(arm: Sequence[Segment], qpos: Sequence[Scalar]) -> list[Rotation]:
-    """Maps of each joint's frame into the one before."""
-    return [
+    """Maps of each joint's frame into the one before; none of the first angle, on which nothing depends."""
+    return [IDENTITY] + [
         compose(segment.placement, axis_rotation(_Z, plus(angle, -segment.reference)))
-        for segment, angle in zip(arm, qpos, strict=True)
+        for segment, angle in zip(arm[1:], qpos[1:], strict=True)
     ]
 
 
@@ -162,18 +177,24 @@ def mass_matrix(arm: Sequence[Segment], turns: Sequence[Rotation]) -> list[list[
       turns: maps each joint's frame into the one before.
     """
     matrix: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(len(arm))]
-    composite = Inertia(0.0, ZERO, _NONE)
+    composite = Inertia(ZERO, _NONE)
     for i in reversed(range(len(arm))):
-        if i + 1 < len(arm):
-            composite = _moved(composite, turns[i + 1], arm[i + 1].offset)
         composite = _joined(composite, arm[i].inertia)
+        matrix[i][i] = plus(composite.second[0][0], composite.second[1][1])
+        if i == 0:
+            break
+        trace = plus(matrix[i][i], composite.second[2][2])
+        composite = _turned(composite, turns[i])
         # Force and moment for a unit acceleration about this joint, as the joints below feel them.
-        force, moment = cross(_Z, composite.moment), tuple(row[2] for row in composite.tensor)
-        matrix[i][i] = moment[2]
-        for j in reversed(range(i)):
-            force, moment = rotate(turns[j + 1], force), rotate(turns[j + 1], moment)
-            moment = add(moment, cross(arm[j + 1].offset, force))
-            matrix[i][j] = moment[2]
+        axis, offset = transpose(arm[i].placement)[2], arm[i].offset
+        force = cross(axis, composite.first)
+        moment = add(scale(trace, axis), rotate(composite.second, scale(-1.0, axis)))
+        moment = add(moment, cross(offset, force))
+        matrix[i][i - 1] = moment[2]
+        for j in reversed(range(1, i)):
+            force, moment = _passed_on(arm[: j + 1], turns[j], force, moment)
+            matrix[i][j - 1] = moment[2]
+        composite = _shifted(composite, offset)
     return matrix
 
 
@@ -186,32 +207,53 @@ def bias_forces(arm: Sequence[Segment], turns: Sequence[Rotation], qvel: Sequenc
       qvel: joint velocities [rad/s].
     """
     omega, alpha, linear = ZERO, ZERO, ZERO  # angular velocity and acceleration, linear acceleration of the origin
+    field = _NONE  # a point r of the body accelerates by linear + field r
     wrenches: list[tuple[Vector, Vector]] = []
     for segment, turn, speed in zip(arm, turns, qvel, strict=True):
         back = transpose(turn)
-        linear = add(linear, add(cross(alpha, segment.offset), cross(omega, cross(omega, segment.offset))))
-        spin = scale(speed, _Z)
-        carried = rotate(back, omega)
-        omega, alpha, linear = (
-            add(carried, spin),
-            add(rotate(back, alpha), cross(carried, spin)),
-            rotate(back, linear),
-        )
-        inertia = segment.inertia
-        momentum = rotate(inertia.tensor, omega)
-        force = add(
-            scale(inertia.mass, linear), add(cross(alpha, inertia.moment), cross(omega, cross(omega, inertia.moment)))
-        )
-        moment = add(rotate(inertia.tensor, alpha), add(cross(omega, momentum), cross(inertia.moment, linear)))
-        wrenches.append((force, moment))
+        linear = rotate(back, add(linear, rotate(field, segment.offset)))
+        spin, carried = scale(speed, _Z), rotate(back, omega)
+        omega, alpha = add(carried, spin), add(rotate(back, alpha), cross(carried, spin))
+        field = _acceleration_field(omega, alpha)
+        first, second = segment.inertia.first, segment.inertia.second
+        moment = add(_moment(field, second), cross(first, linear))
+        wrenches.append((rotate(field, first), moment))
     torques: list[Scalar] = [0.0] * len(arm)
     force, moment = ZERO, ZERO
     for i in reversed(range(len(arm))):
         force, moment = add(force, wrenches[i][0]), add(moment, wrenches[i][1])
         torques[i] = moment[2]
-        force, moment = rotate(turns[i], force), rotate(turns[i], moment)
-        moment = add(moment, cross(arm[i].offset, force))
+        force, moment = _passed_on(arm[: i + 1], turns[i], force, moment)
     return torques
+
+
+def _passed_on(arm: Sequence[Segment], turn: Rotation, force: Vector, moment: Vector) -> tuple[Vector, Vector]:
+    """What acts in the frame of the last joint, in the frame before; without the force where no joint feels it."""
+    force, moment = rotate(turn, force), rotate(turn, moment)
+    moment = add(moment, cross(arm[-1].offset, force))
+    return force if any(any(segment.offset) for segment in arm[:-1]) else ZERO, moment
+
+
+def _acceleration_field(omega: Vector, alpha: Vector) -> Rotation:
+    """The matrix of alpha x r + omega x (omega x r)."""
+    x, y, z = omega
+    xx, yy, zz = times(x, x), times(y, y), times(z, z)
+    xy, yz, zx = times(x, y), times(y, z), times(z, x)
+    less_xx, less_yy = times(-1.0, xx), times(-1.0, yy)
+    return (
+        (minus(less_yy, zz), minus(xy, alpha[2]), plus(zx, alpha[1])),
+        (plus(xy, alpha[2]), minus(less_xx, zz), minus(yz, alpha[0])),
+        (minus(zx, alpha[1]), plus(yz, alpha[0]), minus(less_xx, yy)),
+    )
+
+
+def _moment(field: Rotation, second: Rotation) -> Vector:
+    """The sum of m r x (field r)."""
+
+    def minor(i: int, j: int) -> Scalar:
+        return minus(dot(field[j], second[i]), dot(field[i], second[j]))
+
+    return minor(1, 2), minor(2, 0), minor(0, 1)
 
 
 def _solve(matrix: list[list[Scalar]], values: list[Scalar]) -> list[Scalar]:
@@ -242,26 +284,32 @@ def _solve(matrix: list[list[Scalar]], values: list[Scalar]) -> list[Scalar]:
     return found
 
 
-def _moved(inertia: Inertia, turn: Rotation, offset: Vector) -> Inertia:
-    """The same body about the origin of the frame that `turn` and `offset` map into."""
-    moment = rotate(turn, inertia.moment)
-    tensor = compose(compose(turn, inertia.tensor), transpose(turn))
-    tensor = add_outer(add_outer(tensor, scale(-1.0, offset), moment), scale(-1.0, moment), offset)
-    tensor = add_outer(tensor, scale(times(-1.0, inertia.mass), offset), offset)
-    trace = plus(times(2.0, dot(offset, moment)), times(inertia.mass, dot(offset, offset)))
-    return Inertia(
-        mass=inertia.mass,
-        moment=add(moment, scale(inertia.mass, offset)),
-        tensor=_sum(tensor, tuple(scale(trace, unit) for unit in IDENTITY)),  # pyright: ignore[reportArgumentType]
-    )
-
-
 def _joined(a: Inertia, b: Inertia) -> Inertia:
-    return Inertia(plus(a.mass, b.mass), add(a.moment, b.moment), _sum(a.tensor, b.tensor))
+    return Inertia(add(a.first, b.first), _symmetric(lambda i, j: plus(a.second[i][j], b.second[i][j])))
 
 
-def _sum(a: Rotation, b: Rotation) -> Rotation:
-    return add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2])
+def _turned(inertia: Inertia, turn: Rotation) -> Inertia:
+    """The same mass along the axes that `turn` maps into."""
+    half = compose(turn, inertia.second)
+    return Inertia(rotate(turn, inertia.first), _symmetric(lambda i, j: dot(half[i], turn[j])))
+
+
+def _shifted(inertia: Inertia, offset: Vector) -> Inertia:
+    """The same mass about the origin of the frame before."""
+    first, second = inertia.first, inertia.second
+
+    def entry(i: int, j: int) -> Scalar:
+        if i == j:
+            return plus(second[i][i], times(2.0 * offset[i], first[i]))
+        return plus(second[i][j], plus(times(offset[i], first[j]), times(offset[j], first[i])))
+
+    return Inertia(first, _symmetric(entry))
+
+
+def _symmetric(entry: Callable[[int, int], Scalar]) -> Rotation:
+    """Rows of a symmetric matrix, from its entries on and above the diagonal."""
+    xx, xy, xz, yy, yz, zz = entry(0, 0), entry(0, 1), entry(0, 2), entry(1, 1), entry(1, 2), entry(2, 2)
+    return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 
 
 def _frame(axis: np.ndarray, previous: np.ndarray) -> np.ndarray:
@@ -272,13 +320,14 @@ def _frame(axis: np.ndarray, previous: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(axis, x), axis], axis=1)
 
 
-def _inertia(model: mujoco.MjModel, data: mujoco.MjData, body: int, frame: np.ndarray, origin: np.ndarray) -> Inertia:
-    mass = float(model.body_mass[body])
-    centre = frame.T @ (data.xipos[body] - origin)
-    principal = frame.T @ data.ximat[body].reshape(3, 3)
-    tensor = principal @ np.diag(model.body_inertia[body]) @ principal.T
-    tensor += mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    return Inertia(mass, vector(mass * centre), rotation(tensor))
+def _mass(model: mujoco.MjModel, data: mujoco.MjData, body: int, frame: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """The sum of m p p^T over a body's points p = (x, y, z, 1) in a frame: second and first moments, and the mass."""
+    inertia = model.body_inertia[body]
+    result = np.zeros((4, 4))
+    axes = frame.T @ data.ximat[body].reshape(3, 3)
+    result[:3, :3] = axes @ np.diag(inertia.sum() / 2 - inertia) @ axes.T
+    centre = np.append(frame.T @ (data.xipos[body] - origin), 1.0)
+    return result + model.body_mass[body] * np.outer(centre, centre)
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:
