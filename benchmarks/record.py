@@ -18,7 +18,7 @@ def write_results(out: Path, benchmark: str, commit: str | None, **content: Any)
     """Replaces a file of results, with what they were made on, only when the new one is whole."""
     results = {
         "benchmark": benchmark,
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes"),
         "commit": commit or commit_id(),
         "hardware": runs.hardware(),
         "versions": {**runs.versions(), "mink": importlib.metadata.version("mink")},
