@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from mimic import cli
+from mimic.sweeping.sweeper import Sweeper
 
 REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("**/*.md"))]
@@ -140,13 +141,22 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _compose(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Makes the command's config of its arguments, and does nothing with it."""
+    """Makes the command's config of its arguments, of a sweep those of its runs, and does nothing with it."""
     composed: list[Any] = []
     prepare: Callable[[Any], cli.Work] = lambda config: composed.append(config) or (lambda: 0)  # noqa: E731
     assert hasattr(importlib.import_module(f"mimic.{name}"), "prepare")
+
+    def setup(sweeper: Sweeper, *, hydra_context: Any, task_function: Any, config: Any) -> None:
+        sweeper.hydra_context, sweeper.config = hydra_context, config  # and no launcher, which would look for Slurm
+
+    def plan(sweeper: Sweeper, arguments: list[str]) -> None:
+        composed.extend(sweeper.plan(arguments, pathlib.Path()))
+
     monkeypatch.setattr(sys, "argv", [f"mimic.{name}", *arguments])
+    monkeypatch.setattr(Sweeper, "setup", setup)
+    monkeypatch.setattr(Sweeper, "sweep", plan)
     cli.run(prepare, name)
-    assert composed
+    assert composed or "--cfg" in arguments
 
 
 def _parse(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:

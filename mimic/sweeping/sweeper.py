@@ -86,7 +86,7 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         folder = Path(self.config.hydra.sweep.dir)
         if (folder / SWEEP).exists():
             raise HydraException(f"hydra.sweep.dir: {str(folder)!r} has a sweep already; name another folder")
-        planned = self._plan([*self._params, *arguments], folder)
+        planned = self.plan(arguments, folder)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, folder / "multirun.yaml")
         _write_sweep(folder, planned, [])
@@ -99,10 +99,15 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         _write_sweep(folder, planned, outcomes)
         self._report(folder, planned, outcomes)
 
-    def _plan(self, arguments: list[str], folder: Path) -> list[PlannedRun]:
+    def plan(self, arguments: list[str], folder: Path) -> list[PlannedRun]:
+        """The runs of a sweep with these overrides, composed; nothing is written.
+
+        Raises:
+          HydraException: a run that cannot be composed.
+        """
         assert self.config is not None and self.hydra_context is not None
         loader = self.hydra_context.config_loader
-        parsed = OverridesParser.create(config_loader=loader).parse_overrides(arguments)
+        parsed = OverridesParser.create(config_loader=loader).parse_overrides([*self._params, *arguments])
         (combinations,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
         shared = set(combinations[0]).intersection(*combinations)
         width = len(str(len(combinations) - 1))
