@@ -67,7 +67,7 @@ print("gradient [1/rad]:     ", np.asarray(gradient).round(4))
 print("central differences:  ", np.asarray(differences).round(4))
 
 # At a match the distance has a kink, like an absolute value at 0: velocities count by the norm of their difference. The
-# gradient is defined there all the same. It is 0, and not NaN.
+# gradient is defined there all the same. It is 0, but for rounding, and not NaN.
 
 twin = mimic.motion_distance(expert, expert, mimic.overlap_correspondence(expert, expert), mimic.PAPER_WEIGHTS)
 value, slopes = jax.jit(jax.value_and_grad(twin, argnums=(2, 3)))(sample[0], sample[1], sample[0], sample[1])

@@ -103,7 +103,7 @@ def test_batches_and_gradients(said):
     np.testing.assert_allclose(gradient, differences, atol=2e-3)  # float32 over 0.02 rad, and four digits
     assert np.abs(gradient).max() > 0.01
     ((distance, slope),) = re.findall(r"same motion: distance (\S+), gradient (\S+)", said)
-    assert (float(distance), float(slope)) == (0, 0)
+    assert float(distance) < 1e-9 and float(slope) < 1e-2  # rounding, of a distance whose terms have a kink there
     assert number(r"one by one differ by (\S+)", said) < 1e-5
     rates = re.findall(r" s +\S+ ms +([\d,]+)$", said, re.MULTILINE)
     assert len(rates) == 4 and all(int(rate.replace(",", "")) > 0 for rate in rates)

@@ -28,6 +28,7 @@ def test_the_first_example_of_the_readme_runs():
     assert scope["gradient"].shape == (4,)
 
 
+@pytest.mark.slow
 def test_the_examples_on_poses_run(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     settings = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}

@@ -86,6 +86,7 @@ def test_evaluate_repeats_the_report(finished, tmp_path):
         assert again["worst_demonstrations"][split] == pytest.approx(gaps, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_video_shows_the_whole_motion(finished):
     run_dir, _ = finished
     result = command("render", f"run={run_dir}", "demonstration=1", "gif=true")
