@@ -142,4 +142,4 @@ def test_a_sweep_in_step_is_refused(tmp_path):
     alone = ["distributed.coordinator=localhost:1", "distributed.processes=1", "distributed.process=0"]
     command = [sys.executable, "-m", "mimic.train", "-m", *alone, "seed=0,1"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False, cwd=tmp_path)
-    assert result.returncode == 2 and "expected one run, got a sweep" in result.stderr
+    assert result.returncode == 1 and result.stderr.count("expected one run, got a sweep") == 2  # of either run

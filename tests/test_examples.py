@@ -96,7 +96,7 @@ def test_metric(said, tmp_path):
     assert is_picture(tmp_path / "links.png")
 
 
-@example("02_batches_and_gradients")
+@example("02_batches_and_gradients", pytest.mark.slow)
 def test_batches_and_gradients(said):
     rows = re.findall(r"(?:gradient \[1/rad\]|central differences): +\[(.*)\]", said)
     gradient, differences = (np.array(row.split(), float) for row in rows)

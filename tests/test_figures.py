@@ -37,6 +37,7 @@ def test_planar_arms_are_seen_from_above():
     assert changed[:, :80].any() and not changed[:, 80:].any()  # the expert stands on the left here too
 
 
+@pytest.mark.slow
 def test_figures_without_a_mapper(tmp_path):
     names = ["links", "correspondence", "weights", "contours"]
     assert prepare_figures(FiguresConfig(out=str(tmp_path), only=names))() == 0

@@ -78,6 +78,7 @@ def test_an_arm_that_runs_away_is_given_rotors(inspected, tmp_path):
     assert re.search(r"train it: .* env.learner.armature=\S+ env.learner.damping=\S+ env.physics=fused", said)
 
 
+@pytest.mark.slow
 def test_how_near_an_equal_arm_can_come(inspected):
     said = inspected("panda")
     ((bound, hold, share),) = re.findall(r"best poses: (\S+), of holding still: (\S+); (\d+)% of it", said)

@@ -117,6 +117,7 @@ def test_resume_goes_on(tmp_path):
     assert report["quality"]["held_out"] < short["quality"]["held_out"]
 
 
+@pytest.mark.slow
 def test_the_paper_overfits_and_early_stopping_goes_back_to_the_best(tmp_path):
     run_dir = tmp_path / "run"
     settings = {"samples": 64, "batch_size": 32, "epochs": 400, "evaluations": 40, "patience": 3}

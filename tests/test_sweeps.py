@@ -62,7 +62,9 @@ def slurm(tmp_path):
 
 
 # Any command can be swept, and this one is quick: collecting a folder with a run, and one that is not there.
-@pytest.mark.parametrize("launcher", ["basic", "submitit_local", "submitit_slurm", "ray"])
+@pytest.mark.parametrize(
+    "launcher", ["basic", pytest.param("submitit_local", marks=pytest.mark.slow), "submitit_slurm", "ray"]
+)
 def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
     if launcher == "ray":
         pytest.importorskip("ray")

@@ -119,7 +119,7 @@ def test_training_ends_at_the_target_gap(tmp_path):
     assert json.loads((run_dir / "report.json").read_text())["env_steps"] < 5000
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
     run_dir = tmp_path / "stopped"
     arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
@@ -144,6 +144,7 @@ def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
     assert compat.needs_cpu_flag(version) is needed
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not compat.needs_cpu_flag(), reason="this jax does not need the flag and aborts on it")
 def test_the_cpu_flag_speeds_up_kinematics(capsys):
     """Times MJX's kinematics of 64 Pandas with and without it, each in a process of its own."""

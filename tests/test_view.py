@@ -118,6 +118,7 @@ def test_weights_change_without_compiling_and_the_distance_scales(live):
     assert frame is not None and frame.distance == pytest.approx(2 * before, rel=1e-3)  # the minimum stays in its place
 
 
+@pytest.mark.slow
 def test_the_view_goes_on_while_another_correspondence_is_compiled():
     session = LiveSession(env_config("planar4dof"))
     session.compile()
@@ -141,6 +142,7 @@ def test_locked_joints_switch_the_learner(env):
         learner_arm(env, ("joint9",))
 
 
+@pytest.mark.slow
 def test_a_trained_mapper_moves_the_learner(tmp_path):
     tiny = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}
     trainer = PoseMapperConfig(**tiny, evaluations=1, validation_poses=32)
