@@ -34,8 +34,10 @@ class FreshEpisodeWrapper(Wrapper):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Batched step."""
-        counted = {key: jnp.where(state.done, 0, steps) for key, steps in state.info.items() if key == "steps"}
-        state = state.replace(done=jnp.zeros_like(state.done), info={**state.info, **counted})
+        info = state.info
+        if "steps" in info:  # brax's EpisodeWrapper counts them
+            info = {**info, "steps": jnp.where(state.done, 0, info["steps"])}
+        state = state.replace(done=jnp.zeros_like(state.done), info=info)
         state = self.env.step(state, action)
         arm_state: ArmState = state.pipeline_state  # type: ignore[assignment]
         fresh, fresh_obs = jax.vmap(self._begin)(arm_state.key)

@@ -132,7 +132,7 @@ def _stretches(
     networks = make_networks(config, env.observation_size, env.action_size)
     begin, learn = make_programs(env, config, networks, batches, _learning_rate(config, step), restored)
     on_compiling()
-    learning = begin()(seed + step)
+    learning = begin()((seed + step) % 2**31)  # what a 32-bit integer holds
     yield _Stretch(step, jax.device_get(learning.params), {})
     walltime = 0.0
     for _ in range(-(-all_batches // batches)):
