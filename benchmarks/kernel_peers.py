@@ -1,5 +1,6 @@
 """What the metric's kernel is measured against: the same function, written the straightforward way."""
 
+import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -71,7 +72,7 @@ def torch_distance(
 
     def prepared(arm: mimic.Embodiment) -> tuple[Any, ...]:
         screws = _screws(arm)
-        return constant(screws), constant(screws @ screws), constant(_homes(arm)), list(np.add(arm.link_joint, 1))
+        return constant(screws), constant(screws @ screws), constant(_homes(arm)), np.add(arm.link_joint, 1).tolist()
 
     def states(arm: mimic.Embodiment, known: tuple[Any, ...], qpos: Any, qvel: Any) -> tuple[Any, ...]:
         axes, squares, homes, moved = known
@@ -110,6 +111,14 @@ def torch_distance(
         return (pairs * total).mean((1, 2))
 
     return distance
+
+
+def give_memory_back() -> None:
+    """What PyTorch keeps for its next tensors."""
+    import torch  # pyright: ignore[reportMissingImports]
+
+    gc.collect()
+    torch.cuda.empty_cache()
 
 
 def _screws(arm: mimic.Embodiment) -> np.ndarray:

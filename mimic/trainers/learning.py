@@ -27,14 +27,12 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import fresh_episodes
 from mimic.kinematics import LinkStates
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.prepared import Prepared
+from mimic.trainers.prepared import Prepared, compiler_options
 
 Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, value parameters
 Metrics = dict[str, Array]
 
 _AXIS = "devices"
-# XLA would try each matrix product in a dozen forms, which takes longer than it saves in a training.
-_GPU_COMPILER_OPTIONS = {"xla_gpu_enable_triton_gemm": False}
 
 
 @struct.dataclass
@@ -61,11 +59,6 @@ class Learning:
     def params(self) -> Params:
         """What a policy is made of, and what is saved."""
         return self.statistics, self.networks.policy, self.networks.value
-
-
-def compiler_options() -> dict[str, Any]:
-    """For programs with large matrix products, on the present backend."""
-    return _GPU_COMPILER_OPTIONS if jax.default_backend() == "gpu" else {}
 
 
 def make_programs(

@@ -1,12 +1,14 @@
 """`trainer=pose_mapper`: a network that maps poses of the expert to the learner's nearest poses."""
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from mimic.kinematics import link_states
 from mimic.pose import imitate_pose
@@ -14,18 +16,39 @@ from mimic.trainers import mapper_training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
 from mimic.trainers.pose_mapper import make_model
+from mimic.trainers.prepared import Prepared, compiling
 from mimic.trainers.signals import Signals
 
 # Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.
 _TRAINING, _VALIDATION, _HELD_OUT, _CHANCE = range(4)
 
 
-class _Reference(NamedTuple):
-    """What the poses allow, by split: the optimiser's poses and distances, and the mean distance of random poses."""
+class _Judged(NamedTuple):
+    """The learner's poses for all of the expert's, and what they are judged by.
 
-    qpos: dict[str, np.ndarray]
-    distance: dict[str, np.ndarray]
-    random: dict[str, float]
+    Attributes:
+      qpos: [poses, learner_joints] [rad].
+      distance: [poses] to the expert's.
+      direction: [poses, links, 3] of the learner's links.
+    """
+
+    qpos: Any
+    distance: Any
+    direction: Any
+
+
+class _Reference(NamedTuple):
+    """What the poses allow.
+
+    Attributes:
+      optimum: the optimiser's poses.
+      random_distance: [poses] of random poses.
+      expert_direction: [poses, links, 3] of the expert's links.
+    """
+
+    optimum: _Judged
+    random_distance: Any
+    expert_direction: Any
 
 
 class MapperJob(Job):
@@ -48,48 +71,63 @@ class MapperJob(Job):
         self._name, self._seed = config.env.name, config.seed
         self.total_steps = self.settings.total_steps
         self._model = model = make_model(config.env, self.settings)
+        self._distance = model.distance
         samples = int(self.settings.samples or 0)
-        seen = mapper_training.random_poses(model, jax.random.fold_in(_key(_TRAINING), config.seed), samples)
-        self._seen = seen
-        self._poses = {
-            "train": seen[: self.settings.validation_poses],
-            "validation": mapper_training.random_poses(model, _key(_VALIDATION), self.settings.validation_poses),
-            "held_out": mapper_training.random_poses(model, _key(_HELD_OUT), self.settings.held_out_poses),
-        }
+        self._seen, unseen = jax.jit(self._draw)(config.seed)
+        self._poses = {"train": self._seen[: self.settings.validation_poses], **unseen}
         kind = "fresh poses in each epoch" if self.settings.fresh else "training poses"
         self.headline = f"{config.env.name}: {model.expert.name} to {model.learner.name}, {samples} {kind}"
-        self._program = jax.jit(lambda params, poses: jax.vmap(functools.partial(model, params))(poses))
-        self._distance = jax.jit(jax.vmap(model.distance))
-        self._directions = jax.jit(
-            lambda qpos, learner_qpos: (
-                jax.vmap(lambda q: link_states(model.expert, q).direction)(qpos),
-                jax.vmap(lambda q: link_states(model.learner, q).direction)(learner_qpos),
-            )
-        )
+        self._every = np.concatenate(list(self._poses.values()))
+        self._reference = Prepared(self._find_reference)
+        self._program = Prepared(self._compile)
 
-    @functools.cached_property
-    def _reference(self) -> _Reference:
-        """Computed when it is first asked for."""
+    def _draw(self, seed: int) -> tuple[Array, dict[str, Array]]:
+        """The poses of an epoch, which training repeats where they are not fresh; and the unseen ones, by split."""
+        settings, draw = self.settings, functools.partial(mapper_training.random_poses, self._model)
+        return draw(jax.random.fold_in(_key(_TRAINING), seed), int(settings.samples or 0)), {
+            "validation": draw(_key(_VALIDATION), settings.validation_poses),
+            "held_out": draw(_key(_HELD_OUT), settings.held_out_poses),
+        }
+
+    def _judge(self, expert_qpos: Array, qpos: Array) -> _Judged:
+        direction = jax.vmap(lambda q: link_states(self._model.learner, q).direction)(qpos)
+        return _Judged(qpos, jax.vmap(self._distance)(expert_qpos, qpos), direction)
+
+    def _compile(self) -> Callable[[Params, np.ndarray], _Judged]:
+        def judged(params: Params, every: Array) -> _Judged:
+            return self._judge(every, jax.vmap(functools.partial(self._model, params))(every))
+
+        return compiling(judged, self.params_template(), self._every)()
+
+    def _find_reference(self) -> _Reference:
         model, metric = self._model, self._model.metric
         correspondence = metric.make_correspondence(model.expert, model.learner)
-        every = jnp.concatenate(list(self._poses.values()))
-        found = imitate_pose(
-            model.expert,
-            model.learner,
-            every,
-            correspondence,
-            metric.make_weights(),
-            rotation=metric.rotation_measure,  # type: ignore[arg-type]
-            reduction=metric.reduction,  # type: ignore[arg-type]
-        )
-        lower, upper = jnp.asarray(model.learner.joint_range, jnp.float32).T
-        chance = jax.random.uniform(_key(_CHANCE), (len(every), len(lower)), minval=lower, maxval=upper)
+
+        def reference(every: Array) -> _Reference:
+            found = imitate_pose(
+                model.expert,
+                model.learner,
+                every,
+                correspondence,
+                metric.make_weights(),
+                rotation=metric.rotation_measure,  # type: ignore[arg-type]
+                reduction=metric.reduction,  # type: ignore[arg-type]
+            )
+            lower, upper = jnp.asarray(model.learner.joint_range, jnp.float32).T
+            chance = jax.random.uniform(_key(_CHANCE), (len(every), len(lower)), minval=lower, maxval=upper)
+            direction = jax.vmap(lambda q: link_states(model.expert, q).direction)(every)
+            return _Reference(self._judge(every, found.qpos), jax.vmap(self._distance)(every, chance), direction)
+
+        return jax.device_get(compiling(reference, self._every)()(self._every))
+
+    def _prepare(self) -> None:
+        """Begins to compile the evaluation, and to compute what it is measured against."""
+        self._reference.start()
+        self._program.start()
+
+    def _by_split(self, values: np.ndarray) -> dict[str, np.ndarray]:
         ends = np.cumsum([len(poses) for poses in self._poses.values()])[:-1]
-        by_split = [
-            dict(zip(self._poses, np.split(np.asarray(values), ends), strict=True))
-            for values in (found.qpos, found.distance, self._distance(every, chance))
-        ]
-        return _Reference(by_split[0], by_split[1], {split: float(x.mean()) for split, x in by_split[2].items()})
+        return dict(zip(self._poses, np.split(values, ends), strict=True))
 
     def save_inputs(self, run_dir: Path) -> None:
         """Nothing: the poses follow from the seed."""
@@ -111,20 +149,24 @@ class MapperJob(Job):
             on_evaluation=on_evaluation,
             signals=signals,
             restore=restore,
+            on_compiling=self._prepare,
         )
 
-    def evaluate(self, params: Params) -> dict[str, np.ndarray]:
-        """The learner's poses, by split."""
-        return {split: np.asarray(self._program(params, poses)) for split, poses in self._poses.items()}
+    def evaluate(self, params: Params) -> _Judged:
+        """The learner's poses, and how good they are."""
+        return jax.device_get(self._program()(params, self._every))
 
-    def figures(self, outcome: dict[str, np.ndarray]) -> Figures:
+    def figures(self, outcome: _Judged) -> Figures:
         """Quality and what it is made of, by split; angles on held-out poses."""
-        reference = self._reference
-        mean = {split: float(self._distance(poses, outcome[split]).mean()) for split, poses in self._poses.items()}
-        optimum = {split: float(distance.mean()) for split, distance in reference.distance.items()}
-        random = reference.random
+        reference = self._reference()
+
+        def means(distance: np.ndarray) -> dict[str, float]:
+            return {split: float(values.mean()) for split, values in self._by_split(distance).items()}
+
+        mean, optimum = means(outcome.distance), means(reference.optimum.distance)
+        random = means(reference.random_distance)
         quality = {split: (mean[split] - optimum[split]) / (random[split] - optimum[split]) for split in mean}
-        to_expert, to_optimum = self._angles(outcome["held_out"])
+        to_expert, to_optimum = self._angles(outcome)
         names = self._model.learner.link_names
         return {
             "quality": quality,
@@ -136,13 +178,14 @@ class MapperJob(Job):
             "link_angle_to_optimum_deg_by_link": dict(zip(names, map(float, to_optimum), strict=True)),
         }
 
-    def _angles(self, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _angles(self, outcome: _Judged) -> tuple[np.ndarray, np.ndarray]:
         """Median angles [deg] of each link on held-out poses: to the expert's corresponding links, to the optimum."""
-        expert, learner = map(np.asarray, self._directions(self._poses["held_out"], found))
-        optimum = np.asarray(self._directions(self._poses["held_out"], self._reference.qpos["held_out"])[1])
-        model = self._model
-        shares = model.metric.shares(model.expert, model.learner)
-        to_expert = np.einsum("ij,pij->pj", shares, _angle(expert[:, :, None], learner[:, None]))
+        reference, model = self._reference(), self._model
+        directions = reference.expert_direction, outcome.direction, reference.optimum.direction
+        expert, learner, optimum = (self._by_split(direction)["held_out"] for direction in directions)
+        to_expert = np.einsum(
+            "ij,pij->pj", model.metric.shares(model.expert, model.learner), _angle(expert[:, :, None], learner[:, None])
+        )
         return np.median(to_expert, axis=0), np.median(_angle(learner, optimum), axis=0)
 
     def status(self, figures: Figures) -> str:

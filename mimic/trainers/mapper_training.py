@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from mimic.trainers.checkpoints import delete_checkpoint, save_checkpoint
 from mimic.trainers.job import OnEvaluation
 from mimic.trainers.pose_mapper import MapperModel, Params
+from mimic.trainers.prepared import compiling
 from mimic.trainers.signals import Signals
 
 _WARM_UP = 0.02  # share of the updates over which the learning rate rises
@@ -32,6 +33,7 @@ def train(
     on_evaluation: OnEvaluation,
     signals: Signals,
     restore: tuple[int, Params] | None = None,
+    on_compiling: Callable[[], None] | None = None,
 ) -> tuple[int, Params]:
     """Trains, and goes back to the best parameters where the distance on the validation poses has risen since.
 
@@ -44,6 +46,7 @@ def train(
       on_evaluation: called after each checkpoint; training ends where it returns True.
       signals: training ends after the next checkpoint if one came.
       restore: training poses so far, and parameters to go on from; the moments of the optimiser start anew.
+      on_compiling: called once the programs are being compiled, so that what else there is can be at the same time.
 
     Returns:
       Training poses, and parameters after these.
@@ -53,14 +56,22 @@ def train(
     """
     config = model.config
     samples, epochs = int(config.samples or 0), int(config.epochs or 0)
-    key_init, key_epochs = jax.random.split(jax.random.key(seed))
-    steps, params = restore or (0, jax.jit(model.init)(key_init))
+    steps, restored = restore or (0, None)
     done = steps // samples
-    optimiser = _optimiser(model, done)
-    optimiser_state = jax.jit(optimiser.init)(params)
     stretch = max(epochs // int(config.evaluations or 1), 1)
-    validate = jax.jit(lambda params, poses: _distances(model, params, poses).min(axis=1).mean())
-    run_stretch = _stretch_program(model, optimiser, training)
+    optimiser = _optimiser(model, done)
+    key = jax.random.key(seed)
+
+    def begin(key: Array, restored: Params | None) -> Any:
+        params = model.init(jax.random.split(key)[0]) if restored is None else restored
+        return params, optimiser.init(params)
+
+    start = jax.eval_shape(begin, key, restored)
+    run_stretch = compiling(_stretch(model, optimiser, stretch), start, key, 0, training)
+    validate = compiling(lambda params: _distances(model, params, validation).min(axis=1).mean(), start[0])
+    if on_compiling:
+        on_compiling()
+    params, optimiser_state = compiling(begin, key, restored)()(key, restored)
 
     def save(steps: int, params: Params, metrics: dict[str, float]) -> bool:
         save_checkpoint(run_dir, steps, params)
@@ -69,17 +80,17 @@ def train(
         return enough
 
     save(steps, params, {})
-    best = float(validate(params, validation)), steps, params
+    best = float(validate()(params)), steps, params
     later: list[int] = []
     for _ in range(math.ceil((epochs - done) / stretch)):
+        program = run_stretch()
         began = time.perf_counter()
-        keys = jax.vmap(lambda epoch: jax.random.fold_in(key_epochs, epoch))(jnp.arange(done, done + stretch))
-        (params, optimiser_state), loss = run_stretch((params, optimiser_state), keys)
-        loss = float(loss.mean())
+        (params, optimiser_state), loss = program((params, optimiser_state), key, done, training)
+        loss = float(loss)
         done += stretch
         steps = done * samples
         speed = stretch * samples / (time.perf_counter() - began)
-        value = float(validate(params, validation))
+        value = float(validate()(params))
         enough = save(steps, params, {"loss": loss, "validation_distance": value, "sps": speed})
         if value < best[0]:
             best, later = (value, steps, params), []
@@ -105,10 +116,13 @@ def _optimiser(model: MapperModel, done_epochs: int) -> optax.GradientTransforma
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(lambda count: schedule(count + offset), b2=0.99))
 
 
-def _stretch_program(
-    model: MapperModel, optimiser: optax.GradientTransformation, training: Poses
-) -> Callable[[Any, Array], tuple[Any, Array]]:
-    """A compiled function of (parameters, optimiser state) and the keys of epochs; also gives each epoch's loss."""
+def _stretch(
+    model: MapperModel, optimiser: optax.GradientTransformation, epochs: int
+) -> Callable[[Any, Array, Any, Poses], tuple[Any, Array]]:
+    """Trains for some epochs: from (parameters, optimiser state), the run's key, the epochs so far, and training poses.
+
+    It gives the first as they are then, and the mean loss.
+    """
     config = model.config
     samples, batch_size = int(config.samples or 0), int(config.batch_size or 1)
 
@@ -123,12 +137,21 @@ def _stretch_program(
         change, state = optimiser.update(gradient, state, params)
         return (optax.apply_updates(params, change), state), value
 
-    def epoch(carry: Any, key: Array) -> tuple[Any, Array]:
-        poses = random_poses(model, key, samples) if config.fresh else training[jax.random.permutation(key, samples)]
-        carry, losses = jax.lax.scan(update, carry, poses.reshape(-1, batch_size, poses.shape[-1]))
+    def run(carry: Any, key: Array, done: Any, training: Poses) -> tuple[Any, Array]:
+        key_epochs = jax.random.split(key)[1]
+
+        def epoch(carry: Any, number: Array) -> tuple[Any, Array]:
+            own = jax.random.fold_in(key_epochs, number)
+            poses = (
+                random_poses(model, own, samples) if config.fresh else training[jax.random.permutation(own, samples)]
+            )
+            carry, losses = jax.lax.scan(update, carry, poses.reshape(-1, batch_size, poses.shape[-1]))
+            return carry, losses.mean()
+
+        carry, losses = jax.lax.scan(epoch, carry, done + jnp.arange(epochs))
         return carry, losses.mean()
 
-    return jax.jit(lambda carry, keys: jax.lax.scan(epoch, carry, keys))
+    return run
 
 
 def random_poses(model: MapperModel, key: Array, count: int) -> Poses:

@@ -13,8 +13,7 @@ from mimic.trainers import ppo, runs
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.evaluation import SPLITS, Evaluator, Rollouts
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
-from mimic.trainers.learning import compiler_options
-from mimic.trainers.prepared import Prepared
+from mimic.trainers.prepared import Prepared, compiling
 from mimic.trainers.signals import Signals
 
 
@@ -69,8 +68,7 @@ class PPOJob(Job):
             return self.evaluator.rollout(controller(params))
 
         template = jax.eval_shape(self.params_template)
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
-        return jax.jit(rollouts, compiler_options=compiler_options()).lower(shapes).compile()
+        return compiling(rollouts, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template))()
 
     def _prepare(self) -> None:
         """Begins to compile the evaluation, and to compute what it is measured against."""

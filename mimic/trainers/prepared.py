@@ -3,11 +3,14 @@
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import jax
 
 WAITED = "/mimic/prepared/wait"  # an event of `jax.monitoring`
+
+# XLA would try each matrix product in a dozen forms, which takes longer than it saves in a training.
+_GPU_COMPILER_OPTIONS = {"xla_gpu_enable_triton_gemm": False}
 
 T = TypeVar("T")
 
@@ -40,3 +43,20 @@ class Prepared(Generic[T]):
             self._future.result()
             jax.monitoring.record_event_duration_secs(WAITED, time.perf_counter() - began)
         return self._future.result()
+
+
+def compiling(function: Callable[..., T], *shapes: Any) -> Prepared[Callable[..., T]]:
+    """`jax.jit` of a function for arguments of these shapes: traced now, compiled in the background.
+
+    Args:
+      function: of arrays.
+      *shapes: arrays, or `jax.ShapeDtypeStruct`s in their place.
+    """
+    program = Prepared(jax.jit(function, compiler_options=compiler_options()).lower(*shapes).compile)
+    program.start()
+    return program
+
+
+def compiler_options() -> dict[str, Any]:
+    """For programs with matrix products that are compiled for one run, on the present backend."""
+    return _GPU_COMPILER_OPTIONS if jax.default_backend() == "gpu" else {}
