@@ -22,7 +22,7 @@ METHODS = ("newton", "gradient_descent")
 
 _ITERATIONS = {"newton": 16, "gradient_descent": 1000}
 _TRACKING_ITERATIONS = 6  # Newton steps from the pose of the neighbouring time
-_ROUGH_SHARE, _POLISHED = 0.35, 2  # all starts descend for this share of the iterations, then the best of them
+_ROUGH_SHARE = 0.35  # all starts descend for this share of the iterations, then the best of them
 _POSES = 256  # random poses that are compared, without a descent, to find the starts
 _FLAT = 1e-3  # gradient [1/rad] of a pose that counts as converged, as a share of the mean distance of random poses
 _ANCHORS = 3  # times of a trajectory at which minima are searched; all others are tracked
@@ -54,6 +54,7 @@ def imitate_pose(
     warm_start: Float[ArrayLike, "*batch learner_joints"] | None = None,
     method: Method = "newton",
     iterations: int | None = None,
+    kept: int | None = 2,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
 ) -> PoseImitation:
@@ -77,6 +78,8 @@ def imitate_pose(
       warm_start: [..., n_hat] the only start, where it is given.
       method: "newton" or "gradient_descent".
       iterations: of each descent; 16 for Newton's method, 1000 for gradient descent where None.
+      kept: descents that go on after a third of the iterations, the best so far. None keeps all, which is twice the
+        work, but half as much to compile.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
 
@@ -89,7 +92,9 @@ def imitate_pose(
     count = _ITERATIONS[method] if iterations is None else iterations
     if starts < 0 or count < 2:
         raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {count}")
-    rough = max(int(_ROUGH_SHARE * count), 1)
+    if kept is not None and kept < 1:
+        raise ValueError(f"kept: expected at least 1, or None for all, got {kept}")
+    rough = count if kept is None else max(int(_ROUGH_SHARE * count), 1)
     key = jax.random.key(0) if key is None else key
     batch = poses.shape[:-1]
     objective = pose_objective(learner, correspondence, weights, rotation, reduction)
@@ -107,8 +112,9 @@ def imitate_pose(
             first = first if warm is None else warm[None]
             of_qpos = functools.partial(objective.derivatives, target)
             ends = jax.vmap(lambda start: descend(of_qpos, start, limits, rough))(first)
-            chosen = jax.lax.top_k(-ends.value, min(_POLISHED, len(first)))[1]
-            ends = jax.vmap(lambda start: descend(of_qpos, start, limits, count - rough))(ends.qpos[chosen])
+            if kept is not None:
+                chosen = jax.lax.top_k(-ends.value, min(kept, len(first)))[1]
+                ends = jax.vmap(lambda start: descend(of_qpos, start, limits, count - rough))(ends.qpos[chosen])
             end: End = jax.tree.map(lambda x: x[jnp.argmin(ends.value)], ends)
             left = objective.distance(states, link_states(learner, end.qpos))
             return PoseImitation(_wrapped(end.qpos, limits), left, end.slope <= _FLAT * scale)

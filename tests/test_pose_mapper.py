@@ -135,12 +135,12 @@ def test_the_paper_overfits_and_early_stopping_goes_back_to_the_best(tmp_path):
 def test_what_is_judged_is_not_what_is_learned(tmp_path):
     jobs = [MapperJob(run_config(tmp_path, seed=seed)) for seed in (0, 1)]
     for job in jobs:
-        seen = np.asarray(job._seen)
+        seen = np.asarray(job._poses["train"])
         for split in ("validation", "held_out"):
             unseen = np.asarray(job._poses[split])
             assert not (unseen[:, None] == seen[None, :512]).all(axis=-1).any()
     np.testing.assert_array_equal(jobs[0]._poses["held_out"], jobs[1]._poses["held_out"])
-    assert not np.array_equal(jobs[0]._seen, jobs[1]._seen)
+    assert not np.array_equal(jobs[0]._poses["train"], jobs[1]._poses["train"])
 
 
 def test_limited_joints_stay_within_their_limits(tmp_path):

@@ -19,7 +19,7 @@ from mimic.imitation import kinematic_bound
 from mimic.kinematics import link_state_table
 from mimic.pose import pose_limits, shared_joints
 from mimic.trainers.measures import WORST, Table, gaps, measure
-from mimic.trainers.prepared import Prepared
+from mimic.trainers.prepared import Prepared, on_host
 
 Controller = Callable[[State], Array]  # state of the environment -> action
 SPLITS = ("train", "held_out")
@@ -197,5 +197,5 @@ def _lower_bound(env: ImitationEnv, qpos: np.ndarray, qvel: np.ndarray) -> np.nd
         )
 
     # On the host's processor in any case: there the program compiles several times faster, and it runs once.
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+    with on_host():
         return np.asarray(jax.jit(jax.vmap(bound))(qpos.astype(np.float32), qvel.astype(np.float32)))

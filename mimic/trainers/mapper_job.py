@@ -71,94 +71,108 @@ class MapperJob(Job):
         self._name, self._seed = config.env.name, config.seed
         self.total_steps = self.settings.total_steps
         self._model = model = make_model(config.env, self.settings)
-        self._distance = model.distance
         samples = int(self.settings.samples or 0)
-        self._seen, unseen = jax.jit(self._draw)(config.seed)
-        self._poses = {"train": self._seen[: self.settings.validation_poses], **unseen}
         kind = "fresh poses in each epoch" if self.settings.fresh else "training poses"
         self.headline = f"{config.env.name}: {model.expert.name} to {model.learner.name}, {samples} {kind}"
-        self._every = np.concatenate(list(self._poses.values()))
-        self._reference = Prepared(self._find_reference)
-        self._program = Prepared(self._compile)
 
-    def _draw(self, seed: int) -> tuple[Array, dict[str, Array]]:
-        """The poses of an epoch, which training repeats where they are not fresh; and the unseen ones, by split."""
+    @functools.cached_property
+    def _poses(self) -> dict[str, Array]:
+        """By split; those of an epoch are repeated where training poses are not fresh."""
+        return jax.jit(self._draw)(self._seed)
+
+    def _draw(self, seed: int) -> dict[str, Array]:
         settings, draw = self.settings, functools.partial(mapper_training.random_poses, self._model)
-        return draw(jax.random.fold_in(_key(_TRAINING), seed), int(settings.samples or 0)), {
+        return {
+            "train": draw(jax.random.fold_in(_key(_TRAINING), seed), int(settings.samples or 0)),
             "validation": draw(_key(_VALIDATION), settings.validation_poses),
             "held_out": draw(_key(_HELD_OUT), settings.held_out_poses),
         }
 
+    @property
+    def _counts(self) -> dict[str, int]:
+        """Poses of each split that the mapper is judged on."""
+        few, many = self.settings.validation_poses, self.settings.held_out_poses
+        return {"train": min(few, int(self.settings.samples or 0)), "validation": few, "held_out": many}
+
+    @property
+    def _every_shape(self) -> jax.ShapeDtypeStruct:
+        return mapper_training.poses_shape(self._model, sum(self._counts.values()))
+
+    @functools.cached_property
+    def _every(self) -> np.ndarray:
+        """The poses that the mapper is judged on."""
+        return np.concatenate([self._poses[split][:count] for split, count in self._counts.items()])
+
+    def _by_split(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        ends = np.cumsum(list(self._counts.values()))[:-1]
+        return dict(zip(self._counts, np.split(values, ends), strict=True))
+
     def _judge(self, expert_qpos: Array, qpos: Array) -> _Judged:
         direction = jax.vmap(lambda q: link_states(self._model.learner, q).direction)(qpos)
-        return _Judged(qpos, jax.vmap(self._distance)(expert_qpos, qpos), direction)
+        return _Judged(qpos, jax.vmap(self._model.distance)(expert_qpos, qpos), direction)
 
-    def _compile(self) -> Callable[[Params, np.ndarray], _Judged]:
+    @functools.cached_property
+    def _evaluation(self) -> Prepared[Callable[[Params, np.ndarray], _Judged]]:
         def judged(params: Params, every: Array) -> _Judged:
             return self._judge(every, jax.vmap(functools.partial(self._model, params))(every))
 
-        return compiling(judged, self.params_template(), self._every)()
+        return compiling(judged, self.params_template(), self._every_shape)
 
-    def _find_reference(self) -> _Reference:
+    @functools.cached_property
+    def _optimisation(self) -> Prepared[Callable[[np.ndarray], _Reference]]:
         model, metric = self._model, self._model.metric
-        correspondence = metric.make_correspondence(model.expert, model.learner)
 
         def reference(every: Array) -> _Reference:
             found = imitate_pose(
                 model.expert,
                 model.learner,
                 every,
-                correspondence,
+                model.correspondence,
                 metric.make_weights(),
+                kept=None,  # compiled in half of the time
                 rotation=metric.rotation_measure,  # type: ignore[arg-type]
                 reduction=metric.reduction,  # type: ignore[arg-type]
             )
             lower, upper = jnp.asarray(model.learner.joint_range, jnp.float32).T
             chance = jax.random.uniform(_key(_CHANCE), (len(every), len(lower)), minval=lower, maxval=upper)
             direction = jax.vmap(lambda q: link_states(model.expert, q).direction)(every)
-            return _Reference(self._judge(every, found.qpos), jax.vmap(self._distance)(every, chance), direction)
+            return _Reference(self._judge(every, found.qpos), jax.vmap(model.distance)(every, chance), direction)
 
-        return jax.device_get(compiling(reference, self._every)()(self._every))
+        return compiling(reference, self._every_shape)
 
-    def _prepare(self) -> None:
-        """Begins to compile the evaluation, and to compute what it is measured against."""
-        self._reference.start()
-        self._program.start()
-
-    def _by_split(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        ends = np.cumsum([len(poses) for poses in self._poses.values()])[:-1]
-        return dict(zip(self._poses, np.split(values, ends), strict=True))
+    @functools.cached_property
+    def _reference(self) -> _Reference:
+        return jax.device_get(self._optimisation()(self._every))
 
     def save_inputs(self, run_dir: Path) -> None:
         """Nothing: the poses follow from the seed."""
 
     def params_template(self) -> Params:
         """Of the network."""
-        return jax.eval_shape(self._model.init, jax.random.key(0))
+        return jax.eval_shape(lambda: self._model.init(jax.random.key(0)))
 
     def train(
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
     ) -> tuple[int, Params]:
         """Through the metric, see `mapper_training`."""
+        _ = self._optimisation, self._evaluation  # compiled beside the training's programs; the longest is the first
         return mapper_training.train(
             self._model,
-            self._seen,
-            self._poses["validation"],
+            lambda: (self._poses["train"], self._poses["validation"]),
             run_dir,
             seed=self._seed,
             on_evaluation=on_evaluation,
             signals=signals,
             restore=restore,
-            on_compiling=self._prepare,
         )
 
     def evaluate(self, params: Params) -> _Judged:
         """The learner's poses, and how good they are."""
-        return jax.device_get(self._program()(params, self._every))
+        return jax.device_get(self._evaluation()(params, self._every))
 
     def figures(self, outcome: _Judged) -> Figures:
         """Quality and what it is made of, by split; angles on held-out poses."""
-        reference = self._reference()
+        reference = self._reference
 
         def means(distance: np.ndarray) -> dict[str, float]:
             return {split: float(values.mean()) for split, values in self._by_split(distance).items()}
@@ -180,7 +194,7 @@ class MapperJob(Job):
 
     def _angles(self, outcome: _Judged) -> tuple[np.ndarray, np.ndarray]:
         """Median angles [deg] of each link on held-out poses: to the expert's corresponding links, to the optimum."""
-        reference, model = self._reference(), self._model
+        reference, model = self._reference, self._model
         directions = reference.expert_direction, outcome.direction, reference.optimum.direction
         expert, learner, optimum = (self._by_split(direction)["held_out"] for direction in directions)
         to_expert = np.einsum(

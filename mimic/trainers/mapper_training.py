@@ -25,28 +25,25 @@ Poses = Float[Array, "poses joints"]
 
 def train(
     model: MapperModel,
-    training: Poses,
-    validation: Poses,
+    poses: Callable[[], tuple[Poses, Poses]],
     run_dir: Path,
     *,
     seed: int,
     on_evaluation: OnEvaluation,
     signals: Signals,
     restore: tuple[int, Params] | None = None,
-    on_compiling: Callable[[], None] | None = None,
 ) -> tuple[int, Params]:
     """Trains, and goes back to the best parameters where the distance on the validation poses has risen since.
 
     Args:
       model: with a resolved config.
-      training: poses that every epoch goes through where they are not fresh.
-      validation: poses that tell when to stop.
+      poses: those that every epoch goes through where they are not fresh, and the ones that tell when to stop; asked
+        for once the programs are being compiled.
       run_dir: where checkpoints go; those after the best are deleted.
       seed: of the network, the order and the fresh poses.
       on_evaluation: called after each checkpoint; training ends where it returns True.
       signals: training ends after the next checkpoint if one came.
       restore: training poses so far, and parameters to go on from; the moments of the optimiser start anew.
-      on_compiling: called once the programs are being compiled, so that what else there is can be at the same time.
 
     Returns:
       Training poses, and parameters after these.
@@ -60,18 +57,18 @@ def train(
     done = steps // samples
     stretch = max(epochs // int(config.evaluations or 1), 1)
     optimiser = _optimiser(model, done)
-    key = jax.random.key(seed)
 
-    def begin(key: Array, restored: Params | None) -> Any:
-        params = model.init(jax.random.split(key)[0]) if restored is None else restored
+    def begin(seed: int, restored: Params | None) -> Any:
+        params = model.init(_keys(seed)[0]) if restored is None else restored
         return params, optimiser.init(params)
 
-    start = jax.eval_shape(begin, key, restored)
-    run_stretch = compiling(_stretch(model, optimiser, stretch), start, key, 0, training)
-    validate = compiling(lambda params: _distances(model, params, validation).min(axis=1).mean(), start[0])
-    if on_compiling:
-        on_compiling()
-    params, optimiser_state = compiling(begin, key, restored)()(key, restored)
+    start = jax.eval_shape(begin, seed, restored)
+    shapes = poses_shape(model, samples), poses_shape(model, config.validation_poses)
+    run_stretch = compiling(_stretch(model, optimiser, stretch), start, seed, 0, shapes[0])
+    begins = compiling(begin, seed, restored)
+    validate = compiling(lambda *given: _distances(model, *given).min(axis=1).mean(), start[0], shapes[1])
+    params, optimiser_state = begins()(seed, restored)
+    training, validation = poses()
 
     def save(steps: int, params: Params, metrics: dict[str, float]) -> bool:
         save_checkpoint(run_dir, steps, params)
@@ -80,17 +77,17 @@ def train(
         return enough
 
     save(steps, params, {})
-    best = float(validate()(params)), steps, params
+    best = float(validate()(params, validation)), steps, params
     later: list[int] = []
     for _ in range(math.ceil((epochs - done) / stretch)):
         program = run_stretch()
         began = time.perf_counter()
-        (params, optimiser_state), loss = program((params, optimiser_state), key, done, training)
+        (params, optimiser_state), loss = program((params, optimiser_state), seed, done, training)
         loss = float(loss)
         done += stretch
         steps = done * samples
         speed = stretch * samples / (time.perf_counter() - began)
-        value = float(validate()(params))
+        value = float(validate()(params, validation))
         enough = save(steps, params, {"loss": loss, "validation_distance": value, "sps": speed})
         if value < best[0]:
             best, later = (value, steps, params), []
@@ -118,8 +115,8 @@ def _optimiser(model: MapperModel, done_epochs: int) -> optax.GradientTransforma
 
 def _stretch(
     model: MapperModel, optimiser: optax.GradientTransformation, epochs: int
-) -> Callable[[Any, Array, Any, Poses], tuple[Any, Array]]:
-    """Trains for some epochs: from (parameters, optimiser state), the run's key, the epochs so far, and training poses.
+) -> Callable[[Any, Any, Any, Poses], tuple[Any, Array]]:
+    """Trains for some epochs: from (parameters, optimiser state), the seed, the epochs so far, and training poses.
 
     It gives the first as they are then, and the mean loss.
     """
@@ -137,8 +134,8 @@ def _stretch(
         change, state = optimiser.update(gradient, state, params)
         return (optax.apply_updates(params, change), state), value
 
-    def run(carry: Any, key: Array, done: Any, training: Poses) -> tuple[Any, Array]:
-        key_epochs = jax.random.split(key)[1]
+    def run(carry: Any, seed: Any, done: Any, training: Poses) -> tuple[Any, Array]:
+        key_epochs = _keys(seed)[1]
 
         def epoch(carry: Any, number: Array) -> tuple[Any, Array]:
             own = jax.random.fold_in(key_epochs, number)
@@ -154,10 +151,20 @@ def _stretch(
     return run
 
 
+def _keys(seed: Any) -> Array:
+    """For the network, and for the epochs."""
+    return jax.random.split(jax.random.key(seed))
+
+
 def random_poses(model: MapperModel, key: Array, count: int) -> Poses:
     """Poses of the expert, uniform within its range."""
     lower, upper = jnp.asarray(model.expert.joint_range, jnp.float32).T
     return jax.random.uniform(key, (count, model.expert.num_joints), minval=lower, maxval=upper)
+
+
+def poses_shape(model: MapperModel, count: int) -> jax.ShapeDtypeStruct:
+    """Of so many poses of the expert."""
+    return jax.ShapeDtypeStruct((count, model.expert.num_joints), jnp.float32)
 
 
 def _distances(model: MapperModel, params: Params, poses: Poses) -> Float[Array, "poses heads"]:

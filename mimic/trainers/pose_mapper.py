@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.distance import embodiment_distance
+from mimic.distance import Correspondence, embodiment_distance
 from mimic.embodiment import Embodiment
 from mimic.envs.arms import build_arm
 from mimic.envs.config import EnvConfig, MetricConfig
@@ -24,6 +24,7 @@ from mimic.pose import pose_limits
 from mimic.trainers import runs
 from mimic.trainers.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.prepared import on_host
 
 Params = Any
 PoseDistance = Callable[[Array, Array], Array]  # expert's pose, learner's pose
@@ -68,11 +69,17 @@ class MapperModel:
         return _Network(tuple(self.config.hidden_layers or ()), outputs, str(self.config.activation))
 
     @functools.cached_property
+    def correspondence(self) -> Correspondence:
+        """W, or the function that makes it of the link distances."""
+        # It must not belong to the first program that asks for it, nor wait until a GPU is there.
+        with jax.ensure_compile_time_eval(), on_host():
+            correspondence = self.metric.make_correspondence(self.expert, self.learner)
+            return correspondence if callable(correspondence) else np.asarray(correspondence)
+
+    @functools.cached_property
     def distance(self) -> PoseDistance:
         """Embodiment distance between a pose of the expert and one of the learner."""
-        with jax.ensure_compile_time_eval():  # kept: it must not belong to the first program that asks for it
-            correspondence = self.metric.make_correspondence(self.expert, self.learner)
-        weights = self.metric.make_weights()
+        correspondence, weights = self.correspondence, self.metric.make_weights()
 
         def distance(qpos: Array, learner_qpos: Array) -> Array:
             return embodiment_distance(

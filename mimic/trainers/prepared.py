@@ -1,5 +1,6 @@
 """Work that goes on in the background: compilers leave Python free to do something else."""
 
+import contextlib
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -60,3 +61,10 @@ def compiling(function: Callable[..., T], *shapes: Any) -> Prepared[Callable[...
 def compiler_options() -> dict[str, Any]:
     """For programs with matrix products that are compiled for one run, on the present backend."""
     return _GPU_COMPILER_OPTIONS if jax.default_backend() == "gpu" else {}
+
+
+def on_host() -> contextlib.AbstractContextManager[Any]:
+    """Where small things are computed by the processor, if JAX may use it: other devices take seconds to start."""
+    with contextlib.suppress(RuntimeError):  # JAX_PLATFORMS names others alone
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    return contextlib.nullcontext()
