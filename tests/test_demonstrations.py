@@ -28,7 +28,7 @@ def recorded():
     return mimic.record_demonstrations(panda(), 2)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["pd", pytest.param("reach", marks=pytest.mark.slow)])
 def test_the_command_records_what_the_library_does(kind, tmp_path):
     out = tmp_path / "demonstrations.npz"
     command = [sys.executable, "-m", "mimic.demonstrations", f"kind={kind}", "count=3", "seed=5", f"out={out}"]

@@ -80,17 +80,30 @@ def test_simulation_model_keeps_only_what_moves():
     assert np.all(effective_inertia(model, np.zeros(4)) > 0)
 
 
-def test_every_environment_resets_and_steps():
-    limited = {"demonstrations": FEW, "limits": "hardware"}
-    settings = [(name, {"demonstrations": FEW}) for name in mimic.environments()]
-    for name, overrides in [*settings, ("panda4dof", limited)]:
-        # MJX takes longest to compile; other tests hold each arm's motion under it against MuJoCo's.
-        env = mimic.make(name, **overrides, physics="mjx" if name == "planar4dof" else "fused")
-        state = env.reset(jax.random.PRNGKey(0))
-        assert state.obs.shape == (env.observation_size,)
-        after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
-        assert after.reward == pytest.approx(-float(after.metrics["distance"]))  # at rest at home, far from any limit
-        assert np.all(np.isfinite(after.obs)) and not after.done
+QUICK = ("planar4dof", "panda3dof")  # the others have all their shapes checked
+
+
+@pytest.mark.parametrize("name", mimic.environments())
+def test_every_environment_has_its_shapes(name):
+    env = mimic.make(name, demonstrations=FEW, physics="fused")
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    assert state.obs.shape == (env.observation_size,)
+    after = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
+
+
+@pytest.mark.parametrize("limits", ["none", "hardware"])
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in mimic.environments()]
+)
+def test_every_environment_resets_and_steps(name, limits):
+    # MJX takes longest to compile; other tests hold each arm's motion under it against MuJoCo's.
+    physics = "mjx" if name == "planar4dof" and limits == "none" else "fused"
+    env = mimic.make(name, demonstrations=FEW, limits=limits, physics=physics)
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
+    assert after.reward == pytest.approx(-float(after.metrics["distance"]))  # at rest at home, far from any limit
+    assert np.all(np.isfinite(after.obs)) and not after.done
 
 
 def test_episodes_end_at_the_horizon_and_draw_fresh_demonstrations(planar_env):

@@ -103,7 +103,7 @@ def test_two_links_against_a_grid():
     np.testing.assert_allclose(bound, tried, atol=0.01)  # half a degree of slope below 1 / rad, in each of two joints
 
 
-@pytest.mark.parametrize("name", ARMS)
+@pytest.mark.parametrize("name", [pytest.param("panda 7->4", marks=pytest.mark.slow), "planar 7->4"])
 def test_more_starts_change_nothing(name):
     expert, learner = ARMS[name]
     motion, correspondence, closest = solved(name)
@@ -138,8 +138,10 @@ def test_velocities_of_any_size_are_found():
     "correspondence, weights, options",
     [
         (hard_correspondence, DistanceWeights(translation=1.0, rotation=0.5), {}),
-        (lambda d: soft_correspondence(d, xi=-5.0), PAPER_WEIGHTS, {"reduction": "frobenius"}),
-        (hard_correspondence, adaptive_weights, {"rotation": "angle"}),
+        pytest.param(
+            lambda d: soft_correspondence(d, xi=-5.0), PAPER_WEIGHTS, {"reduction": "frobenius"}, marks=pytest.mark.slow
+        ),
+        pytest.param(hard_correspondence, adaptive_weights, {"rotation": "angle"}, marks=pytest.mark.slow),
     ],
     ids=["hard", "soft frobenius", "hard adaptive angle"],
 )

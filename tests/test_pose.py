@@ -101,6 +101,14 @@ def test_newton_beats_plain_descent():
     assert np.mean(plain.distance - newton.distance) < 1e-2  # the paper's way gets near
 
 
+def test_descents_that_are_given_up_are_not_missed():
+    expert, learner = PAIRS["planar 7->4"]
+    arguments = expert, learner, poses(expert, 64), overlap_correspondence(expert, learner), DIRECTIONS
+    few, every = (imitate_pose(*arguments, kept=kept) for kept in (2, None))
+    assert np.all(every.converged) and np.all(few.converged)
+    np.testing.assert_allclose(few.distance, every.distance, atol=1e-5)
+
+
 def test_shapes_and_warm_starts():
     expert, learner = PAIRS["planar 7->4"]
     correspondence = overlap_correspondence(expert, learner)
@@ -143,6 +151,7 @@ def test_trajectories_do_not_jump(limits):
         (np.full(7, np.nan), {}, "qpos: expected finite angles"),
         (np.zeros(7), {"method": "magic"}, "method: expected one of newton, gradient_descent, got 'magic'"),
         (np.zeros(7), {"starts": -1}, "starts, iterations"),
+        (np.zeros(7), {"kept": 0}, "kept: expected at least 1, or None for all, got 0"),
         (np.zeros(7), {"warm_start": np.zeros(7)}, r"warm_start: expected shape \[..., 4\]"),
     ],
 )

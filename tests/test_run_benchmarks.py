@@ -47,8 +47,8 @@ def test_each_benchmark_is_read_as_it_is_written(tmp_path):
     pairs = [{"methods": {"newton": {"poses_per_second": rate}}} for rate in (3e6, 2e6)]
     write(tmp_path, "pose.json", "pose", results=pairs)
     mapper = [
-        {"preset": "large", "process_wall_s": 9.0, "report": {"quality": {"held_out": 0.001}}},
-        {"preset": "paper", "process_wall_s": 50.0, "report": {"quality": {"held_out": 0.1}}},
+        {"preset": "large", "to_goal_s": 9.0},
+        {"preset": "paper", "to_goal_s": None},
     ]
     write(tmp_path, "pose_mapper.json", "pose_mapper", runs=mapper)
     candidate = {"engine": "fused", "integrator": "rk4", "substeps": 10, "error_mm": {"end": {"p95": 0.9}}}

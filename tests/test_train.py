@@ -111,6 +111,7 @@ def test_resume_goes_on_from_the_last_checkpoint(finished):
     assert again.returncode == 2 and "larger trainer.num_timesteps" in again.stderr
 
 
+@pytest.mark.slow
 def test_training_ends_at_the_target_gap(tmp_path):
     run_dir = tmp_path / "early"
     result = command("train", *TINY, f"run_dir={run_dir}", "trainer.target_gap=100")
