@@ -1,12 +1,17 @@
 """The programs of the training: what they collect, and what they learn from."""
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from brax.training.agents.ppo import losses
+from brax.training.types import Transition
 
 import mimic
-from mimic.trainers import learning, ppo
+from mimic.trainers import learning, ppo, ppo_loss
 from mimic.trainers.config import PPOConfig
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
@@ -23,18 +28,19 @@ def one_batch():
     networks = ppo.make_networks(config, env.observation_size, env.action_size)
     along = np.random.default_rng(0).normal(size=env.observation_size).astype(np.float32)
 
-    def loss(params, statistics, data, key, **_):
+    def loss(params, statistics, unrolls, key, *_):
         del statistics, key
-        assert data.observation.shape == (config.batch_size, 1, env.observation_size)
-        shown = {"now": (data.observation @ along).mean(), "next": (data.next_observation @ along).mean()}
-        return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), shown
+        assert unrolls.observation.shape == (config.batch_size, 1 + 1, env.observation_size)
+        shown = (unrolls.observation @ along).mean(axis=0)
+        return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), jnp.resize(shown, (len(ppo_loss.METRICS),))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning.losses, "compute_ppo_loss", loss)
+        patch.setattr(learning, "ppo_loss", loss)
         begin, learn = learning.make_programs(env, config, networks, 1, optax.constant_schedule(1e-3), None)
         start = begin()(7)
         before = jax.device_get(start)
-        after, shown = jax.device_get(learn()(start))
+        after, metrics = jax.device_get(learn()(start))
+    shown = {"now": metrics[ppo_loss.METRICS[0]], "next": metrics[ppo_loss.METRICS[1]]}
     return before, after, shown, along
 
 
@@ -57,3 +63,51 @@ def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
     np.testing.assert_array_equal(before.expert_states.position, after.expert_states.position)
     assert not np.array_equal(before.key, after.key)
     assert not np.array_equal(before.episodes.obs, after.episodes.obs)
+
+
+@pytest.mark.parametrize(("time", "entropy_cost"), [(7, 0.0), (40, 0.0), (1, 0.3)])
+def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
+    """The entropy is that of a sample, whose numbers are drawn in the same order for one step alone."""
+    sizes, unrolls = (5, 3), 6
+    config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), entropy_cost=entropy_cost)
+    networks = ppo.make_networks(config, *sizes)
+    rng = np.random.default_rng(time)
+
+    def normal(*shape):
+        return jnp.asarray(rng.normal(size=shape))
+
+    statistics, *params = learning.initial_params(networks, sizes[0], jax.random.PRNGKey(1))
+    statistics = statistics.replace(mean=normal(5), std=jnp.exp(normal(5)))
+    params = jax.tree.map(lambda x: x + 0.1 * normal(*x.shape), losses.PPONetworkParams(*params))
+    observation, raw_action = normal(unrolls, time + 1, 5), normal(unrolls, time + 1, 3)
+    log_prob, reward = normal(unrolls, time + 1), normal(unrolls, time + 1)
+    goes_on = jnp.asarray(rng.random((unrolls, time + 1)) < 0.8, float)
+    ours = ppo_loss.Unrolls(observation, raw_action, log_prob - 4, reward, goes_on)
+    np.testing.assert_array_equal(ours.unpacked(ours.packed()).raw_action, raw_action)
+    now = jax.tree.map(lambda x: x[:, :-1], ours.unpacked(ours.packed()))
+    extras = {"raw_action": now.raw_action, "log_prob": now.log_prob}
+    extras["distribution_params"] = normal(unrolls, time, 6)
+    theirs = Transition(
+        now.observation, now.raw_action, now.reward, now.goes_on, observation[:, 1:],
+        {"policy_extras": extras, "state_extras": {"truncation": jnp.zeros((unrolls, time))}},
+    )  # fmt: skip
+    key = jax.random.PRNGKey(2)
+
+    def own(params):
+        return ppo_loss.ppo_loss(params, statistics, ours, key, networks, config)
+
+    def of_brax(params):
+        names = "entropy_cost", "discounting", "reward_scaling", "gae_lambda", "clipping_epsilon"
+        settings = {name: getattr(config, name) for name in names}
+        return losses.compute_ppo_loss(params, statistics, theirs, key, networks, **settings)
+
+    (loss, metrics), gradient = jax.jit(jax.value_and_grad(own, has_aux=True))(params)
+    (expected, named), expected_gradient = jax.jit(jax.value_and_grad(of_brax, has_aux=True))(params)
+    assert loss == pytest.approx(float(expected), rel=1e-12)
+    for found, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    shown = dict(zip(ppo_loss.METRICS, map(float, metrics), strict=True))
+    assert shown["policy_loss"] == pytest.approx(float(named["policy_loss"]), rel=1e-12)
+    assert shown["value_loss"] == pytest.approx(float(named["v_loss"]), rel=1e-12)
+    assert shown["action_std"] == pytest.approx(float(named["policy_dist_mean_std"]), rel=1e-12)
+    assert 0 < shown["clip_fraction"] < 1 and shown["approx_kl"] > 0

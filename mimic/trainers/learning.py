@@ -1,6 +1,6 @@
 """PPO as two programs, one that begins and one that collects and learns, on all devices at once.
 
-Networks, loss, running statistics and action distribution are brax's. Brax's own loop compiles its programs one after
+Networks, running statistics and action distribution are brax's. Brax's own loop compiles its programs one after
 the other, each before it knows of the next; here all that they need is known from shapes, so that they compile side by
 side, with whatever else there is to compile or to import.
 """
@@ -14,12 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from brax.envs.base import State
-from brax.training import gradients
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses
 from brax.training.agents.ppo import networks as ppo_networks
-from brax.training.types import Transition
 from flax import struct
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
@@ -27,6 +26,7 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import fresh_episodes
 from mimic.kinematics import LinkStates
 from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo_loss import METRICS, Unrolls, ppo_loss
 from mimic.trainers.prepared import Prepared, compiler_options
 
 Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, value parameters
@@ -42,7 +42,7 @@ class Learning:
     Attributes:
       networks: parameters of policy and value.
       statistics: running mean and deviation of the observations.
-      optimizer: state of optax.
+      optimizer: state of optax, of all parameters as one vector.
       episodes: of the environments, shared out among the devices.
       expert_states: of the environment.
       key: for exploration and shuffling.
@@ -134,7 +134,7 @@ def _begin(
     params = losses.PPONetworkParams(policy=policy, value=value)
     keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), config.num_envs // devices)  # type: ignore[operator]
     episodes = fresh_episodes(env.with_expert_states(expert_states)).reset(keys)
-    return Learning(params, statistics, optimizer.init(params), episodes, expert_states, key)  # type: ignore[arg-type]
+    return Learning(params, statistics, optimizer.init(ravel_pytree(params)[0]), episodes, expert_states, key)  # type: ignore[arg-type]
 
 
 def _learn(
@@ -148,68 +148,58 @@ def _learn(
 ) -> tuple[Learning, Metrics]:
     episodes_env = fresh_episodes(env.with_expert_states(learning.expert_states))
     make_policy = ppo_networks.make_inference_fn(networks)
-    unrolls = config.batch_size * config.num_minibatches // config.num_envs  # type: ignore[operator]
-    batch_size = config.batch_size // devices  # type: ignore[operator]
-    loss_and_gradient = gradients.loss_and_pgrad(
-        functools.partial(
-            losses.compute_ppo_loss,
-            ppo_network=networks,
-            entropy_cost=config.entropy_cost,  # type: ignore[arg-type]
-            discounting=config.discounting,  # type: ignore[arg-type]
-            reward_scaling=config.reward_scaling,
-            gae_lambda=config.gae_lambda,
-            clipping_epsilon=config.clipping_epsilon,
-        ),
-        _AXIS,
-        has_aux=True,
-    )
+    rounds = config.batch_size * config.num_minibatches // config.num_envs  # type: ignore[operator]
+    minibatch = config.batch_size // devices  # type: ignore[operator]
+    # One vector of all parameters: a gradient is one message to the other devices, and a step of Adam one kernel.
+    unravel = ravel_pytree(learning.networks)[1]
 
-    def unroll(learning: Learning, key: Array) -> tuple[Learning, tuple[Transition, Array]]:
-        """Steps of all arms, and what they see after the last one."""
+    def unroll(learning: Learning, key: Array) -> tuple[Learning, Unrolls]:
+        """Steps of all arms, [time + 1, arms, ...]."""
         policy = make_policy(learning.params)
 
-        def step(state: State, key: Array) -> tuple[State, Transition]:
-            action, extras = policy(state.obs, key)
+        def step(state: State, key: Array) -> tuple[State, Unrolls]:
+            action, taken = policy(state.obs, key)
             after = episodes_env.step(state, action)
-            extras = {"policy_extras": extras, "state_extras": {"truncation": jnp.zeros_like(after.done)}}
-            return after, Transition(state.obs, action, after.reward, 1 - after.done, (), extras)  # type: ignore[arg-type]
+            return after, Unrolls(state.obs, taken["raw_action"], taken["log_prob"], after.reward, 1 - after.done)  # type: ignore[arg-type]
 
         keys = jax.random.split(key, config.unroll_length)  # type: ignore[arg-type]
-        episodes, transitions = jax.lax.scan(step, learning.episodes, keys)
-        return learning.replace(episodes=episodes), (transitions, episodes.obs)  # type: ignore[attr-defined]
+        episodes, steps = jax.lax.scan(step, learning.episodes, keys)
+        last = jax.tree.map(lambda x: jnp.zeros_like(x[:1]), steps)._replace(observation=episodes.obs[None])
+        steps = jax.tree.map(lambda *x: jnp.concatenate(x), steps, last)
+        return learning.replace(episodes=episodes), steps  # type: ignore[attr-defined]
 
-    def batch(learning: Learning, _: None) -> tuple[Learning, Metrics]:
-        """Collects transitions, and learns from them."""
+    def batch(learning: Learning, _: None) -> tuple[Learning, Array]:
+        """Collects unrolls, and learns from them."""
         key, key_unroll, key_order, key_loss = jax.random.split(learning.key, 4)
         key_unroll, key_order, key_loss = (
             jax.random.fold_in(k, jax.lax.axis_index(_AXIS)) for k in (key_unroll, key_order, key_loss)
         )
-        learning, (transitions, last_seen) = jax.lax.scan(unroll, learning, jax.random.split(key_unroll, unrolls))
-        statistics = running_statistics.update(
-            learning.statistics, transitions.observation, pmap_axis_name=_AXIS
-        )  # of [unrolls, time, arms] observations
+        learning, collected = jax.lax.scan(unroll, learning, jax.random.split(key_unroll, rounds))
+        unrolls = jax.tree.map(lambda x: jnp.moveaxis(x, 2, 1).reshape(-1, x.shape[1], *x.shape[3:]), collected)
+        statistics = running_statistics.update(learning.statistics, unrolls.observation[:, :-1], pmap_axis_name=_AXIS)
+        rows = unrolls.packed()
 
         def update(carry: Any, inputs: Any) -> Any:
             params, optimizer_state = carry
             chosen, key = inputs
-            row, arm = chosen // last_seen.shape[1], chosen % last_seen.shape[1]
-            data: Transition = jax.tree.map(lambda x: x[row, :, arm], transitions)
-            data = data._replace(next_observation=last_seen[row, arm][:, None])  # the loss reads the last one alone
-            (_, metrics), gradient = loss_and_gradient(params, statistics, data, key)
-            change, optimizer_state = optimizer.update(gradient, optimizer_state)
+
+            def loss(params: Array) -> tuple[Array, Array]:
+                given = unravel(params), statistics, unrolls.unpacked(rows[chosen])
+                return ppo_loss(*given, key, networks, config)
+
+            gradient, metrics = jax.grad(loss, has_aux=True)(params)
+            change, optimizer_state = optimizer.update(jax.lax.pmean(gradient, _AXIS), optimizer_state)
             return (optax.apply_updates(params, change), optimizer_state), metrics
 
         passes = jax.random.split(key_order, config.num_updates_per_batch)  # type: ignore[arg-type]
-        samples = unrolls * last_seen.shape[1]
-        order = jax.vmap(lambda key: jax.random.permutation(key, samples))(passes).reshape(-1, batch_size)
+        order = jax.vmap(lambda key: jax.random.permutation(key, len(rows)))(passes).reshape(-1, minibatch)
         keys = jax.random.split(key_loss, len(order))
-        (params, optimizer_state), metrics = jax.lax.scan(
-            update, (learning.networks, learning.optimizer), (order, keys)
-        )
+        start = ravel_pytree(learning.networks)[0], learning.optimizer
+        (params, optimizer_state), metrics = jax.lax.scan(update, start, (order, keys))
         learning = learning.replace(  # type: ignore[attr-defined]
-            networks=params, statistics=statistics, optimizer=optimizer_state, key=key
+            networks=unravel(params), statistics=statistics, optimizer=optimizer_state, key=key
         )
-        return learning, jax.tree.map(jnp.mean, metrics)
+        return learning, metrics.mean(axis=0)
 
     learning, metrics = jax.lax.scan(batch, learning, None, length=batches)
-    return learning, jax.lax.pmean(jax.tree.map(jnp.mean, metrics), _AXIS)
+    return learning, dict(zip(METRICS, jax.lax.pmean(metrics.mean(axis=0), _AXIS), strict=True))

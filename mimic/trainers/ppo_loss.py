@@ -1,0 +1,121 @@
+"""PPO's loss of a minibatch: clipped surrogate, error of the value, entropy (Schulman et al., 2017).
+
+It equals brax's `compute_ppo_loss`, as far as our environments ask for it: episodes end, and are not cut off. On a GPU
+a training is as fast as kernels can be launched, so here is little that asks for one of its own: no loop over time, one
+pass of the value network, few metrics.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.agents.ppo import losses
+from brax.training.agents.ppo import networks as ppo_networks
+from jaxtyping import Array, Float
+
+from mimic.trainers.config import PPOConfig
+
+METRICS = ("loss", "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction", "action_std")
+_VALUE_SHARE = 0.25  # of the squared error of the value
+_UNROLLED = 32  # steps of the advantage estimate that become one kernel
+
+
+class Unrolls(NamedTuple):
+    """Steps of arms, each unroll with what is seen after its last one: of that the observation alone counts.
+
+    Attributes:
+      observation: [*unrolls, time + 1, n].
+      raw_action: [*unrolls, time + 1, m] sample of the policy's normal distribution, before it is squashed.
+      log_prob: [*unrolls, time + 1] of the action, when it was taken.
+      reward: [*unrolls, time + 1].
+      goes_on: [*unrolls, time + 1] 0 where the episode ended with the step, else 1.
+    """
+
+    observation: Array
+    raw_action: Array
+    log_prob: Array
+    reward: Array
+    goes_on: Array
+
+    def packed(self) -> Array:
+        """Side by side along the last axis, so that a minibatch is gathered by one kernel."""
+        return jnp.concatenate([x if x.ndim == self.observation.ndim else x[..., None] for x in self], axis=-1)
+
+    def unpacked(self, rows: Array) -> "Unrolls":
+        """The reverse, of as many rows as there are."""
+        ends = self.observation.shape[-1], self.observation.shape[-1] + self.raw_action.shape[-1]
+        observation, raw_action, rest = jnp.split(rows, ends, axis=-1)
+        return Unrolls(observation, raw_action, *jnp.moveaxis(rest, -1, 0))
+
+
+def ppo_loss(
+    params: losses.PPONetworkParams,
+    statistics: RunningStatisticsState,
+    unrolls: Unrolls,
+    key: Array,
+    networks: ppo_networks.PPONetworks,
+    config: PPOConfig,
+) -> tuple[Array, Float[Array, " metrics"]]:
+    """The loss, and `METRICS`.
+
+    Args:
+      params: of policy and value.
+      statistics: of the observations.
+      unrolls: [unrolls, time + 1, ...].
+      key: for the entropy, which is estimated by a sample.
+      networks: of the config.
+      config: resolved.
+    """
+    values = networks.value_network.apply(statistics, params.value, unrolls.observation)
+    logits = networks.policy_network.apply(statistics, params.policy, unrolls.observation[:, :-1])
+    raw_action, old_log_prob, reward, goes_on = (x[:, :-1] for x in unrolls[1:])
+    targets, advantages = jax.lax.stop_gradient(
+        estimates(config.reward_scaling * reward, config.discounting * goes_on, values, config.gae_lambda)  # type: ignore[operator]
+    )
+    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+    actions = networks.parametric_action_distribution
+    log_ratio = actions.log_prob(logits, raw_action) - old_log_prob
+    ratio, least, most = jnp.exp(log_ratio), 1 - config.clipping_epsilon, 1 + config.clipping_epsilon
+    policy_loss = -jnp.minimum(ratio * advantages, jnp.clip(ratio, least, most) * advantages).mean()
+    value_loss = _VALUE_SHARE * jnp.square(targets - values[:, :-1]).mean()
+    entropy = actions.entropy(logits, key).mean()
+    loss = policy_loss + value_loss - config.entropy_cost * entropy  # type: ignore[operator]
+
+    approx_kl = (ratio - 1 - log_ratio).mean()
+    clip_fraction = ((ratio < least) | (ratio > most)).mean()
+    action_std = actions.create_dist(logits).scale.mean()  # type: ignore[attr-defined]
+    return loss, jnp.stack([loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction, action_std])
+
+
+def estimates(
+    reward: Float[Array, "unrolls time"],
+    discount: Float[Array, "unrolls time"],
+    values: Float[Array, "unrolls time+1"],
+    gae_lambda: float,
+) -> tuple[Float[Array, "unrolls time"], Float[Array, "unrolls time"]]:
+    """Targets of the value and advantages, by generalised advantage estimation (Schulman et al., 2016).
+
+    The advantage is that of an action against the value, where the target of the next step is what comes of it.
+
+    Args:
+      reward: of each step.
+      discount: of what comes after it; 0 where the episode ended.
+      values: of what is seen before each step, and after the last one.
+      gae_lambda: 0 trusts the value after one step, 1 not at all.
+    """
+    errors = reward + discount * values[:, 1:] - values[:, :-1]
+
+    def back(later: Array, step: Any) -> tuple[Array, Array]:
+        error, decay = step
+        now = error + decay * later
+        return now, now
+
+    steps = errors.T, gae_lambda * discount.T
+    _, above = jax.lax.scan(
+        back, jnp.zeros_like(reward[:, 0]), steps, reverse=True, unroll=min(len(errors.T), _UNROLLED)
+    )
+    targets = above.T + values[:, :-1]
+    after = jnp.concatenate([targets[:, 1:], values[:, -1:]], axis=1)
+    return targets, reward + discount * after - values[:, :-1]
