@@ -111,3 +111,14 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     assert shown["value_loss"] == pytest.approx(float(named["v_loss"]), rel=1e-12)
     assert shown["action_std"] == pytest.approx(float(named["policy_dist_mean_std"]), rel=1e-12)
     assert 0 < shown["clip_fraction"] < 1 and shown["approx_kl"] > 0
+
+
+def test_a_vector_of_all_parameters_begins_each_array_where_a_gpu_takes_it():
+    tree = {"a": jnp.arange(6.0).reshape(2, 3), "b": jnp.arange(64.0), "c": (jnp.ones(65), jnp.ones((1, 1)))}
+    to_vector, from_vector = learning.as_vector(tree)
+    vector = to_vector(tree)
+    assert vector.shape == (64 + 64 + 128 + 64,)
+    np.testing.assert_array_equal(np.flatnonzero(vector)[[0, 5]], [1, 64 + 1])
+    assert jax.tree.all(jax.tree.map(np.array_equal, from_vector(vector), tree))
+    gradient = jax.grad(lambda vector: sum(x.sum() for x in jax.tree.leaves(from_vector(vector))))(vector)
+    assert gradient.sum() == 6 + 64 + 65 + 1  # nothing pulls at the zeros between
