@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from mimic import compat
 
 compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
+compat.import_mujoco()
 
 from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence  # noqa: E402
 from mimic.distance import (  # noqa: E402

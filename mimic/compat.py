@@ -39,6 +39,22 @@ def prepare_cpu() -> None:
     os.environ["XLA_FLAGS"] = f"{flags} {_SLOW_CPU_FLAG}".strip()
 
 
+def import_mujoco() -> None:
+    """Imports MuJoCo also where the graphics library that MUJOCO_GL names is missing: who draws is told so then."""
+    asked_for = os.environ.get("MUJOCO_GL", "")
+    try:
+        importlib.import_module("mujoco")
+    except (AttributeError, OSError):  # of PyOpenGL and ctypes, while they look for the library
+        os.environ["MUJOCO_GL"] = "disabled"
+        try:
+            package = importlib.import_module("mujoco")
+        finally:
+            os.environ["MUJOCO_GL"] = asked_for
+        for name, part in list(sys.modules.items()):  # what was imported before it failed belonged to the first try
+            if name.startswith("mujoco.") and name.count(".") == 1:
+                setattr(package, name.partition(".")[2], part)
+
+
 def import_mjx() -> None:
     """Imports MJX without its two lines about Warp, an optional backend that mimic does not use."""
     with contextlib.redirect_stdout(io.StringIO()):

@@ -2,6 +2,7 @@
 
 import io
 import pickle
+import os
 import subprocess
 import sys
 
@@ -51,6 +52,17 @@ def test_bad_input_of_a_whole_process():
         [sys.executable, "-m", "mimic.train", "env=panda5dof"], capture_output=True, text=True, timeout=60, check=False
     )
     assert result.returncode == 2 and result.stderr.count("\n") == 1 and "unknown env" in result.stderr
+
+
+def test_a_graphics_library_that_is_missing_is_said_when_something_is_drawn(tmp_path):
+    """PyOpenGL fails so where there is no libEGL."""
+    (tmp_path / "OpenGL").mkdir()
+    (tmp_path / "OpenGL" / "__init__.py").write_text("raise AttributeError('no eglQueryString')")
+    code = "import mimic, mujoco.mjx; from mimic import ArmScene; ArmScene([mimic.ArmConfig()])"
+    found = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}", "MUJOCO_GL": "egl"}
+    ended = subprocess.run([sys.executable, "-c", code], env=found, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1].startswith("ValueError: rendering: no OpenGL library that works; expected EGL")
 
 
 @pytest.fixture(scope="module")
