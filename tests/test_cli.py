@@ -1,8 +1,8 @@
 """What the commands refuse: one line that says what is valid, exit code 2, nothing written."""
 
 import io
-import pickle
 import os
+import pickle
 import subprocess
 import sys
 
