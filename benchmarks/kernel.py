@@ -14,6 +14,7 @@ from the same run: memory traffic of a copy, and the rate of fused multiply-adds
 import argparse
 import dataclasses
 import functools
+import itertools
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -170,27 +171,24 @@ def available(methods: Sequence[str]) -> dict[str, str | None]:
     return {method: missing if method.startswith("torch") else None for method in methods}
 
 
-def sweep(
-    name: str, cases: dict[int, tuple[Arms, int]], methods: Sequence[str], console: Console
-) -> Iterator[dict[str, Any]]:
-    """All methods on cases that grow; one that was too large for a method is its last."""
-    for method in methods:
-        run = run_torch if method.startswith("torch") else run_jax
-        for quantity in QUANTITIES if method == "mimic" else ("value", "gradient"):
-            for size, (arms, batch) in cases.items():
-                row: dict[str, Any] = {"sweep": name, "size": size, "batch": batch}
-                row |= {"method": method, "quantity": quantity}
-                try:
-                    row |= run(method, arms, batch, quantity)
-                except Exception as error:  # the kinds for memory differ by backend; the message is in the file
-                    yield row | {"failed": f"{type(error).__name__}: {error}"[:200]}
-                    console.print(f"{name} {size:g}, {method}, {quantity}: {type(error).__name__}", markup=False)
-                    break
-                yield row
-                if row["median_ms"] > 1e3 * PATIENCE:
-                    break
-        if method.startswith("torch"):
-            kernel_peers.give_memory_back()
+def sweep(name: str, cases: dict[int, tuple[Arms, int]], method: str, console: Console) -> Iterator[dict[str, Any]]:
+    """A method on cases that grow; one that was too large for it is its last."""
+    run = run_torch if method.startswith("torch") else run_jax
+    for quantity in QUANTITIES if method == "mimic" else ("value", "gradient"):
+        for size, (arms, batch) in cases.items():
+            row: dict[str, Any] = {"sweep": name, "size": size, "batch": batch}
+            row |= {"method": method, "quantity": quantity}
+            try:
+                row |= run(method, arms, batch, quantity)
+            except Exception as error:  # the kinds for memory differ by backend; the message is in the file
+                yield row | {"failed": f"{type(error).__name__}: {error}"[:200]}
+                console.print(f"{name} {size:g}, {method}, {quantity}: {type(error).__name__}", markup=False)
+                break
+            yield row
+            if row["median_ms"] > 1e3 * PATIENCE:
+                break
+    if method.startswith("torch"):
+        kernel_peers.give_memory_back()
 
 
 def limits() -> dict[str, float]:
@@ -244,7 +242,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
     options = parser.parse_args()
-    absent = available(options.methods)
+    absent = available([method for method in METHODS if method in options.methods])
     methods = [method for method, missing in absent.items() if missing is None]
     panda, link_batch = panda_pair(), int(options.link_batch)
     sweeps = {
@@ -254,8 +252,8 @@ def main() -> None:
     console = Console(width=120)  # also where there is no terminal
     device, results = limits(), []
     absentees = {method: missing for method, missing in absent.items() if missing}
-    for name, cases in sweeps.items():
-        for row in sweep(name, cases, methods, console):
+    for method, (name, cases) in itertools.product(methods, sweeps.items()):
+        for row in sweep(name, cases, method, console):
             results.append(row)
             if options.out:
                 content = {"limits": device, "absent": absentees, "results": results}

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import mimic
-from benchmarks.record import train, write_results
+from benchmarks.record import time_to_goal, train, write_results
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -50,19 +50,11 @@ def poses_per_second(run_dir: Path, batch: int) -> float:
 
 
 def curves(run_dir: Path) -> dict[str, list[float]]:
-    """Quality on training and unseen poses after each evaluation, and the time since the process started [s]."""
+    """Quality on training and unseen poses after each evaluation."""
     with (run_dir / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     quality = {split: [round(float(row[f"quality/quality.{split}"]), 6) for row in rows] for split in _SPLITS}
-    steps, seconds = ([form(row[key]) for row in rows] for key, form in (("step", int), ("wall_time_s", float)))
-    return {"training_poses": steps, "wall_time_s": seconds, **quality}
-
-
-def time_to_goal(result: dict[str, Any]) -> float | None:
-    """Time [s] since the process started from which the quality on unseen poses is good; None where it never is."""
-    qualities, seconds = (result["curves"][key] for key in ("held_out", "wall_time_s"))
-    good = (wall for i, wall in enumerate(seconds) if all(quality <= GOAL for quality in qualities[i:]))
-    return next(good, None)
+    return {"training_poses": [int(row["step"]) for row in rows], **quality}
 
 
 def plot(results: Sequence[dict[str, Any]], out: Path) -> None:
@@ -129,7 +121,7 @@ def main() -> None:
                     arguments = ["trainer=pose_mapper", f"trainer.preset={preset}", f"env={name}", f"seed={seed}"]
                     result = {"preset": preset, **train(run_dir, arguments)}
                     result |= {"curves": curves(run_dir), "poses_per_second": poses_per_second(run_dir, BATCH)}
-                    result["to_goal_s"] = time_to_goal(result)
+                    result["to_goal_s"] = time_to_goal(run_dir, "quality.held_out", GOAL)
                 results.append(result)
                 if options.out:
                     write_results(options.out, "pose_mapper", options.commit, batch=BATCH, runs=results)

@@ -1,5 +1,6 @@
 """What all benchmarks share: a training run as a process of its own, and files of results that can be trusted."""
 
+import csv
 import datetime
 import importlib.metadata
 import json
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from mimic.trainers import runs
+
+_HELD = 3  # evaluations on end
 
 
 def write_results(out: Path, benchmark: str, commit: str | None, **content: Any) -> None:
@@ -27,6 +30,17 @@ def write_results(out: Path, benchmark: str, commit: str | None, **content: Any)
     partial = out.with_name(out.name + ".partial")
     partial.write_text(json.dumps(results, indent=2) + "\n")
     os.replace(partial, out)
+
+
+def time_to_goal(run_dir: Path, quality: str, goal: float) -> float | None:
+    """Time [s] since the process started from which a quality is at most the goal, for three evaluations on end.
+
+    For all that are left, if the training ends before; None where it never is.
+    """
+    with (run_dir / runs.METRICS).open(newline="") as file:
+        rows = [(float(row[f"quality/{quality}"]), float(row["wall_time_s"])) for row in csv.DictReader(file)]
+    reached = (wall for i, (_, wall) in enumerate(rows) if all(value <= goal for value, _ in rows[i : i + _HELD]))
+    return next(reached, None)
 
 
 def commit_id() -> str:

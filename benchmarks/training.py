@@ -9,7 +9,6 @@ run's report.
 """
 
 import argparse
-import csv
 import dataclasses
 import tempfile
 from collections.abc import Sequence
@@ -20,10 +19,7 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.record import train, write_results
-from mimic.trainers import runs
-
-_HELD = 3  # evaluations on end
+from benchmarks.record import time_to_goal, train, write_results
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,14 +52,6 @@ CASES = {
 }
 
 
-def time_to_goal(metrics: Path, goal: float) -> float | None:
-    """Wall time [s] from which the gap stays at a goal for three evaluations; None where it never does."""
-    with metrics.open(newline="") as file:
-        rows = [(float(r["quality/optimality_gap.train"]), float(r["wall_time_s"])) for r in csv.DictReader(file)]
-    reached = (wall for i, (_, wall) in enumerate(rows) if all(gap <= goal for gap, _ in rows[i : i + _HELD]))
-    return next(reached, None)
-
-
 def run_case(name: str, seed: int, starts: Sequence[str] = ("cold", "warm")) -> list[dict[str, Any]]:
     """The run, from each start."""
     case = CASES[name]
@@ -73,7 +61,7 @@ def run_case(name: str, seed: int, starts: Sequence[str] = ("cold", "warm")) -> 
         for start in starts:
             run_dir = Path(folder) / start
             result = train(run_dir, arguments, cache=Path(folder) / "cache")
-            to_goal = time_to_goal(run_dir / runs.METRICS, case.goal)
+            to_goal = time_to_goal(run_dir, "optimality_gap.train", case.goal)
             results.append({"case": name, "start": start, "goal": case.goal, "to_goal_s": to_goal, **result})
     return results
 

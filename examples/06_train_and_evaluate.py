@@ -41,7 +41,7 @@ print(f"reward of the first step, without any torque: {float(state.reward):.4f}"
 
 # ---- Training --------------------------------------------------------------------------------------------------------
 #
-# Brax's PPO on 256 arms at once. 184,000 steps are few, and so are 16 demonstrations; the defaults are 3 million steps
+# PPO on 256 arms at once. 184,000 steps are few, and so are 16 demonstrations; the defaults are 3 million steps
 # and 124 demonstrations on CPUs, and 150 million steps on a GPU. All keys are in `python -m mimic.train --help`.
 
 run = out / "run"

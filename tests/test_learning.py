@@ -1,6 +1,9 @@
 """The programs of the training: what they collect, and what they learn from."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -107,10 +110,47 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     for found, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
     shown = dict(zip(ppo_loss.METRICS, map(float, metrics), strict=True))
+    assert shown["loss"] == pytest.approx(float(expected), rel=1e-12)
+    assert -entropy_cost * shown["entropy"] == pytest.approx(float(named["entropy_loss"]), rel=1e-12, abs=1e-12)
     assert shown["policy_loss"] == pytest.approx(float(named["policy_loss"]), rel=1e-12)
     assert shown["value_loss"] == pytest.approx(float(named["v_loss"]), rel=1e-12)
     assert shown["action_std"] == pytest.approx(float(named["policy_dist_mean_std"]), rel=1e-12)
-    assert 0 < shown["clip_fraction"] < 1 and shown["approx_kl"] > 0
+    logits = networks.policy_network.apply(statistics, params.policy, now.observation)
+    log_ratio = networks.parametric_action_distribution.log_prob(logits, now.raw_action) - now.log_prob
+    assert shown["approx_kl"] == pytest.approx(float((jnp.expm1(log_ratio) - log_ratio).mean()), rel=1e-9)
+    clipped = np.abs(np.exp(log_ratio) - 1) > config.clipping_epsilon
+    assert shown["clip_fraction"] == pytest.approx(clipped.mean()) and 0 < clipped.mean() < 1
+
+
+ON_TWO_DEVICES = """
+import jax, numpy as np, optax, mimic
+from mimic.trainers import learning, ppo
+from mimic.trainers.config import PPOConfig
+env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
+config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
+                   hidden_layers=[8]).resolve("cpu", 2)
+networks = ppo.make_networks(config, env.observation_size, env.action_size)
+begin, learn = learning.make_programs(env, config, networks, 2, optax.constant_schedule(1e-3), None)
+start = begin()(7)
+before = jax.device_get(start.networks)
+after, metrics = learn()(start)
+changed = jax.tree.map(lambda x, y: not np.array_equal(x, y), before, jax.device_get(after.networks))
+assert any(jax.tree.leaves(changed))
+for x in jax.tree.leaves((after.networks, after.statistics, after.optimizer, metrics)):
+    shards = [np.asarray(shard.data) for shard in x.addressable_shards]
+    assert len(shards) == 2 and np.array_equal(*shards)
+observed = [np.asarray(shard.data) for shard in after.episodes.obs.addressable_shards]
+assert not np.array_equal(*observed)
+"""
+
+
+def test_devices_see_different_arms_and_learn_the_same():
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    settings = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    ended = subprocess.run(
+        [sys.executable, "-c", ON_TWO_DEVICES], env=settings, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr[-2000:]
 
 
 def test_a_vector_of_all_parameters_begins_each_array_where_a_gpu_takes_it():

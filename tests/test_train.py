@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -102,8 +103,8 @@ def test_a_video_shows_the_whole_motion(finished):
     assert beyond.returncode == 2 and "expected 0 to 1, the held_out ones of the run, got 2" in beyond.stderr
 
 
-def test_resume_goes_on_from_the_last_checkpoint(finished):
-    run_dir, _ = finished
+def test_resume_goes_on_from_the_last_checkpoint(finished, tmp_path):
+    run_dir = shutil.copytree(finished[0], tmp_path / "run")
     result = command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
     assert result.returncode == 0, result.stderr[-2000:]
     assert json.loads((run_dir / "report.json").read_text())["env_steps"] >= 8000

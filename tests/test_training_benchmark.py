@@ -4,7 +4,7 @@ import jax
 import pytest
 from rich.console import Console
 
-from benchmarks import training
+from benchmarks import record, training
 from mimic import cli
 
 
@@ -19,7 +19,7 @@ from mimic import cli
 def test_the_goal_is_reached_when_it_is_held(gaps, reached, tmp_path):
     rows = [f"{step},{gap},{step}.0" for step, gap in enumerate(gaps)]
     (tmp_path / "metrics.csv").write_text("\n".join(["step,quality/optimality_gap.train,wall_time_s", *rows]))
-    assert training.time_to_goal(tmp_path / "metrics.csv", 0.02) == reached
+    assert record.time_to_goal(tmp_path, "optimality_gap.train", 0.02) == reached
 
 
 @pytest.mark.slow  # two runs as processes of their own

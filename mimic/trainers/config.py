@@ -73,7 +73,7 @@ class TrainerConfig:
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig(TrainerConfig):
-    """PPO, of brax's networks and loss. A field that is None takes its value from the preset.
+    """PPO, on brax's networks. A field that is None takes its value from the preset.
 
     Attributes:
       name: "ppo".
@@ -132,7 +132,7 @@ class PPOConfig(TrainerConfig):
 
         Args:
           backend: of JAX.
-          devices: that brax spreads environments and batches over.
+          devices: that environments and batches are spread over.
 
         Raises:
           ValueError: numbers out of range, or batch sizes that PPO cannot divide.

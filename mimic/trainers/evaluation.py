@@ -196,6 +196,6 @@ def _lower_bound(env: ImitationEnv, qpos: np.ndarray, qvel: np.ndarray) -> np.nd
             reduction=metric.reduction,  # type: ignore[arg-type]
         )
 
-    # On the host's processor in any case: there the program compiles several times faster, and it runs once.
+    # On the host's processor where JAX may use it: there the program compiles several times faster, and it runs once.
     with on_host():
         return np.asarray(jax.jit(jax.vmap(bound))(qpos.astype(np.float32), qvel.astype(np.float32)))

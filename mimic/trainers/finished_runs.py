@@ -179,7 +179,8 @@ def _history(path: Path) -> dict[str, dict[int, float]]:
             for row in csv.DictReader(file):
                 step = int(row.pop("step"))
                 for key, value in row.items():
-                    columns.setdefault(key, {})[step] = float(value)
+                    if value:
+                        columns.setdefault(key, {})[step] = float(value)
     return columns
 
 

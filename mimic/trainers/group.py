@@ -1,7 +1,7 @@
 """Training spread over several processes: they find each other, train in step, and end together.
 
-Brax calls back in the first process alone, which writes, evaluates and may stop early, while the others wait in their
-next training program for it. So the end of a training is told to them beside the programs, through JAX's coordination
+The first process alone writes, evaluates and may stop early, while the others wait in their next training program for
+it. So the end of a training is told to them beside the programs, through JAX's coordination
 service; a failure, or a signal that only one of them got, is told in the same way.
 """
 

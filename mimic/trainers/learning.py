@@ -37,7 +37,7 @@ _ALIGNED = 64  # numbers; matrix products on NVIDIA GPUs refuse arrays that begi
 
 @struct.dataclass
 class Learning:
-    """What goes from one call of `Programs.learn` to the next.
+    """What goes from one call of the program that learns to the next.
 
     Attributes:
       networks: parameters of policy and value.

@@ -68,7 +68,7 @@ class MapperJob(Job):
         del run_dir
         assert isinstance(config.trainer, PoseMapperConfig)
         self.settings: PoseMapperConfig = config.trainer.resolve()
-        self._name, self._seed = config.env.name, config.seed
+        self._name, self._seed = config.env.name, config.seed % 2**31  # what a 32-bit integer holds
         self.total_steps = self.settings.total_steps
         self._model = model = make_model(config.env, self.settings)
         samples = int(self.settings.samples or 0)
@@ -168,6 +168,7 @@ class MapperJob(Job):
 
     def evaluate(self, params: Params) -> _Judged:
         """The learner's poses, and how good they are."""
+        _ = self._optimisation  # compiled beside the evaluation where there was no training
         return jax.device_get(self._evaluation()(params, self._every))
 
     def figures(self, outcome: _Judged) -> Figures:

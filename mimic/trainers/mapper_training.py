@@ -159,7 +159,7 @@ def _keys(seed: Any) -> Array:
 def random_poses(model: MapperModel, key: Array, count: int) -> Poses:
     """Poses of the expert, uniform within its range."""
     lower, upper = jnp.asarray(model.expert.joint_range, jnp.float32).T
-    return jax.random.uniform(key, (count, model.expert.num_joints), minval=lower, maxval=upper)
+    return jax.random.uniform(key, (count, model.expert.num_joints), jnp.float32, minval=lower, maxval=upper)
 
 
 def poses_shape(model: MapperModel, count: int) -> jax.ShapeDtypeStruct:

@@ -71,7 +71,7 @@ class MapperModel:
     @functools.cached_property
     def correspondence(self) -> Correspondence:
         """W, or the function that makes it of the link distances."""
-        # It must not belong to the first program that asks for it, nor wait until a GPU is there.
+        # It must not belong to the first program that asks for it, nor wait for the first work on a GPU.
         with jax.ensure_compile_time_eval(), on_host():
             correspondence = self.metric.make_correspondence(self.expert, self.learner)
             return correspondence if callable(correspondence) else np.asarray(correspondence)

@@ -96,7 +96,7 @@ class PPOJob(Job):
 
     def evaluate(self, params: Params) -> Rollouts:
         """Each demonstration once, without exploration."""
-        # From the host: how brax or orbax spread the parameters over devices would each ask for a program of its own.
+        # From the host: each way of spreading the parameters over devices would ask for a program of its own.
         return self._program()(jax.device_get(params))
 
     def figures(self, outcome: Rollouts) -> Figures:

@@ -64,7 +64,7 @@ def compiler_options() -> dict[str, Any]:
 
 
 def on_host() -> contextlib.AbstractContextManager[Any]:
-    """Where small things are computed by the processor, if JAX may use it: other devices take seconds to start."""
+    """Where the processor computes, if JAX may use it: the first work on a GPU waits for seconds."""
     with contextlib.suppress(RuntimeError):  # JAX_PLATFORMS names others alone
         return jax.default_device(jax.local_devices(backend="cpu")[0])
     return contextlib.nullcontext()

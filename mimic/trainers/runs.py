@@ -130,16 +130,32 @@ class MetricsLog:
         self._writer = compat.import_tensorboard().SummaryWriter(str(run_dir / "tensorboard"))
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Appends one row; every row of a run has the same columns."""
+        """Appends one row; what it does not have of the columns is empty."""
         row = {"step": step, **metrics}
-        fresh = not self._path.exists()
+        columns = self._columns(row)
         with self._path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(row))
-            if fresh:
-                writer.writeheader()
-            writer.writerow(row)
+            csv.DictWriter(file, columns).writerow(row)
         for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
+
+    def _columns(self, row: Mapping[str, float]) -> list[str]:
+        """Of the file, which gets those of the row that it lacks: all in a new run, some if it is an old one."""
+        columns: list[str] = []
+        rows: list[dict[str, str]] = []
+        if self._path.exists():
+            with self._path.open(newline="") as file:
+                reader = csv.DictReader(file)
+                columns, rows = list(reader.fieldnames or ()), list(reader)
+        missing = [name for name in row if name not in columns]
+        if missing:
+            columns += missing
+            new = self._path.with_suffix(".new")
+            with new.open("w", newline="") as file:
+                writer = csv.DictWriter(file, columns)
+                writer.writeheader()
+                writer.writerows(rows)
+            new.replace(self._path)
+        return columns
 
     def close(self) -> None:
         """Writes what is buffered."""
