@@ -10,7 +10,7 @@ an invisible comment, the only mark there is:
     <!-- not run: needs two GPUs -->
 
 What trains gets the arguments in `SMALL` before those of the page, and those in `SHORT` after them. `runs/NAME` is the
-newest run; `runs/NAME/FILE` the newest that has the file.
+newest run; `runs/NAME/FILE` the newest that has the file; `runs/SWEEP` the newest sweep.
 """
 
 import argparse
@@ -225,6 +225,8 @@ def _run(words: list[str], folder: pathlib.Path) -> None:
 
 
 def _newest_run(word: str, folder: pathlib.Path) -> str:
+    if word.endswith("runs/SWEEP"):
+        return word.replace("runs/SWEEP", str(max(folder.glob("runs/sweep-*"), key=lambda path: path.stat().st_mtime)))
     key, placeholder, rest = word.partition("runs/NAME")
     if not placeholder:
         return word
