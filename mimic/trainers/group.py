@@ -1,8 +1,8 @@
 """Training spread over several processes: they find each other, train in step, and end together.
 
 The first process alone writes, evaluates and may stop early, while the others wait in their next training program for
-it. So the end of a training is told to them beside the programs, through JAX's coordination
-service; a failure, or a signal that only one of them got, is told in the same way.
+it. So the end of a training is told to them beside the programs, through JAX's coordination service; a failure, or a
+signal that only one of them got, is told in the same way.
 """
 
 import atexit
