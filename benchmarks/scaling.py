@@ -1,20 +1,26 @@
 """PPO on several GPUs of one host: environment steps per second with learning, and how good the policy gets.
 
-    python -m benchmarks.scaling --out FILE [--devices 1 2 4 8] [--env panda4dof] [--seeds 0 1]
+    python -m benchmarks.scaling --out FILE [--devices 1 2 4 8] [--processes one each] [--env panda4dof] [--seeds 0 1]
 
 Weak scaling gives each device as many arms, minibatches as large and as many steps as one device has; strong scaling
-spreads what one device has. Each run is a process of its own that sees so many devices; without GPUs, so many that XLA
-makes of the processor, which shows that it runs and not how fast. The speed is that of the training between two
-evaluations, the median of all but the first, which compiles; efficiency is the speed of a device, relative to that with
-the fewest. Strong scaling changes nothing but the random numbers: the gaps must agree within the noise of the seeds.
+spreads what one device has. A run is one process that sees so many devices, or a process for each of them; without
+GPUs, of devices that XLA makes of the processor, which shows that it runs and not how fast. The speed is that of the
+training between two evaluations, the median of all but the first, which compiles; efficiency is the speed of a device,
+relative to that with the fewest. Strong scaling changes nothing but the random numbers: the gaps must agree within the
+noise of the seeds.
 """
 
 import argparse
+import contextlib
 import csv
+import itertools
 import os
+import socket
 import statistics
+import subprocess
+import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +39,7 @@ from mimic.trainers import runs  # noqa: E402
 from mimic.trainers.config import PRESETS  # noqa: E402
 
 KINDS = ("weak", "strong")
+PROCESSES = ("one", "each")  # for all devices, or for each
 STEPS = {"gpu": 30_000_000, "cpu": 200_000}  # of one device
 _EVALUATIONS = 8
 _PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
@@ -50,15 +57,41 @@ def arguments(kind: str, devices: int, of_one: dict[str, int]) -> list[str]:
     return [f"trainer.{key}={factor * value}" for key, value in of_one.items()]
 
 
-def environment(devices: int, backend: str) -> dict[str, str]:
-    """Of a process that sees so many devices."""
+def environment(devices: range, backend: str) -> dict[str, str]:
+    """Of a process that sees these devices."""
     inherited = {key: value for key, value in os.environ.items() if key != _PREALLOCATE}
     if backend == "gpu":
         visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-        names = visible.split(",") if visible else [str(index) for index in range(devices)]
-        return {**inherited, "CUDA_VISIBLE_DEVICES": ",".join(names[:devices])}
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+        names = visible.split(",") if visible else [str(index) for index in range(devices.stop)]
+        return {**inherited, "CUDA_VISIBLE_DEVICES": ",".join(names[devices.start : devices.stop])}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={len(devices)}"
     return {**inherited, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags.strip()}
+
+
+@contextlib.contextmanager
+def together(run_dir: Path, given: Sequence[str], processes: int, backend: str) -> Iterator[list[str]]:
+    """All processes of a training but the first, each with its device; yields the first one's further arguments."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    common = [f"distributed.coordinator=127.0.0.1:{port}", f"distributed.processes={processes}"]
+    command = [sys.executable, "-m", "mimic.train", *given, f"run_dir={run_dir}", "compilation_cache=", *common]
+    others = [
+        subprocess.Popen(
+            [*command, f"distributed.process={index}"],
+            env=environment(range(index, index + 1), backend),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for index in range(1, processes)
+    ]
+    try:
+        yield [*common, "distributed.process=0"]
+        for other in others:
+            other.wait()  # they end with the first
+    finally:
+        for other in others:
+            other.kill()
 
 
 def speed(metrics: Path) -> dict[str, float]:
@@ -69,17 +102,25 @@ def speed(metrics: Path) -> dict[str, float]:
     return {"steps_per_s": float(median), "spread": round(float(high - low) / float(median), 4)}
 
 
-def measure(kind: str, devices: int, seed: int, common: Sequence[str], of_one: dict[str, int]) -> dict[str, Any]:
+def measure(
+    kind: str, devices: int, processes: int, seed: int, common: Sequence[str], of_one: dict[str, int]
+) -> dict[str, Any]:
     """One run."""
     given = [*common, *arguments(kind, devices, of_one), f"seed={seed}"]
+    backend = jax.default_backend()
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        result = train(run_dir, given, environment=environment(devices, jax.default_backend()))
+        if processes == 1:
+            result = train(run_dir, given, environment=environment(range(devices), backend))
+        else:
+            with together(run_dir, given, processes, backend) as joined:
+                result = train(run_dir, [*given, *joined], environment=environment(range(1), backend))
         rates = speed(run_dir / runs.METRICS)
     report = result["report"]
     return {
         "scaling": kind,
         "devices": devices,
+        "processes": processes,
         "seed": seed,
         **rates,
         "optimality_gap": report["optimality_gap"],
@@ -90,77 +131,93 @@ def measure(kind: str, devices: int, seed: int, common: Sequence[str], of_one: d
 
 
 def summary(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each kind and number of devices: medians over the seeds, efficiency, and the gaps' spread."""
+    """A row for each kind, number of devices and of processes: medians over the seeds, efficiency, the gaps' spread.
+
+    Efficiency is relative to the fewest devices, in as few processes.
+    """
+    keys = sorted({(row["scaling"], row["processes"], row["devices"]) for row in results}, key=_order)
+    groups = {key: [r for r in results if (r["scaling"], r["processes"], r["devices"]) == key] for key in keys}
+    rates = {key: statistics.median(row["steps_per_s"] for row in rows) for key, rows in groups.items()}
     rows = []
-    for kind in KINDS:
-        of_kind = [row for row in results if row["scaling"] == kind]
-        rates = {
-            devices: statistics.median(row["steps_per_s"] for row in of_kind if row["devices"] == devices)
-            for devices in sorted({row["devices"] for row in of_kind})
-        }
-        for devices, rate in rates.items():
-            fewest = min(rates)
-            gaps = [row["optimality_gap"]["train"] for row in of_kind if row["devices"] == devices]
-            rows.append(
-                {
-                    "scaling": kind,
-                    "devices": devices,
-                    "steps_per_s": rate,
-                    "efficiency": rate / devices / (rates[fewest] / fewest),
-                    "gap": statistics.fmean(gaps),
-                    "gap_deviation": statistics.stdev(gaps) if len(gaps) > 1 else 0.0,
-                    "seeds": len(gaps),
-                }
-            )
+    for (kind, processes, devices), found in groups.items():
+        first = min((key for key in keys if key[0] == kind), key=lambda key: (key[2], key[1]))
+        gaps = [row["optimality_gap"]["train"] for row in found]
+        rate = rates[kind, processes, devices]
+        rows.append(
+            {
+                "scaling": kind,
+                "devices": devices,
+                "processes": processes,
+                "steps_per_s": rate,
+                "efficiency": rate / devices / (rates[first] / first[2]),
+                "gap": statistics.fmean(gaps),
+                "gap_deviation": statistics.stdev(gaps) if len(gaps) > 1 else 0.0,
+                "seeds": len(gaps),
+            }
+        )
     return rows
 
 
+def _order(key: tuple[str, int, int]) -> tuple[int, bool, int]:
+    kind, processes, devices = key
+    return KINDS.index(kind), processes > 1, devices
+
+
 def run(
-    kinds: Sequence[str], devices: Sequence[int], seeds: Sequence[int], common: Sequence[str], of_one: dict[str, int]
+    kinds: Sequence[str],
+    devices: Sequence[int],
+    processes: Sequence[str],
+    seeds: Sequence[int],
+    common: Sequence[str],
+    of_one: dict[str, int],
 ) -> list[dict[str, Any]]:
-    """All runs; on one device both kinds are the same one."""
-    results: list[dict[str, Any]] = []
-    jobs = [(count, seed, kind) for count in devices for seed in seeds for kind in kinds]
-    for count, seed, kind in track(jobs, "scaling", console=Console(stderr=True), transient=True):
-        if count == 1 and results and (results[-1]["devices"], results[-1]["seed"]) == (count, seed):
-            results.append({**results[-1], "scaling": kind})
-        else:
-            results.append(measure(kind, count, seed, common, of_one))
-    return results
+    """All runs; on one device all kinds are the same one."""
+    jobs = [
+        (kind, count, count if how == "each" else 1, seed)
+        for count, seed, how, kind in itertools.product(devices, seeds, processes, kinds)
+        if count > 1 or (how, kind) == (processes[0], kinds[0])
+    ]
+    shown = track(jobs, "scaling", console=Console(stderr=True), transient=True)
+    results = [measure(*job, common, of_one) for job in shown]
+    alone = [row for row in results if row["devices"] == 1]
+    return [*results, *({**row, "scaling": kind} for row in alone for kind in kinds[1:])]
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
     """Speed, efficiency and quality."""
-    shown = Table("scaling", "devices", "env steps/s", "efficiency", "gap", "seeds")
+    shown = Table("scaling", "devices", "processes", "env steps/s", "efficiency", "gap", "seeds")
     for row in rows:
         gap = f"{row['gap']:.2%} ± {row['gap_deviation']:.2%}"
-        speed, efficiency = f"{row['steps_per_s']:,.0f}", f"{row['efficiency']:.1%}"
-        shown.add_row(row["scaling"], str(row["devices"]), speed, efficiency, gap, str(row["seeds"]))
+        counts = str(row["devices"]), str(row["processes"])
+        shown.add_row(
+            row["scaling"], *counts, f"{row['steps_per_s']:,.0f}", f"{row['efficiency']:.1%}", gap, str(row["seeds"])
+        )
     return shown
 
 
 def draw(rows: Sequence[dict[str, Any]], title: str, out: Path) -> None:
     """Steps per second against the devices, with what would be ideal; and the efficiency."""
     figure, (speeds, shares) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    for index, kind in enumerate(KINDS):
+    for index, (kind, each) in enumerate(itertools.product(KINDS, (False, True))):
         of_kind = [row for row in rows if row["scaling"] == kind]
-        if not of_kind:
+        line = [row for row in of_kind if row["devices"] == 1 or (row["processes"] > 1) == each]
+        if all(row["devices"] == 1 for row in line):
             continue
-        devices, rates = [row["devices"] for row in of_kind], [row["steps_per_s"] for row in of_kind]
-        ideal = [rates[0] * count / devices[0] for count in devices]
-        speeds.loglog(devices, rates, "o-", color=f"C{index}", label=kind)
-        speeds.loglog(devices, ideal, ":", color=f"C{index}", label=f"{kind}, ideal")
-        shares.semilogx(devices, [row["efficiency"] for row in of_kind], "o-", color=f"C{index}", label=kind)
+        devices = [row["devices"] for row in line]
+        label = f"{kind}, {'a process for each' if each else 'one process'}"
+        speeds.plot(devices, [row["steps_per_s"] for row in line], "o-", color=f"C{index}", label=label)
+        shares.plot(devices, [row["efficiency"] for row in line], "o-", color=f"C{index}", label=label)
+        ideal = [row["steps_per_s"] / row["efficiency"] for row in line]
+        speeds.plot(devices, ideal, ":", color="grey", label="" if index else "ideal")
     ticks = sorted({row["devices"] for row in rows})
     for axes in (speeds, shares):
         axes.set(xlabel="devices", title=title)
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
-        axes.minorticks_off()
+        axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
     speeds.set_ylabel("environment steps/s, with learning")
     shares.set_ylabel("efficiency")
-    shares.set_ylim(bottom=0)
     figure.savefig(out, dpi=150)
     plt.close(figure)
 
@@ -172,6 +229,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, metavar="FILE", help="file of results; the figure goes beside it")
     parser.add_argument("--devices", type=int, nargs="+", default=[1, 2, 4, 8], metavar="K")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--processes", nargs="+", choices=PROCESSES, default=list(PROCESSES), help="for the devices")
     parser.add_argument("--env", default="panda4dof", metavar="NAME")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N")
     parser.add_argument("--num-envs", type=int, default=preset["num_envs"], metavar="N", help="arms of one device")
@@ -195,7 +253,7 @@ def main() -> None:
     options = _options()
     of_one = {"num_envs": options.num_envs, "batch_size": options.batch_size, "num_timesteps": options.steps}
     common = [f"env={options.env}", "env.physics=fused", f"trainer.evaluations={_EVALUATIONS}", *options.arguments]
-    results = run(options.kinds, sorted(options.devices), options.seeds, common, of_one)
+    results = run(options.kinds, sorted(options.devices), options.processes, options.seeds, common, of_one)
     rows = summary(results)
     Console().print(table(rows))
     if options.out:

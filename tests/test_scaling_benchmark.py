@@ -23,10 +23,11 @@ def test_weak_scaling_multiplies_and_strong_scaling_does_not():
 def test_a_process_sees_so_many_devices(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--of-the-user")
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    assert scaling.environment(2, "gpu")["CUDA_VISIBLE_DEVICES"] == "0,1"
-    assert scaling.environment(2, "cpu")["XLA_FLAGS"] == "--of-the-user --xla_force_host_platform_device_count=2"
+    assert scaling.environment(range(2), "gpu")["CUDA_VISIBLE_DEVICES"] == "0,1"
+    assert scaling.environment(range(2), "cpu")["XLA_FLAGS"] == "--of-the-user --xla_force_host_platform_device_count=2"
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5,7")
-    assert scaling.environment(2, "gpu")["CUDA_VISIBLE_DEVICES"] == "3,5"
+    assert scaling.environment(range(2), "gpu")["CUDA_VISIBLE_DEVICES"] == "3,5"
+    assert scaling.environment(range(2, 3), "gpu")["CUDA_VISIBLE_DEVICES"] == "7"
 
 
 def test_the_speed_leaves_out_what_compiled(tmp_path):
@@ -38,16 +39,16 @@ def test_the_speed_leaves_out_what_compiled(tmp_path):
 
 
 def test_efficiency_is_relative_to_the_fewest_devices(tmp_path):
-    rates = {("weak", 2): 200.0, ("weak", 4): 300.0, ("strong", 2): 100.0}
+    rates = {("weak", 2, 1): 200.0, ("weak", 4, 4): 360.0, ("weak", 4, 1): 300.0, ("strong", 2, 1): 100.0}
     results = [
-        {"scaling": kind, "devices": devices, "seed": seed, "steps_per_s": rate + seed - 1}
+        {"scaling": kind, "devices": devices, "processes": processes, "seed": seed, "steps_per_s": rate + seed - 1}
         | {"optimality_gap": {"train": 0.01 * seed}}
-        for (kind, devices), rate in rates.items()
+        for (kind, devices, processes), rate in rates.items()
         for seed in range(3)
     ]
     rows = scaling.summary(results)
-    assert [(row["scaling"], row["devices"], row["efficiency"]) for row in rows] == [
-        ("weak", 2, 1.0), ("weak", 4, 0.75), ("strong", 2, 1.0),
+    assert [(row["scaling"], row["devices"], row["processes"], row["efficiency"]) for row in rows] == [
+        ("weak", 2, 1, 1.0), ("weak", 4, 1, 0.75), ("weak", 4, 4, 0.9), ("strong", 2, 1, 1.0),
     ]  # fmt: skip
     assert rows[0]["gap"] == pytest.approx(0.01) and rows[0]["gap_deviation"] == pytest.approx(0.01)
     Console(file=(tmp_path / "table").open("w")).print(scaling.table(rows))
@@ -56,9 +57,14 @@ def test_efficiency_is_relative_to_the_fewest_devices(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_devices_train_the_same_in_both_ways():
-    alone, _, weak, strong = scaling.run(scaling.KINDS, [1, 2], [0], SMALL, OF_ONE)
-    assert (weak["scaling"], strong["scaling"]) == scaling.KINDS
-    assert min(row["steps_per_s"] for row in (alone, weak, strong)) > 0
-    assert weak["env_steps"] == pytest.approx(2 * alone["env_steps"], rel=0.2)  # whole batches
-    assert strong["env_steps"] == alone["env_steps"]
+def test_two_devices_train_the_same_in_all_ways():
+    results = scaling.run(scaling.KINDS, [1, 2], scaling.PROCESSES, [0], SMALL, OF_ONE)
+    found = {(row["scaling"], row["devices"], row["processes"]): row for row in results}
+    counts = (1, 1), (2, 1), (2, 2)
+    assert sorted(found) == sorted((kind, *count) for kind in scaling.KINDS for count in counts)
+    assert min(row["steps_per_s"] for row in results) > 0
+    alone = found["weak", 1, 1]
+    for processes in (1, 2):
+        weak, strong = found["weak", 2, processes], found["strong", 2, processes]
+        assert weak["env_steps"] == pytest.approx(2 * alone["env_steps"], rel=0.2)  # whole batches
+        assert strong["env_steps"] == alone["env_steps"]
