@@ -58,14 +58,14 @@ def learn(name: str, config: PPOConfig, batches: int, stretches: int) -> tuple[i
     model = PPO(
         "MlpPolicy",
         VecNormalize(workers, norm_reward=False),
-        learning_rate=config.learning_rate,
+        learning_rate=config.learning_rate,  # type: ignore[arg-type]
         n_steps=STEPS,
         batch_size=max(arms * STEPS // config.num_minibatches, 2),  # type: ignore[operator]
-        n_epochs=config.num_updates_per_batch,
-        gamma=config.discounting,
+        n_epochs=config.num_updates_per_batch,  # type: ignore[arg-type]
+        gamma=config.discounting,  # type: ignore[arg-type]
         gae_lambda=config.gae_lambda,
         clip_range=config.clipping_epsilon,
-        ent_coef=config.entropy_cost,
+        ent_coef=config.entropy_cost,  # type: ignore[arg-type]
         max_grad_norm=config.max_grad_norm,
         policy_kwargs={"net_arch": list(config.hidden_layers or ())},
         device="cpu",
