@@ -255,11 +255,12 @@ def free_port():
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-mjx[view]'")
-def test_ctrl_c_ends_it_cleanly():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_it_cleanly(number):
     command = [sys.executable, "-m", "mimic.view", "env=planar4dof", f"port={free_port()}"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert "view: http://127.0.0.1:" in process.stdout.readline()
-    process.send_signal(signal.SIGINT)  # most likely while it compiles
+    process.send_signal(number)  # most likely while it compiles
     out, error = process.communicate(timeout=120)
     assert process.returncode == 0 and "Traceback" not in error and "view: ended" in out

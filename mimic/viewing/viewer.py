@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import io
+import signal
 import socket
 import time
 from collections import deque
@@ -111,12 +112,14 @@ def _serve(
     before: Callable[[], None] | None = None,
     after: Callable[[], None] | None = None,
 ) -> int:
-    """Shows a page until Ctrl-C."""
+    """Shows a page until Ctrl-C or SIGTERM."""
     import viser
 
     from mimic.viewing.page import Page
     from mimic.viewing.shapes import ArmShape
 
+    for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C too, which is ignored in what a script starts with `&`
+        signal.signal(number, signal.default_int_handler)
     server = None
     try:
         if before is not None:
