@@ -97,7 +97,7 @@ def link_distances(
     _check_choice("rotation", rotation, ROTATION_MEASURES)
     if not callable(weights):
         _check_candidate_points(expert_states, learner_states, weights)
-    over_learner = jax.vmap(lambda a, b: _pair_distances(a, b, rotation), in_axes=(None, 0))
+    over_learner = jax.vmap(lambda a, b: pair_distances(a, b, rotation), in_axes=(None, 0))
     parts = jax.vmap(over_learner, in_axes=(0, None))(expert_states, learner_states)
     alpha = jax.vmap(jax.vmap(weights))(parts) if callable(weights) else weights
     total: Any = 0.0
@@ -143,7 +143,8 @@ def embodiment_distance(
     return spatial.safe_sqrt(jnp.sum(weighted * weighted))
 
 
-def _pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> PairDistances:
+def pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> PairDistances:
+    """The parts of the distance between two links, of whose states each array is [3]; 0 for what one of them lacks."""
     zero = jnp.zeros((), a.position.dtype)  # of what candidate points lack
 
     def apart(x: Array | None, y: Array | None) -> Array:

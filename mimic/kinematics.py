@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -63,6 +64,10 @@ class LinkVectors(NamedTuple):
     angular_velocity: Vector
 
 
+_BASE = JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)
+LONG = 16  # joints; an arm with more is a loop over them, because a program that spells them out takes long to compile
+
+
 def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Frames:
     """Link frames (paper, eq. 5).
 
@@ -77,9 +82,9 @@ def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Fr
     frames = joint_frames(arm, qpos, None)
     positions, rotations = [], []
     for link, joint in enumerate(arm.link_joint):
-        position, _ = _link_point(arm, frames, link, joint)
-        positions.append(position)
-        rotations.append(spatial.compose(frames[joint + 1].rotation, spatial.rotation(arm.link_rotation[link])))
+        frame = frames[joint + 1]
+        positions.append(spatial.add(frame.anchor, spatial.rotate(frame.rotation, _zero_lever(arm, link, joint))))
+        rotations.append(spatial.compose(frame.rotation, spatial.rotation(arm.link_rotation[link])))
     return Frames(
         position=spatial.stack(positions, qpos.dtype),
         rotation=spatial.stack([sum(rotation, ()) for rotation in rotations], qpos.dtype).reshape(-1, 3, 3),
@@ -107,8 +112,34 @@ def link_states(
     qpos = joint_values(arm, qpos, "qpos")
     if qvel is not None:
         qvel = joint_values(arm, qvel, "qvel")
+    if arm.num_joints > LONG:
+        return _states_of_long_arm(arm, qpos, qvel, normalized)
     columns = _link_state_columns(arm, qpos, qvel, normalized)
     return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
+
+
+def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array | None, normalized: bool) -> LinkStates:
+    """The same by a loop over the joints, which is compiled once for all of them."""
+
+    def arrays(tree: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.asarray(x, qpos.dtype), tree)
+
+    def behind(parent: JointFrame, joint: Any) -> tuple[JointFrame, JointFrame]:
+        offset, axis, angle, speed = joint
+        frame = arrays(_behind(parent, spatial.vector(offset), spatial.vector(axis), angle, speed))
+        return frame, frame
+
+    base = arrays(_BASE)
+    offsets = jnp.diff(jnp.asarray(arm.joint_anchor), axis=0, prepend=jnp.zeros((1, 3)))
+    joints = *arrays((offsets, arm.joint_axis)), qpos, jnp.zeros_like(qpos) if qvel is None else qvel
+    _, frames = jax.lax.scan(behind, base, joints)
+    moves = np.asarray(arm.link_joint) + 1
+    frames = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest])[moves], base, frames)
+    anchors = jnp.concatenate([jnp.zeros((1, 3)), jnp.asarray(arm.joint_anchor)])[moves]
+    levers, directions = arrays((jnp.asarray(arm.link_position) - anchors, arm.link_rotation[:, :, 0]))
+    link = _link_vectors(frames, spatial.vector(levers.T), spatial.vector(directions.T))
+    unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
+    return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, link)))
 
 
 def link_state_table(
@@ -138,13 +169,14 @@ def link_state_table(
 def _link_state_columns(arm: Embodiment, qpos: Any, qvel: Any, normalized: bool) -> tuple[list[Vector], ...]:
     """Position, direction, linear and angular velocity of each link, as scalar components."""
     unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
-    links = [
-        link._replace(
-            position=spatial.scale(unit, link.position), linear_velocity=spatial.scale(unit, link.linear_velocity)
-        )
-        for link in link_vectors(arm, joint_frames(arm, qpos, qvel))
-    ]
+    links = [_in_units(unit, link) for link in link_vectors(arm, joint_frames(arm, qpos, qvel))]
     return tuple(list(column) for column in zip(*links, strict=True))
+
+
+def _in_units(unit: spatial.Scalar, link: LinkVectors) -> LinkVectors:
+    """With lengths times a factor."""
+    position, velocity = (spatial.scale(unit, x) for x in (link.position, link.linear_velocity))
+    return link._replace(position=position, linear_velocity=velocity)
 
 
 def candidate_points(states: LinkStates) -> LinkStates:
@@ -217,41 +249,54 @@ def joint_frames(
       qpos: an angle [rad] for each joint.
       qvel: a velocity [rad/s] for each joint; at rest where None.
     """
-    frames = [JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)]
+    frames = [_BASE]
     previous_anchor = spatial.ZERO  # in the zero pose
     for joint in range(arm.num_joints):
-        parent = frames[-1]
-        axis, zero_anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
-        lever = spatial.rotate(parent.rotation, spatial.subtract(zero_anchor, previous_anchor))
-        angular_velocity = parent.angular_velocity
-        linear_velocity = spatial.add(parent.linear_velocity, spatial.cross(angular_velocity, lever))
-        if qvel is not None:
-            spin = spatial.scale(qvel[joint], spatial.rotate(parent.rotation, axis))
-            angular_velocity = spatial.add(angular_velocity, spin)
-        rotation = spatial.compose(parent.rotation, spatial.axis_rotation(axis, qpos[joint]))
-        frames.append(JointFrame(rotation, spatial.add(parent.anchor, lever), angular_velocity, linear_velocity))
-        previous_anchor = zero_anchor
+        axis, anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
+        speed = 0.0 if qvel is None else qvel[joint]
+        frames.append(_behind(frames[-1], spatial.subtract(anchor, previous_anchor), axis, qpos[joint], speed))
+        previous_anchor = anchor
     return frames
+
+
+def _behind(
+    parent: JointFrame, offset: Vector, axis: Vector, angle: spatial.Scalar, speed: spatial.Scalar
+) -> JointFrame:
+    """The body behind a joint; offset is the joint's anchor from the parent's, in the zero pose as the axis."""
+    lever = spatial.rotate(parent.rotation, offset)
+    spin = spatial.scale(speed, spatial.rotate(parent.rotation, axis))
+    return JointFrame(
+        rotation=spatial.compose(parent.rotation, spatial.axis_rotation(axis, angle)),
+        anchor=spatial.add(parent.anchor, lever),
+        angular_velocity=spatial.add(parent.angular_velocity, spin),
+        linear_velocity=spatial.add(parent.linear_velocity, spatial.cross(parent.angular_velocity, lever)),
+    )
 
 
 def link_vectors(arm: Embodiment, frames: Sequence[JointFrame]) -> list[LinkVectors]:
     """The links' states, of the frames that `joint_frames` gives."""
-    links = []
-    for link, joint in enumerate(arm.link_joint):
-        position, lever = _link_point(arm, frames, link, joint)
-        frame = frames[joint + 1]
-        velocity = spatial.add(frame.linear_velocity, spatial.cross(frame.angular_velocity, lever))
-        direction = spatial.rotate(frame.rotation, spatial.vector(arm.link_rotation[link, :, 0]))
-        links.append(LinkVectors(position, direction, velocity, frame.angular_velocity))
-    return links
+    directions = [spatial.vector(rotation[:, 0]) for rotation in arm.link_rotation]
+    return [
+        _link_vectors(frames[joint + 1], _zero_lever(arm, link, joint), directions[link])
+        for link, joint in enumerate(arm.link_joint)
+    ]
 
 
-def _link_point(arm: Embodiment, frames: Sequence[JointFrame], link: int, joint: int) -> tuple[Vector, Vector]:
-    """A link frame's origin, and the lever from the anchor of the joint that moves it."""
-    zero_anchor = spatial.vector(arm.joint_anchor[joint]) if joint >= 0 else spatial.ZERO
-    zero_lever = spatial.subtract(spatial.vector(arm.link_position[link]), zero_anchor)
-    lever = spatial.rotate(frames[joint + 1].rotation, zero_lever)
-    return spatial.add(frames[joint + 1].anchor, lever), lever
+def _link_vectors(frame: JointFrame, lever: Vector, direction: Vector) -> LinkVectors:
+    """Of one link, with its lever from the anchor and its direction in the zero pose."""
+    lever = spatial.rotate(frame.rotation, lever)
+    return LinkVectors(
+        position=spatial.add(frame.anchor, lever),
+        direction=spatial.rotate(frame.rotation, direction),
+        linear_velocity=spatial.add(frame.linear_velocity, spatial.cross(frame.angular_velocity, lever)),
+        angular_velocity=frame.angular_velocity,
+    )
+
+
+def _zero_lever(arm: Embodiment, link: int, joint: int) -> Vector:
+    """From the anchor of the joint that moves a link to its origin, in the zero pose."""
+    anchor = spatial.vector(arm.joint_anchor[joint]) if joint >= 0 else spatial.ZERO
+    return spatial.subtract(spatial.vector(arm.link_position[link]), anchor)
 
 
 def joint_values(arm: Embodiment, values: ArrayLike, what: str) -> Array:

@@ -22,9 +22,10 @@ from mimic.distance import (
     RotationMeasure,
     Weights,
     embodiment_distance,
+    pair_distances,
 )
 from mimic.embodiment import Embodiment
-from mimic.kinematics import joint_values, link_states
+from mimic.kinematics import LONG, joint_values, link_states
 
 MotionDistance = Callable[..., Float[Array, ""]]  # expert_qpos, expert_qvel, learner_qpos, learner_qvel
 
@@ -70,7 +71,8 @@ def motion_distance(
     jax.eval_shape(composed, *(jax.ShapeDtypeStruct((arm.num_joints,), jnp.float32) for arm in arms for _ in range(2)))
     usual = rotation == "cosine" and reduction == "mean" and not callable(correspondence)
     if usual and isinstance(weights, DistanceWeights) and _is_known((arms, correspondence, weights)):
-        distance = _closed_form(arms, _factors(np.asarray(correspondence, float), weights))
+        factors = _factors(np.asarray(correspondence, float), weights)
+        distance = (_by_pairs if expert.num_joints + learner.num_joints > 2 * LONG else _closed_form)(arms, factors)
     else:
         distance = composed
 
@@ -93,6 +95,22 @@ def _factors(matrix: Float[np.ndarray, "expert learner"], weights: DistanceWeigh
     """What each part of each pair's distance counts for in the mean, [4, n, n_hat]."""
     of_parts = [np.broadcast_to(np.asarray(getattr(weights, part), float), matrix.shape) for part in PARTS]
     return np.stack(of_parts) * matrix / matrix.size
+
+
+def _by_pairs(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Callable[..., Array]:
+    """Of long arms: the pairs of links that correspond, and no others."""
+    chosen = np.nonzero(factors.any(axis=0))
+    weighing = [part for part, factor in zip(PARTS, factors, strict=True) if factor.any()] or PARTS[:1]
+    factors = np.stack([factors[PARTS.index(part), *chosen] for part in weighing])
+
+    def distance(*motion: Array) -> Array:
+        states = link_states(arms[0], *motion[:2]), link_states(arms[1], *motion[2:])
+        ends = [jax.tree.map(lambda x, rows=rows: x[rows], own) for own, rows in zip(states, chosen, strict=True)]
+        parts = jax.vmap(functools.partial(pair_distances, measure="cosine"))(*ends)
+        distances = jnp.stack([getattr(parts, part) for part in weighing])
+        return jnp.sum(factors.astype(distances.dtype) * distances)
+
+    return distance
 
 
 def _closed_form(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Callable[..., Array]:
