@@ -12,27 +12,27 @@ def has_link_sites(seed: int) -> bool:
     return seed % 3 == 0
 
 
-def random_arm(seed: int) -> mujoco.MjModel:
-    """A serial arm of 1 to 9 hinges.
+def random_arm(seed: int, hinges: int | None = None) -> mujoco.MjModel:
+    """A serial arm of as many hinges; of 1 to 9 by the seed where None.
 
     Random axes, anchors and body rotations, with static bodies at the root, between and behind the moving ones. Some
     joints have a reference angle other than 0; some bodies of the arms without link sites have two hinges with one
     anchor, so that the link between these has length zero.
     """
     rng = np.random.default_rng(seed)
-    opened, hinges = [], 0
-    while hinges < 1 + seed % 9:
+    opened, made, hinges = [], 0, hinges or 1 + seed % 9
+    while made < hinges:
         if rng.random() < 0.4:
             opened.append(f"<body {_pose(rng)}>")
         opened.append(f'<body {_pose(rng)}><geom size="0.02"/>')
         anchor = _text(rng.uniform(-_REACH, _REACH, 3))
-        twins = not has_link_sites(seed) and hinges + 2 <= 1 + seed % 9 and rng.random() < 0.25
+        twins = not has_link_sites(seed) and made + 2 <= hinges and rng.random() < 0.25
         for _ in range(2 if twins else 1):
-            hinges += 1
+            made += 1
             ref = rng.choice([0.0, rng.uniform(-1, 1)])
-            opened[-1] += f'<joint name="hinge{hinges}" pos="{anchor}" axis="{_text(rng.normal(size=3))}" ref="{ref}"/>'
+            opened[-1] += f'<joint name="hinge{made}" pos="{anchor}" axis="{_text(rng.normal(size=3))}" ref="{ref}"/>'
         if has_link_sites(seed):
-            site = f'<site name="link{hinges}" fromto="{_text(rng.uniform(-_REACH, _REACH, 6))}"/>'
+            site = f'<site name="link{made}" fromto="{_text(rng.uniform(-_REACH, _REACH, 6))}"/>'
             opened[-1] += site if rng.random() < 0.5 else f"<body {_pose(rng)}>{site}</body>"
     opened[-1] += f'<site name="tip" type="sphere" pos="{_text(rng.uniform(-_REACH, _REACH, 3))}"/>'
     xml = f"""<mujoco model="random{seed}">

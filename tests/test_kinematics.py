@@ -9,7 +9,7 @@ import pytest
 import random_arms
 
 from mimic.embodiment import load_mjcf, panda, panda_path, planar_arm
-from mimic.kinematics import body_twists, candidate_points, forward_kinematics, link_states
+from mimic.kinematics import LONG, body_twists, candidate_points, forward_kinematics, link_states
 from mimic.model_files import read_model
 
 # Against MuJoCo, in m, m/s and rad/s. Arms are up to 3 m long and move at up to 10 rad/s and 10 m/s.
@@ -72,6 +72,16 @@ def test_random_arms_move_as_in_mujoco(dtype, seed):
     arm = load_mjcf(model)
     assert arm.num_joints == model.njnt
     assert_moves_as_in_mujoco(arm, model, dtype)
+
+
+@pytest.mark.parametrize("locked", [{}, {"hinge1": 0.3, "hinge7": -0.5}], ids=["free", "locked"])
+@pytest.mark.parametrize("seed", [3, 4])
+def test_long_arms_move_as_in_mujoco(x64, seed, locked):
+    model = random_arms.random_arm(seed, hinges=LONG + 8)
+    arm = load_mjcf(model, locked=locked, merge_locked=False)
+    assert arm.num_joints == LONG + 8 - len(locked) > LONG
+    assert (-1 in arm.link_joint) == bool(locked)
+    assert_moves_as_in_mujoco(arm, model, np.dtype("float64"), locked)
 
 
 @pytest.mark.parametrize("merge_locked", [True, False])

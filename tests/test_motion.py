@@ -13,12 +13,13 @@ from mimic import kernel, motion_distance
 from mimic.correspondence import hard_correspondence, overlap_correspondence
 from mimic.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
 from mimic.embodiment import panda, planar_arm
-from mimic.kinematics import link_states
+from mimic.kinematics import LONG, link_states
 
 PAIRS = {
     "panda 7->4": (panda(), panda(locked=(3, 6, 7))),
     "panda 4->7": (panda(locked=(3, 6, 7)), panda()),
     "planar": (EXPERT, LEARNER),
+    "long": (planar_arm(np.linspace(0.1, 0.3, LONG + 3)), planar_arm(np.linspace(0.2, 0.1, LONG))),
     # Links 1 of the locked arms are fixed to the base.
     "fixed links": (panda(locked=(1,), merge_locked=False), panda(locked=(1, 4), merge_locked=False)),
 }
@@ -54,6 +55,7 @@ def largest_difference(found, expected):
         ("panda 7->4", "paper"),
         ("panda 4->7", "static"),
         ("planar", "all"),
+        ("long", "paper"),
         pytest.param("fixed links", "all", marks=pytest.mark.slow),
     ],
 )

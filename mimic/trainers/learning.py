@@ -32,7 +32,7 @@ Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, valu
 Metrics = dict[str, Array]
 
 _AXIS = "devices"
-_UNROLLED = 4  # updates in a turn of their loop on several GPUs, which wait for the host at each turn and each message
+_UNROLLED = 4  # updates in a turn of their loop where one process launches on several GPUs, which wait for it
 _ALIGNED = 64  # numbers; matrix products on NVIDIA GPUs refuse arrays that begin at any odd place
 
 
@@ -213,7 +213,7 @@ def _learn(
         order = jax.vmap(lambda key: jax.random.permutation(key, len(rows)))(passes).reshape(-1, minibatch)
         keys = jax.random.split(key_loss, len(order))
         start = to_vector(learning.networks), learning.optimizer
-        unrolled = _UNROLLED if devices > 1 else 1
+        unrolled = _UNROLLED if jax.local_device_count() > 1 else 1
         (params, optimizer_state), metrics = jax.lax.scan(update, start, (order, keys), unroll=unrolled)
         learning = learning.replace(  # type: ignore[attr-defined]
             networks=from_vector(params), statistics=statistics, optimizer=optimizer_state, key=key
