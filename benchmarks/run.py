@@ -21,6 +21,7 @@ from benchmarks import targets
 
 # What each is run with besides, on any device and on a GPU. Poses on a GPU: as many as keep it busy.
 BENCHMARKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "startup": ((), ()),
     "kernel": ((), ()),
     "rollout": ((), ()),
     "physics": ((), ()),

@@ -39,6 +39,8 @@ def test_the_newest_file_that_holds_it_counts(tmp_path):
 def test_each_benchmark_is_read_as_it_is_written(tmp_path):
     physics = {"env": "panda7dof", "group": "physics", "case": "fused"}
     write(tmp_path, "rollout.json", "rollout", rows=[{**physics, "arms": 8192, "steps_per_s": 7e7}])
+    processes = [{"what": "import jax", "median_s": 1.0}, {"what": "import mimic", "median_s": 2.25}]
+    write(tmp_path, "startup.json", "startup", "cpu", rows=processes)
     write(tmp_path, "ppo.json", "ppo", rows=[{"case": "mimic, fused", "steps_per_s": 3e6}])
     weak = {"scaling": "weak", "devices": 8, "efficiency": 0.85}
     write(tmp_path, "scaling.json", "scaling", rows=[weak, {**weak, "scaling": "strong", "efficiency": 0.2}])
@@ -56,6 +58,7 @@ def test_each_benchmark_is_read_as_it_is_written(tmp_path):
     gaps = {"panda4dof": [{"optimality_gap": {"train": gap, "held_out": 0.05}} for gap in (0.01, 0.03)]}
     write(tmp_path, "study.json", "dynamic_imitation", results=gaps)
     expected = {
+        ("import of mimic beyond jax", "cpu"): (1.25, True),
         ("physics of 8192 arms, steps/s", "gpu"): (7e7, True),
         ("PPO with learning, env steps/s", "gpu"): (3e6, True),
         ("PPO on 8 GPUs, efficiency", "gpu"): (0.85, False),
@@ -105,5 +108,5 @@ def test_benchmarks_are_started_with_what_they_take(tmp_path):
 def test_an_unknown_benchmark_is_refused(tmp_path):
     command = [sys.executable, "-m", "benchmarks.run", "nothing", "--out", str(tmp_path / "out")]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 2 and "unknown benchmark 'nothing'; valid are all, kernel" in result.stderr
+    assert result.returncode == 2 and "unknown benchmark 'nothing'; valid are all, startup, kernel" in result.stderr
     assert not (tmp_path / "out").exists()
