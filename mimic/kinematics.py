@@ -1,6 +1,7 @@
 """Frames, twists and link states of an embodiment: one sample per call, batched by `jax.vmap`."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -118,6 +119,7 @@ def link_states(
     return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
 
 
+@functools.partial(jax.jit, static_argnames="normalized")
 def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array | None, normalized: bool) -> LinkStates:
     """The same by a loop over the joints, which is compiled once for all of them."""
 
