@@ -21,6 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from mimic import compat
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, InspectConfig, RecordingConfig, RetargetConfig
 from mimic.sweeping.services import check_launcher, register_launchers
@@ -60,6 +61,7 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises, and the line below is all that is shown
     sys.argv[1:] = [_written_out(argument, config_name) for argument in sys.argv[1:]]
+    compat.share_config_store()
     _register_schemas()
     register_sweeper()
     register_launchers()

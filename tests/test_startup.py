@@ -1,5 +1,6 @@
 """What happens before the first training step: nothing heavy is imported, compiled or computed that is not needed."""
 
+import copy
 import os
 import subprocess
 import sys
@@ -8,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hydra.core.config_store import ConfigStore
 
 import mimic
-from mimic import cli
+from mimic import cli, compat
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.wrappers import wrap_for_training
 from mimic.kinematics import link_state_table
@@ -117,3 +119,13 @@ def test_tensorboard_does_not_bring_torch(tmp_path):
     code += "\nassert 'torch' not in sys.modules"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
     subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+
+
+def test_hydra_shares_what_is_registered_and_copies_what_it_loads():
+    compat.share_config_store()
+    store = ConfigStore.instance()
+    assert copy.deepcopy(store) is store
+    store.store(name="tried", node={"list": [1]})
+    store.load("tried.yaml").node["list"].append(2)
+    assert store.load("tried.yaml").node == {"list": [1]}
+    del store.repo["tried.yaml"]
