@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 # Extras of the package to install with it; `EXTRAS=cuda` on a machine with an NVIDIA GPU.
 EXTRAS ?=
-# Passed on to `python -m mimic.train`. The fused physics is the same as the default, MJX, and ten times as fast on CPUs.
+# Passed on to `python -m mimic.train`. The fused physics is the same as the default, MJX, and nine times as fast on CPUs.
 ARGS ?= env.physics=fused
 # Passed on to pytest, and the number of its workers (0: none, run in one process).
 PYTEST_ARGS ?=
@@ -38,7 +38,7 @@ install: $(STAMP) ## install alone
 train: $(STAMP) ## install if needed, then train: make train ARGS="env=panda4dof"
 	@$(BIN)/python -m mimic.train $(ARGS)
 
-test: static ## install if needed, then ruff, pyright and the quick tests
+test: static ## install if needed, then ruff, pyright, the quick tests and all examples
 	$(PYTEST) $(PYTEST_ARGS)
 
 test-all: static ## the same with the slow tests

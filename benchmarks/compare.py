@@ -22,7 +22,7 @@ from rich.table import Table
 _NAMES = ("size", "arms", "links", "batch", "joints", "devices", "substeps", "horizon", "starts", "count")
 _MADE_ON = ("hardware", "versions", "date", "commit", "note", "arguments")
 # Times and rates of one measurement share its spread.
-_TIMED = ("median_ms", "steps_per_s", "pairs_per_s", "poses_per_s")
+_TIMED = ("median_s", "median_ms", "steps_per_s", "pairs_per_s", "poses_per_s")
 
 
 class Figure(NamedTuple):

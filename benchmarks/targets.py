@@ -44,7 +44,9 @@ class Target:
         return _FORMS[self.unit].format(value)
 
 
-def _process(what: str, beyond: str | None = None) -> Callable[[Results], float]:
+def _start(what: str, beyond: str | None = None) -> Callable[[Results], float]:
+    """Seconds of a process, less those of another."""
+
     def seconds(results: Results) -> float:
         median = {row["what"]: row["median_s"] for row in results["rows"]}
         return median[what] - (median[beyond] if beyond else 0.0)
@@ -115,10 +117,8 @@ _QUALITY = (
     *((f"{arm[5]}-DOF, held out", arm, "held_out", 0.04) for arm in ("panda7dof", "panda4dof", "panda3dof")),
 )
 TARGETS = (
-    Target(
-        "import of mimic beyond jax", "cpu", "startup", _process("import mimic", "import jax"), 1.5, "s", least=False
-    ),
-    Target("mimic.train --help", "cpu", "startup", _process("mimic.train --help"), 3, "s", least=False),
+    Target("import of mimic beyond jax", "cpu", "startup", _start("import mimic", "import jax"), 1.5, "s", least=False),
+    Target("mimic.train --help", "cpu", "startup", _start("mimic.train --help"), 3, "s", least=False),
     Target("kernel, pairs/s", "gpu", "kernel", _pairs("value"), 10e9),
     Target("kernel with gradient, pairs/s", "gpu", "kernel", _pairs("gradient"), 4e9),
     Target("physics of 8192 arms, steps/s", "gpu", "rollout", _physics(8192), 60e6),

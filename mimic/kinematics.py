@@ -66,7 +66,7 @@ class LinkVectors(NamedTuple):
 
 
 _BASE = JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)
-LONG = 16  # joints; an arm with more is a loop over them, because a program that spells them out takes long to compile
+LONG = 16  # joints; `link_states` of more is a loop, because a program that spells them out takes long to compile
 
 
 def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Frames:
@@ -141,7 +141,7 @@ def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array | None, normal
     levers, directions = arrays((jnp.asarray(arm.link_position) - anchors, arm.link_rotation[:, :, 0]))
     link = _link_vectors(frames, spatial.vector(levers.T), spatial.vector(directions.T))
     unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
-    return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, link)))
+    return LinkStates(*arrays(tuple(jnp.stack(x, axis=-1) for x in _in_units(unit, link))))
 
 
 def link_state_table(

@@ -45,7 +45,9 @@ def motion_distance(
     of them costs nothing later. For the usual metric, a given matrix and constant weights with the mean of the smooth
     rotational measure, it is a program of its own: pairs of links that do not correspond and parts that weigh nothing
     are left out, the gradient is in closed form (forward or reverse, of those arguments alone that are differentiated),
-    and `jax.vmap` of it, or of its gradient, is one kernel on NVIDIA GPUs. Any other metric is the plain composition.
+    and `jax.vmap` of it, or of its gradient, is one kernel on NVIDIA GPUs. With an arm of more than 16 joints it is a
+    loop over the joints, differentiated automatically: it compiles in seconds, but is many kernels and far slower. Any
+    other metric is the plain composition.
 
     Args:
       expert: the embodiment that is imitated.
@@ -72,7 +74,8 @@ def motion_distance(
     usual = rotation == "cosine" and reduction == "mean" and not callable(correspondence)
     if usual and isinstance(weights, DistanceWeights) and _is_known((arms, correspondence, weights)):
         factors = _factors(np.asarray(correspondence, float), weights)
-        distance = (_by_pairs if expert.num_joints + learner.num_joints > 2 * LONG else _closed_form)(arms, factors)
+        is_long = max(expert.num_joints, learner.num_joints) > LONG
+        distance = (_by_pairs if is_long else _closed_form)(arms, factors)
     else:
         distance = composed
 

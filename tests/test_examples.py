@@ -24,7 +24,7 @@ ENVIRONMENT = {
     "JAX_COMPILATION_CACHE_DIR": str(CACHE),
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
 }
-minutes = pytest.mark.timeout(900)
+patience = pytest.mark.timeout(900)
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def test_batches_and_gradients(said):
     assert float(after) < 0.7 * float(before)
 
 
-@example("03_imitate_poses", minutes)
+@example("03_imitate_poses", patience)
 def test_imitate_poses(said, tmp_path):
     methods = ("imitate_pose", "gradient descent, one start", "copied angles", "random")
     shares = [number(rf"\n{method} +\S+ +(\S+)%", said) for method in methods]
@@ -119,7 +119,7 @@ def test_imitate_poses(said, tmp_path):
     assert is_picture(tmp_path / "poses.png")
 
 
-@example("04_pose_mapper", minutes)
+@example("04_pose_mapper", patience)
 def test_pose_mapper(said, tmp_path):
     assert number(r"for a random pose: (\S+)%", said) < 20
     optimiser, mapper = (
@@ -151,7 +151,7 @@ def test_demonstrations(said, tmp_path):
     assert is_picture(tmp_path / "waves_and_bound.png") and is_picture(tmp_path / "waves.png")
 
 
-@example("06_train_and_evaluate", minutes)
+@example("06_train_and_evaluate", patience)
 def test_train_and_evaluate(said, tmp_path):
     gap = json.loads((tmp_path / "run" / "report.json").read_text())["optimality_gap"]
     assert gap["train"] < 0.3  # it learns: the start is at 1.8
@@ -162,7 +162,7 @@ def test_train_and_evaluate(said, tmp_path):
     assert (tmp_path / "policy.mp4").stat().st_size > 10_000
 
 
-@example("07_own_arm", minutes)
+@example("07_own_arm", patience)
 def test_own_arm(said, tmp_path):
     assert mimic.load_mjcf(tmp_path / "arm.xml").joint_names == ("turn", "shoulder", "elbow", "bend", "roll")
     findings = json.loads((tmp_path / "inspected" / "inspection.json").read_text())
@@ -173,7 +173,7 @@ def test_own_arm(said, tmp_path):
     assert report["env"] == "pair" and report["optimality_gap"]["train"] < 1  # better than to stay; the start is at 2
 
 
-@example("08_other_tools", minutes)
+@example("08_other_tools", patience)
 def test_other_tools(said, tmp_path):
     pytest.importorskip("onnxruntime")
     rewards = {name: number(rf"\n  {name} +(\S+)", said) for name in ("no torque", "the policy, by ONNX Runtime")}

@@ -147,12 +147,13 @@ def test_body_twists_are_the_derivative_of_the_frames(x64, arm):
 
 
 @pytest.mark.parametrize("frame_at", [0.5, 1.0, 0.0])
-@pytest.mark.parametrize("lengths", [[0.7], [1.0, 0.5], [0.2, 0.1, 0.4, 0.3]])
+@pytest.mark.parametrize("lengths", [[0.7], [1.0, 0.5], [0.2, 0.1, 0.4, 0.3], np.linspace(0.1, 0.3, LONG + 2)], ids=len)
 def test_planar_arm_has_the_closed_form(x64, lengths, frame_at):
     arm = planar_arm(lengths, frame_at=frame_at)
     (qpos, *_), (qvel, *_) = motions(arm.num_joints)
     states, twists = link_states(arm, qpos, qvel), body_twists(arm, qpos, qvel)
     joint, velocity, angle, rate = np.zeros(2), np.zeros(2), 0.0, 0.0
+    rounding = 1e-14 * max(1, arm.num_joints / 4) ** 2  # 10 roundings of speeds, which add up along the arm
     for i, length in enumerate(lengths):
         angle, rate = angle + qpos[i], rate + qvel[i]
         along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
@@ -164,9 +165,9 @@ def test_planar_arm_has_the_closed_form(x64, lengths, frame_at):
             "angular_velocity": [0, 0, rate],
         }
         for field, values in expected.items():
-            np.testing.assert_allclose(getattr(states, field)[i], values, atol=1e-14, err_msg=field)  # 10 roundings
+            np.testing.assert_allclose(getattr(states, field)[i], values, atol=rounding, err_msg=field)
         in_link_frame = [velocity @ along, velocity @ across + reach * rate, 0]
-        np.testing.assert_allclose(twists[i], [0, 0, rate, *in_link_frame], atol=1e-14)  # 10 roundings
+        np.testing.assert_allclose(twists[i], [0, 0, rate, *in_link_frame], atol=rounding)
         joint, velocity = joint + length * along, velocity + length * rate * across
 
 
@@ -193,9 +194,10 @@ def test_a_batch_is_a_vmap_is_a_loop():
 
 
 @pytest.mark.parametrize("function", [forward_kinematics, link_states, body_twists])
-def test_jit_takes_the_arm_as_an_argument(function):
-    arm = load_mjcf(random_arms.random_arm(11))  # 3 joints
-    (qpos, *_), (qvel, *_) = (x.astype(np.float32) for x in motions(3))
+@pytest.mark.parametrize("joints", [3, LONG + 2])
+def test_jit_takes_the_arm_as_an_argument(function, joints):
+    arm = load_mjcf(random_arms.random_arm(11, joints))
+    (qpos, *_), (qvel, *_) = (x.astype(np.float32) for x in motions(joints))
     inputs = (qpos,) if function is forward_kinematics else (qpos, qvel)
     traced = []
 

@@ -138,15 +138,25 @@ def test_zero_with_finite_gradients_at_a_match():
             assert np.all(np.isfinite(gradients)) and np.abs(gradients).max() < 100  # weights, angular velocities
 
 
-def test_dtypes_stay(x64):
-    arms = EXPERT, LEARNER
+@pytest.mark.parametrize("arms", [(EXPERT, LEARNER), PAIRS["long"]], ids=["short", "long"])
+def test_dtypes_stay(x64, arms):
     distance = motion_distance(*arms, overlap_correspondence(*arms))
     for dtype in (np.float32, np.float64):
         sample = [x[0] for x in motions(arms, dtype=dtype)]
         value, gradient = jax.value_and_grad(distance, 2)(*sample)
         assert value.dtype == gradient.dtype == dtype
+        assert {leaf.dtype for leaf in jax.tree.leaves(link_states(arms[0], sample[0], sample[1]))} == {np.dtype(dtype)}
     mixed = distance(*sample[:2], *(np.asarray(x, np.float32) for x in sample[2:]))
     assert mixed.dtype == np.float64
+
+
+def test_programs_of_long_arms_do_not_grow():
+    def operations(joints):
+        arms = planar_arm(np.full(joints, 0.1)), planar_arm(np.full(joints, 0.2))
+        gradient = jax.jit(jax.vmap(jax.grad(motion_distance(*arms, overlap_correspondence(*arms)), ALL_ARGUMENTS)))
+        return gradient.lower(*motions(arms, dtype=np.float32)).as_text().count("stablehlo.multiply")
+
+    assert operations(LONG + 1) == operations(2 * LONG) < operations(LONG) / 2
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -161,7 +161,8 @@ def test_a_policy_plays_and_can_be_scrubbed(page, serve, tmp_path):
     scrub.focus()
     for _ in range(12):
         scrub.press("ArrowLeft")
-    page.wait_for_function(f"document.querySelector('#mimic-distance').innerText !== '{paused}'", timeout=LATEST)
+    other = "before => document.querySelector('#mimic-distance').innerText !== before"
+    page.wait_for_function(other, arg=paused, timeout=LATEST)
     assert settled(page) != paused
     page.screenshot(path=tmp_path / "scrubbed.png")
     print(f"screenshots: {tmp_path}")
