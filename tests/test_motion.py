@@ -138,8 +138,9 @@ def test_zero_with_finite_gradients_at_a_match():
             assert np.all(np.isfinite(gradients)) and np.abs(gradients).max() < 100  # weights, angular velocities
 
 
-@pytest.mark.parametrize("arms", [(EXPERT, LEARNER), PAIRS["long"]], ids=["short", "long"])
-def test_dtypes_stay(x64, arms):
+@pytest.mark.parametrize("pair", ["planar", "long"])
+def test_dtypes_stay(x64, pair):
+    arms = PAIRS[pair]
     distance = motion_distance(*arms, overlap_correspondence(*arms))
     for dtype in (np.float32, np.float64):
         sample = [x[0] for x in motions(arms, dtype=dtype)]
