@@ -114,34 +114,30 @@ def link_states(
     if qvel is not None:
         qvel = joint_values(arm, qvel, "qvel")
     if arm.num_joints > LONG:
-        return _states_of_long_arm(arm, qpos, qvel, normalized)
+        of_dtype = jax.tree.map(lambda leaf: jnp.asarray(leaf, qpos.dtype), arm)
+        return _states_of_long_arm(of_dtype, qpos, jnp.zeros_like(qpos) if qvel is None else qvel, normalized)
     columns = _link_state_columns(arm, qpos, qvel, normalized)
     return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
 
 
 @functools.partial(jax.jit, static_argnames="normalized")
-def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array | None, normalized: bool) -> LinkStates:
-    """The same by a loop over the joints, which is compiled once for all of them."""
-
-    def arrays(tree: Any) -> Any:
-        return jax.tree.map(lambda x: jnp.asarray(x, qpos.dtype), tree)
+def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: bool) -> LinkStates:
+    """The same by a loop over the joints, which is compiled once for all of them; all numbers are of one dtype."""
+    base = jax.tree.map(lambda number: jnp.asarray(number, qpos.dtype), _BASE)
 
     def behind(parent: JointFrame, joint: Any) -> tuple[JointFrame, JointFrame]:
         offset, axis, angle, speed = joint
-        frame = arrays(_behind(parent, spatial.vector(offset), spatial.vector(axis), angle, speed))
+        frame = _behind(parent, spatial.vector(offset), spatial.vector(axis), angle, speed)
         return frame, frame
 
-    base = arrays(_BASE)
-    offsets = jnp.diff(jnp.asarray(arm.joint_anchor), axis=0, prepend=jnp.zeros((1, 3)))
-    joints = *arrays((offsets, arm.joint_axis)), qpos, jnp.zeros_like(qpos) if qvel is None else qvel
-    _, frames = jax.lax.scan(behind, base, joints)
+    anchors = jnp.concatenate([jnp.zeros((1, 3), qpos.dtype), arm.joint_anchor])  # the base's first
+    _, frames = jax.lax.scan(behind, base, (jnp.diff(anchors, axis=0), arm.joint_axis, qpos, qvel))
     moves = np.asarray(arm.link_joint) + 1
     frames = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest])[moves], base, frames)
-    anchors = jnp.concatenate([jnp.zeros((1, 3)), jnp.asarray(arm.joint_anchor)])[moves]
-    levers, directions = arrays((jnp.asarray(arm.link_position) - anchors, arm.link_rotation[:, :, 0]))
-    link = _link_vectors(frames, spatial.vector(levers.T), spatial.vector(directions.T))
-    unit = 1 / spatial.scalar(arm.chain_length) if normalized else 1.0
-    return LinkStates(*arrays(tuple(jnp.stack(x, axis=-1) for x in _in_units(unit, link))))
+    levers, directions = arm.link_position - anchors[moves], arm.link_rotation[:, :, 0]
+    links = _link_vectors(frames, spatial.vector(levers.T), spatial.vector(directions.T))
+    unit = 1 / arm.chain_length if normalized else 1.0
+    return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, links)))
 
 
 def link_state_table(

@@ -84,6 +84,16 @@ def test_long_arms_move_as_in_mujoco(x64, seed, locked):
     assert_moves_as_in_mujoco(arm, model, np.dtype("float64"), locked)
 
 
+def test_long_arms_take_both_precisions_in_one_process():
+    arm = planar_arm([0.1] * (LONG + 1))
+    (qpos, *_), (qvel, *_) = motions(arm.num_joints)
+    for wide in (False, True, False):
+        dtype = np.dtype(np.float64 if wide else np.float32)
+        with jax.enable_x64(wide):
+            found = jax.jit(lambda *motion: link_states(arm, *motion))(qpos.astype(dtype), qvel.astype(dtype))
+            assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {dtype}
+
+
 @pytest.mark.parametrize("merge_locked", [True, False])
 @pytest.mark.parametrize("locked", PANDA_LOCKED.values(), ids=PANDA_LOCKED)
 def test_panda_moves_as_in_mujoco(dtype, locked, merge_locked):
