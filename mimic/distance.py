@@ -144,7 +144,13 @@ def embodiment_distance(
 
 
 def pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> PairDistances:
-    """The parts of the distance between two links, of whose states each array is [3]; 0 for what one of them lacks."""
+    """The parts of the distance between two links (paper, the terms of eq. 19), in the units of `PairDistances`.
+
+    Args:
+      a: states of one link, each [3]; what is None makes its part 0.
+      b: of the other.
+      measure: see `rotation_distance`.
+    """
     zero = jnp.zeros((), a.position.dtype)  # of what candidate points lack
 
     def apart(x: Array | None, y: Array | None) -> Array:

@@ -123,9 +123,10 @@ def test_one_expert_pose_serves_a_batch_of_learners():
     np.testing.assert_allclose(every[0], expected, rtol=1e-6)
 
 
-def test_zero_with_finite_gradients_at_a_match():
+@pytest.mark.parametrize("lengths", [[0.5, 0.2, 0.3], np.linspace(0.1, 0.3, LONG + 1)], ids=["short", "long"])
+def test_zero_with_finite_gradients_at_a_match(lengths):
     """Exactly, where each operation is rounded by itself; a compiled program may round the two arms differently."""
-    arm = planar_arm([0.5, 0.2, 0.3])
+    arm = planar_arm(lengths)
     distance = jax.value_and_grad(motion_distance(arm, arm, 2 * np.eye(arm.num_links), ALL_WEIGHTS), (2, 3))
     compiled = jax.jit(jax.vmap(distance))
     qpos, qvel, *_ = motions((arm, arm), dtype=np.float32)
