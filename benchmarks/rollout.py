@@ -1,6 +1,7 @@
 """How fast arms are simulated, and the environment steps: steps per second, and where the time of a step goes.
 
     python -m benchmarks.rollout --out FILE [--envs panda7dof ...] [--arms 64 512 ...] [--peer-arms 512 ...]
+                                [--cases fused MJX-Warp ...]
 
 Every program makes control steps of 0.1 s under random torques: 10 Runge-Kutta steps of 10 ms, the environment's own.
 Physics is that of the environments, `fused` and `mjx`, against a loop that carries `mjx.Data` as is usual, MJX-Warp
@@ -172,6 +173,7 @@ CASES: dict[str, dict[str, Case]] = {
     "environment": {"fused": environment("fused"), "mjx": environment("mjx"), "stock": stock_environment},
     "part": {name: part(name) for name in ("reward", "observation", "new episode")},
 }
+NAMES = tuple(dict.fromkeys(case for cases in CASES.values() for case in cases))
 OWN = {("physics", "fused"), ("environment", "fused"), ("part", "reward")}  # quick to compile: with all numbers of arms
 
 
@@ -180,14 +182,19 @@ def _with_physics(env: ImitationEnv, physics: str) -> ImitationEnv:
 
 
 def run(
-    envs: Sequence[str], sizes: Sequence[int], peer_sizes: Sequence[int], save: Callable[[list[dict[str, Any]]], None]
+    envs: Sequence[str],
+    sizes: Sequence[int],
+    peer_sizes: Sequence[int],
+    save: Callable[[list[dict[str, Any]]], None],
+    names: Sequence[str] = NAMES,
 ) -> list[dict[str, Any]]:
-    """A row for each measurement, saved as they come; what fails is a row that says why."""
+    """A row for each measurement of the cases so named, saved as they come; what fails is a row that says why."""
     jobs = [
         (name, group, case, arms)
         for name in envs
         for group, cases in CASES.items()
         for case in cases
+        if case in names
         for arms in sorted({*peer_sizes, *(sizes if (group, case) in OWN else ())})
     ]
     made = {name: mimic.make(name, physics="fused") for name in envs}
@@ -232,7 +239,8 @@ def draw(rows: list[dict[str, Any]], out: Path) -> None:
                 axes.loglog([r["arms"] for r in found], [r["steps_per_s"] for r in found], "o-", ms=3, label=case)
         axes.set(xlabel="arms", title=f"{first}: {title}")
         axes.grid(alpha=0.3, which="both")
-        axes.legend(fontsize="small")
+        if axes.lines:
+            axes.legend(fontsize="small")
     figure.savefig(out, dpi=150)
     plt.close(figure)
 
@@ -245,6 +253,7 @@ def main() -> None:
     parser.add_argument("--envs", nargs="+", choices=ENVS, default=list(ENVS), metavar="NAME", help=", ".join(ENVS))
     parser.add_argument("--arms", nargs="+", type=int, default=list(ARMS), metavar="N")
     parser.add_argument("--peer-arms", nargs="*", type=int, default=list(PEER_ARMS), metavar="N", help="of the others")
+    parser.add_argument("--cases", nargs="+", choices=NAMES, default=NAMES, metavar="CASE", help=", ".join(NAMES))
     parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
     options = parser.parse_args()
 
@@ -252,7 +261,7 @@ def main() -> None:
         if options.out:
             write_results(options.out, "rollout", options.commit, control_steps=STEPS, rows=rows)
 
-    rows = run(options.envs, options.arms, options.peer_arms, save)
+    rows = run(options.envs, options.arms, options.peer_arms, save, options.cases)
     show(rows, Console())
     if options.out:
         draw(rows, options.out.with_suffix(".png"))

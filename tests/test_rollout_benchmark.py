@@ -43,6 +43,11 @@ def test_a_peer_that_cannot_run_says_why(monkeypatch):
     assert row["failed"] == "no room"
 
 
+def test_only_the_cases_asked_for_are_measured():
+    rows = rollout.run(["panda4dof"], [], [16], lambda _: None, ["observation", "C MuJoCo, all cores"])
+    assert [row["case"] for row in rows] == ["C MuJoCo, all cores", "observation"]
+
+
 @pytest.mark.parametrize("group, case", [("physics", "C MuJoCo, all cores"), ("part", "observation")])
 def test_peers_run(group, case):
     env = mimic.make("panda4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
