@@ -1,10 +1,12 @@
 """Scalar-component code over a batch: one GPU kernel on NVIDIA, a plain batched program elsewhere."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array
@@ -55,10 +57,27 @@ def fused(
     one = plain or by_program
     # Asked for several outputs at once, XLA's CPU compiler computes what they share many times over: the distance and
     # its gradient by the learner's angles took seven times as long (by measurement).
-    many_elsewhere = jax.vmap(plain or one_after_the_other)
+    elsewhere = plain or one_after_the_other
+    return batched_by(gpu_kernel(program, widths, block, warps), one, elsewhere, len(widths))
+
+
+def batched_by(
+    kernel: Callable[..., tuple[Array, ...]],
+    one: Callable[..., tuple[Array, ...]],
+    elsewhere: Callable[..., tuple[Array, ...]],
+    outputs: int,
+) -> Callable[..., tuple[Array, ...]]:
+    """A function of vectors whose `jax.vmap` is a kernel on NVIDIA GPUs; its derivatives are as XLA compiles them.
+
+    Args:
+      kernel: of arrays [samples, width]; gives such arrays.
+      one: the same of one sample.
+      elsewhere: what is batched where there is no such GPU; of one sample too.
+      outputs: how many arrays they give.
+    """
+    many_elsewhere = jax.vmap(elsewhere)
     function = jax.custom_jvp(jax.custom_batching.custom_vmap(one))
     function.defjvp(lambda primals, tangents: jax.jvp(one, primals, tangents))
-    kernel = gpu_kernel(program, widths, block, warps)
 
     @function.fun.def_vmap
     def many(size: int, batched: Any, *vectors: Array) -> Any:
@@ -66,7 +85,7 @@ def fused(
             vector if is_batched else jnp.broadcast_to(vector, (size, *vector.shape))
             for vector, is_batched in zip(vectors, batched, strict=True)
         ]
-        return jax.lax.platform_dependent(*rows, cuda=kernel, default=many_elsewhere), (True,) * len(widths)
+        return jax.lax.platform_dependent(*rows, cuda=kernel, default=many_elsewhere), (True,) * outputs
 
     return function
 
@@ -76,9 +95,6 @@ def gpu_kernel(
 ) -> Callable[..., tuple[Array, ...]]:
     """The program over arrays [samples, width], as one Pallas kernel.
 
-    A thread reads the few numbers of its sample, which lie side by side: what a group of threads reads is in whole
-    lines of the cache, so that transposing the arrays first would only move them through memory once more.
-
     Args:
       program: see `fused`.
       widths: see `fused`.
@@ -86,29 +102,85 @@ def gpu_kernel(
       warps: groups of 32 threads in a block.
     """
 
+    def body(given: Sequence[Columns], made: Sequence[Columns]) -> None:
+        # Columns are named by arrays, because interpret mode refuses plain numbers.
+        inputs = [[columns.read(jnp.int32(k)) for k in range(columns.width)] for columns in given]
+        for columns, scalars in zip(made, program(*inputs), strict=True):
+            for k, value in enumerate(scalars):
+                columns.write(jnp.int32(k), value)
+
+    return by_columns(body, widths, block=block, warps=warps)
+
+
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """What a kernel sees of an array [samples, width]: a block of its rows, column by column.
+
+    Attributes:
+      ref: of the block.
+      inside: which of its samples there are: the last block may stick out.
+    """
+
+    ref: Any
+    inside: Array
+
+    @property
+    def width(self) -> int:
+        """How many columns."""
+        return self.ref.shape[1]
+
+    def read(self, column: Array) -> Array:
+        """A column, [block]; 0 where its number is negative."""
+        there = self.inside & (column >= 0)
+        return triton.load(self.ref.at[:, jnp.maximum(column, 0)], mask=there, other=0.0)
+
+    def write(self, column: Array, values: Scalar) -> None:
+        """A column; none where its number is negative."""
+        there = self.inside & (column >= 0)
+        values = jnp.broadcast_to(jnp.asarray(values, self.ref.dtype), self.inside.shape)
+        triton.store(self.ref.at[:, jnp.maximum(column, 0)], values, mask=there)
+
+
+def by_columns(
+    body: Callable[..., None],
+    widths: Sequence[int],
+    *tables: np.ndarray,
+    block: int = BLOCK,
+    warps: int = WARPS,
+) -> Callable[..., tuple[Array, ...]]:
+    """A function of arrays [samples, width] as one Pallas kernel: a thread computes a sample.
+
+    A thread reads the few numbers of its sample, which lie side by side: what a group of threads reads is in whole
+    lines of the cache, so that transposing the arrays first would only move them through memory once more.
+
+    Args:
+      body: of `Columns` of what is given and of what is made, and of references to the tables.
+      widths: of the arrays that are made.
+      *tables: what all samples share.
+      block: see `gpu_kernel`.
+      warps: see `gpu_kernel`.
+    """
+
     def batched(*rows: Array) -> tuple[Array, ...]:
         count, dtype = rows[0].shape[0], rows[0].dtype
 
         def kernel(*refs: Any) -> None:
-            # Columns are named by arrays, because interpret mode refuses plain numbers.
-            inside = pl.program_id(0) * block + jnp.arange(block) < count  # the last block may stick out
-            inputs = [
-                [triton.load(ref.at[:, jnp.int32(k)], mask=inside, other=0.0) for k in range(ref.shape[1])]
-                for ref in refs[: len(rows)]
-            ]
-            for ref, scalars in zip(refs[len(rows) :], program(*inputs), strict=True):
-                for k, value in enumerate(scalars):
-                    triton.store(ref.at[:, jnp.int32(k)], jnp.broadcast_to(value, block).astype(dtype), mask=inside)
+            inside = pl.program_id(0) * block + jnp.arange(block) < count
+            given, shared = refs[: len(rows)], refs[len(rows) : len(rows) + len(tables)]
+            made = refs[len(rows) + len(tables) :]
+            body([Columns(ref, inside) for ref in given], [Columns(ref, inside) for ref in made], *shared)
 
+        numbers = [jnp.asarray(x, dtype if np.issubdtype(x.dtype, np.floating) else x.dtype) for x in tables]
+        whole = [pl.BlockSpec(x.shape, lambda i, rank=x.ndim: (0,) * rank) for x in tables]
         return tuple(
             pl.pallas_call(
                 kernel,
                 out_shape=[jax.ShapeDtypeStruct((count, width), dtype) for width in widths],
                 grid=(pl.cdiv(count, block),),
-                in_specs=[_side_by_side(block, x.shape[1]) for x in rows],
+                in_specs=[*(_side_by_side(block, x.shape[1]) for x in rows), *whole],
                 out_specs=[_side_by_side(block, width) for width in widths],
                 compiler_params=triton.CompilerParams(num_warps=warps, num_stages=1),
-            )(*rows)
+            )(*rows, *numbers)
         )
 
     return batched

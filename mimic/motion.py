@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from mimic import kernel, motion_gradient
+from mimic import kernel, motion_gradient, motion_walk
 from mimic.distance import (
     PAPER_WEIGHTS,
     PARTS,
@@ -74,8 +74,7 @@ def motion_distance(
     usual = rotation == "cosine" and reduction == "mean" and not callable(correspondence)
     if usual and isinstance(weights, DistanceWeights) and _is_known((arms, correspondence, weights)):
         factors = _factors(np.asarray(correspondence, float), weights)
-        is_long = max(expert.num_joints, learner.num_joints) > LONG
-        distance = (_by_pairs if is_long else _closed_form)(arms, factors)
+        distance = _closed_form(arms, factors)
     else:
         distance = composed
 
@@ -119,12 +118,24 @@ def _by_pairs(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Calla
 def _closed_form(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Callable[..., Array]:
     sizes = [_of_length_one(arm) for arm in arms]
     joints = [arm.num_joints for arm in arms for _ in range(2)]
+    by_pairs, walk = _by_pairs(arms, factors), motion_walk.plan(*sizes, factors)
+    if max(joints) > LONG and walk is None:
+        return by_pairs
 
     @functools.cache
     def values(wanted: tuple[int, ...]) -> Callable[..., tuple[Array, ...]]:
         """The distance, and its gradient by the wanted ones of the four arguments."""
-        program = functools.partial(motion_gradient.distance_and_gradient, *sizes, factors, wanted)
-        return kernel.fused(program, [1, *(joints[k] for k in wanted)])
+        widths = [joints[k] for k in wanted]
+        if walk is None or max(joints) <= LONG:
+            program = functools.partial(motion_gradient.distance_and_gradient, *sizes, factors, wanted)
+            return kernel.fused(program, [1, *widths])
+
+        def differentiated(*motion: Array) -> tuple[Array, ...]:
+            value, gradients = jax.value_and_grad(by_pairs, wanted)(*motion) if wanted else (by_pairs(*motion), ())
+            return value[None], *gradients
+
+        on_gpu = motion_walk.gpu_kernel(walk, wanted, widths)
+        return kernel.batched_by(on_gpu, differentiated, differentiated, 1 + len(wanted))
 
     @jax.custom_jvp
     def distance(*motion: Array) -> Array:

@@ -8,6 +8,7 @@ Jacobian: one sweep from the tip to the base, whatever the number of joints.
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +19,23 @@ from mimic import spatial
 from mimic.distance import PARTS
 from mimic.embodiment import Embodiment
 from mimic.kinematics import JointFrame, LinkVectors, joint_frames, link_vectors
-from mimic.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract
+from mimic.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract, times
 
 _ROTATION = PARTS.index("rotation")
 _REST = LinkVectors(ZERO, ZERO, ZERO, ZERO)
+
+
+class Slopes(NamedTuple):
+    """Sums over the links behind a joint: of the distance's slopes with respect to their states, and of moments."""
+
+    force: Vector  # by positions
+    push: Vector  # by linear velocities
+    spin: Vector  # by angular velocities
+    moment: Vector  # states x slopes, of all four
+    swing: Vector  # positions x slopes by linear velocities
+
+
+NO_SLOPES = Slopes(ZERO, ZERO, ZERO, ZERO, ZERO)
 
 
 def distance_and_gradient(
@@ -61,19 +75,24 @@ def _compare(
     value: Scalar = 0.0
     slopes = [[list(_REST) for _ in links] for links in (expert, learner)]
     for part, i, j in np.argwhere(factors).tolist():
-        factor = float(factors[part, i, j])
-        apart = subtract(learner[j][part], expert[i][part])
-        square = dot(apart, apart)
-        if part == _ROTATION:
-            value = plus(value, 0.25 * math.pi * factor * square)
-            slope = scale(0.5 * math.pi * factor, apart)
-        else:
-            inverse = _inverse_root(square)
-            value = plus(value, factor * square * inverse)
-            slope = scale(factor * inverse, apart)
+        term, slope = compare_part(part, float(factors[part, i, j]), expert[i], learner[j])
+        value = plus(value, term)
         slopes[0][i][part] = subtract(slopes[0][i][part], slope)
         slopes[1][j][part] = add(slopes[1][j][part], slope)
     return value, [[LinkVectors(*slope) for slope in side] for side in slopes]
+
+
+def compare_part(part: int, factor: Scalar, expert: LinkVectors, learner: LinkVectors) -> tuple[Scalar, Vector]:
+    """A part of the distance of two links times a factor, and its slope with respect to the learner's state.
+
+    The slope with respect to the expert's is the negative of it.
+    """
+    apart = subtract(learner[part], expert[part])
+    square = dot(apart, apart)
+    if part == _ROTATION:
+        return times(times(0.25 * math.pi, factor), square), scale(times(0.5 * math.pi, factor), apart)
+    over_length = times(factor, _inverse_root(square))
+    return times(over_length, square), scale(over_length, apart)
 
 
 def _inverse_root(square: Scalar) -> Scalar:
@@ -86,32 +105,52 @@ def _inverse_root(square: Scalar) -> Scalar:
 def _by_joints(
     arm: Embodiment, frames: Sequence[JointFrame], links: Sequence[LinkVectors], slopes: Sequence[LinkVectors]
 ) -> tuple[list[Scalar], list[Scalar]]:
-    """The gradient by qpos and by qvel.
-
-    With joint k's axis a, its anchor c that moves at u, and the angular velocity w_k of the body behind it, for a link
-    behind it at r = p - c
-
-        dp/dq = a x r    de/dq = a x e    dw/dq = a x (w - w_k)    dv/dq = a x (v - u) + (w_k x a) x r
-                                          dw/dqdot = a             dv/dqdot = a x r
-
-    so that only sums of the slopes and of their moments are needed, over all links behind the joint.
-    """
-    force, push, spin, moment, swing = ZERO, ZERO, ZERO, ZERO, ZERO
+    """The gradient by qpos and by qvel."""
+    behind = NO_SLOPES
     by_qpos, by_qvel = [], []
     for joint in reversed(range(arm.num_joints)):
-        for link, slope in ((links[i], slopes[i]) for i, own in enumerate(arm.link_joint) if own == joint):
-            force = add(force, slope.position)
-            push = add(push, slope.linear_velocity)
-            spin = add(spin, slope.angular_velocity)
-            swing = add(swing, cross(link.position, slope.linear_velocity))
-            for state, by_state in zip(link, slope, strict=True):
-                moment = add(moment, cross(state, by_state))
+        for link in (link for link, own in enumerate(arm.link_joint) if own == joint):
+            behind = with_link(behind, links[link], slopes[link])
         frame = frames[joint + 1]
-        axis: Vector = spatial.rotate(frame.rotation, spatial.vector(arm.joint_axis[joint]))
-        about_anchor = subtract(swing, cross(frame.anchor, push))
-        turning = subtract(moment, cross(frame.anchor, force))
-        turning = subtract(turning, cross(frame.linear_velocity, push))
-        turning = add(turning, cross(frame.angular_velocity, subtract(ZERO, add(spin, about_anchor))))
-        by_qpos.append(dot(axis, turning))
-        by_qvel.append(dot(axis, add(spin, about_anchor)))
+        axis = spatial.rotate(frame.rotation, spatial.vector(arm.joint_axis[joint]))
+        by_angle, by_speed = by_joint(frame, axis, behind)
+        by_qpos.append(by_angle)
+        by_qvel.append(by_speed)
     return by_qpos[::-1], by_qvel[::-1]
+
+
+def with_link(behind: Slopes, link: LinkVectors, slope: LinkVectors) -> Slopes:
+    """The sums with one more link."""
+    moment = behind.moment
+    for state, by_state in zip(link, slope, strict=True):
+        moment = add(moment, cross(state, by_state))
+    return Slopes(
+        force=add(behind.force, slope.position),
+        push=add(behind.push, slope.linear_velocity),
+        spin=add(behind.spin, slope.angular_velocity),
+        moment=moment,
+        swing=add(behind.swing, cross(link.position, slope.linear_velocity)),
+    )
+
+
+def by_joint(frame: JointFrame, axis: Vector, behind: Slopes) -> tuple[Scalar, Scalar]:
+    """The slopes by a joint's angle and by its velocity.
+
+    With the joint's axis a, its anchor c that moves at u, and the angular velocity w of the body behind it, for a link
+    behind it at r = p - c, whose body turns at w_l
+
+        dp/dq = a x r    de/dq = a x e    dw_l/dq = a x (w_l - w)    dv/dq = a x (v - u) + (w x a) x r
+                                          dw_l/dqdot = a             dv/dqdot = a x r
+
+    so that only sums over all links behind the joint are needed.
+
+    Args:
+      frame: of the body behind the joint.
+      axis: the joint's, in the base frame.
+      behind: of the links.
+    """
+    about_anchor = subtract(behind.swing, cross(frame.anchor, behind.push))
+    turning = subtract(behind.moment, cross(frame.anchor, behind.force))
+    turning = subtract(turning, cross(frame.linear_velocity, behind.push))
+    turning = add(turning, cross(frame.angular_velocity, subtract(ZERO, add(behind.spin, about_anchor))))
+    return dot(axis, turning), dot(axis, add(behind.spin, about_anchor))

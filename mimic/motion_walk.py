@@ -1,0 +1,228 @@
+"""The usual embodiment distance of long arms and its gradient: `mimic.motion_gradient` as a loop.
+
+A program that spells out all links takes a time to compile that grows faster than their number. Here both arms are
+walked along at once, a step at a time: each arm crosses a joint or stays, then a pair of links is compared. Where the
+links that correspond lie in order along both arms, every pair is met so. For the gradient the arms are first walked to
+their tips, then back, and the slopes of the links behind are gathered on the way; a frame is then what it was but for
+rounding. Nothing is kept of a link once it is passed: what a sample takes stays in the registers of its thread.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mimic import kernel, spatial
+from mimic.embodiment import Embodiment
+from mimic.kinematics import BASE, JointFrame, LinkVectors, behind_joint, link_behind
+from mimic.motion_gradient import NO_SLOPES, Slopes, by_joint, compare_part, with_link
+from mimic.spatial import ZERO, Scalar, Vector, plus, subtract
+
+_BLOCK, _WARPS = 128, 4  # samples, and groups of 32 threads, in a block (by measurement)
+_VECTORS = 4  # of an arm in a row of numbers: the last of them of the link
+
+
+class Crossing(NamedTuple):
+    """Of a joint by one arm; vectors are those of the zero pose."""
+
+    offset: Vector  # of its anchor, from the one before
+    axis: Vector
+    angle: Scalar
+    speed: Scalar
+
+
+class Step(NamedTuple):
+    """Joints that are crossed, then links that are compared."""
+
+    crosses: Sequence[Scalar]  # whether each arm does
+    crossings: Sequence[Crossing]
+    links: Sequence[tuple[Vector, Vector]]  # lever from the anchor, and direction
+    factors: Sequence[Scalar]  # what the parts of the links' distance count for
+
+
+class State(NamedTuple):
+    """Of a walk."""
+
+    value: Scalar  # of the pairs that were compared
+    frames: tuple[JointFrame, ...]  # of both arms
+    behind: tuple[Slopes, ...]  # of the arms that have gradients
+
+
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    """From the bases to the tips.
+
+    Attributes:
+      joints: that are crossed in each step; -1 where none.
+      numbers: of each step: vectors of the crossing and of the link of each arm, then factors.
+      parts: indices of the parts of the distance that the factors are of.
+    """
+
+    joints: Int[np.ndarray, "steps 2"]
+    numbers: Float[np.ndarray, "steps columns"]
+    parts: tuple[int, ...]
+
+    def step(self, joints: Sequence[Scalar], numbers: Sequence[Scalar], motion: Sequence[Scalar]) -> Step:
+        """Of a row of the tables, with angle and speed of each arm's joint."""
+        vectors = [(numbers[k], numbers[k + 1], numbers[k + 2]) for k in range(0, 6 * _VECTORS, 3)]
+        sides = vectors[:_VECTORS], vectors[_VECTORS:]
+        return Step(
+            crosses=[joint >= 0 for joint in joints],
+            crossings=[Crossing(*side[:2], *motion[2 * k : 2 * k + 2]) for k, side in enumerate(sides)],
+            links=[(side[2], side[3]) for side in sides],
+            factors=numbers[6 * _VECTORS :],
+        )
+
+
+def plan(expert: Embodiment, learner: Embodiment, factors: Float[np.ndarray, "parts expert learner"]) -> Walk | None:
+    """The walk that meets all pairs of links whose factors are not 0; None where they do not lie in order.
+
+    Args:
+      expert: in units of its chain length.
+      learner: likewise.
+      factors: see `motion_gradient.distance_and_gradient`.
+    """
+    arms = expert, learner
+    pairs = np.argwhere(factors.any(axis=0))  # in the expert's order
+    movers = np.array([[arm.link_joint[link] for arm, link in zip(arms, pair, strict=True)] for pair in pairs])
+    if any(np.any(np.diff(x, axis=0) < 0) for x in (pairs, movers)):
+        return None
+    parts = np.flatnonzero(factors.any(axis=(1, 2)))
+    steps: list[tuple[tuple[int, ...], Any]] = []  # joints that are crossed, and the pair that is compared, if any
+    reached = [-1, -1]
+    tips = [arm.num_joints - 1 for arm in arms]
+    for pair, ends in [*zip(pairs, movers.tolist(), strict=True), (None, tips)]:
+        ways = [range(last + 1, end + 1) for last, end in zip(reached, ends, strict=True)]
+        count = max(*map(len, ways), 0 if pair is None else 1)
+        steps.extend((joints, None) for joints in zip(*([-1] * (count - len(way)) + [*way] for way in ways)))
+        if pair is not None:
+            steps[-1] = steps[-1][0], pair
+        reached = ends
+    rows = []
+    for joints, pair in steps:
+        links = (None, None) if pair is None else pair
+        vectors = [_vectors(arm, joint, link) for arm, joint, link in zip(arms, joints, links, strict=True)]
+        rows.append([*vectors, np.zeros(len(parts)) if pair is None else factors[parts, *pair]])
+    return Walk(np.array([j for j, _ in steps], np.int32), np.array([np.concatenate(r) for r in rows]), tuple(parts))
+
+
+def _vectors(arm: Embodiment, joint: int, link: int | None) -> np.ndarray:
+    """Of a step, for one arm; zeros for a joint or a link that there is not."""
+    anchors = np.concatenate([np.zeros((1, 3)), arm.joint_anchor])  # the base's first
+    vectors = np.zeros((_VECTORS, 3))
+    if joint >= 0:
+        vectors[:2] = anchors[joint + 1] - anchors[joint], arm.joint_axis[joint]
+    if link is not None:
+        vectors[2:] = arm.link_position[link] - anchors[arm.link_joint[link] + 1], arm.link_rotation[link][:, 0]
+    return vectors.ravel()
+
+
+def gpu_kernel(walk: Walk, wanted: Sequence[int], sizes: Sequence[int]) -> Callable[..., tuple[Array, ...]]:
+    """A Pallas kernel of qpos [rad] and qvel [rad/s], each [samples, joints], of the expert, then of the learner.
+
+    It gives the distance, [samples, 1], and its gradient by those of its arguments that are wanted.
+
+    Args:
+      walk: see `plan`.
+      wanted: indices of arguments.
+      sizes: of these, numbers of joints.
+    """
+    count, sides = len(walk.joints), sorted({index // 2 for index in wanted})
+
+    def body(given: Sequence[kernel.Columns], made: Sequence[kernel.Columns], joints: Any, numbers: Any) -> None:
+        def step(index: Array) -> Step:
+            crossed = [joints[index, side] for side in (0, 1)]
+            motion = [columns.read(crossed[k // 2]) for k, columns in enumerate(given)]
+            return walk.step(crossed, [numbers[index, k] for k in range(walk.numbers.shape[1])], motion)
+
+        def onward(index: Array, state: State) -> State:
+            return _onward(state, step(index))
+
+        def compare(index: Array, state: State) -> State:
+            row = step(index)
+            return _compare(walk.parts, _onward(state, row), row)
+
+        def back(index: Array, state: State) -> State:
+            index = count - 1 - index
+            state, slopes = _back(walk.parts, sides, state, step(index))
+            for columns, k in zip(made[1:], wanted, strict=True):
+                columns.write(joints[index, k // 2], slopes[sides.index(k // 2)][k % 2])
+            return state
+
+        start = State(0.0, (BASE, BASE), tuple(NO_SLOPES for _ in sides))
+        state = jax.tree.map(lambda x: jnp.full(given[0].inside.shape, x, given[0].ref.dtype), start)
+        for loop in (onward, back) if wanted else (compare,):
+            state = jax.lax.fori_loop(0, count, loop, state)
+        made[0].write(jnp.int32(0), state.value)
+
+    return kernel.by_columns(body, [1, *sizes], walk.joints, walk.numbers, block=_BLOCK, warps=_WARPS)
+
+
+def _onward(state: State, step: Step) -> State:
+    """Each arm across its joint."""
+
+    def cross(frame: JointFrame, crossing: Crossing) -> JointFrame:
+        return behind_joint(frame, *crossing)
+
+    def stay(frame: JointFrame, _: Crossing) -> JointFrame:
+        return frame
+
+    moves = zip(step.crosses, state.frames, step.crossings, strict=True)
+    return state._replace(frames=tuple(jax.lax.cond(crosses, cross, stay, *move) for crosses, *move in moves))
+
+
+def _links(state: State, step: Step) -> list[LinkVectors]:
+    return [link_behind(frame, *link) for frame, link in zip(state.frames, step.links, strict=True)]
+
+
+def _compare(parts: Sequence[int], state: State, step: Step) -> State:
+    """With the distance of the step's links."""
+    links = _links(state, step)
+    terms = [compare_part(part, factor, *links)[0] for part, factor in zip(parts, step.factors, strict=True)]
+    return state._replace(value=sum(terms, state.value))
+
+
+def _back(
+    parts: Sequence[int], sides: Sequence[int], state: State, step: Step
+) -> tuple[State, list[tuple[Scalar, Scalar]]]:
+    """The step's links compared, then each arm back across its joint; the slopes by that joint's angle and speed."""
+    links, value, slopes = _links(state, step), state.value, [[ZERO] * len(LinkVectors._fields) for _ in range(2)]
+    for part, factor in zip(parts, step.factors, strict=True):
+        term, slope = compare_part(part, factor, *links)
+        value, slopes[0][part], slopes[1][part] = plus(value, term), subtract(ZERO, slope), slope
+    behind = [
+        with_link(own, links[side], LinkVectors(*slopes[side])) for side, own in zip(sides, state.behind, strict=True)
+    ]
+    frames, found = [], []
+    for side, (crosses, frame, crossing) in enumerate(zip(step.crosses, state.frames, step.crossings, strict=True)):
+        own = behind[sides.index(side)] if side in sides else None
+        frame, by = jax.lax.cond(crosses, _cross_back, _stay, frame, crossing, own)
+        frames.append(frame)
+        if side in sides:
+            found.append(by)
+    return State(value, tuple(frames), tuple(behind)), found
+
+
+def _cross_back(frame: JointFrame, crossing: Crossing, behind: Slopes | None) -> tuple[JointFrame, Any]:
+    """The body before the joint, and the slopes by its angle and speed."""
+    offset, axis, angle, speed = crossing
+    axis_now = spatial.rotate(frame.rotation, axis)
+    rotation = spatial.compose(frame.rotation, spatial.transpose(spatial.axis_rotation(axis, angle)))
+    lever = spatial.rotate(rotation, offset)
+    spin = subtract(frame.angular_velocity, spatial.scale(speed, axis_now))
+    before = JointFrame(
+        rotation=rotation,
+        anchor=subtract(frame.anchor, lever),
+        angular_velocity=spin,
+        linear_velocity=subtract(frame.linear_velocity, spatial.cross(spin, lever)),
+    )
+    return before, None if behind is None else by_joint(frame, axis_now, behind)
+
+
+def _stay(frame: JointFrame, _: Crossing, behind: Slopes | None) -> tuple[JointFrame, Any]:
+    nothing = jnp.zeros_like(frame.anchor[0])
+    return frame, None if behind is None else (nothing, nothing)
