@@ -13,9 +13,29 @@ from jaxtyping import Array
 
 from mimic.spatial import Scalar, stack
 
-BLOCK, WARPS = 128, 4  # samples, and groups of 32 threads, in a block of the GPU kernel (by measurement)
-
 Program = Callable[..., Sequence[Sequence[Scalar]]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """How a GPU kernel shares out its work; the best is a matter of measurement.
+
+    Where samples are the first axis, a thread reads numbers that lie side by side, so that a group of threads reads
+    whole lines of the cache. That is best for few columns, which are all read at once: to transpose them first would
+    only move them through memory once more. Many columns, one after the other, would throw each other out of the cache.
+
+    Attributes:
+      block: samples in a block; a power of 2.
+      warps: groups of 32 threads in a block.
+      sample_axis: of the arrays within the kernel; those outside, [samples, width], are transposed where it is 1.
+    """
+
+    block: int = 128
+    warps: int = 4
+    sample_axis: int = 0
+
+
+DEFAULT = Layout()
 
 
 def fused(
@@ -23,8 +43,7 @@ def fused(
     widths: Sequence[int],
     *,
     plain: Callable[..., tuple[Array, ...]] | None = None,
-    block: int = BLOCK,
-    warps: int = WARPS,
+    layout: Layout = DEFAULT,
 ) -> Callable[..., tuple[Array, ...]]:
     """A function of vectors whose `jax.vmap` is one kernel on NVIDIA GPUs.
 
@@ -36,8 +55,7 @@ def fused(
         `mimic.spatial` does: in the kernel a scalar is a block of samples.
       widths: length of each sequence that the program gives.
       plain: the same on vectors, for where there is no such GPU; the program itself where None.
-      block: see `gpu_kernel`.
-      warps: see `gpu_kernel`.
+      layout: of the kernel.
 
     Returns:
       The function, of vectors of one floating dtype. Its derivatives are those of the program, as XLA compiles it.
@@ -58,24 +76,25 @@ def fused(
     # Asked for several outputs at once, XLA's CPU compiler computes what they share many times over: the distance and
     # its gradient by the learner's angles took seven times as long (by measurement).
     elsewhere = plain or one_after_the_other
-    return batched_by(gpu_kernel(program, widths, block, warps), one, elsewhere, len(widths))
+    return batched_by(gpu_kernel(program, widths, layout), one, elsewhere, outputs=len(widths))
 
 
 def batched_by(
     kernel: Callable[..., tuple[Array, ...]],
     one: Callable[..., tuple[Array, ...]],
-    elsewhere: Callable[..., tuple[Array, ...]],
+    elsewhere: Callable[..., tuple[Array, ...]] | None = None,
+    *,
     outputs: int,
 ) -> Callable[..., tuple[Array, ...]]:
-    """A function of vectors whose `jax.vmap` is a kernel on NVIDIA GPUs; its derivatives are as XLA compiles them.
+    """A function of vectors whose `jax.vmap` is a kernel on NVIDIA GPUs.
 
     Args:
       kernel: of arrays [samples, width]; gives such arrays.
-      one: the same of one sample.
-      elsewhere: what is batched where there is no such GPU; of one sample too.
+      one: the same of one sample; the function's derivatives are those of it.
+      elsewhere: the same, to be batched where there is no such GPU; `one` where None.
       outputs: how many arrays they give.
     """
-    many_elsewhere = jax.vmap(elsewhere)
+    many_elsewhere = jax.vmap(elsewhere or one)
     function = jax.custom_jvp(jax.custom_batching.custom_vmap(one))
     function.defjvp(lambda primals, tangents: jax.jvp(one, primals, tangents))
 
@@ -90,26 +109,23 @@ def batched_by(
     return function
 
 
-def gpu_kernel(
-    program: Program, widths: Sequence[int], block: int = BLOCK, warps: int = WARPS
-) -> Callable[..., tuple[Array, ...]]:
+def gpu_kernel(program: Program, widths: Sequence[int], layout: Layout = DEFAULT) -> Callable[..., tuple[Array, ...]]:
     """The program over arrays [samples, width], as one Pallas kernel.
 
     Args:
       program: see `fused`.
       widths: see `fused`.
-      block: samples in a block; a power of 2.
-      warps: groups of 32 threads in a block.
+      layout: of the kernel.
     """
 
     def body(given: Sequence[Columns], made: Sequence[Columns]) -> None:
         # Columns are named by arrays, because interpret mode refuses plain numbers.
-        inputs = [[columns.read(jnp.int32(k)) for k in range(columns.width)] for columns in given]
+        inputs = [[columns.read(jnp.asarray(k)) for k in range(columns.width)] for columns in given]
         for columns, scalars in zip(made, program(*inputs), strict=True):
             for k, value in enumerate(scalars):
-                columns.write(jnp.int32(k), value)
+                columns.write(jnp.asarray(k), value)
 
-    return by_columns(body, widths, block=block, warps=warps)
+    return by_columns(body, widths, layout=layout)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,47 +135,53 @@ class Columns:
     Attributes:
       ref: of the block.
       inside: which of its samples there are: the last block may stick out.
+      sample_axis: of the array.
     """
 
     ref: Any
     inside: Array
+    sample_axis: int
 
     @property
     def width(self) -> int:
         """How many columns."""
-        return self.ref.shape[1]
+        return self.ref.shape[1 - self.sample_axis]
+
+    def _at(self, column: Array) -> Any:
+        column = jnp.maximum(column, 0).astype(
+            int
+        )  # of one kind with the start of a slice, which interpret mode asks for
+        return self.ref.at[column, :] if self.sample_axis else self.ref.at[:, column]
 
     def read(self, column: Array) -> Array:
         """A column, [block]; 0 where its number is negative."""
         there = self.inside & (column >= 0)
-        return triton.load(self.ref.at[:, jnp.maximum(column, 0)], mask=there, other=0.0)
+        return triton.load(self._at(column), mask=there, other=0.0)
 
     def write(self, column: Array, values: Scalar) -> None:
         """A column; none where its number is negative."""
         there = self.inside & (column >= 0)
         values = jnp.broadcast_to(jnp.asarray(values, self.ref.dtype), self.inside.shape)
-        triton.store(self.ref.at[:, jnp.maximum(column, 0)], values, mask=there)
+        triton.store(self._at(column), values, mask=there)
 
 
 def by_columns(
-    body: Callable[..., None],
-    widths: Sequence[int],
-    *tables: np.ndarray,
-    block: int = BLOCK,
-    warps: int = WARPS,
+    body: Callable[..., None], widths: Sequence[int], *tables: np.ndarray, layout: Layout = DEFAULT
 ) -> Callable[..., tuple[Array, ...]]:
     """A function of arrays [samples, width] as one Pallas kernel: a thread computes a sample.
-
-    A thread reads the few numbers of its sample, which lie side by side: what a group of threads reads is in whole
-    lines of the cache, so that transposing the arrays first would only move them through memory once more.
 
     Args:
       body: of `Columns` of what is given and of what is made, and of references to the tables.
       widths: of the arrays that are made.
       *tables: what all samples share.
-      block: see `gpu_kernel`.
-      warps: see `gpu_kernel`.
+      layout: of the kernel.
     """
+    block, sample_axis = layout.block, layout.sample_axis
+
+    def side_by_side(width: int) -> pl.BlockSpec:
+        if sample_axis:
+            return pl.BlockSpec((width, block), lambda i: (0, i))
+        return pl.BlockSpec((block, width), lambda i: (i, 0))
 
     def batched(*rows: Array) -> tuple[Array, ...]:
         count, dtype = rows[0].shape[0], rows[0].dtype
@@ -168,23 +190,19 @@ def by_columns(
             inside = pl.program_id(0) * block + jnp.arange(block) < count
             given, shared = refs[: len(rows)], refs[len(rows) : len(rows) + len(tables)]
             made = refs[len(rows) + len(tables) :]
-            body([Columns(ref, inside) for ref in given], [Columns(ref, inside) for ref in made], *shared)
+            body(*([Columns(ref, inside, sample_axis) for ref in own] for own in (given, made)), *shared)
 
         numbers = [jnp.asarray(x, dtype if np.issubdtype(x.dtype, np.floating) else x.dtype) for x in tables]
         whole = [pl.BlockSpec(x.shape, lambda i, rank=x.ndim: (0,) * rank) for x in tables]
-        return tuple(
-            pl.pallas_call(
-                kernel,
-                out_shape=[jax.ShapeDtypeStruct((count, width), dtype) for width in widths],
-                grid=(pl.cdiv(count, block),),
-                in_specs=[*(_side_by_side(block, x.shape[1]) for x in rows), *whole],
-                out_specs=[_side_by_side(block, width) for width in widths],
-                compiler_params=triton.CompilerParams(num_warps=warps, num_stages=1),
-            )(*rows, *numbers)
-        )
+        shapes = [(width, count) if sample_axis else (count, width) for width in widths]
+        made = pl.pallas_call(
+            kernel,
+            out_shape=[jax.ShapeDtypeStruct(shape, dtype) for shape in shapes],
+            grid=(pl.cdiv(count, block),),
+            in_specs=[*(side_by_side(x.shape[1]) for x in rows), *whole],
+            out_specs=[side_by_side(width) for width in widths],
+            compiler_params=triton.CompilerParams(num_warps=layout.warps, num_stages=1),
+        )(*(x.T if sample_axis else x for x in rows), *numbers)
+        return tuple(x.T if sample_axis else x for x in made)
 
     return batched
-
-
-def _side_by_side(block: int, width: int) -> pl.BlockSpec:
-    return pl.BlockSpec((block, width), lambda i: (i, 0))

@@ -46,8 +46,9 @@ def motion_distance(
     rotational measure, it is a program of its own: pairs of links that do not correspond and parts that weigh nothing
     are left out, the gradient is in closed form (forward or reverse, of those arguments alone that are differentiated),
     and `jax.vmap` of it, or of its gradient, is one kernel on NVIDIA GPUs. With an arm of more than 16 joints it is a
-    loop over the joints, differentiated automatically: it compiles in seconds, but is many kernels and far slower. Any
-    other metric is the plain composition.
+    loop over the joints, which compiles in seconds: one kernel too if the links that correspond lie in order along both
+    arms; else, and on CPUs, many and slower ones, differentiated automatically. Any other metric is the plain
+    composition.
 
     Args:
       expert: the embodiment that is imitated.
@@ -116,17 +117,20 @@ def _by_pairs(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Calla
 
 
 def _closed_form(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Callable[..., Array]:
-    sizes = [_of_length_one(arm) for arm in arms]
+    """Its gradient is; for long arms on GPUs alone, and if the links that correspond lie in order."""
     joints = [arm.num_joints for arm in arms for _ in range(2)]
-    by_pairs, walk = _by_pairs(arms, factors), motion_walk.plan(*sizes, factors)
-    if max(joints) > LONG and walk is None:
+    sizes = [_of_length_one(arm) for arm in arms]
+    by_pairs = _by_pairs(arms, factors)
+    is_long = max(joints) > LONG
+    walk = motion_walk.plan(sizes, factors) if is_long else None
+    if is_long and walk is None:
         return by_pairs
 
     @functools.cache
     def values(wanted: tuple[int, ...]) -> Callable[..., tuple[Array, ...]]:
         """The distance, and its gradient by the wanted ones of the four arguments."""
         widths = [joints[k] for k in wanted]
-        if walk is None or max(joints) <= LONG:
+        if walk is None:
             program = functools.partial(motion_gradient.distance_and_gradient, *sizes, factors, wanted)
             return kernel.fused(program, [1, *widths])
 
@@ -135,7 +139,7 @@ def _closed_form(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Ca
             return value[None], *gradients
 
         on_gpu = motion_walk.gpu_kernel(walk, wanted, widths)
-        return kernel.batched_by(on_gpu, differentiated, differentiated, 1 + len(wanted))
+        return kernel.batched_by(on_gpu, differentiated, outputs=1 + len(wanted))
 
     @jax.custom_jvp
     def distance(*motion: Array) -> Array:

@@ -22,7 +22,6 @@ from mimic.kinematics import BASE, JointFrame, LinkVectors, behind_joint, link_b
 from mimic.motion_gradient import NO_SLOPES, Slopes, by_joint, compare_part, with_link
 from mimic.spatial import ZERO, Scalar, Vector, plus, subtract
 
-_BLOCK, _WARPS = 128, 4  # samples, and groups of 32 threads, in a block (by measurement)
 _VECTORS = 4  # of an arm in a row of numbers: the last of them of the link
 
 
@@ -49,7 +48,7 @@ class State(NamedTuple):
 
     value: Scalar  # of the pairs that were compared
     frames: tuple[JointFrame, ...]  # of both arms
-    behind: tuple[Slopes, ...]  # of the arms that have gradients
+    behind: tuple[Slopes | None, ...]  # of both; None where no gradient is wanted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,36 +77,34 @@ class Walk:
         )
 
 
-def plan(expert: Embodiment, learner: Embodiment, factors: Float[np.ndarray, "parts expert learner"]) -> Walk | None:
+def plan(arms: Sequence[Embodiment], factors: Float[np.ndarray, "parts expert learner"]) -> Walk | None:
     """The walk that meets all pairs of links whose factors are not 0; None where they do not lie in order.
 
     Args:
-      expert: in units of its chain length.
-      learner: likewise.
+      arms: expert and learner, each in units of its chain length.
       factors: see `motion_gradient.distance_and_gradient`.
     """
-    arms = expert, learner
-    pairs = np.argwhere(factors.any(axis=0))  # in the expert's order
-    movers = np.array([[arm.link_joint[link] for arm, link in zip(arms, pair, strict=True)] for pair in pairs])
-    if any(np.any(np.diff(x, axis=0) < 0) for x in (pairs, movers)):
+    pairs = np.argwhere(factors.any(axis=0)).tolist()  # in the expert's order
+    ends = [[arm.link_joint[link] for arm, link in zip(arms, pair, strict=True)] for pair in pairs]
+    if any(np.any(np.diff(ordered, axis=0) < 0) for ordered in (pairs, ends)):
         return None
-    parts = np.flatnonzero(factors.any(axis=(1, 2)))
-    steps: list[tuple[tuple[int, ...], Any]] = []  # joints that are crossed, and the pair that is compared, if any
+    joints: list[list[int]] = []
+    compared: dict[int, list[int]] = {}  # pairs, by the steps in which they are
     reached = [-1, -1]
-    tips = [arm.num_joints - 1 for arm in arms]
-    for pair, ends in [*zip(pairs, movers.tolist(), strict=True), (None, tips)]:
-        ways = [range(last + 1, end + 1) for last, end in zip(reached, ends, strict=True)]
-        count = max(*map(len, ways), 0 if pair is None else 1)
-        steps.extend((joints, None) for joints in zip(*([-1] * (count - len(way)) + [*way] for way in ways)))
+    for pair, end in [*zip(pairs, ends, strict=True), (None, [arm.num_joints - 1 for arm in arms])]:
+        steps = max(*(now - last for now, last in zip(end, reached, strict=True)), 0 if pair is None else 1)
+        for left in reversed(range(steps)):  # who has fewer joints to cross stays first
+            joints.append([now - left if now - left > last else -1 for now, last in zip(end, reached, strict=True)])
         if pair is not None:
-            steps[-1] = steps[-1][0], pair
-        reached = ends
+            compared[len(joints) - 1] = pair
+        reached = end
+    parts = np.flatnonzero(factors.any(axis=(1, 2)))
     rows = []
-    for joints, pair in steps:
-        links = (None, None) if pair is None else pair
-        vectors = [_vectors(arm, joint, link) for arm, joint, link in zip(arms, joints, links, strict=True)]
-        rows.append([*vectors, np.zeros(len(parts)) if pair is None else factors[parts, *pair]])
-    return Walk(np.array([j for j, _ in steps], np.int32), np.array([np.concatenate(r) for r in rows]), tuple(parts))
+    for step, crossed in enumerate(joints):
+        links = compared.get(step, [None, None])
+        vectors = [_vectors(arm, joint, link) for arm, joint, link in zip(arms, crossed, links, strict=True)]
+        rows.append([*vectors, factors[parts, *links] if step in compared else np.zeros(len(parts))])
+    return Walk(np.array(joints, np.int32), np.array([np.concatenate(row) for row in rows]), tuple(parts.tolist()))
 
 
 def _vectors(arm: Embodiment, joint: int, link: int | None) -> np.ndarray:
@@ -131,35 +128,39 @@ def gpu_kernel(walk: Walk, wanted: Sequence[int], sizes: Sequence[int]) -> Calla
       wanted: indices of arguments.
       sizes: of these, numbers of joints.
     """
-    count, sides = len(walk.joints), sorted({index // 2 for index in wanted})
+    steps = len(walk.joints)
+    has_gradient = [any(index // 2 == side for index in wanted) for side in (0, 1)]
+    start = State(0.0, (BASE, BASE), tuple(NO_SLOPES if has else None for has in has_gradient))
 
     def body(given: Sequence[kernel.Columns], made: Sequence[kernel.Columns], joints: Any, numbers: Any) -> None:
         def step(index: Array) -> Step:
-            crossed = [joints[index, side] for side in (0, 1)]
+            crossed, row = (
+                [table[index, jnp.asarray(k)] for k in range(table.shape[1])] for table in (joints, numbers)
+            )
             motion = [columns.read(crossed[k // 2]) for k, columns in enumerate(given)]
-            return walk.step(crossed, [numbers[index, k] for k in range(walk.numbers.shape[1])], motion)
+            return walk.step(crossed, row, motion)
 
         def onward(index: Array, state: State) -> State:
             return _onward(state, step(index))
 
         def compare(index: Array, state: State) -> State:
-            row = step(index)
-            return _compare(walk.parts, _onward(state, row), row)
+            there = step(index)
+            return _compare(walk.parts, _onward(state, there), there)
 
         def back(index: Array, state: State) -> State:
-            index = count - 1 - index
-            state, slopes = _back(walk.parts, sides, state, step(index))
+            index = steps - 1 - index
+            state, slopes = _back(walk.parts, state, step(index))
             for columns, k in zip(made[1:], wanted, strict=True):
-                columns.write(joints[index, k // 2], slopes[sides.index(k // 2)][k % 2])
+                columns.write(joints[index, k // 2], slopes[k // 2][k % 2])
             return state
 
-        start = State(0.0, (BASE, BASE), tuple(NO_SLOPES for _ in sides))
         state = jax.tree.map(lambda x: jnp.full(given[0].inside.shape, x, given[0].ref.dtype), start)
         for loop in (onward, back) if wanted else (compare,):
-            state = jax.lax.fori_loop(0, count, loop, state)
-        made[0].write(jnp.int32(0), state.value)
+            state = jax.lax.fori_loop(0, steps, loop, state)
+        made[0].write(jnp.asarray(0), state.value)
 
-    return kernel.by_columns(body, [1, *sizes], walk.joints, walk.numbers, block=_BLOCK, warps=_WARPS)
+    layout = kernel.Layout(sample_axis=1 if wanted else 0)  # for 32 and 64 links
+    return kernel.by_columns(body, [1, *sizes], walk.joints, walk.numbers, layout=layout)
 
 
 def _onward(state: State, step: Step) -> State:
@@ -175,10 +176,6 @@ def _onward(state: State, step: Step) -> State:
     return state._replace(frames=tuple(jax.lax.cond(crosses, cross, stay, *move) for crosses, *move in moves))
 
 
-def _links(state: State, step: Step) -> list[LinkVectors]:
-    return [link_behind(frame, *link) for frame, link in zip(state.frames, step.links, strict=True)]
-
-
 def _compare(parts: Sequence[int], state: State, step: Step) -> State:
     """With the distance of the step's links."""
     links = _links(state, step)
@@ -186,29 +183,31 @@ def _compare(parts: Sequence[int], state: State, step: Step) -> State:
     return state._replace(value=sum(terms, state.value))
 
 
-def _back(
-    parts: Sequence[int], sides: Sequence[int], state: State, step: Step
-) -> tuple[State, list[tuple[Scalar, Scalar]]]:
+def _back(parts: Sequence[int], state: State, step: Step) -> tuple[State, tuple[Any, ...]]:
     """The step's links compared, then each arm back across its joint; the slopes by that joint's angle and speed."""
-    links, value, slopes = _links(state, step), state.value, [[ZERO] * len(LinkVectors._fields) for _ in range(2)]
+    links = _links(state, step)
+    value, by_learner = state.value, [ZERO] * len(LinkVectors._fields)
     for part, factor in zip(parts, step.factors, strict=True):
-        term, slope = compare_part(part, factor, *links)
-        value, slopes[0][part], slopes[1][part] = plus(value, term), subtract(ZERO, slope), slope
-    behind = [
-        with_link(own, links[side], LinkVectors(*slopes[side])) for side, own in zip(sides, state.behind, strict=True)
-    ]
-    frames, found = [], []
-    for side, (crosses, frame, crossing) in enumerate(zip(step.crosses, state.frames, step.crossings, strict=True)):
-        own = behind[sides.index(side)] if side in sides else None
-        frame, by = jax.lax.cond(crosses, _cross_back, _stay, frame, crossing, own)
-        frames.append(frame)
-        if side in sides:
-            found.append(by)
-    return State(value, tuple(frames), tuple(behind)), found
+        term, by_learner[part] = compare_part(part, factor, *links)
+        value = plus(value, term)
+    by_links = [subtract(ZERO, slope) for slope in by_learner], by_learner
+    behind = tuple(
+        own if own is None else with_link(own, link, LinkVectors(*slopes))
+        for own, link, slopes in zip(state.behind, links, by_links, strict=True)
+    )
+    moves = zip(step.crosses, state.frames, step.crossings, behind, strict=True)
+    frames, by_joints = zip(
+        *(jax.lax.cond(crosses, _cross_back, _stay, *move) for crosses, *move in moves), strict=True
+    )
+    return State(value, frames, behind), by_joints
+
+
+def _links(state: State, step: Step) -> list[LinkVectors]:
+    return [link_behind(frame, *link) for frame, link in zip(state.frames, step.links, strict=True)]
 
 
 def _cross_back(frame: JointFrame, crossing: Crossing, behind: Slopes | None) -> tuple[JointFrame, Any]:
-    """The body before the joint, and the slopes by its angle and speed."""
+    """The body before the joint; the slopes by its angle and speed, where they are wanted."""
     offset, axis, angle, speed = crossing
     axis_now = spatial.rotate(frame.rotation, axis)
     rotation = spatial.compose(frame.rotation, spatial.transpose(spatial.axis_rotation(axis, angle)))

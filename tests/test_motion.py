@@ -192,7 +192,7 @@ def test_what_weighs_nothing_is_left_out():
 # --- the GPU kernel ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [1, kernel.BLOCK, kernel.BLOCK + 1])
+@pytest.mark.parametrize("count", [1, kernel.DEFAULT.block, kernel.DEFAULT.block + 1])
 def test_the_kernel_computes_what_the_plain_program_does(monkeypatch, count):
     """The GPU kernel, interpreted on the CPU."""
     monkeypatch.setattr(kernel.pl, "pallas_call", functools.partial(kernel.pl.pallas_call, interpret=True))

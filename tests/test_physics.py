@@ -179,11 +179,11 @@ def test_a_batch_steps_as_each_of_its_arms(planar):
 
 def test_the_kernel_computes_what_the_plain_program_does(planar, monkeypatch):
     """The GPU kernel, interpreted on the CPU, for a batch that is no multiple of its block."""
-    count = physics._BLOCK + 1
+    count = physics._LAYOUT.block + 1
     model, states, loads = planar
     monkeypatch.setattr(kernel.pl, "pallas_call", partial(kernel.pl.pallas_call, interpret=True))
     step = physics._scalar_step(dynamics.segments(model), 0.01, 2)
-    on_gpu = kernel.gpu_kernel(step, (3, 3), physics._BLOCK, physics._WARPS)
+    on_gpu = kernel.gpu_kernel(step, (3, 3), physics._LAYOUT)
     rows = [jnp.resize(x, (count, *x.shape[1:])) for x in (*states, *loads)]
     found = jax.jit(lambda *rows: on_gpu(*rows[:3], jnp.stack(rows[3:], axis=1)))(*rows)
     expected = jax.jit(jax.vmap(make_advance(model, 0.01, 2, "fused")))(*rows[:3], Load(*rows[3:]))

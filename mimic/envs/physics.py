@@ -12,7 +12,7 @@ from mujoco import mjx
 from mimic import kernel
 from mimic.envs import dynamics
 
-_BLOCK, _WARPS = 64, 2  # arms, and groups of 32 threads, in a block of the GPU kernel (by measurement)
+_LAYOUT = kernel.Layout(block=64, warps=2)
 
 
 class Load(NamedTuple):
@@ -77,7 +77,7 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
 
     # On CPUs a loop over a few arrays is twice as fast as one over as many as there are joints.
     widths = len(arm), len(arm)
-    step = kernel.fused(_scalar_step(arm, timestep, substeps), widths, plain=plain, block=_BLOCK, warps=_WARPS)
+    step = kernel.fused(_scalar_step(arm, timestep, substeps), widths, plain=plain, layout=_LAYOUT)
 
     def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
         qpos, qvel = step(qpos, qvel, torque, jnp.stack([jnp.asarray(x, qpos.dtype) for x in load]))

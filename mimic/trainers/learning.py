@@ -32,7 +32,6 @@ Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, valu
 Metrics = dict[str, Array]
 
 _AXIS = "devices"
-_UNROLLED = 4  # updates in a turn of their loop where one process launches on several GPUs, which wait for it
 _ALIGNED = 64  # numbers; matrix products on NVIDIA GPUs refuse arrays that begin at any odd place
 
 
@@ -138,6 +137,13 @@ def as_vector(template: Any) -> tuple[Callable[[Any], Array], Callable[[Array], 
     return to_vector, from_vector
 
 
+def _unrolled(devices: int) -> int:
+    """Updates in a turn of their loop: what is fastest on H200s (by measurement, see docs/performance.md)."""
+    if jax.local_device_count() > 1:
+        return 4  # one process launches on all of them, and they wait for it
+    return 2 if devices == 1 and jax.default_backend() == "gpu" else 1
+
+
 def _begin(
     env: ImitationEnv,
     config: PPOConfig,
@@ -213,8 +219,7 @@ def _learn(
         order = jax.vmap(lambda key: jax.random.permutation(key, len(rows)))(passes).reshape(-1, minibatch)
         keys = jax.random.split(key_loss, len(order))
         start = to_vector(learning.networks), learning.optimizer
-        unrolled = _UNROLLED if jax.local_device_count() > 1 else 1
-        (params, optimizer_state), metrics = jax.lax.scan(update, start, (order, keys), unroll=unrolled)
+        (params, optimizer_state), metrics = jax.lax.scan(update, start, (order, keys), unroll=_unrolled(devices))
         learning = learning.replace(  # type: ignore[attr-defined]
             networks=from_vector(params), statistics=statistics, optimizer=optimizer_state, key=key
         )
