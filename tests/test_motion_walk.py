@@ -35,9 +35,15 @@ CASES = {
 }
 
 
-def walk_of(arms, correspondence, weights):
+def plan(arms, correspondence, weights):
     factors = motion._factors(np.asarray(correspondence, float), weights)
     return motion_walk.plan([motion._of_length_one(arm) for arm in arms], factors)
+
+
+def walk_of(*case):
+    walk = plan(*case)
+    assert walk is not None
+    return walk
 
 
 def motions(arms, batch, dtype: DTypeLike = np.float64):
@@ -101,7 +107,7 @@ def test_links_that_correspond_out_of_order_are_not_walked(x64):
     arms = LONG_ARMS
     crossed = np.zeros((LONG + 3, 5))
     crossed[[3, 6], [2, 1]] = 1.0
-    assert walk_of(arms, crossed, PAPER_WEIGHTS) is None
+    assert plan(arms, crossed, PAPER_WEIGHTS) is None
     batch = motions(arms, 4)
     distance = jax.value_and_grad(motion_distance(*arms, crossed), ARGUMENTS)
     value, gradients = jax.jit(jax.vmap(distance))(*batch)
