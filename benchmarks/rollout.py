@@ -262,6 +262,8 @@ def main() -> None:
             write_results(options.out, "rollout", options.commit, control_steps=STEPS, rows=rows)
 
     rows = run(options.envs, options.arms, options.peer_arms, save, options.cases)
+    if not rows:
+        parser.error("--arms, --peer-arms: expected a number of arms for what --cases names, got none")
     show(rows, Console())
     if options.out:
         draw(rows, options.out.with_suffix(".png"))

@@ -27,6 +27,7 @@ from mimic.distance import (
 from mimic.embodiment import Embodiment
 from mimic.kinematics import LONG, joint_values, link_states
 
+Values = Callable[..., tuple[Array, ...]]  # of motions: a distance, and gradients
 MotionDistance = Callable[..., Float[Array, ""]]  # expert_qpos, expert_qvel, learner_qpos, learner_qvel
 
 
@@ -75,7 +76,8 @@ def motion_distance(
     usual = rotation == "cosine" and reduction == "mean" and not callable(correspondence)
     if usual and isinstance(weights, DistanceWeights) and _is_known((arms, correspondence, weights)):
         factors = _factors(np.asarray(correspondence, float), weights)
-        distance = _closed_form(arms, factors)
+        is_long = max(expert.num_joints, learner.num_joints) > LONG
+        distance = (_long if is_long else _short)([_of_length_one(arm) for arm in arms], factors)
     else:
         distance = composed
 
@@ -100,8 +102,8 @@ def _factors(matrix: Float[np.ndarray, "expert learner"], weights: DistanceWeigh
     return np.stack(of_parts) * matrix / matrix.size
 
 
-def _by_pairs(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Callable[..., Array]:
-    """Of long arms: the pairs of links that correspond, and no others."""
+def _by_pairs(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
+    """The pairs of links that correspond, and no others."""
     chosen = np.nonzero(factors.any(axis=0))
     weighing = [part for part, factor in zip(PARTS, factors, strict=True) if factor.any()] or PARTS[:1]
     factors = np.stack([factors[PARTS.index(part), *chosen] for part in weighing])
@@ -116,30 +118,36 @@ def _by_pairs(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Calla
     return distance
 
 
-def _closed_form(arms: tuple[Embodiment, Embodiment], factors: np.ndarray) -> Callable[..., Array]:
-    """Its gradient is; for long arms on GPUs alone, and if the links that correspond lie in order."""
+def _short(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
+    """All links spelled out."""
     joints = [arm.num_joints for arm in arms for _ in range(2)]
-    sizes = [_of_length_one(arm) for arm in arms]
-    by_pairs = _by_pairs(arms, factors)
-    is_long = max(joints) > LONG
-    walk = motion_walk.plan(sizes, factors) if is_long else None
-    if is_long and walk is None:
+
+    def values(wanted: tuple[int, ...]) -> Values:
+        program = functools.partial(motion_gradient.distance_and_gradient, *arms, factors, wanted)
+        return kernel.fused(program, [1, *(joints[k] for k in wanted)])
+
+    return _with_gradient(values)
+
+
+def _long(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
+    """Loops, with a gradient of their own on GPUs, if the links that correspond lie in order."""
+    by_pairs, walk = _by_pairs(arms, factors), motion_walk.plan(arms, factors)
+    if walk is None:
         return by_pairs
 
-    @functools.cache
-    def values(wanted: tuple[int, ...]) -> Callable[..., tuple[Array, ...]]:
-        """The distance, and its gradient by the wanted ones of the four arguments."""
-        widths = [joints[k] for k in wanted]
-        if walk is None:
-            program = functools.partial(motion_gradient.distance_and_gradient, *sizes, factors, wanted)
-            return kernel.fused(program, [1, *widths])
-
+    def values(wanted: tuple[int, ...]) -> Values:
         def differentiated(*motion: Array) -> tuple[Array, ...]:
             value, gradients = jax.value_and_grad(by_pairs, wanted)(*motion) if wanted else (by_pairs(*motion), ())
             return value[None], *gradients
 
-        on_gpu = motion_walk.gpu_kernel(walk, wanted, widths)
-        return kernel.batched_by(on_gpu, differentiated, outputs=1 + len(wanted))
+        return kernel.batched_by(motion_walk.gpu_kernel(walk, wanted), differentiated)
+
+    return _with_gradient(values)
+
+
+def _with_gradient(values: Callable[[tuple[int, ...]], Values]) -> Callable[..., Array]:
+    """The distance, of what makes a function that gives it, [1], and its gradient by the wanted of its arguments."""
+    values = functools.cache(values)
 
     @jax.custom_jvp
     def distance(*motion: Array) -> Array:

@@ -22,7 +22,8 @@ from mimic.kinematics import BASE, JointFrame, LinkVectors, behind_joint, link_b
 from mimic.motion_gradient import NO_SLOPES, Slopes, by_joint, compare_part, with_link
 from mimic.spatial import ZERO, Scalar, Vector, plus, subtract
 
-_VECTORS = 4  # of an arm in a row of numbers: the last of them of the link
+_VECTORS = 4  # of an arm in a row of numbers: the last two of the link
+_PER_ARM = 3 * _VECTORS
 
 
 class Crossing(NamedTuple):
@@ -53,7 +54,7 @@ class State(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Walk:
-    """From the bases to the tips.
+    """From the bases to the last pair of links.
 
     Attributes:
       joints: that are crossed in each step; -1 where none.
@@ -67,44 +68,47 @@ class Walk:
 
     def step(self, joints: Sequence[Scalar], numbers: Sequence[Scalar], motion: Sequence[Scalar]) -> Step:
         """Of a row of the tables, with angle and speed of each arm's joint."""
-        vectors = [(numbers[k], numbers[k + 1], numbers[k + 2]) for k in range(0, 6 * _VECTORS, 3)]
+        vectors = [(numbers[k], numbers[k + 1], numbers[k + 2]) for k in range(0, 2 * _PER_ARM, 3)]
         sides = vectors[:_VECTORS], vectors[_VECTORS:]
         return Step(
             crosses=[joint >= 0 for joint in joints],
             crossings=[Crossing(*side[:2], *motion[2 * k : 2 * k + 2]) for k, side in enumerate(sides)],
             links=[(side[2], side[3]) for side in sides],
-            factors=numbers[6 * _VECTORS :],
+            factors=numbers[2 * _PER_ARM :],
         )
 
 
 def plan(arms: Sequence[Embodiment], factors: Float[np.ndarray, "parts expert learner"]) -> Walk | None:
-    """The walk that meets all pairs of links whose factors are not 0; None where they do not lie in order.
+    """The walk that meets all pairs of links whose factors are not 0; what lies beyond the last of them is left out.
+
+    None where the pairs do not lie in order, or where none of the links of an arm has a joint before it.
 
     Args:
       arms: expert and learner, each in units of its chain length.
       factors: see `motion_gradient.distance_and_gradient`.
     """
-    pairs = np.argwhere(factors.any(axis=0)).tolist()  # in the expert's order
-    ends = [[arm.link_joint[link] for arm, link in zip(arms, pair, strict=True)] for pair in pairs]
-    if any(np.any(np.diff(ordered, axis=0) < 0) for ordered in (pairs, ends)):
+
+    def movers(pair: Sequence[int]) -> list[int]:
+        return [arm.link_joint[link] for arm, link in zip(arms, pair, strict=True)]
+
+    pairs = sorted(np.argwhere(factors.any(axis=0)).tolist(), key=movers)
+    ends = [movers(pair) for pair in pairs]
+    if not pairs or min(ends[-1]) < 0 or np.any(np.diff(ends, axis=0) < 0):
         return None
-    joints: list[list[int]] = []
-    compared: dict[int, list[int]] = {}  # pairs, by the steps in which they are
-    reached = [-1, -1]
-    for pair, end in [*zip(pairs, ends, strict=True), (None, [arm.num_joints - 1 for arm in arms])]:
-        steps = max(*(now - last for now, last in zip(end, reached, strict=True)), 0 if pair is None else 1)
-        for left in reversed(range(steps)):  # who has fewer joints to cross stays first
-            joints.append([now - left if now - left > last else -1 for now, last in zip(end, reached, strict=True)])
-        if pair is not None:
-            compared[len(joints) - 1] = pair
-        reached = end
     parts = np.flatnonzero(factors.any(axis=(1, 2)))
-    rows = []
-    for step, crossed in enumerate(joints):
-        links = compared.get(step, [None, None])
-        vectors = [_vectors(arm, joint, link) for arm, joint, link in zip(arms, crossed, links, strict=True)]
-        rows.append([*vectors, factors[parts, *links] if step in compared else np.zeros(len(parts))])
-    return Walk(np.array(joints, np.int32), np.array([np.concatenate(row) for row in rows]), tuple(parts.tolist()))
+    joints: list[list[int]] = []
+    numbers: list[np.ndarray] = []
+    reached = [-1, -1]
+    for pair, end in zip(pairs, ends, strict=True):
+        steps = max(1, *(now - last for now, last in zip(end, reached, strict=True)))
+        for left in reversed(range(steps)):  # the arm with fewer joints to cross stays first
+            crossed = [now - left if now - left > last else -1 for now, last in zip(end, reached, strict=True)]
+            links = [None, None] if left else pair
+            vectors = [_vectors(arm, joint, link) for arm, joint, link in zip(arms, crossed, links, strict=True)]
+            joints.append(crossed)
+            numbers.append(np.concatenate([*vectors, np.zeros(len(parts)) if left else factors[parts, *pair]]))
+        reached = end
+    return Walk(np.array(joints, np.int32), np.array(numbers), tuple(parts.tolist()))
 
 
 def _vectors(arm: Embodiment, joint: int, link: int | None) -> np.ndarray:
@@ -118,7 +122,7 @@ def _vectors(arm: Embodiment, joint: int, link: int | None) -> np.ndarray:
     return vectors.ravel()
 
 
-def gpu_kernel(walk: Walk, wanted: Sequence[int], sizes: Sequence[int]) -> Callable[..., tuple[Array, ...]]:
+def gpu_kernel(walk: Walk, wanted: Sequence[int]) -> Callable[..., tuple[Array, ...]]:
     """A Pallas kernel of qpos [rad] and qvel [rad/s], each [samples, joints], of the expert, then of the learner.
 
     It gives the distance, [samples, 1], and its gradient by those of its arguments that are wanted.
@@ -126,9 +130,8 @@ def gpu_kernel(walk: Walk, wanted: Sequence[int], sizes: Sequence[int]) -> Calla
     Args:
       walk: see `plan`.
       wanted: indices of arguments.
-      sizes: of these, numbers of joints.
     """
-    steps = len(walk.joints)
+    steps, crossed = len(walk.joints), walk.joints.max(axis=0) + 1
     has_gradient = [any(index // 2 == side for index in wanted) for side in (0, 1)]
     start = State(0.0, (BASE, BASE), tuple(NO_SLOPES if has else None for has in has_gradient))
 
@@ -159,8 +162,16 @@ def gpu_kernel(walk: Walk, wanted: Sequence[int], sizes: Sequence[int]) -> Calla
             state = jax.lax.fori_loop(0, steps, loop, state)
         made[0].write(jnp.asarray(0), state.value)
 
-    layout = kernel.Layout(sample_axis=1 if wanted else 0)  # for 32 and 64 links
-    return kernel.by_columns(body, [1, *sizes], walk.joints, walk.numbers, layout=layout)
+    widths = [1, *(int(crossed[index // 2]) for index in wanted)]
+    layout = kernel.Layout(sample_axis=1 if wanted else 0)  # the fastest for 32 and 64 links, by measurement
+    walked = kernel.by_columns(body, widths, walk.joints, walk.numbers, layout=layout)
+
+    def with_joints_beyond(*motion: Array) -> tuple[Array, ...]:
+        value, *gradients = walked(*motion)
+        sizes = [motion[index].shape[1] for index in wanted]
+        return value, *(jnp.pad(x, ((0, 0), (0, n - x.shape[1]))) for x, n in zip(gradients, sizes, strict=True))
+
+    return with_joints_beyond
 
 
 def _onward(state: State, step: Step) -> State:

@@ -1,5 +1,6 @@
 """What all tests share: shapes checked at run time, compiled programs kept, both precisions."""
 
+import functools
 import importlib
 import importlib.util
 import pathlib
@@ -54,6 +55,14 @@ def dtype(request: pytest.FixtureRequest):
     """Runs a test in both precisions."""
     with jax.enable_x64(request.param == "float64"):
         yield jax.numpy.dtype(request.param)
+
+
+@pytest.fixture
+def interpreted(monkeypatch: pytest.MonkeyPatch):
+    """Runs GPU kernels on the CPU, step by step."""
+    from mimic import kernel
+
+    monkeypatch.setattr(kernel.pl, "pallas_call", functools.partial(kernel.pl.pallas_call, interpret=True))
 
 
 @pytest.fixture

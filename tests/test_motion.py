@@ -1,4 +1,3 @@
-import functools
 import itertools
 
 import jax
@@ -193,10 +192,8 @@ def test_what_weighs_nothing_is_left_out():
 
 
 @pytest.mark.parametrize("count", [1, kernel.DEFAULT.block, kernel.DEFAULT.block + 1])
-def test_the_kernel_computes_what_the_plain_program_does(monkeypatch, count):
-    """The GPU kernel, interpreted on the CPU."""
-    monkeypatch.setattr(kernel.pl, "pallas_call", functools.partial(kernel.pl.pallas_call, interpret=True))
-
+@pytest.mark.usefixtures("interpreted")
+def test_the_kernel_computes_what_the_plain_program_does(count):
     def program(x, y):
         return [[x[0] * y[1] + 2.0], [jnp.sin(x[1]), 0.5, y[0] - x[0]]]
 

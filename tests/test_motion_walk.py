@@ -1,7 +1,5 @@
 """Distances of long arms: the GPU kernel that walks along both, interpreted on the CPU, beside the composition."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +19,8 @@ ARGUMENTS = (0, 1, 2, 3)
 LONG_ARMS = planar_arm(np.linspace(0.1, 0.3, LONG + 3)), planar_arm(np.linspace(0.2, 0.1, 5))
 SPARSE = np.zeros((7, 4))
 SPARSE[[2, 2, 5], [0, 1, 1]] = 1.0, 0.5, 2.0  # links without a partner before, between and behind those that have one
+SWAPPED = np.zeros((7, 7))
+SWAPPED[[2, 3], [3, 2]] = 1.0, 2.0  # the expert's links 2 and 3 are on one joint
 CASES = {
     "7 joints, 4": ((panda(), panda(locked=(3, 6, 7))), None, PAPER_WEIGHTS),
     # Links 1 of the locked arms are fixed to the base.
@@ -30,8 +30,9 @@ CASES = {
         ALL_WEIGHTS,
     ),
     "few pairs": ((panda(), panda(locked=(3, 6, 7))), SPARSE, ALL_WEIGHTS),
-    "no pair": ((panda(locked=(3, 6, 7)), planar_arm([1.0])), np.zeros((4, 1)), PAPER_WEIGHTS),
-    "long and short": (LONG_ARMS, None, DistanceWeights(rotation=1.0)),
+    "links swapped": ((panda(locked=(1, 4), merge_locked=False), panda()), SWAPPED, PAPER_WEIGHTS),
+    "long and short": (LONG_ARMS, None, ALL_WEIGHTS),
+    "rotation alone": (LONG_ARMS, None, DistanceWeights(rotation=1.0)),
 }
 
 
@@ -63,11 +64,6 @@ def values_and_gradients(arms, correspondence, weights, batch):
     return value[:, None], *gradients
 
 
-@pytest.fixture
-def interpreted(monkeypatch):
-    monkeypatch.setattr(kernel.pl, "pallas_call", functools.partial(kernel.pl.pallas_call, interpret=True))
-
-
 @pytest.mark.usefixtures("x64", "interpreted")
 @pytest.mark.parametrize("case", CASES)
 def test_the_kernel_computes_what_the_composition_does(case):
@@ -77,8 +73,7 @@ def test_the_kernel_computes_what_the_composition_does(case):
     expected = values_and_gradients(arms, correspondence, weights, batch)
     walk = walk_of(arms, correspondence, weights)
     for wanted in ((), (2,), ARGUMENTS):
-        sizes = [batch[k].shape[1] for k in wanted]
-        found = jax.jit(motion_walk.gpu_kernel(walk, wanted, sizes))(*batch)
+        found = jax.jit(motion_walk.gpu_kernel(walk, wanted))(*batch)
         for values, reference in zip(found, [expected[0], *(expected[1 + k] for k in wanted)], strict=True):
             np.testing.assert_allclose(values, reference, atol=1e-13)  # rounding
 
@@ -88,8 +83,7 @@ def test_arms_of_any_shape_are_walked():
     arms = load_mjcf(random_arm(4, 9)), load_mjcf(random_arm(7, 6))
     metric = overlap_correspondence(*arms), ALL_WEIGHTS
     batch = motions(arms, 3)
-    sizes = [x.shape[1] for x in batch]
-    found = jax.jit(motion_walk.gpu_kernel(walk_of(arms, *metric), ARGUMENTS, sizes))(*batch)
+    found = jax.jit(motion_walk.gpu_kernel(walk_of(arms, *metric), ARGUMENTS))(*batch)
     for values, reference in zip(found, values_and_gradients(arms, *metric, batch), strict=True):
         np.testing.assert_allclose(values, reference, atol=1e-12)  # rounding, of velocities up to 20 chain lengths/s
 
@@ -101,6 +95,35 @@ def test_a_step_crosses_no_more_joints_than_it_must():
     np.testing.assert_array_equal(alike.joints, np.repeat(np.arange(20)[:, None], 2, axis=1))
     overlap = overlap_correspondence(*LONG_ARMS)
     assert len(walk_of(LONG_ARMS, overlap, PAPER_WEIGHTS).joints) == np.count_nonzero(overlap)
+
+
+@pytest.mark.usefixtures("interpreted")
+def test_zero_with_gradients_of_zero_at_a_match():
+    arm = panda()
+    walk = walk_of((arm, arm), 2 * np.eye(7), ALL_WEIGHTS)
+    qpos, qvel, *_ = motions((arm, arm), 2, np.float32)
+    for motion_of_both in ((qpos, qvel), (qpos, 0 * qvel), (0 * qpos, 0 * qvel)):
+        for values in motion_walk.gpu_kernel(walk, ARGUMENTS)(*motion_of_both, *motion_of_both):
+            assert np.all(np.abs(values) < 1e-6)  # rounding, where the two arms are rounded otherwise
+
+
+def test_joints_beyond_the_last_pair_are_not_walked():
+    walk = walk_of(CASES["few pairs"][0], SPARSE, PAPER_WEIGHTS)
+    assert walk.joints.max(axis=0).tolist() == [5, 1]
+
+
+@pytest.mark.parametrize("pairs", [[], [(0, 1)]], ids=["no pair", "a link fixed to the base"])
+def test_nothing_is_walked_where_nothing_moves(x64, pairs):
+    arms = panda(locked=(1,), merge_locked=False), LONG_ARMS[0]
+    correspondence = np.zeros((7, LONG + 3))
+    for pair in pairs:
+        correspondence[pair] = 1.0
+    assert plan(arms, correspondence, PAPER_WEIGHTS) is None
+    batch = motions(arms, 2)
+    value, gradients = jax.vmap(jax.value_and_grad(motion_distance(*arms, correspondence), ARGUMENTS))(*batch)
+    expected = values_and_gradients(arms, correspondence, PAPER_WEIGHTS, batch)
+    for values, reference in zip((value[:, None], *gradients), expected, strict=True):
+        np.testing.assert_allclose(values, reference, atol=1e-13)  # rounding
 
 
 def test_links_that_correspond_out_of_order_are_not_walked(x64):
@@ -133,11 +156,11 @@ def test_the_kernel_lowers_in_double_precision(x64):
 
 @pytest.mark.gpu
 def test_the_gpu_computes_what_double_precision_does():
-    arms = planar_arm(np.linspace(0.1, 0.3, 64)), planar_arm(np.linspace(0.2, 0.1, 32))
-    metric = overlap_correspondence(*arms), DistanceWeights(rotation=1.0)
+    arms = load_mjcf(random_arm(4, 40)), load_mjcf(random_arm(7, 20))
+    metric = overlap_correspondence(*arms), PAPER_WEIGHTS
     batch = motions(arms, 10_001, np.float32)
     value, gradients = jax.jit(jax.vmap(jax.value_and_grad(motion_distance(*arms, *metric), ARGUMENTS)))(*batch)
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         expected = values_and_gradients(arms, *metric, [np.asarray(x, np.float64) for x in batch])
     for values, reference in zip((value[:, None], *gradients), expected, strict=True):
-        np.testing.assert_allclose(values, reference, atol=1e-5)
+        np.testing.assert_allclose(values, reference, atol=1e-5)  # float32, there and back over 40 joints

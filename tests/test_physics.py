@@ -1,6 +1,5 @@
 """Our dynamics and both physics against C MuJoCo, in double precision, and the GPU kernel as far as a CPU can tell."""
 
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -177,11 +176,11 @@ def test_a_batch_steps_as_each_of_its_arms(planar):
             np.testing.assert_allclose(batched[i], single, atol=1e-5)  # rounding of velocities up to 10 rad/s
 
 
-def test_the_kernel_computes_what_the_plain_program_does(planar, monkeypatch):
+@pytest.mark.usefixtures("interpreted")
+def test_the_kernel_computes_what_the_plain_program_does(planar):
     """The GPU kernel, interpreted on the CPU, for a batch that is no multiple of its block."""
     count = physics._LAYOUT.block + 1
     model, states, loads = planar
-    monkeypatch.setattr(kernel.pl, "pallas_call", partial(kernel.pl.pallas_call, interpret=True))
     step = physics._scalar_step(dynamics.segments(model), 0.01, 2)
     on_gpu = kernel.gpu_kernel(step, (3, 3), physics._LAYOUT)
     rows = [jnp.resize(x, (count, *x.shape[1:])) for x in (*states, *loads)]
