@@ -1,6 +1,5 @@
 """Our dynamics and both physics against C MuJoCo, in double precision, and the GPU kernel as far as a CPU can tell."""
 
-
 import jax
 import jax.numpy as jnp
 import mujoco
