@@ -91,15 +91,19 @@ def compare_part(part: int, factor: Scalar, expert: LinkVectors, learner: LinkVe
     square = dot(apart, apart)
     if part == _ROTATION:
         return times(times(0.25 * math.pi, factor), square), scale(times(0.5 * math.pi, factor), apart)
-    over_length = times(factor, _inverse_root(square))
-    return times(over_length, square), scale(over_length, apart)
+    inverse = _inverse_root(square)
+    return times(times(factor, square), inverse), scale(times(factor, inverse), apart)
 
 
 def _inverse_root(square: Scalar) -> Scalar:
-    """1 / sqrt, but finite at 0: a norm and its gradient are then 0 at a match."""
+    """1 / sqrt of the square of a length, in units of about 1; but no more than 1 / rounding.
+
+    A length and its gradient are then 0 at a match. A compiler may compute a difference twice, rounded otherwise the
+    second time: the gradient of a length of nothing but rounding is still no more than 1.
+    """
     if isinstance(square, float):
         return 1 / math.sqrt(square) if square else 0.0
-    return jax.lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny))
+    return jax.lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).eps ** 2))
 
 
 def _by_joints(

@@ -122,20 +122,24 @@ def test_one_expert_pose_serves_a_batch_of_learners():
     np.testing.assert_allclose(every[0], expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("lengths", [[0.5, 0.2, 0.3], np.linspace(0.1, 0.3, LONG + 1)], ids=["short", "long"])
-def test_zero_with_finite_gradients_at_a_match(lengths):
+@pytest.mark.parametrize(
+    "arm",
+    [planar_arm([0.5, 0.2, 0.3]), panda(), planar_arm(np.linspace(0.1, 0.3, LONG + 1))],
+    ids=["planar", "panda", "long"],
+)
+def test_zero_with_finite_gradients_at_a_match(arm):
     """Exactly, where each operation is rounded by itself; a compiled program may round the two arms differently."""
-    arm = planar_arm(lengths)
     distance = jax.value_and_grad(motion_distance(arm, arm, 2 * np.eye(arm.num_links), ALL_WEIGHTS), (2, 3))
-    compiled = jax.jit(jax.vmap(distance))
+    compiled, one = jax.jit(jax.vmap(distance)), jax.jit(distance)
     qpos, qvel, *_ = motions((arm, arm), dtype=np.float32)
     for motion in ((qpos, qvel), (qpos, 0 * qvel), (0 * qpos, 0 * qvel)):
         value, gradients = distance(*(x[0] for x in (*motion, *motion)))
         assert value == 0 and not np.any(gradients)
         for apart in (0.0, 1e-20, 1e-7):  # the square of the second underflows
-            value, gradients = compiled(*motion, motion[0] + apart, motion[1])
-            assert np.all(value < 1e-5)  # float32, times weights of up to 3
-            assert np.all(np.isfinite(gradients)) and np.abs(gradients).max() < 100  # weights, angular velocities
+            batch = *motion, motion[0] + apart, motion[1]
+            for value, gradients in (compiled(*batch), one(*(x[0] for x in batch))):
+                assert np.all(value < 1e-5)  # float32, times weights of up to 3
+                assert np.all(np.isfinite(gradients)) and np.abs(gradients).max() < 100  # weights, angular velocities
 
 
 @pytest.mark.parametrize("pair", ["planar", "long"])
