@@ -3,8 +3,8 @@
 A program that spells out all links takes a time to compile that grows faster than their number. Here both arms are
 walked along at once, a step at a time: each arm crosses a joint or stays, then a pair of links is compared. Where the
 links that correspond lie in order along both arms, every pair is met so. For the gradient the arms are first walked to
-their tips, then back, and the slopes of the links behind are gathered on the way; a frame is then what it was but for
-rounding. Nothing is kept of a link once it is passed: what a sample takes stays in the registers of its thread.
+the last pair, then back, and the slopes of the links behind are gathered on the way; a frame is then what it was but
+for rounding. Nothing is kept of a link once it is passed: what a sample takes stays in the registers of its thread.
 """
 
 import dataclasses
@@ -131,7 +131,7 @@ def gpu_kernel(walk: Walk, wanted: Sequence[int]) -> Callable[..., tuple[Array, 
       walk: see `plan`.
       wanted: indices of arguments.
     """
-    steps, crossed = len(walk.joints), walk.joints.max(axis=0) + 1
+    steps, reached = len(walk.joints), walk.joints.max(axis=0) + 1
     has_gradient = [any(index // 2 == side for index in wanted) for side in (0, 1)]
     start = State(0.0, (BASE, BASE), tuple(NO_SLOPES if has else None for has in has_gradient))
 
@@ -162,7 +162,7 @@ def gpu_kernel(walk: Walk, wanted: Sequence[int]) -> Callable[..., tuple[Array, 
             state = jax.lax.fori_loop(0, steps, loop, state)
         made[0].write(jnp.asarray(0), state.value)
 
-    widths = [1, *(int(crossed[index // 2]) for index in wanted)]
+    widths = [1, *(int(reached[index // 2]) for index in wanted)]
     layout = kernel.Layout(sample_axis=1 if wanted else 0)  # the fastest for 32 and 64 links, by measurement
     walked = kernel.by_columns(body, widths, walk.joints, walk.numbers, layout=layout)
 
