@@ -175,7 +175,7 @@ def by_columns(
     """
     block, sample_axis = layout.block, layout.sample_axis
 
-    def side_by_side(width: int) -> pl.BlockSpec:
+    def window(width: int) -> pl.BlockSpec:
         if sample_axis:
             return pl.BlockSpec((width, block), lambda i: (0, i))
         return pl.BlockSpec((block, width), lambda i: (i, 0))
@@ -196,8 +196,8 @@ def by_columns(
             kernel,
             out_shape=[jax.ShapeDtypeStruct(shape, dtype) for shape in shapes],
             grid=(pl.cdiv(count, block),),
-            in_specs=[*(side_by_side(x.shape[1]) for x in rows), *whole],
-            out_specs=[side_by_side(width) for width in widths],
+            in_specs=[*(window(x.shape[1]) for x in rows), *whole],
+            out_specs=[window(width) for width in widths],
             compiler_params=triton.CompilerParams(num_warps=layout.warps, num_stages=1),
         )(*(x.T if sample_axis else x for x in rows), *numbers)
         return tuple(x.T if sample_axis else x for x in made)

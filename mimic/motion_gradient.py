@@ -86,6 +86,12 @@ def compare_part(part: int, factor: Scalar, expert: LinkVectors, learner: LinkVe
     """A part of the distance of two links times a factor, and its slope with respect to the learner's state.
 
     The slope with respect to the expert's is the negative of it.
+
+    Args:
+      part: index into `PARTS`.
+      factor: what the part of this pair's distance counts for.
+      expert: one of its links, in units of its chain length.
+      learner: likewise.
     """
     apart = subtract(learner[part], expert[part])
     square = dot(apart, apart)
@@ -99,7 +105,7 @@ def _inverse_root(square: Scalar) -> Scalar:
     """1 / sqrt of the square of a length, in units of about 1; but no more than 1 / rounding.
 
     A length and its gradient are then 0 at a match. A compiler may compute a difference twice, rounded otherwise the
-    second time: the gradient of a length of nothing but rounding is still no more than 1.
+    second time: the gradient of a length of nothing but rounding is still of the order of 1.
     """
     if isinstance(square, float):
         return 1 / math.sqrt(square) if square else 0.0
