@@ -79,15 +79,19 @@ def ppo_loss(
     actions = networks.parametric_action_distribution
     log_ratio = actions.log_prob(logits, raw_action) - old_log_prob
     ratio, least, most = jnp.exp(log_ratio), 1 - config.clipping_epsilon, 1 + config.clipping_epsilon
-    policy_loss = -jnp.minimum(ratio * advantages, jnp.clip(ratio, least, most) * advantages).mean()
-    value_loss = _VALUE_SHARE * jnp.square(targets - values[:, :-1]).mean()
-    entropy = actions.entropy(logits, key).mean()
-    loss = policy_loss + value_loss - config.entropy_cost * entropy  # type: ignore[operator]
+    surrogate = -jnp.minimum(ratio * advantages, jnp.clip(ratio, least, most) * advantages)
+    value_error = _VALUE_SHARE * jnp.square(targets - values[:, :-1])
+    entropy = actions.entropy(logits, key)
+    loss = surrogate.mean() + value_error.mean() - config.entropy_cost * entropy.mean()  # type: ignore[operator]
 
-    approx_kl = (ratio - 1 - log_ratio).mean()
-    clip_fraction = ((ratio < least) | (ratio > most)).mean()
-    action_std = actions.create_dist(logits).scale.mean()  # type: ignore[attr-defined]
-    return loss, jnp.stack([loss, policy_loss, value_loss, entropy, approx_kl, clip_fraction, action_std])
+    approx_kl = ratio - 1 - log_ratio
+    clipped = (ratio < least) | (ratio > most)
+    action_std = actions.create_dist(logits).scale.mean(axis=-1)  # type: ignore[attr-defined]
+    terms = jax.lax.stop_gradient(jnp.stack([surrogate, value_error, entropy, approx_kl, clipped, action_std]))
+    # With their means XLA would compute the terms in one fusion, and that in few threads: 38 us on an H200.
+    means = jax.lax.optimization_barrier(terms).mean(axis=(1, 2))
+    total = means[0] + means[1] - config.entropy_cost * means[2]  # type: ignore[operator]
+    return loss, jnp.concatenate([total[None], means])
 
 
 def estimates(
