@@ -137,13 +137,6 @@ def as_vector(template: Any) -> tuple[Callable[[Any], Array], Callable[[Array], 
     return to_vector, from_vector
 
 
-def _unrolled(devices: int) -> int:
-    """Updates in a turn of their loop: what is fastest on H200s (by measurement, see docs/performance.md)."""
-    if jax.local_device_count() > 1:
-        return 4  # one process launches on all of them, and they wait for it
-    return 2 if devices == 1 and jax.default_backend() == "gpu" else 1
-
-
 def _begin(
     env: ImitationEnv,
     config: PPOConfig,
@@ -219,7 +212,7 @@ def _learn(
         order = jax.vmap(lambda key: jax.random.permutation(key, len(rows)))(passes).reshape(-1, minibatch)
         keys = jax.random.split(key_loss, len(order))
         start = to_vector(learning.networks), learning.optimizer
-        (params, optimizer_state), metrics = jax.lax.scan(update, start, (order, keys), unroll=_unrolled(devices))
+        (params, optimizer_state), metrics = jax.lax.scan(update, start, (order, keys))
         learning = learning.replace(  # type: ignore[attr-defined]
             networks=from_vector(params), statistics=statistics, optimizer=optimizer_state, key=key
         )
