@@ -3,11 +3,13 @@
 import contextlib
 import importlib
 import importlib.metadata
+import importlib.util
 import io
 import logging
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 _log = logging.getLogger(__name__)
@@ -56,9 +58,36 @@ def import_mujoco() -> None:
 
 
 def import_mjx() -> None:
-    """Imports MJX without its two lines about Warp, an optional backend that mimic does not use."""
+    """Imports MJX without its two lines about Warp, an optional backend that mimic does not use.
+
+    MJX's meshes and brax's solver of contacts wait until something asks for them: arms have no use for them, and
+    trimesh, jaxopt and SciPy would take half of the time.
+    """
+    for name in ("mujoco.mjx._src.mesh", "jaxopt"):
+        if name not in sys.modules:
+            _import_later(name)
     with contextlib.redirect_stdout(io.StringIO()):
         importlib.import_module("mujoco.mjx")
+
+
+def _import_later(name: str) -> None:
+    """Lets a module run when something of it is first used, not when it is imported; if there is such a one."""
+    package, *path = name.split(".")
+    spec = importlib.util.find_spec(package)
+    if spec and path:  # found without its parents, which would import it
+        file = Path((spec.submodule_search_locations or [""])[0], *path).with_suffix(".py")
+        spec = importlib.util.spec_from_file_location(name, file) if file.is_file() else None
+    if spec is None or spec.loader is None:
+        return
+    module, execute = importlib.util.module_from_spec(spec), spec.loader.exec_module
+
+    def load(attribute: str) -> Any:  # PEP 562: what is asked for and is not there
+        del module.__getattr__
+        execute(module)
+        return getattr(module, attribute)
+
+    module.__getattr__ = load  # type: ignore[method-assign]
+    sys.modules[name] = module
 
 
 def import_tensorboard() -> Any:

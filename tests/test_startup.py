@@ -49,6 +49,31 @@ def test_pose_mappers_need_no_simulator():
     assert "mimic.trainers.pose_mapper" in imported and not imported.intersection({"brax", "mujoco.mjx"})
 
 
+def test_training_needs_no_meshes_and_no_contacts():
+    """Of MJX and brax; what is put off is there when it is asked for."""
+    code = "import sys\nfrom mimic import compat\ncompat.import_mjx()\nfrom mimic.trainers import ppo_job, session"
+    code += "\nprint(*sys.modules)"
+    code += "\nimport jaxopt\nfrom mujoco.mjx._src import mesh\nassert mesh.trimesh.Trimesh and jaxopt.projection"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr[-2000:]
+    imported = set(result.stdout.splitlines()[-1].split())
+    assert "brax" in imported and not imported.intersection({"scipy.optimize", "scipy.spatial", "trimesh"})
+
+
+def test_what_is_imported_later_runs_once_and_may_be_missing(tmp_path, monkeypatch):
+    (tmp_path / "waiting").mkdir()
+    (tmp_path / "waiting" / "__init__.py").write_text("raise SystemExit('the parent was imported')")
+    (tmp_path / "waiting" / "part.py").write_text("import sys\nsys.modules['runs'].append(__name__)\nvalue = 3")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "runs", [])
+    for name in ("waiting.part", "waiting.missing", "missing"):
+        compat._import_later(name)
+    part = sys.modules.pop("waiting.part")
+    assert sys.modules["runs"] == []
+    assert part.value == part.value == 3
+    assert sys.modules["runs"] == ["waiting.part"] and not {"waiting.missing", "missing"}.intersection(sys.modules)
+
+
 def test_the_process_started_before_now():
     code = "import time\nfrom mimic import cli\nprint(time.perf_counter() - cli.process_started())"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
