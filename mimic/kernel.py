@@ -69,14 +69,13 @@ def fused(
         done: list[Array] = []
         for index in range(len(widths)):
             vectors, done = jax.lax.optimization_barrier((vectors, done))
-            done.append(by_program(*vectors)[index])
+            done.append(one(*vectors)[index])
         return tuple(done)
 
-    one = plain or by_program
+    one = jax.jit(plain or by_program)  # traced once for all outputs, and for all programs that ask for it
     # Asked for several outputs at once, XLA's CPU compiler computes what they share many times over: the distance and
     # its gradient by the learner's angles took seven times as long (by measurement).
-    elsewhere = plain or one_after_the_other
-    return batched_by(gpu_kernel(program, widths, layout), one, elsewhere)
+    return batched_by(gpu_kernel(program, widths, layout), one, one if plain else one_after_the_other)
 
 
 def batched_by(

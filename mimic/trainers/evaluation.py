@@ -78,19 +78,20 @@ class Evaluator:
         """Runs a controller on every demonstration; the caller jits this, with the parameters inside."""
         env = self.env
 
-        def one(demonstration: Array) -> Rollouts:
+        def begin(demonstration: Array) -> State:
             key = jax.random.fold_in(jax.random.PRNGKey(0), demonstration)
-            state = env.begin(env.start(key, demonstration))
+            return env.begin(env.start(key, demonstration))
 
-            def step(state: State, _: None) -> tuple[State, Rollouts]:
-                action = jnp.clip(controller(state), -1.0, 1.0)
-                state = env.step(state, action)
-                after: Any = state.pipeline_state
-                return state, Rollouts(after.qpos, after.qvel, action * env.torque_scale, state.metrics["distance"])
+        def step(state: State) -> tuple[State, Rollouts]:
+            action = jnp.clip(controller(state), -1.0, 1.0)
+            state = env.step(state, action)
+            after: Any = state.pipeline_state
+            return state, Rollouts(after.qpos, after.qvel, action * env.torque_scale, state.metrics["distance"])
 
-            return jax.lax.scan(step, state, None, length=env.config.horizon)[1]
-
-        return jax.vmap(one)(jnp.arange(env.demonstrations.count))
+        # Batched within the loop: around it JAX would trace a step once for one demonstration, and again for all.
+        start = jax.vmap(begin)(jnp.arange(env.demonstrations.count))
+        _, over_time = jax.lax.scan(lambda state, _: jax.vmap(step)(state), start, None, length=env.config.horizon)
+        return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), over_time)
 
     @property
     def parts(self) -> dict[str, slice]:
