@@ -19,7 +19,7 @@ from mimic.kinematics import link_state_table
 from mimic.trainers import evaluation
 from mimic.trainers.config import PRESETS, PPOConfig
 from mimic.trainers.evaluation import Evaluator
-from mimic.trainers.prepared import Prepared
+from mimic.trainers.prepared import Prepared, compiler_options, compiling
 
 HEAVY = ("brax", "mujoco.mjx", "orbax", "matplotlib", "tensorboardX", "mink", "optax", "scipy", "trimesh")
 REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_initialized()\nprint(*sys.modules)"
@@ -129,6 +129,13 @@ def test_what_is_prepared_is_made_once():
     failing.start()
     with pytest.raises(ZeroDivisionError):
         failing()
+
+
+def test_options_for_gpus_are_known_to_jaxlib(monkeypatch):
+    """Which takes them on CPUs too, and refuses a wrong name or value."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert compiler_options()
+    assert compiling(lambda x: x + 1, 1.0)()(1.0) == 2.0
 
 
 def test_a_run_with_a_target_looks_more_often():
