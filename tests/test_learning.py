@@ -16,8 +16,10 @@ from brax.training.types import Transition
 import mimic
 from mimic.trainers import learning, ppo, ppo_loss
 from mimic.trainers.config import PPOConfig
+from mimic.trainers.prepared import compiler_options
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
+_SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +153,23 @@ def test_devices_see_different_arms_and_learn_the_same():
         [sys.executable, "-c", ON_TWO_DEVICES], env=settings, capture_output=True, text=True, check=False
     )
     assert ended.returncode == 0, ended.stderr[-2000:]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("physics", ["fused", "mjx"])
+def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):
+    """To the bit, where XLA takes the same forms of matrix products in both."""
+    env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
+    config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")
+    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    given, learned = compiler_options(), []
+    assert given[_SCHEDULING] == "CONCURRENT"
+    for scheduling in ("SERIALIZE", given[_SCHEDULING]):
+        options = {**given, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0}
+        monkeypatch.setattr(learning, "compiler_options", lambda options=options: options)
+        begin, learn = learning.make_programs(env, config, networks, 5, optax.constant_schedule(1e-3), None)
+        learned.append(jax.device_get(learn()(begin()(7))))
+    assert jax.tree.all(jax.tree.map(np.array_equal, *learned))
 
 
 def test_a_vector_of_all_parameters_begins_each_array_where_a_gpu_takes_it():
