@@ -4,7 +4,8 @@
 
 One call of the training program, which collects so many batches and learns from them, after another that warms up. The
 kernels that the device ran are added up by what they are; so are copies between host and device, of which there should
-be none but what starts the call. "Busy" is the share of the call's wall time in which a kernel ran.
+be none but what starts the call. Kernels run side by side, so that their times add up to more than the call's. "Busy" is
+the share of the call's wall time in which a kernel ran.
 """
 
 import argparse
@@ -121,9 +122,10 @@ def main() -> None:
     if jax.default_backend() != "gpu":
         parser.error(f"expected a GPU, whose kernels the profiler tells, got {jax.default_backend()}")
     found = profile(options.env, options.batches)
-    table = Table("on the device", "times", "ms", "share of the call")
+    table = Table("on the device", "times", "ms", "share of that")
+    total = sum(row["ms"] for row in found["kinds"])
     for row in found["kinds"]:
-        share = row["ms"] / 1e3 / found["wall_s"]
+        share = row["ms"] / total
         table.add_row(row["what"], f"{row['count']:,}", f"{row['ms']:.2f}", f"{share:.1%}")
     Console().print(table)
     share = found["busy_s"] / found["wall_s"]

@@ -11,7 +11,8 @@ import jax
 WAITED = "/mimic/prepared/wait"  # an event of `jax.monitoring`
 
 _GPU_COMPILER_OPTIONS = {
-    # Kernels that do not wait for each other run side by side; the results are the same to the bit.
+    # Kernels that do not wait for each other run side by side: a third faster for PPO, and the same to the bit where XLA
+    # picks the same matrix products.
     "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
     # XLA would try each matrix product in a dozen forms, which takes longer than it saves in a training.
     "xla_gpu_enable_triton_gemm": False,
@@ -63,7 +64,7 @@ def compiling(function: Callable[..., T], *shapes: Any) -> Prepared[Callable[...
 
 
 def compiler_options() -> dict[str, Any]:
-    """For programs with matrix products that are compiled for one run, on the present backend."""
+    """For programs that are compiled for one run, on the present backend."""
     return _GPU_COMPILER_OPTIONS if jax.default_backend() == "gpu" else {}
 
 
