@@ -4,7 +4,7 @@
 
 One call of the training program, which collects so many batches and learns from them, after another that warms up. The
 kernels that the device ran are added up by what they are; so are copies between host and device, of which there should
-be none but what starts the call. Kernels run side by side, and their times add up to more than the call's. "Busy" is the
+be none but what starts the call. Kernels run side by side, so their times add up to more than the call's. "Busy" is the
 share of the call's wall time in which a kernel ran.
 """
 

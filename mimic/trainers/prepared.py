@@ -11,8 +11,8 @@ import jax
 WAITED = "/mimic/prepared/wait"  # an event of `jax.monitoring`
 
 _GPU_COMPILER_OPTIONS = {
-    # Kernels that do not wait for each other run side by side: PPO is 30 % faster, and the same to the bit where XLA picks
-    # the same matrix products.
+    # Kernels that do not wait for each other run side by side: PPO is 30 % faster, and the same to the bit where XLA
+    # picks the same matrix products.
     "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
     # XLA would try each matrix product in a dozen forms, which takes longer than it saves in a training.
     "xla_gpu_enable_triton_gemm": False,
