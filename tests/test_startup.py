@@ -138,6 +138,13 @@ def test_options_for_gpus_are_known_to_jaxlib(monkeypatch):
     assert compiling(lambda x: x + 1, 1.0)()(1.0) == 2.0
 
 
+def test_xla_flags_of_the_user_stay(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    first, *rest = compiler_options()
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to=/tmp --{first}=LHS")
+    assert list(compiler_options()) == rest
+
+
 def test_a_run_with_a_target_looks_more_often():
     usual, targeted = (PPOConfig(target_gap=gap).resolve("cpu").evaluations for gap in (0.0, 0.02))
     assert usual and targeted

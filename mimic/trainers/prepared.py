@@ -1,6 +1,7 @@
 """Work that goes on in the background: compilers leave Python free to do something else."""
 
 import contextlib
+import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -64,8 +65,10 @@ def compiling(function: Callable[..., T], *shapes: Any) -> Prepared[Callable[...
 
 
 def compiler_options() -> dict[str, Any]:
-    """For programs that are compiled for one run, on the present backend."""
-    return _GPU_COMPILER_OPTIONS if jax.default_backend() == "gpu" else {}
+    """For programs that are compiled for one run, on the present backend; without what the user set in XLA_FLAGS."""
+    given = os.environ.get("XLA_FLAGS", "")
+    options = _GPU_COMPILER_OPTIONS if jax.default_backend() == "gpu" else {}
+    return {name: value for name, value in options.items() if f"--{name}=" not in given}
 
 
 def on_host() -> contextlib.AbstractContextManager[Any]:
