@@ -122,7 +122,7 @@ def main() -> None:
     if jax.default_backend() != "gpu":
         parser.error(f"expected a GPU, whose kernels the profiler tells, got {jax.default_backend()}")
     found = profile(options.env, options.batches)
-    table = Table("on the device", "times", "ms", "share of that")
+    table = Table("on the device", "times", "ms", "share of all")
     total = sum(row["ms"] for row in found["kinds"])
     for row in found["kinds"]:
         share = row["ms"] / total

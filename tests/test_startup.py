@@ -19,7 +19,7 @@ from mimic.kinematics import link_state_table
 from mimic.trainers import evaluation
 from mimic.trainers.config import PRESETS, PPOConfig
 from mimic.trainers.evaluation import Evaluator
-from mimic.trainers.prepared import Prepared, compiler_options, compiling
+from mimic.trainers.prepared import Prepared, compiler_options
 
 HEAVY = ("brax", "mujoco.mjx", "orbax", "matplotlib", "tensorboardX", "mink", "optax", "scipy", "trimesh")
 REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_initialized()\nprint(*sys.modules)"
@@ -134,15 +134,18 @@ def test_what_is_prepared_is_made_once():
 def test_options_for_gpus_are_known_to_jaxlib(monkeypatch):
     """Which takes them on CPUs too, and refuses a wrong name or value."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert compiler_options()
-    assert compiling(lambda x: x + 1, 1.0)()(1.0) == 2.0
+    options = compiler_options(side_by_side=True)
+    assert len(options) == 2
+    assert jax.jit(lambda x: x + 1, compiler_options=options)(1.0) == 2.0
 
 
 def test_xla_flags_of_the_user_stay(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    first, *rest = compiler_options()
-    monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to=/tmp --{first}=LHS")
-    assert list(compiler_options()) == rest
+    boolean, scheduling = compiler_options(side_by_side=True)
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to=/tmp --{scheduling}=LHS")
+    assert list(compiler_options(side_by_side=True)) == [boolean]
+    monkeypatch.setenv("XLA_FLAGS", f"--{boolean}")
+    assert list(compiler_options(side_by_side=True)) == [scheduling]
 
 
 def test_a_run_with_a_target_looks_more_often():
