@@ -87,8 +87,8 @@ def make_programs(
     same, shared = PartitionSpec(), PartitionSpec(_AXIS)
     learning = Learning(same, same, same, shared, same, same)  # type: ignore[arg-type]
 
-    # 30 % more steps per second on an H200, and the same to the bit where XLA picks the same matrix products. It has not
-    # been tried with MJX.
+    # 30 % more steps per second on an H200, and the same to the bit where XLA picks the same matrix products. Not tried
+    # with MJX.
     options = compiler_options(side_by_side=env.config.physics == "fused")
 
     def program(function: Any, inputs: Any, outputs: Any, **how: Any) -> Any:
