@@ -155,20 +155,6 @@ def test_devices_see_different_arms_and_learn_the_same():
     assert ended.returncode == 0, ended.stderr[-2000:]
 
 
-@pytest.mark.parametrize("physics", ["fused", "mjx"])
-def test_kernels_run_side_by_side_where_that_was_measured(physics, monkeypatch):
-    class AskedError(Exception):
-        pass
-
-    def options(*, side_by_side):
-        raise AskedError(side_by_side)
-
-    monkeypatch.setattr(learning, "compiler_options", options)
-    env = mimic.make("planar4dof", physics=physics, demonstrations={"count": 1, "held_out": 1})
-    with pytest.raises(AskedError, match=str(physics == "fused")):
-        learning.make_programs(env, PPOConfig().resolve("gpu"), None, 1, optax.constant_schedule(1e-3), None)
-
-
 @pytest.mark.gpu
 @pytest.mark.parametrize("physics", ["fused", "mjx"])
 def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):
@@ -176,10 +162,10 @@ def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):
     env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
     config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")
     networks = ppo.make_networks(config, env.observation_size, env.action_size)
-    given, learned = compiler_options(side_by_side=True), []
+    given, learned = compiler_options(), []
     for scheduling in ("SERIALIZE", given[_SCHEDULING]):
         options = {**given, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
-        monkeypatch.setattr(learning, "compiler_options", lambda options=options, **_: options)
+        monkeypatch.setattr(learning, "compiler_options", lambda options=options: options)
         begin, learn = learning.make_programs(env, config, networks, 5, optax.constant_schedule(1e-3), None)
         learned.append(jax.device_get(learn()(begin()(7))))
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))

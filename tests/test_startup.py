@@ -134,18 +134,18 @@ def test_what_is_prepared_is_made_once():
 def test_options_for_gpus_are_known_to_jaxlib(monkeypatch):
     """Which takes them on CPUs too, and refuses a wrong name or value."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    options = compiler_options(side_by_side=True)
+    options = compiler_options()
     assert len(options) == 2
     assert jax.jit(lambda x: x + 1, compiler_options=options)(1.0) == 2.0
 
 
 def test_xla_flags_of_the_user_stay(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    boolean, scheduling = compiler_options(side_by_side=True)
+    boolean, scheduling = compiler_options()
     monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to=/tmp --{scheduling}=LHS")
-    assert list(compiler_options(side_by_side=True)) == [boolean]
+    assert list(compiler_options()) == [boolean]
     monkeypatch.setenv("XLA_FLAGS", f"--{boolean}")
-    assert list(compiler_options(side_by_side=True)) == [scheduling]
+    assert list(compiler_options()) == [scheduling]
 
 
 def test_a_run_with_a_target_looks_more_often():

@@ -11,9 +11,13 @@ import jax
 
 WAITED = "/mimic/prepared/wait"  # an event of `jax.monitoring`
 
-# XLA would try each matrix product in a dozen forms, which takes longer than it saves in a training.
-_GPU_COMPILER_OPTIONS = {"xla_gpu_enable_triton_gemm": False}
-_SIDE_BY_SIDE = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+_GPU_COMPILER_OPTIONS = {
+    # XLA would try each matrix product in a dozen forms, which takes longer than it saves in a training.
+    "xla_gpu_enable_triton_gemm": False,
+    # Kernels that do not wait for each other run at once: PPO makes 30 % more steps per second on an H200 (5 % with MJX),
+    # and learns the same to the bit where XLA picks the same matrix products.
+    "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
+}
 
 T = TypeVar("T")
 
@@ -60,17 +64,12 @@ def compiling(function: Callable[..., T], *shapes: Any) -> Prepared[Callable[...
     return program
 
 
-def compiler_options(*, side_by_side: bool = False) -> dict[str, Any]:
-    """For programs that are compiled for one run, on the present backend; without what the user set in XLA_FLAGS.
-
-    Args:
-      side_by_side: let a GPU run kernels at once that do not wait for each other.
-    """
+def compiler_options() -> dict[str, Any]:
+    """For programs that are compiled for one run, on the present backend; without what the user set in XLA_FLAGS."""
     if jax.default_backend() != "gpu":
         return {}
     given = {flag.partition("=")[0] for flag in os.environ.get("XLA_FLAGS", "").split()}
-    options = _GPU_COMPILER_OPTIONS | (_SIDE_BY_SIDE if side_by_side else {})
-    return {name: value for name, value in options.items() if f"--{name}" not in given}
+    return {name: value for name, value in _GPU_COMPILER_OPTIONS.items() if f"--{name}" not in given}
 
 
 def on_host() -> contextlib.AbstractContextManager[Any]:
