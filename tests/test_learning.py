@@ -155,6 +155,16 @@ def test_devices_see_different_arms_and_learn_the_same():
     assert ended.returncode == 0, ended.stderr[-2000:]
 
 
+def test_both_programs_are_compiled_with_the_options_of_a_run(monkeypatch):
+    monkeypatch.setattr(learning, "compiler_options", lambda: {"no_option_of_xla": True})
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
+    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    for program in learning.make_programs(env, config, networks, 1, optax.constant_schedule(1e-3), None):
+        with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
+            program()
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("physics", ["fused", "mjx"])
 def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):

@@ -16,7 +16,7 @@ from mimic import cli, compat
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.wrappers import wrap_for_training
 from mimic.kinematics import link_state_table
-from mimic.trainers import evaluation
+from mimic.trainers import evaluation, prepared
 from mimic.trainers.config import PRESETS, PPOConfig
 from mimic.trainers.evaluation import Evaluator
 from mimic.trainers.prepared import Prepared, compiler_options
@@ -122,8 +122,8 @@ def test_what_is_prepared_is_made_once():
     lazy, started = Prepared(lambda: made.append("lazy")), Prepared(lambda: made.append("started"))
     started.start()
     started.start()
-    for prepared in (started, started, lazy, lazy):
-        prepared()
+    for program in (started, started, lazy, lazy):
+        program()
     assert made == ["started", "lazy"]
     failing = Prepared(lambda: 1 / 0)
     failing.start()
@@ -137,6 +137,12 @@ def test_options_for_gpus_are_known_to_jaxlib(monkeypatch):
     options = compiler_options()
     assert len(options) == 2
     assert jax.jit(lambda x: x + 1, compiler_options=options)(1.0) == 2.0
+
+
+def test_what_is_compiled_beside_a_training_is_compiled_with_them(monkeypatch):
+    monkeypatch.setattr(prepared, "compiler_options", lambda: {"no_option_of_xla": True})
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
+        prepared.compiling(lambda x: x + 1, jnp.zeros(3))()
 
 
 def test_xla_flags_of_the_user_stay(monkeypatch):

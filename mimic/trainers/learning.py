@@ -90,8 +90,9 @@ def make_programs(
     def program(function: Any, inputs: Any, outputs: Any, **how: Any) -> Any:
         spread = jax.shard_map(function, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
         placed = [jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs) for specs in (inputs, outputs)]
-        how |= {"in_shardings": placed[0], "out_shardings": placed[1], "compiler_options": compiler_options()}
-        return jax.jit(spread, **how)
+        return jax.jit(
+            spread, in_shardings=placed[0], out_shardings=placed[1], compiler_options=compiler_options(), **how
+        )
 
     training = env, config, networks, optimizer, mesh.size
     begin = program(functools.partial(_begin, *training), (same, same, same), learning)

@@ -1,9 +1,8 @@
 """PPO's loss of a minibatch: clipped surrogate, error of the value, entropy (Schulman et al., 2017).
 
 It equals brax's `compute_ppo_loss`, as far as our environments ask for it: episodes end, and are not cut off. Only the
-sample that the entropy is estimated by is drawn in another order. On a GPU a training can be no faster than kernels are
-launched, so here is little that asks for one of its own: no loop over a few steps, one pass of the value network, few
-metrics.
+sample that the entropy is estimated by is drawn in another order. On a GPU a training is many small kernels, so here is
+little that asks for one of its own: no loop over a few steps, one pass of the value network, few metrics.
 """
 
 from typing import Any, NamedTuple
