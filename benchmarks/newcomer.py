@@ -89,7 +89,7 @@ def table(results: list[dict[str, Any]]) -> Table:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.newcomer", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--out", type=Path, metavar="FILE", help="file of results; printed only where none is given")
-    parser.add_argument("--default", action="store_true", help="`make train` as it is too: five minutes on two cores")
+    parser.add_argument("--default", action="store_true", help="`make train` as it is too: three minutes on two cores")
     parser.add_argument("--note", default="", metavar="TEXT", help="kept with the results")
     return parser.parse_args()
 
