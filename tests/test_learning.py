@@ -179,14 +179,3 @@ def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):
         begin, learn = learning.make_programs(env, config, networks, 5, optax.constant_schedule(1e-3), None)
         learned.append(jax.device_get(learn()(begin()(7))))
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))
-
-
-def test_a_vector_of_all_parameters_begins_each_array_where_a_gpu_takes_it():
-    tree = {"a": jnp.arange(6.0).reshape(2, 3), "b": jnp.arange(64.0), "c": (jnp.ones(65), jnp.ones((1, 1)))}
-    to_vector, from_vector = learning.as_vector(tree)
-    vector = to_vector(tree)
-    assert vector.shape == (64 + 64 + 128 + 64,)
-    np.testing.assert_array_equal(np.flatnonzero(vector)[[0, 5]], [1, 64 + 1])
-    assert jax.tree.all(jax.tree.map(np.array_equal, from_vector(vector), tree))
-    gradient = jax.grad(lambda vector: sum(x.sum() for x in jax.tree.leaves(from_vector(vector))))(vector)
-    assert gradient.sum() == 6 + 64 + 65 + 1  # nothing pulls at the zeros between

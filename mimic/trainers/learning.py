@@ -18,6 +18,7 @@ from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses
 from brax.training.agents.ppo import networks as ppo_networks
 from flax import struct
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
@@ -32,7 +33,6 @@ Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, valu
 Metrics = dict[str, Array]
 
 _AXIS = "devices"
-_ALIGNED = 64  # numbers; matrix products on NVIDIA GPUs refuse arrays that begin at any odd place
 
 
 @struct.dataclass
@@ -119,24 +119,6 @@ def initial_params(networks: ppo_networks.PPONetworks, observation_size: int, ke
     return statistics, networks.policy_network.init(key_policy), networks.value_network.init(key_value)
 
 
-def as_vector(template: Any) -> tuple[Callable[[Any], Array], Callable[[Array], Any]]:
-    """Functions from a tree of arrays to one vector of all their numbers, with zeros between them, and back.
-
-    A gradient is then one message to the other devices, and a step of Adam one kernel.
-    """
-    leaves, structure = jax.tree.flatten(template)
-    ends = np.cumsum([leaf.size + -leaf.size % _ALIGNED for leaf in leaves])
-
-    def to_vector(tree: Any) -> Array:
-        return jnp.concatenate([jnp.pad(x.ravel(), (0, -x.size % _ALIGNED)) for x in jax.tree.leaves(tree)])
-
-    def from_vector(vector: Array) -> Any:
-        parts = jnp.split(vector, ends[:-1])
-        return structure.unflatten([x[: like.size].reshape(like.shape) for x, like in zip(parts, leaves, strict=True)])
-
-    return to_vector, from_vector
-
-
 def _begin(
     env: ImitationEnv,
     config: PPOConfig,
@@ -152,7 +134,7 @@ def _begin(
     params = losses.PPONetworkParams(policy=policy, value=value)
     keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), config.num_envs // devices)  # type: ignore[operator]
     episodes = fresh_episodes(env.with_expert_states(expert_states)).reset(keys)
-    return Learning(params, statistics, optimizer.init(as_vector(params)[0](params)), episodes, expert_states, key)  # type: ignore[arg-type]
+    return Learning(params, statistics, optimizer.init(ravel_pytree(params)[0]), episodes, expert_states, key)  # type: ignore[arg-type]
 
 
 def _learn(
@@ -168,7 +150,7 @@ def _learn(
     make_policy = ppo_networks.make_inference_fn(networks)
     rounds = config.batch_size * config.num_minibatches // config.num_envs  # type: ignore[operator]
     minibatch = config.batch_size // devices  # type: ignore[operator]
-    to_vector, from_vector = as_vector(learning.networks)
+    unravel = ravel_pytree(learning.networks)[1]
 
     def unroll(learning: Learning, key: Array) -> tuple[Learning, Unrolls]:
         """Steps of all arms, [time + 1, arms, ...]."""
@@ -199,22 +181,20 @@ def _learn(
         def update(carry: Any, inputs: Any) -> Any:
             params, optimizer_state = carry
             chosen, key = inputs
-
-            def loss(params: Array) -> tuple[Array, Array]:
-                given = from_vector(params), statistics, unrolls.unpacked(rows[chosen])
-                return ppo_loss(*given, key, networks, config)
-
-            gradient, metrics = jax.grad(loss, has_aux=True)(params)
-            change, optimizer_state = optimizer.update(jax.lax.pmean(gradient, _AXIS), optimizer_state)
-            return (optax.apply_updates(params, change), optimizer_state), metrics
+            given = statistics, unrolls.unpacked(rows[chosen]), key, networks, config
+            gradients, metrics = jax.grad(ppo_loss, has_aux=True)(params, *given)
+            # One vector is one message to the other devices, and a step of Adam is one kernel.
+            gradient = jax.lax.pmean(ravel_pytree(gradients)[0], _AXIS)
+            change, optimizer_state = optimizer.update(gradient, optimizer_state)
+            return (optax.apply_updates(params, unravel(change)), optimizer_state), metrics
 
         passes = jax.random.split(key_order, config.num_updates_per_batch)  # type: ignore[arg-type]
         order = jax.vmap(lambda key: jax.random.permutation(key, len(rows)))(passes).reshape(-1, minibatch)
         keys = jax.random.split(key_loss, len(order))
-        start = to_vector(learning.networks), learning.optimizer
+        start = learning.networks, learning.optimizer
         (params, optimizer_state), metrics = jax.lax.scan(update, start, (order, keys))
         learning = learning.replace(  # type: ignore[attr-defined]
-            networks=from_vector(params), statistics=statistics, optimizer=optimizer_state, key=key
+            networks=params, statistics=statistics, optimizer=optimizer_state, key=key
         )
         return learning, metrics.mean(axis=0)
 
