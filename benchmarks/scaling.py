@@ -170,17 +170,17 @@ def run(
     seeds: Sequence[int],
     common: Sequence[str],
     of_one: dict[str, int],
-) -> list[dict[str, Any]]:
-    """All runs; on one device all kinds are the same one."""
+) -> Iterator[dict[str, Any]]:
+    """Each run as it ends; on one device it is one of all kinds."""
     jobs = [
         (kind, count, count if how == "each" else 1, seed)
         for count, seed, how, kind in itertools.product(devices, seeds, processes, kinds)
         if count > 1 or (how, kind) == (processes[0], kinds[0])
     ]
     shown = track(jobs, "scaling", console=Console(stderr=True), transient=True)
-    results = [measure(*job, common, of_one) for job in shown]
-    alone = [row for row in results if row["devices"] == 1]
-    return [*results, *({**row, "scaling": kind} for row in alone for kind in kinds[1:])]
+    for job in shown:
+        result = measure(*job, common, of_one)
+        yield from ({**result, "scaling": kind} for kind in (kinds if result["devices"] == 1 else [job[0]]))
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
@@ -253,11 +253,14 @@ def main() -> None:
     options = _options()
     of_one = {"num_envs": options.num_envs, "batch_size": options.batch_size, "num_timesteps": options.steps}
     common = [f"env={options.env}", "env.physics=fused", f"trainer.evaluations={_EVALUATIONS}", *options.arguments]
-    results = run(options.kinds, sorted(options.devices), options.processes, options.seeds, common, of_one)
-    rows = summary(results)
+    results, rows = [], []
+    for result in run(options.kinds, sorted(options.devices), options.processes, options.seeds, common, of_one):
+        results.append(result)
+        rows = summary(results)
+        if options.out:  # a run that fails loses none of those before it
+            write_results(options.out, "scaling", options.commit, env=options.env, rows=rows, runs=results)
     Console().print(table(rows))
     if options.out:
-        write_results(options.out, "scaling", options.commit, env=options.env, rows=rows, runs=results)
         draw(rows, options.env, options.out.with_suffix(".png"))
 
 

@@ -1,5 +1,8 @@
 """`python -m benchmarks.scaling`."""
 
+import json
+import sys
+
 import pytest
 from rich.console import Console
 
@@ -56,9 +59,29 @@ def test_efficiency_is_relative_to_the_fewest_devices(tmp_path):
     assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
+def test_a_run_that_fails_loses_none_of_those_before_it(tmp_path, monkeypatch):
+    def measure(kind, devices, processes, seed, common, of_one):
+        if devices == 4:
+            sys.exit("error: out of memory")
+        quality = {"optimality_gap": {"train": 0.01}}
+        of_run = {"scaling": kind, "devices": devices, "processes": processes, "seed": seed}
+        return of_run | {"steps_per_s": 100.0 * devices} | quality
+
+    out = tmp_path / "scaling.json"
+    monkeypatch.setattr(scaling, "measure", measure)
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "true")  # and back, after the test
+    monkeypatch.setattr(sys, "argv", ["scaling", "--devices", "1", "2", "4", "--processes", "one", "--out", str(out)])
+    with pytest.raises(SystemExit, match="out of memory"):
+        scaling.main()
+    runs = json.loads(out.read_text())["runs"]
+    assert [(row["scaling"], row["devices"]) for row in runs] == [
+        ("weak", 1), ("strong", 1), ("weak", 2), ("strong", 2),
+    ]  # fmt: skip
+
+
 @pytest.mark.slow
 def test_two_devices_train_the_same_in_all_ways():
-    results = scaling.run(scaling.KINDS, [1, 2], scaling.PROCESSES, [0], SMALL, OF_ONE)
+    results = list(scaling.run(scaling.KINDS, [1, 2], scaling.PROCESSES, [0], SMALL, OF_ONE))
     found = {(row["scaling"], row["devices"], row["processes"]): row for row in results}
     counts = (1, 1), (2, 1), (2, 2)
     assert sorted(found) == sorted((kind, *count) for kind in scaling.KINDS for count in counts)
