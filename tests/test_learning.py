@@ -14,7 +14,7 @@ from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 
 import mimic
-from mimic.trainers import learning, ppo, ppo_loss
+from mimic.trainers import learning, ppo, ppo_loss, updates
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.prepared import compiler_options
 
@@ -33,19 +33,22 @@ def one_batch():
     networks = ppo.make_networks(config, env.observation_size, env.action_size)
     along = np.random.default_rng(0).normal(size=env.observation_size).astype(np.float32)
 
-    def loss(params, statistics, unrolls, key, *_):
-        del statistics, key
+    def of_value(params, statistics, unrolls, *_):
         assert unrolls.observation.shape == (config.batch_size, 1 + 1, env.observation_size)
-        shown = (unrolls.observation @ along).mean(axis=0)
-        return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), jnp.resize(shown, (len(ppo_loss.METRICS),))
+        now, after = (unrolls.observation @ along).mean(axis=0)
+        return now + 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), after
+
+    def of_policy(params, statistics, unrolls, after, *_):
+        return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), jnp.full(len(ppo_loss.METRICS), after)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning, "ppo_loss", loss)
+        patch.setattr(updates, "value_loss", of_value)
+        patch.setattr(updates, "policy_loss", of_policy)
         begin, learn = learning.make_programs(env, config, networks, 1, optax.constant_schedule(1e-3), None)
         start = begin()(7)
         before = jax.device_get(start)
         after, metrics = jax.device_get(learn()(start))
-    shown = {"now": metrics[ppo_loss.METRICS[0]], "next": metrics[ppo_loss.METRICS[1]]}
+    shown = {"now": metrics["value_loss"], "next": metrics["policy_loss"]}
     return before, after, shown, along
 
 
@@ -64,7 +67,7 @@ def test_what_is_seen_next_belongs_to_its_transition(one_batch):
 
 def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
     before, after, *_ = one_batch
-    assert jax.tree.all(jax.tree.map(np.array_equal, before.networks, after.networks))
+    assert jax.tree.all(jax.tree.map(np.array_equal, before.params[1:], after.params[1:]))
     np.testing.assert_array_equal(before.expert_states.position, after.expert_states.position)
     assert not np.array_equal(before.key, after.key)
     assert not np.array_equal(before.episodes.obs, after.episodes.obs)
@@ -99,20 +102,20 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     key = jax.random.PRNGKey(2)
 
     def own(params):
-        return ppo_loss.ppo_loss(params, statistics, ours, key, networks, config)
+        value, advantages = ppo_loss.value_loss(params.value, statistics, ours, networks, config)
+        policy, metrics = ppo_loss.policy_loss(params.policy, statistics, ours, advantages, key, networks, config)
+        return value + policy, dict(zip(ppo_loss.METRICS, metrics, strict=True), value_loss=value)
 
     def of_brax(params):
         names = "entropy_cost", "discounting", "reward_scaling", "gae_lambda", "clipping_epsilon"
         settings = {name: getattr(config, name) for name in names}
         return losses.compute_ppo_loss(params, statistics, theirs, key, networks, **settings)
 
-    (loss, metrics), gradient = jax.jit(jax.value_and_grad(own, has_aux=True))(params)
+    (loss, shown), gradient = jax.jit(jax.value_and_grad(own, has_aux=True))(params)
     (expected, named), expected_gradient = jax.jit(jax.value_and_grad(of_brax, has_aux=True))(params)
     assert loss == pytest.approx(float(expected), rel=1e-12)
     for found, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
-    shown = dict(zip(ppo_loss.METRICS, map(float, metrics), strict=True))
-    assert shown["loss"] == pytest.approx(float(expected), rel=1e-12)
     assert -entropy_cost * shown["entropy"] == pytest.approx(float(named["entropy_loss"]), rel=1e-12, abs=1e-12)
     assert shown["policy_loss"] == pytest.approx(float(named["policy_loss"]), rel=1e-12)
     assert shown["value_loss"] == pytest.approx(float(named["v_loss"]), rel=1e-12)
@@ -134,11 +137,11 @@ config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2,
 networks = ppo.make_networks(config, env.observation_size, env.action_size)
 begin, learn = learning.make_programs(env, config, networks, 2, optax.constant_schedule(1e-3), None)
 start = begin()(7)
-before = jax.device_get(start.networks)
+before = jax.device_get(start.params)
 after, metrics = learn()(start)
-changed = jax.tree.map(lambda x, y: not np.array_equal(x, y), before, jax.device_get(after.networks))
+changed = jax.tree.map(lambda x, y: not np.array_equal(x, y), before, jax.device_get(after.params))
 assert any(jax.tree.leaves(changed))
-for x in jax.tree.leaves((after.networks, after.statistics, after.optimizer, metrics)):
+for x in jax.tree.leaves((after.policy, after.value, after.statistics, metrics)):
     shards = [np.asarray(shard.data) for shard in x.addressable_shards]
     assert len(shards) == 2 and np.array_equal(*shards)
 observed = [np.asarray(shard.data) for shard in after.episodes.obs.addressable_shards]

@@ -15,18 +15,17 @@ import numpy as np
 import optax
 from brax.envs.base import State
 from brax.training.acme import running_statistics, specs
-from brax.training.agents.ppo import losses
 from brax.training.agents.ppo import networks as ppo_networks
 from flax import struct
-from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import fresh_episodes
 from mimic.kinematics import LinkStates
+from mimic.trainers import updates
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo_loss import METRICS, Unrolls, ppo_loss
+from mimic.trainers.ppo_loss import Unrolls
 from mimic.trainers.prepared import Prepared, compiler_options
 
 Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, value parameters
@@ -40,17 +39,17 @@ class Learning:
     """What goes from one call of the program that learns to the next.
 
     Attributes:
-      networks: parameters of policy and value.
+      policy: what it has learned.
+      value: what it has learned.
       statistics: running mean and deviation of the observations.
-      optimizer: state of optax, of all parameters as one vector.
       episodes: of the environments, shared out among the devices.
       expert_states: of the environment.
       key: for exploration and shuffling.
     """
 
-    networks: losses.PPONetworkParams
+    policy: updates.Learner
+    value: updates.Learner
     statistics: running_statistics.RunningStatisticsState
-    optimizer: optax.OptState
     episodes: State
     expert_states: LinkStates
     key: Array
@@ -58,7 +57,7 @@ class Learning:
     @property
     def params(self) -> Params:
         """What a policy is made of, and what is saved."""
-        return self.statistics, self.networks.policy, self.networks.value
+        return self.statistics, self.policy.params, self.value.params
 
 
 def make_programs(
@@ -131,10 +130,10 @@ def _begin(
 ) -> Learning:
     key_networks, key_episodes, key = jax.random.split(jax.random.PRNGKey(seed), 3)
     statistics, policy, value = restored or initial_params(networks, env.observation_size, key_networks)
-    params = losses.PPONetworkParams(policy=policy, value=value)
     keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), config.num_envs // devices)  # type: ignore[operator]
     episodes = fresh_episodes(env.with_expert_states(expert_states)).reset(keys)
-    return Learning(params, statistics, optimizer.init(ravel_pytree(params)[0]), episodes, expert_states, key)  # type: ignore[arg-type]
+    learners = updates.begin(policy, optimizer), updates.begin(value, optimizer)
+    return Learning(*learners, statistics, episodes, expert_states, key)  # type: ignore[arg-type]
 
 
 def _learn(
@@ -150,7 +149,6 @@ def _learn(
     make_policy = ppo_networks.make_inference_fn(networks)
     rounds = config.batch_size * config.num_minibatches // config.num_envs  # type: ignore[operator]
     minibatch = config.batch_size // devices  # type: ignore[operator]
-    unravel = ravel_pytree(learning.networks)[1]
 
     def unroll(learning: Learning, key: Array) -> tuple[Learning, Unrolls]:
         """Steps of all arms, [time + 1, arms, ...]."""
@@ -176,27 +174,17 @@ def _learn(
         learning, collected = jax.lax.scan(unroll, learning, jax.random.split(key_unroll, rounds))
         unrolls = jax.tree.map(lambda x: jnp.moveaxis(x, 2, 1).reshape(-1, x.shape[1], *x.shape[3:]), collected)
         statistics = running_statistics.update(learning.statistics, unrolls.observation[:, :-1], pmap_axis_name=_AXIS)
-        rows = unrolls.packed()
-
-        def update(carry: Any, inputs: Any) -> Any:
-            params, optimizer_state = carry
-            chosen, key = inputs
-            given = statistics, unrolls.unpacked(rows[chosen]), key, networks, config
-            gradients, metrics = jax.grad(ppo_loss, has_aux=True)(params, *given)
-            # One vector is one message to the other devices, and a step of Adam is one kernel.
-            gradient = jax.lax.pmean(ravel_pytree(gradients)[0], _AXIS)
-            change, optimizer_state = optimizer.update(gradient, optimizer_state)
-            return (optax.apply_updates(params, unravel(change)), optimizer_state), metrics
-
         passes = jax.random.split(key_order, config.num_updates_per_batch)  # type: ignore[arg-type]
-        order = jax.vmap(lambda key: jax.random.permutation(key, len(rows)))(passes).reshape(-1, minibatch)
-        keys = jax.random.split(key_loss, len(order))
-        start = learning.networks, learning.optimizer
-        (params, optimizer_state), metrics = jax.lax.scan(update, start, (order, keys))
-        learning = learning.replace(  # type: ignore[attr-defined]
-            networks=params, statistics=statistics, optimizer=optimizer_state, key=key
-        )
-        return learning, metrics.mean(axis=0)
+        count = len(unrolls.observation)
+        order = jax.vmap(lambda key: jax.random.permutation(key, count))(passes).reshape(-1, minibatch)
+        policy, value, metrics = updates.updated(
+            learning.policy, learning.value, statistics, unrolls, order, key_loss, networks, config, optimizer,
+            _AXIS, overlap=devices > 1,
+        )  # fmt: skip
+        learning = learning.replace(policy=policy, value=value, statistics=statistics, key=key)  # type: ignore[attr-defined]
+        return learning, metrics
 
     learning, metrics = jax.lax.scan(batch, learning, None, length=batches)
-    return learning, dict(zip(METRICS, jax.lax.pmean(metrics.mean(axis=0), _AXIS), strict=True))
+    means = dict(zip(updates.METRICS, jax.lax.pmean(metrics.mean(axis=0), _AXIS), strict=True))
+    loss = means["policy_loss"] + means["value_loss"] - config.entropy_cost * means["entropy"]  # type: ignore[operator]
+    return learning, {"loss": loss, **means}

@@ -1,8 +1,9 @@
-"""PPO's loss of a minibatch: clipped surrogate, error of the value, entropy (Schulman et al., 2017).
+"""PPO's losses of a minibatch: clipped surrogate and entropy, error of the value (Schulman et al., 2017).
 
-It equals brax's `compute_ppo_loss`, as far as our environments ask for it: episodes end, and are not cut off. Only the
-sample that the entropy is estimated by is drawn in another order. On a GPU a training is many small kernels, so here is
-little that asks for one of its own: no loop over a few steps, one pass of the value network, few metrics.
+Together they equal brax's `compute_ppo_loss`, as far as our environments ask for it: episodes end, and are not cut off.
+Only the sample that the entropy is estimated by is drawn in another order. They are two, since policy and value have no
+parameter in common. On a GPU a training is many small kernels, so here is little that asks for one of its own: no loop
+over a few steps, one pass of the value network, few metrics.
 """
 
 from typing import Any, NamedTuple
@@ -10,13 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from brax.training.acme.running_statistics import RunningStatisticsState
-from brax.training.agents.ppo import losses
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float
 
 from mimic.trainers.config import PPOConfig
 
-METRICS = ("loss", "policy_loss", "value_loss", "entropy", "approx_kl", "clip_fraction", "action_std")
+METRICS = ("policy_loss", "entropy", "approx_kl", "clip_fraction", "action_std")  # of the policy
 _VALUE_SHARE = 0.25  # of the squared error of the value
 _UNROLLED = 32  # steps of the advantage estimate that become one kernel
 
@@ -49,49 +49,67 @@ class Unrolls(NamedTuple):
         return Unrolls(observation, raw_action, *jnp.moveaxis(rest, -1, 0))
 
 
-def ppo_loss(
-    params: losses.PPONetworkParams,
+def value_loss(
+    params: Any,
     statistics: RunningStatisticsState,
     unrolls: Unrolls,
+    networks: ppo_networks.PPONetworks,
+    config: PPOConfig,
+) -> tuple[Array, Float[Array, "unrolls time"]]:
+    """The loss of the value, and the advantages, normalised, that the policy learns from.
+
+    Args:
+      params: of the value.
+      statistics: of the observations.
+      unrolls: [unrolls, time + 1, ...].
+      networks: of the config.
+      config: resolved.
+    """
+    values = networks.value_network.apply(statistics, params, unrolls.observation)
+    reward, goes_on = unrolls.reward[:, :-1], unrolls.goes_on[:, :-1]
+    targets, advantages = jax.lax.stop_gradient(
+        estimates(config.reward_scaling * reward, config.discounting * goes_on, values, config.gae_lambda)  # type: ignore[operator]
+    )
+    loss = _VALUE_SHARE * jnp.square(targets - values[:, :-1]).mean()
+    return loss, (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+
+def policy_loss(
+    params: Any,
+    statistics: RunningStatisticsState,
+    unrolls: Unrolls,
+    advantages: Float[Array, "unrolls time"],
     key: Array,
     networks: ppo_networks.PPONetworks,
     config: PPOConfig,
 ) -> tuple[Array, Float[Array, " metrics"]]:
-    """The loss, and `METRICS`.
+    """The loss of the policy, entropy included, and `METRICS`.
 
     Args:
-      params: of policy and value.
+      params: of the policy.
       statistics: of the observations.
       unrolls: [unrolls, time + 1, ...].
+      advantages: of `value_loss`.
       key: for the entropy, which is estimated by a sample.
       networks: of the config.
       config: resolved.
     """
-    values = networks.value_network.apply(statistics, params.value, unrolls.observation)
-    logits = networks.policy_network.apply(statistics, params.policy, unrolls.observation[:, :-1])
-    raw_action, old_log_prob, reward, goes_on = (x[:, :-1] for x in unrolls[1:])
-    targets, advantages = jax.lax.stop_gradient(
-        estimates(config.reward_scaling * reward, config.discounting * goes_on, values, config.gae_lambda)  # type: ignore[operator]
-    )
-    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-
+    logits = networks.policy_network.apply(statistics, params, unrolls.observation[:, :-1])
+    raw_action, old_log_prob = unrolls.raw_action[:, :-1], unrolls.log_prob[:, :-1]
     actions = networks.parametric_action_distribution
     log_ratio = actions.log_prob(logits, raw_action) - old_log_prob
     ratio, least, most = jnp.exp(log_ratio), 1 - config.clipping_epsilon, 1 + config.clipping_epsilon
     surrogate = -jnp.minimum(ratio * advantages, jnp.clip(ratio, least, most) * advantages)
-    value_error = _VALUE_SHARE * jnp.square(targets - values[:, :-1])
     entropy = actions.entropy(logits, key)
-    loss = surrogate.mean() + value_error.mean() - config.entropy_cost * entropy.mean()  # type: ignore[operator]
+    loss = surrogate.mean() - config.entropy_cost * entropy.mean()  # type: ignore[operator]
 
     approx_kl = ratio - 1 - log_ratio
     clipped = (ratio < least) | (ratio > most)
     action_std = actions.create_dist(logits).scale.mean(axis=-1)  # type: ignore[attr-defined]
-    terms = jax.lax.stop_gradient(jnp.stack([surrogate, value_error, entropy, approx_kl, clipped, action_std]))
-    # One mean of all terms, not six: 208 instead of 217 us an update on an H200. The barrier keeps XLA from fusing both
-    # in few threads, which costs 38 us where kernels run one after the other.
-    means = jax.lax.optimization_barrier(terms).mean(axis=(1, 2))
-    total = means[0] + means[1] - config.entropy_cost * means[2]  # type: ignore[operator]
-    return loss, jnp.concatenate([total[None], means])
+    terms = jax.lax.stop_gradient(jnp.stack([surrogate, entropy, approx_kl, clipped, action_std]))
+    # One mean of all terms, not one of each: 208 instead of 217 us an update on an H200. The barrier keeps XLA from
+    # fusing both in few threads, which costs 38 us where kernels run one after the other.
+    return loss, jax.lax.optimization_barrier(terms).mean(axis=(1, 2))
 
 
 def estimates(

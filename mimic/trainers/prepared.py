@@ -19,6 +19,11 @@ _GPU_COMPILER_OPTIONS = {
     "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
 }
 
+# Messages between GPUs within CUDA graphs, so that they go on beside computation; the rest is what XLA puts there anyway.
+_MESSAGES = {
+    "xla_gpu_enable_command_buffer": "FUSION,CUBLAS,CUBLASLT,CUSTOM_CALL,CUDNN,DYNAMIC_SLICE_FUSION,COLLECTIVES"
+}
+
 T = TypeVar("T")
 
 
@@ -68,8 +73,9 @@ def compiler_options() -> dict[str, Any]:
     """For programs that are compiled for one run, on the present backend; without what the user set in XLA_FLAGS."""
     if jax.default_backend() != "gpu":
         return {}
+    options = {**_GPU_COMPILER_OPTIONS, **(_MESSAGES if jax.device_count() > 1 else {})}
     given = {flag.partition("=")[0] for flag in os.environ.get("XLA_FLAGS", "").split()}
-    return {name: value for name, value in _GPU_COMPILER_OPTIONS.items() if f"--{name}" not in given}
+    return {name: value for name, value in options.items() if f"--{name}" not in given}
 
 
 def on_host() -> contextlib.AbstractContextManager[Any]:
