@@ -26,7 +26,7 @@ from mimic.kinematics import LinkStates
 from mimic.trainers import updates
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo_loss import Unrolls
-from mimic.trainers.prepared import Prepared, compiler_options
+from mimic.trainers.prepared import Prepared, a_process_for_each_gpu, compiler_options
 
 Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, value parameters
 Metrics = dict[str, Array]
@@ -179,7 +179,7 @@ def _learn(
         order = jax.vmap(lambda key: jax.random.permutation(key, count))(passes).reshape(-1, minibatch)
         policy, value, metrics = updates.updated(
             learning.policy, learning.value, statistics, unrolls, order, key_loss, networks, config, optimizer,
-            _AXIS, overlap=devices > 1,
+            _AXIS, staggered=a_process_for_each_gpu(),
         )  # fmt: skip
         learning = learning.replace(policy=policy, value=value, statistics=statistics, key=key)  # type: ignore[attr-defined]
         return learning, metrics

@@ -19,7 +19,7 @@ _GPU_COMPILER_OPTIONS = {
     "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
 }
 
-# Messages between GPUs within CUDA graphs, so that they go on beside computation; the rest is what XLA puts there anyway.
+# Messages between GPUs within CUDA graphs, so that they go on beside computation; the rest is there by default.
 _MESSAGES = {
     "xla_gpu_enable_command_buffer": "FUSION,CUBLAS,CUBLASLT,CUSTOM_CALL,CUDNN,DYNAMIC_SLICE_FUSION,COLLECTIVES"
 }
@@ -73,9 +73,14 @@ def compiler_options() -> dict[str, Any]:
     """For programs that are compiled for one run, on the present backend; without what the user set in XLA_FLAGS."""
     if jax.default_backend() != "gpu":
         return {}
-    options = {**_GPU_COMPILER_OPTIONS, **(_MESSAGES if jax.device_count() > 1 else {})}
+    options = {**_GPU_COMPILER_OPTIONS, **(_MESSAGES if a_process_for_each_gpu() else {})}
     given = {flag.partition("=")[0] for flag in os.environ.get("XLA_FLAGS", "").split()}
     return {name: value for name, value in options.items() if f"--{name}" not in given}
+
+
+def a_process_for_each_gpu() -> bool:
+    """Whether there are several GPUs, none of which shares its process with another."""
+    return jax.default_backend() == "gpu" and jax.process_count() == jax.device_count() > 1
 
 
 def on_host() -> contextlib.AbstractContextManager[Any]:

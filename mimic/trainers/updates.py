@@ -45,13 +45,9 @@ def updated(
     config: PPOConfig,
     optimizer: optax.GradientTransformation,
     axis: str,
-    overlap: bool,
+    staggered: bool,
 ) -> tuple[Learner, Learner, Float[Array, " metrics"]]:
     """Policy and value after an update by each minibatch, and the means of `METRICS` on this device.
-
-    Policy and value have no parameter in common, so that the message that makes a mean of one's gradients can be on its
-    way while the other's are computed: the policy takes a step when the value has begun with the next minibatch.
-    That changes nothing of what is learned.
 
     Args:
       policy: before.
@@ -64,45 +60,56 @@ def updated(
       config: resolved.
       optimizer: of both.
       axis: over the devices.
-      overlap: messages with computation. It pays where there is more than one device.
+      staggered: whether the policy takes its step when the value has begun with the next minibatch. Each waits for the
+        mean of its gradients over the devices while the other computes, and what they learn is the same. Else both take
+        their steps at once, after one message.
     """
     rows = unrolls.packed()
 
-    def mean(vector: Array, after: Array | None = None) -> Array:
-        """Over the devices. It waits for a message before it: NCCL must not be given two at once."""
-        if after is None:
-            return jax.lax.pmean(vector, axis)
-        return jax.lax.pmean(jnp.append(vector, after[0]), axis)[:-1]
+    def of_value(learner: Learner, given: Any) -> tuple[Array, Array, Array]:
+        differentiated = jax.value_and_grad(value_loss, has_aux=True)
+        (error, advantages), gradients = differentiated(learner.params, *given, networks, config)
+        return ravel_pytree(gradients)[0], error, advantages
+
+    def of_policy(learner: Learner, given: Any, advantages: Array, key: Array) -> tuple[Array, Array]:
+        differentiated = jax.grad(policy_loss, has_aux=True)
+        gradients, metrics = differentiated(learner.params, *given, advantages, key, networks, config)
+        return ravel_pytree(gradients)[0], metrics
 
     def step(learner: Learner, gradient: Array) -> Learner:
         change, state = optimizer.update(gradient, learner.optimizer)
         unravel = ravel_pytree(learner.params)[1]
         return Learner(optax.apply_updates(learner.params, unravel(change)), state)
 
-    def update(carry: Any, inputs: Any) -> Any:
-        policy, value, late = carry
-        chosen, key = inputs
+    def at_once(carry: Any, inputs: Any) -> Any:
+        policy, value = carry
+        chosen, key, _ = inputs
         given = statistics, unrolls.unpacked(rows[chosen])
-        arrived = None
-        if overlap:
-            waiting, gradient = late
-            arrived = mean(gradient)
-            policy = jax.tree.map(lambda new, old: jnp.where(waiting, new, old), step(policy, arrived), policy)
-        of_value = jax.value_and_grad(value_loss, has_aux=True)
-        (error, advantages), gradients = of_value(value.params, *given, networks, config)
-        value = step(value, mean(ravel_pytree(gradients)[0], after=arrived))
-        of_policy = jax.grad(policy_loss, has_aux=True)
-        gradients, metrics = of_policy(policy.params, *given, advantages, key, networks, config)
-        gradient = ravel_pytree(gradients)[0]
-        if overlap:
-            late = jnp.array(True), gradient
-        else:
-            policy = step(policy, mean(gradient))
-        return (policy, value, late), jnp.append(error, metrics)
+        value_gradient, error, advantages = of_value(value, given)
+        policy_gradient, metrics = of_policy(policy, given, advantages, key)
+        mean = jax.lax.pmean(jnp.concatenate([policy_gradient, value_gradient]), axis)
+        policy, value = step(policy, mean[: len(policy_gradient)]), step(value, mean[len(policy_gradient) :])
+        return (policy, value), jnp.append(error, metrics)
 
-    nothing = (jnp.array(False), jnp.zeros_like(ravel_pytree(policy.params)[0])) if overlap else None
-    inputs = order, jax.random.split(key, len(order))
-    (policy, value, late), metrics = jax.lax.scan(update, (policy, value, nothing), inputs)
-    if overlap:
-        policy = step(policy, mean(late[1]))  # type: ignore[index]
-    return policy, value, metrics.mean(axis=0)
+    def in_turn(carry: Any, inputs: Any) -> Any:
+        policy, value, gradient = carry
+        chosen, key, first = inputs
+        given = statistics, unrolls.unpacked(rows[chosen])
+        mean = jax.lax.pmean(gradient, axis)
+        stepped = step(policy, mean)
+        norm = optax.global_norm(mean)  # as it is clipped by
+        policy = jax.tree.map(lambda old, new: jnp.where(first, old, new), policy, stepped)
+        policy = jax.lax.optimization_barrier(policy)  # the mean is needed no more
+        gradient, error, advantages = of_value(value, given)
+        # NCCL must not be given two messages at once: with the first one's norm in it, this one comes after it.
+        mean = jax.lax.pmean(jnp.append(gradient, norm), axis)[:-1]
+        gradient, metrics = of_policy(policy, given, advantages, key)
+        return (policy, step(value, mean), gradient), jnp.append(error, metrics)
+
+    inputs = order, jax.random.split(key, len(order)), jnp.arange(len(order)) == 0
+    if not staggered:
+        (policy, value), metrics = jax.lax.scan(at_once, (policy, value), inputs)
+        return policy, value, metrics.mean(axis=0)
+    none = jnp.zeros_like(ravel_pytree(policy.params)[0])
+    (policy, value, gradient), metrics = jax.lax.scan(in_turn, (policy, value, none), inputs)
+    return step(policy, jax.lax.pmean(gradient, axis)), value, metrics.mean(axis=0)

@@ -1,0 +1,121 @@
+"""PPO's updates of policy and value, over devices that JAX makes of one."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from mimic.trainers import learning, ppo, prepared, updates
+from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo_loss import Unrolls, policy_loss, value_loss
+
+DEVICES, UNROLLS, TIME, UPDATES, MINIBATCH = 2, 6, 3, 5, 4
+SIZES = OBSERVED, ACTIONS = 5, 2
+
+
+@dataclasses.dataclass
+class Case:
+    """What there is to learn from, and with what; of each array the first axis is the devices."""
+
+    config: PPOConfig
+    unrolls: Unrolls
+    order: jax.Array
+    keys: jax.Array
+
+    def __post_init__(self):
+        self.networks = ppo.make_networks(self.config, *SIZES)
+        self.statistics, *self.params = learning.initial_params(self.networks, OBSERVED, jax.random.PRNGKey(1))
+        self.optimizer = optax.chain(optax.clip_by_global_norm(self.config.max_grad_norm), optax.adam(0.01))
+
+    def on_device(self, staggered, unrolls, order, key):
+        """By mimic: policy, value, metrics."""
+        policy, value = (updates.begin(params, self.optimizer) for params in self.params)
+        given = self.statistics, unrolls, order, key, self.networks, self.config, self.optimizer
+        return updates.updated(policy, value, *given, axis="devices", staggered=staggered)
+
+    def expected(self):
+        """One update after the other, array by array, the means over the devices by hand."""
+        params = list(self.params)
+        states = [self.optimizer.init(network) for network in params]
+        metrics = []
+        keys = jnp.stack([jax.random.split(key, UPDATES) for key in self.keys])
+        for i in range(UPDATES):
+            gradients, shown = [], []
+            for device in range(DEVICES):
+                minibatch = jax.tree.map(lambda x, at=self.order[device, i], device=device: x[device][at], self.unrolls)
+                given = self.statistics, minibatch
+                of = self.networks, self.config
+                (error, advantages), of_value = jax.value_and_grad(value_loss, has_aux=True)(params[1], *given, *of)
+                of_policy, of_loss = jax.grad(policy_loss, has_aux=True)(
+                    params[0], *given, advantages, keys[device, i], *of
+                )
+                gradients.append((of_policy, of_value))
+                shown.append(jnp.append(error, of_loss))
+            metrics.append(shown)
+            for j, mean in enumerate(jax.tree.map(lambda *x: sum(x) / DEVICES, *gradients)):
+                change, states[j] = self.optimizer.update(mean, states[j])
+                params[j] = optax.apply_updates(params[j], change)
+        return params, np.mean(metrics, axis=0)
+
+
+@pytest.fixture
+def case(x64):
+    rng = np.random.default_rng(0)
+
+    def normal(*shape):
+        return jnp.asarray(rng.normal(size=(DEVICES, UNROLLS, TIME + 1, *shape)))
+
+    goes_on = jnp.asarray(rng.random((DEVICES, UNROLLS, TIME + 1)) < 0.8, float)
+    unrolls = Unrolls(normal(OBSERVED), normal(ACTIONS), normal() - 3, normal(), goes_on)
+    order = jnp.asarray([[rng.permutation(UNROLLS)[:MINIBATCH] for _ in range(UPDATES)] for _ in range(DEVICES)])
+    config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), max_grad_norm=0.3)
+    return Case(config, unrolls, order, jax.random.split(jax.random.PRNGKey(2), DEVICES))
+
+
+@pytest.mark.parametrize("staggered", [False, True])
+def test_updates_are_those_of_each_minibatch_in_turn(case, staggered):
+    on_all = jax.jit(jax.vmap(functools.partial(case.on_device, staggered), axis_name="devices"))
+    *learners, metrics = on_all(case.unrolls, case.order, case.keys)
+    params, expected_metrics = case.expected()
+    np.testing.assert_allclose(metrics, expected_metrics, rtol=1e-6, atol=1e-9)
+    for learner, expected, before in zip(learners, params, case.params, strict=True):
+        for found, wanted, old in zip(*map(jax.tree.leaves, (learner.params, expected, before)), strict=True):
+            np.testing.assert_array_equal(found[0], found[1])  # on both devices
+            np.testing.assert_allclose(found[0], wanted, rtol=1e-6, atol=1e-9)
+            assert not np.array_equal(wanted, old)
+        assert set(np.ravel(learner.optimizer[1][0].count)) == {UPDATES}
+
+
+def test_a_second_message_waits_for_the_first(case):
+    """Else NCCL could get both at once, on each GPU in an order of its own."""
+    of_one = jax.tree.map(lambda x: x[0], (case.unrolls, case.order, case.keys))
+    on_one = functools.partial(case.on_device, True)
+    program = jax.make_jaxpr(on_one, axis_env=[("devices", DEVICES)])(*of_one).jaxpr
+    (loop,) = (e for e in program.eqns if e.primitive.name == "scan" and e.params["length"] == UPDATES)
+    body = loop.params["jaxpr"].jaxpr
+    messages = [equation for equation in body.eqns if equation.primitive.name.startswith("psum")]
+    assert len(messages) == 2
+    after = set(messages[0].outvars)
+    for equation in body.eqns:
+        if after.intersection(v for v in equation.invars if not hasattr(v, "val")):
+            after.update(equation.outvars)
+    assert messages[1].outvars[0] in after
+
+
+@pytest.mark.parametrize(
+    ("backend", "processes", "devices", "expected"),
+    [("gpu", 4, 4, True), ("gpu", 1, 4, False), ("gpu", 1, 1, False), ("gpu", 2, 8, False), ("cpu", 2, 2, False)],
+)
+def test_messages_go_beside_computation_where_each_gpu_has_a_process(
+    monkeypatch, backend, processes, devices, expected
+):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(jax, "process_count", lambda: processes)
+    monkeypatch.setattr(jax, "device_count", lambda: devices)
+    assert prepared.a_process_for_each_gpu() == expected
+    given = prepared.compiler_options().get("xla_gpu_enable_command_buffer", "")
+    assert ("COLLECTIVES" in given) == expected
