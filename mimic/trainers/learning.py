@@ -82,7 +82,7 @@ def make_programs(
       What begins, of a seed; and what learns, which gives the means of the loss's metrics too.
     """
     mesh = Mesh(np.array(jax.devices()), (_AXIS,))
-    optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(learning_rate))
+    optimizer = optax.adam(learning_rate)
     same, shared = PartitionSpec(), PartitionSpec(_AXIS)
     learning = Learning(same, same, same, shared, same, same)  # type: ignore[arg-type]
 
