@@ -32,11 +32,11 @@ class Case:
         self.statistics, *self.params = learning.initial_params(self.networks, OBSERVED, jax.random.PRNGKey(1))
         self.optimizer = optax.adam(0.01)
 
-    def on_device(self, staggered, unrolls, order, key):
+    def on_device(self, staggered, unroll, unrolls, order, key):
         """By mimic: policy, value, metrics."""
         policy, value = (updates.begin(params, self.optimizer) for params in self.params)
         given = self.statistics, unrolls, order, key, self.networks, self.config, self.optimizer
-        return updates.updated(policy, value, *given, axis="devices", staggered=staggered)
+        return updates.updated(policy, value, *given, axis="devices", staggered=staggered, unroll=unroll)
 
     def expected(self):
         """One update after the other, array by array, the means over the devices by hand."""
@@ -80,9 +80,9 @@ def case(x64):
     return Case(config, unrolls, order, jax.random.split(jax.random.PRNGKey(2), DEVICES))
 
 
-@pytest.mark.parametrize("staggered", [False, True])
-def test_updates_are_those_of_each_minibatch_in_turn(case, staggered):
-    on_all = jax.jit(jax.vmap(functools.partial(case.on_device, staggered), axis_name="devices"))
+@pytest.mark.parametrize(("staggered", "unroll"), [(False, 1), (True, 1), (True, 2)])
+def test_updates_are_those_of_each_minibatch_in_turn(case, staggered, unroll):
+    on_all = jax.jit(jax.vmap(functools.partial(case.on_device, staggered, unroll), axis_name="devices"))
     *learners, metrics = on_all(case.unrolls, case.order, case.keys)
     params, expected_metrics = case.expected()
     np.testing.assert_allclose(metrics, expected_metrics, rtol=1e-5, atol=1e-7)
@@ -94,20 +94,26 @@ def test_updates_are_those_of_each_minibatch_in_turn(case, staggered):
         assert set(np.ravel(learner.optimizer[0].count)) == {UPDATES}
 
 
-def test_a_second_message_waits_for_the_first(case):
-    """Else NCCL could get both at once, on each GPU in an order of its own."""
+def test_each_message_waits_for_the_one_before(case):
+    """Else NCCL could get two at once, on each GPU in an order of its own."""
     of_one = jax.tree.map(lambda x: x[0], (case.unrolls, case.order, case.keys))
-    on_one = functools.partial(case.on_device, True)
+    on_one = functools.partial(case.on_device, True, 1)
     program = jax.make_jaxpr(on_one, axis_env=[("devices", DEVICES)])(*of_one).jaxpr
     (loop,) = (e for e in program.eqns if e.primitive.name == "scan" and e.params["length"] == UPDATES)
     body = loop.params["jaxpr"].jaxpr
-    messages = [equation for equation in body.eqns if equation.primitive.name.startswith("psum")]
-    assert len(messages) == 2
-    after = set(messages[0].outvars)
-    for equation in body.eqns:
-        if after.intersection(v for v in equation.invars if not hasattr(v, "val")):
-            after.update(equation.outvars)
-    assert messages[1].outvars[0] in after
+    first, second = (e for e in body.eqns if e.primitive.name.startswith("psum"))
+    assert second.outvars[0] in _made_of(first.outvars, body)
+    carried = body.invars[loop.params["num_consts"] :]
+    sent = carried.index(first.invars[0])  # in the next update
+    assert body.outvars[sent] in _made_of(second.outvars, body)
+
+
+def _made_of(variables, program):
+    made = set(variables)
+    for equation in program.eqns:
+        if made.intersection(v for v in equation.invars if not hasattr(v, "val")):
+            made.update(equation.outvars)
+    return made
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,7 @@ def updated(
     optimizer: optax.GradientTransformation,
     axis: str,
     staggered: bool,
+    unroll: int,
 ) -> tuple[Learner, Learner, Float[Array, " metrics"]]:
     """Policy and value after an update by each minibatch, and the means of `METRICS` on this device.
 
@@ -66,6 +67,7 @@ def updated(
       staggered: whether the policy takes its step when the value has begun with the next minibatch. Each waits for the
         mean of its gradients over the devices while the other computes, and what they learn is the same. Else both take
         their steps at once, after one message.
+      unroll: updates in each pass of the compiled loop.
     """
     rows = unrolls.packed()
 
@@ -96,31 +98,33 @@ def updated(
         learners = step(policy, policy_mean, _norm(mean)), step(value, value_mean, _norm(value_mean))
         return learners, jnp.append(error, metrics)
 
+    # NCCL must not be given two messages at once: each has the norm in it that comes of the one before.
     def in_turn(carry: Any, inputs: Any) -> Any:
-        policy, value, gradient, value_norm = carry
+        policy, value, message = carry
         chosen, key, first = inputs
         given = statistics, unrolls.unpacked(rows[chosen])
-        mean = jax.lax.pmean(gradient, axis)
-        norm = _norm(mean)
-        stepped = step(policy, mean, jnp.hypot(norm, value_norm))
+        stepped, norm = policy_step(policy, message)
         policy = jax.tree.map(lambda old, new: jnp.where(first, old, new), policy, stepped)
-        policy = jax.lax.optimization_barrier(policy)  # the mean is needed no more
+        policy = jax.lax.optimization_barrier(policy)  # the message is needed no more
         gradient, error, advantages = of_value(value, given)
-        # NCCL must not be given two messages at once: with the first one's norm in it, this one comes after it.
+        advantages += 0 * gradient[0]  # after the gradient: beside its message the policy's is computed
         mean = jax.lax.pmean(jnp.append(gradient, norm), axis)[:-1]
         value_norm = _norm(mean)
         gradient, metrics = of_policy(policy, given, advantages, key)
-        return (policy, step(value, mean, value_norm), gradient, value_norm), jnp.append(error, metrics)
+        return (policy, step(value, mean, value_norm), jnp.append(gradient, value_norm)), jnp.append(error, metrics)
+
+    def policy_step(policy: Learner, message: Array) -> tuple[Learner, Array]:
+        mean = jax.lax.pmean(message, axis)
+        norm = _norm(mean[:-1])
+        return step(policy, mean[:-1], jnp.hypot(norm, mean[-1])), norm
 
     inputs = order, jax.random.split(key, len(order)), jnp.arange(len(order)) == 0
     if not staggered:
-        (policy, value), metrics = jax.lax.scan(at_once, (policy, value), inputs)
+        (policy, value), metrics = jax.lax.scan(at_once, (policy, value), inputs, unroll=unroll)
         return policy, value, metrics.mean(axis=0)
-    none = jnp.zeros_like(ravel_pytree(policy.params)[0])
-    start = policy, value, none, _norm(none)
-    (policy, value, gradient, value_norm), metrics = jax.lax.scan(in_turn, start, inputs)
-    mean = jax.lax.pmean(gradient, axis)
-    return step(policy, mean, jnp.hypot(_norm(mean), value_norm)), value, metrics.mean(axis=0)
+    nothing = jnp.zeros_like(jnp.append(ravel_pytree(policy.params)[0], 0))
+    (policy, value, message), metrics = jax.lax.scan(in_turn, (policy, value, nothing), inputs, unroll=unroll)
+    return policy_step(policy, message)[0], value, metrics.mean(axis=0)
 
 
 def _norm(vector: Array) -> Array:
