@@ -152,7 +152,8 @@ def _learn(
     make_policy = ppo_networks.make_inference_fn(networks)
     rounds = config.batch_size * config.num_minibatches // config.num_envs  # type: ignore[operator]
     minibatch = config.batch_size // devices  # type: ignore[operator]
-    in_a_graph = _UPDATES_IN_A_GRAPH if jax.default_backend() == "gpu" else 1
+    # A GPU pauses between CUDA graphs, each a pass of a loop. With one GPU alone, more to compile takes what it saves.
+    updates_in_a_pass = 2 if devices > 1 else 1
 
     def unroll(learning: Learning, key: Array) -> tuple[Learning, Unrolls]:
         """Steps of all arms, [time + 1, arms, ...]."""
@@ -183,7 +184,7 @@ def _learn(
         order = jax.vmap(lambda key: jax.random.permutation(key, count))(passes).reshape(-1, minibatch)
         policy, value, metrics = updates.updated(
             learning.policy, learning.value, statistics, unrolls, order, key_loss, networks, config, optimizer,
-            _AXIS, staggered=a_process_for_each_gpu(), unroll=in_a_graph,
+            _AXIS, staggered=a_process_for_each_gpu(), unroll=updates_in_a_pass,
         )  # fmt: skip
         learning = learning.replace(policy=policy, value=value, statistics=statistics, key=key)  # type: ignore[attr-defined]
         return learning, metrics
