@@ -11,14 +11,10 @@ noise of the seeds.
 """
 
 import argparse
-import contextlib
 import csv
 import itertools
 import os
-import socket
 import statistics
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -57,41 +53,15 @@ def arguments(kind: str, devices: int, of_one: dict[str, int]) -> list[str]:
     return [f"trainer.{key}={factor * value}" for key, value in of_one.items()]
 
 
-def environment(devices: range, backend: str) -> dict[str, str]:
-    """Of a process that sees these devices."""
+def environment(devices: int, processes: int, backend: str) -> dict[str, str]:
+    """Of a run that sees so many devices, or so many in all its processes where XLA makes them of the processor."""
     inherited = {key: value for key, value in os.environ.items() if key != _PREALLOCATE}
     if backend == "gpu":
         visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-        names = visible.split(",") if visible else [str(index) for index in range(devices.stop)]
-        return {**inherited, "CUDA_VISIBLE_DEVICES": ",".join(names[devices.start : devices.stop])}
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={len(devices)}"
+        names = visible.split(",") if visible else [str(index) for index in range(devices)]
+        return {**inherited, "CUDA_VISIBLE_DEVICES": ",".join(names[:devices])}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices // processes}"
     return {**inherited, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags.strip()}
-
-
-@contextlib.contextmanager
-def together(run_dir: Path, given: Sequence[str], processes: int, backend: str) -> Iterator[list[str]]:
-    """All processes of a training but the first, each with its device; yields the first one's further arguments."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    common = [f"distributed.coordinator=127.0.0.1:{port}", f"distributed.processes={processes}"]
-    command = [sys.executable, "-m", "mimic.train", *given, f"run_dir={run_dir}", "compilation_cache=", *common]
-    others = [
-        subprocess.Popen(
-            [*command, f"distributed.process={index}"],
-            env=environment(range(index, index + 1), backend),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for index in range(1, processes)
-    ]
-    try:
-        yield [*common, "distributed.process=0"]
-        for other in others:
-            other.wait()  # they end with the first
-    finally:
-        for other in others:
-            other.kill()
 
 
 def speed(metrics: Path) -> dict[str, float]:
@@ -110,11 +80,8 @@ def measure(
     backend = jax.default_backend()
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        if processes == 1:
-            result = train(run_dir, given, environment=environment(range(devices), backend))
-        else:
-            with together(run_dir, given, processes, backend) as joined:
-                result = train(run_dir, [*given, *joined], environment=environment(range(1), backend))
+        here = ["distributed.coordinator=local", f"distributed.processes={processes}"] if processes > 1 else []
+        result = train(run_dir, [*given, *here], environment=environment(devices, processes, backend))
         rates = speed(run_dir / runs.METRICS)
     report = result["report"]
     return {

@@ -1,5 +1,6 @@
 """Training over several processes: one run directory, and none is left behind however it ends."""
 
+import contextlib
 import json
 import os
 import pathlib
@@ -14,10 +15,13 @@ import pytest
 from omegaconf import OmegaConf
 from tiny import TINY
 
+from mimic.trainers import group
 from mimic.trainers.group import DistributedConfig
+from mimic.trainers.local_processes import LocalProcesses
 from mimic.trainers.runs import run_schema
 
 FUSED = [*TINY, "env.physics=fused"]
+LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with many checkpoints
 
 
 def start(tmp_path, *arguments, slurm=False):
@@ -76,6 +80,101 @@ def test_slurm_tells_all_that_is_needed(tmp_path):
     assert json.loads((tmp_path / "run" / "report.json").read_text())["hardware"]["processes"] == 2
 
 
+def alone(tmp_path, *arguments):
+    """One command, that starts the other process by itself."""
+    command = [sys.executable, "-m", "mimic.train", *FUSED, "distributed.coordinator=local", *arguments]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, cwd=tmp_path
+    )
+
+
+def wait_for_checkpoint(tmp_path, processes):
+    until = time.monotonic() + 200
+    while time.monotonic() < until and not list(tmp_path.glob("run/checkpoints/0*[1-9]*")):
+        assert all(process.poll() is None for process in processes)
+        time.sleep(0.2)
+
+
+def started_by(process):
+    """Numbers of the processes that it started and that are there."""
+    children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [int(child) for child in children]
+
+
+def there(process):
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(process, 0)
+        return True
+    return False
+
+
+@pytest.mark.slow
+def test_one_command_starts_all_processes_of_a_host(tmp_path):
+    ((code, shown),) = finish([alone(tmp_path, "distributed.processes=2", "run_dir=run")])
+    assert code == 0, shown[-2000:]
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert (report["hardware"]["devices"], report["hardware"]["processes"]) == (2, 2)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_all_that_one_command_started(tmp_path):
+    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
+    wait_for_checkpoint(tmp_path, [process])
+    (other,) = started_by(process)
+    process.send_signal(signal.SIGINT)
+    ((code, shown),) = finish([process])
+    assert code == 128 + signal.SIGINT, shown[-2000:]
+    assert shown.count("stopping at the next checkpoint") == 1 and "resume=run" in shown
+    assert not there(other)
+
+
+@pytest.mark.slow
+def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path):
+    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
+    wait_for_checkpoint(tmp_path, [process])
+    (other,) = started_by(process)
+    os.kill(other, signal.SIGKILL)
+    lost = time.monotonic()
+    ((code, shown),) = finish([process])
+    assert code == 1 and "error: process 1 of the training failed" in shown, shown[-2000:]
+    assert time.monotonic() - lost < 20
+
+
+def test_other_processes_are_told_who_they_are(monkeypatch):
+    """Each has this command and its number, and is killed if it does not end; what it says is kept."""
+    program = "import os, sys; print(os.environ['JAX_LOCAL_DEVICE_IDS'], *sys.argv[1:], file=sys.stderr)"
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-c", program, "seed=1"])
+    others = LocalProcesses(3)
+    others.end()
+    for index in (1, 2):
+        number, *given = others.said(index).split()
+        found = [f"coordinator={others.address}", "processes=3", f"process={index}"]
+        assert (number, given) == (str(index), ["seed=1", *(f"distributed.{setting}" for setting in found)])
+
+
+@pytest.mark.parametrize(
+    ("asked", "gpus", "platforms", "expected"),
+    [
+        (None, 4, "", 4),
+        (2, 4, "", 2),
+        (2, 0, "", 2),
+        (8, 4, "cpu", 8),
+        (8, 4, "", "expected at most 4"),
+        (None, 0, "", "expected a number"),
+    ],
+)
+def test_there_is_a_gpu_for_each_process_of_a_host(monkeypatch, asked, gpus, platforms, expected):
+    monkeypatch.setattr(group, "gpus", lambda: gpus)
+    monkeypatch.setenv("JAX_PLATFORMS", platforms)
+    if isinstance(expected, int):
+        assert group.processes_here(asked) == expected
+    else:
+        with pytest.raises(ValueError, match=f"distributed.processes: {expected}"):
+            group.processes_here(asked)
+
+
 @pytest.mark.slow
 def test_the_other_processes_end_with_the_first_where_it_is_good_enough(tmp_path):
     (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run", "trainer.target_gap=100"))
@@ -85,12 +184,8 @@ def test_the_other_processes_end_with_the_first_where_it_is_good_enough(tmp_path
 
 @pytest.mark.slow
 def test_a_signal_to_one_process_stops_all_after_a_checkpoint(tmp_path):
-    longer = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"
-    processes = start(tmp_path, "run_dir=run", *longer)
-    until = time.monotonic() + 200
-    while time.monotonic() < until and not list(tmp_path.glob("run/checkpoints/0*[1-9]*")):
-        assert all(process.poll() is None for process in processes)
-        time.sleep(0.2)
+    processes = start(tmp_path, "run_dir=run", *LONG)
+    wait_for_checkpoint(tmp_path, processes)
     processes[1].send_signal(signal.SIGTERM)
     (first, shown), (second, _) = finish(processes)
     assert (first, second) == (128 + signal.SIGTERM, 128 + signal.SIGTERM), shown[-2000:]
@@ -119,13 +214,15 @@ def test_the_page_shows_settings_that_exist():
 @pytest.mark.parametrize(
     "settings, reason",
     [
-        ({"coordinator": "host"}, "expected HOST:PORT or auto, got 'host'"),
+        ({"coordinator": "host"}, "expected HOST:PORT, auto or local, got 'host'"),
         ({"coordinator": "host:1", "processes": 2}, "distributed.process: expected a number"),
         ({"coordinator": "host:1", "process": 0}, "distributed.processes: expected a number"),
         ({"coordinator": "host:1", "processes": 2, "process": 2}, "distributed.process: expected 0 to 1, got 2"),
         ({"coordinator": "host:1", "processes": 0, "process": 0}, "distributed.processes: expected at least 1, got 0"),
         ({"process": 1}, "distributed.process: expected with distributed.coordinator=HOST:PORT alone, got 1"),
         ({"coordinator": "auto", "processes": 2}, "distributed.processes: expected with"),
+        ({"coordinator": "local", "processes": 2, "process": 0}, "distributed.process: expected with"),
+        ({"coordinator": "local", "processes": 0}, "distributed.processes: expected at least 1, got 0"),
     ],
 )
 def test_nonsense_is_refused(settings, reason):

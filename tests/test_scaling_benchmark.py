@@ -23,14 +23,15 @@ def test_weak_scaling_multiplies_and_strong_scaling_does_not():
     assert scaling.arguments("strong", 4, OF_ONE) == scaling.arguments("weak", 1, OF_ONE)
 
 
-def test_a_process_sees_so_many_devices(monkeypatch):
+def test_a_run_sees_so_many_devices(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--of-the-user")
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    assert scaling.environment(range(2), "gpu")["CUDA_VISIBLE_DEVICES"] == "0,1"
-    assert scaling.environment(range(2), "cpu")["XLA_FLAGS"] == "--of-the-user --xla_force_host_platform_device_count=2"
+    assert scaling.environment(2, 1, "gpu")["CUDA_VISIBLE_DEVICES"] == "0,1"
+    made = "--of-the-user --xla_force_host_platform_device_count"
+    assert scaling.environment(2, 1, "cpu")["XLA_FLAGS"] == f"{made}=2"
+    assert scaling.environment(2, 2, "cpu")["XLA_FLAGS"] == f"{made}=1"
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5,7")
-    assert scaling.environment(range(2), "gpu")["CUDA_VISIBLE_DEVICES"] == "3,5"
-    assert scaling.environment(range(2, 3), "gpu")["CUDA_VISIBLE_DEVICES"] == "7"
+    assert scaling.environment(2, 2, "gpu")["CUDA_VISIBLE_DEVICES"] == "3,5"
 
 
 def test_the_speed_leaves_out_what_compiled(tmp_path):

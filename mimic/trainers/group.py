@@ -16,9 +16,10 @@ import threading
 import jax
 
 from mimic import compat
+from mimic.trainers.local_processes import LocalProcesses, gpus
 from mimic.trainers.signals import STOPPED_BY_SIGNAL, Signals
 
-AUTO = "auto"
+AUTO, LOCAL = "auto", "local"
 _ENDED, _SIGNAL = "mimic/ended", "mimic/signal"  # keys of the coordination service
 _LOOK_S = 0.5
 _LEAVE_S = 60  # the last process to leave is waited for this long
@@ -31,8 +32,8 @@ class DistributedConfig:
 
     Attributes:
       coordinator: HOST:PORT of the first process, where all find each other; "auto" under Slurm and Open MPI, which
-        tell everything; one process alone where empty.
-      processes: how many.
+        tell everything; "local" for processes on this host, which the first starts; one process alone where empty.
+      processes: how many; with "local" one for each GPU where None.
       process: number of this one; the first, 0, evaluates and writes the run directory.
     """
 
@@ -42,21 +43,22 @@ class DistributedConfig:
 
     def __post_init__(self) -> None:
         given = {"processes": self.processes, "process": self.process}
-        if self.coordinator in ("", AUTO):
-            for key, value in given.items():
-                if value is not None:
-                    raise ValueError(
-                        f"distributed.{key}: expected with distributed.coordinator=HOST:PORT alone, got {value} with "
-                        f"distributed.coordinator={self.coordinator!r}"
-                    )
+        takes = {"": (), AUTO: (), LOCAL: ("processes",)}.get(self.coordinator, tuple(given))
+        for key, value in given.items():
+            if value is not None and key not in takes:
+                raise ValueError(
+                    f"distributed.{key}: expected with distributed.coordinator=HOST:PORT alone, got {value} with "
+                    f"distributed.coordinator={self.coordinator!r}"
+                )
+        if self.processes is not None and self.processes < 1:
+            raise ValueError(f"distributed.processes: expected at least 1, got {self.processes}")
+        if self.coordinator in ("", AUTO, LOCAL):
             return
         if not re.fullmatch(r"\S+:\d+", self.coordinator):
-            raise ValueError(f"distributed.coordinator: expected HOST:PORT or auto, got {self.coordinator!r}")
+            raise ValueError(f"distributed.coordinator: expected HOST:PORT, auto or local, got {self.coordinator!r}")
         for key, value in given.items():
             if value is None:
                 raise ValueError(f"distributed.{key}: expected a number besides distributed.coordinator")
-        if self.processes < 1:  # type: ignore[operator]
-            raise ValueError(f"distributed.processes: expected at least 1, got {self.processes}")
         if not 0 <= self.process < self.processes:  # type: ignore[operator]
             raise ValueError(f"distributed.process: expected 0 to {self.processes - 1}, got {self.process}")  # type: ignore[operator]
 
@@ -69,8 +71,15 @@ class Group:
       signals: what this process was sent; the first process gets the others' too.
     """
 
-    def __init__(self, index: int):
+    def __init__(self, index: int, others: LocalProcesses | None = None):
+        """Watches over the others.
+
+        Args:
+          index: number of this process.
+          others: those that this process started.
+        """
         self.index = index
+        self._others = others
         self.signals = Signals()
         self._client = compat.coordination_client()
         self._left = threading.Event()
@@ -89,6 +98,7 @@ class Group:
             return
         self._left.set()
         self._watcher.join()
+        self._end_if_one_is_lost()
         with contextlib.suppress(jax.errors.JaxRuntimeError):  # another process was faster
             self._client.key_value_set(_ENDED, f"{self.index} {exit_code}")
         _leave()
@@ -107,14 +117,28 @@ class Group:
                 with contextlib.suppress(jax.errors.JaxRuntimeError):
                     self._client.key_value_set(_SIGNAL, str(self.signals.caught[0]))
                 told = True
+            # The main thread may wait in a program that will never end.
             if ended := self._read(_ENDED):
                 process, exit_code = map(int, ended.split())
                 if 0 < exit_code < STOPPED_BY_SIGNAL:
-                    print(f"error: process {process} of the training failed", file=sys.stderr)
+                    self._report(process)
                 _leave()
-                for stream in (sys.stdout, sys.stderr):
-                    stream.flush()
-                os._exit(exit_code)  # the main thread may wait in a program that will never end
+                if self._others:
+                    self._others.end()
+                _exit(exit_code)
+            self._end_if_one_is_lost()
+
+    def _end_if_one_is_lost(self) -> None:
+        """Of those that this process started: JAX would wait for it."""
+        if self._others and (gone := self._others.gone()):
+            self._report(gone)
+            self._others.end(patience_s=0)
+            _exit(_FAILED)
+
+    def _report(self, failed: int) -> None:
+        """Says which process failed, or what it said of it itself."""
+        said = self._others.said(failed) if self._others and failed else ""
+        print(said or f"error: process {failed} of the training failed", file=sys.stderr)
 
     def _read(self, key: str) -> str:
         """What the processes were told; nothing where they were not."""
@@ -133,13 +157,43 @@ def join(config: DistributedConfig) -> Group | None:
     if not config.coordinator:
         return None
     jax.config.update("jax_enable_preemption_service", False)  # would take SIGTERM, which is ours
-    address = None if config.coordinator == AUTO else config.coordinator
+    address, count, index, devices = config.coordinator, config.processes, config.process, None
+    others = None
+    if address == LOCAL:
+        others = LocalProcesses(count := processes_here(count))
+        address, index, devices = others.address, 0, [0]
     try:
-        jax.distributed.initialize(address, config.processes, config.process, shutdown_timeout_seconds=_LEAVE_S)
+        jax.distributed.initialize(
+            None if address == AUTO else address,
+            count,
+            index,
+            local_device_ids=devices,
+            shutdown_timeout_seconds=_LEAVE_S,
+        )
     except (RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"distributed.coordinator={config.coordinator}: no processes found: {reason}") from error
-    return Group(compat.process_number())
+    return Group(compat.process_number(), others)
+
+
+def processes_here(asked: int | None) -> int:
+    """How many processes train on this host, with a GPU for each where there are GPUs.
+
+    Raises:
+      ValueError: more than there are GPUs, or neither GPUs nor a number.
+    """
+    available = 0 if os.environ.get("JAX_PLATFORMS") == "cpu" else gpus()
+    if not (asked or available):
+        raise ValueError("distributed.processes: expected a number with distributed.coordinator=local without GPUs")
+    if available and asked and asked > available:
+        raise ValueError(f"distributed.processes: expected at most {available}, a GPU for each, got {asked}")
+    return asked or available
+
+
+def _exit(exit_code: int) -> None:
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(exit_code)
 
 
 def _leave() -> None:
