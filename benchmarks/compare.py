@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 # Numbers that say which row it is, besides all text in it; everything else is a figure.
-_NAMES = ("size", "arms", "links", "batch", "joints", "devices", "substeps", "horizon", "starts", "count")
+_NAMES = ("size", "arms", "links", "batch", "joints", "devices", "processes", "substeps", "horizon", "starts", "count")
 _MADE_ON = ("hardware", "versions", "date", "commit", "note", "arguments")
 # Times and rates of one measurement share its spread.
 _TIMED = ("median_s", "median_ms", "steps_per_s", "pairs_per_s", "poses_per_s")

@@ -29,6 +29,11 @@ def test_seeds_are_one_figure_with_their_standard_deviation():
     assert figures(_results(rows=rows)) == {"rows / x / gap": Figure(2.0, 1.0)}
 
 
+def test_one_process_is_not_a_process_for_each_device():
+    rows = [{"devices": 2, "processes": processes, "rate": 1.0 * processes} for processes in (1, 2)]
+    assert set(figures(_results(rows=rows)).values()) == {Figure(1.0, 0.0), Figure(2.0, 0.0)}
+
+
 @pytest.mark.parametrize(
     "before, after, is_moved",
     [
