@@ -17,7 +17,7 @@ from tiny import TINY
 
 from mimic.trainers import group
 from mimic.trainers.group import DistributedConfig
-from mimic.trainers.local_processes import LocalProcesses
+from mimic.trainers.local_processes import LocalProcesses, Told, told
 from mimic.trainers.runs import run_schema
 
 FUSED = [*TINY, "env.physics=fused"]
@@ -97,9 +97,10 @@ def wait_for_checkpoint(tmp_path, processes):
 
 
 def started_by(process):
-    """Numbers of the processes that it started and that are there."""
+    """Numbers of the other processes of the training that it started and that are there."""
     children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    return [int(child) for child in children]
+    told = {child: pathlib.Path(f"/proc/{child}/environ") for child in children}
+    return [int(child) for child, given in told.items() if given.exists() and b"MIMIC_LOCAL" in given.read_bytes()]
 
 
 def there(process):
@@ -131,9 +132,14 @@ def test_ctrl_c_ends_all_that_one_command_started(tmp_path):
 
 
 @pytest.mark.slow
-def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path):
+@pytest.mark.parametrize("early", [False, True])
+def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path, early):
+    """Early: before they have found each other."""
     process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
-    wait_for_checkpoint(tmp_path, [process])
+    if not early:
+        wait_for_checkpoint(tmp_path, [process])
+    while not started_by(process):
+        time.sleep(0.1)
     (other,) = started_by(process)
     os.kill(other, signal.SIGKILL)
     lost = time.monotonic()
@@ -142,16 +148,43 @@ def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path):
     assert time.monotonic() - lost < 20
 
 
+@pytest.mark.slow
+def test_what_both_processes_refuse_is_one_line(tmp_path):
+    process = alone(tmp_path, "distributed.processes=3", "run_dir=run")
+    ((code, shown),) = finish([process])
+    assert code == 2 and shown.count("expected a multiple of") == 1, shown
+
+
 def test_other_processes_are_told_who_they_are(monkeypatch):
-    """Each has this command and its number, and is killed if it does not end; what it says is kept."""
-    program = "import os, sys; print(os.environ['JAX_LOCAL_DEVICE_IDS'], *sys.argv[1:], file=sys.stderr)"
-    monkeypatch.setattr(sys, "orig_argv", ["python", "-c", program, "seed=1"])
+    """Each is the same command; what it says last is kept, and it is killed if it does not end."""
+    program = "import sys; from mimic.trainers.local_processes import told; this = told();"
+    program += " print('x' * 3000, this, file=sys.stderr)"
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-c", program])
     others = LocalProcesses(3)
-    others.end()
+    assert others.lost_at_start() is None
+    others.end(patience_s=60)
     for index in (1, 2):
-        number, *given = others.said(index).split()
-        found = [f"coordinator={others.address}", "processes=3", f"process={index}"]
-        assert (number, given) == (str(index), ["seed=1", *(f"distributed.{setting}" for setting in found)])
+        said = others.said(index)
+        assert said.startswith("xx") and len(said) <= 2000
+        assert said.endswith(str(Told(others.address, 3, index, os.getpid())))
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-c", "import time; time.sleep(100)"])
+    others = LocalProcesses(3)
+    assert others.gone() is None
+    others.end(patience_s=0)
+    assert others.gone() == others.lost_at_start() == 1
+
+
+def test_who_is_told_nothing_is_the_first(monkeypatch):
+    monkeypatch.delenv("MIMIC_LOCAL_PROCESS", raising=False)
+    assert told() is None
+
+
+def test_a_process_without_its_first_ends(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "none")  # this process goes on
+    monkeypatch.setenv("MIMIC_LOCAL_PROCESS", "127.0.0.1:1 2 1 1")
+    monkeypatch.setattr(os, "getppid", lambda: 2)
+    with pytest.raises(SystemExit):
+        told()
 
 
 @pytest.mark.parametrize(
@@ -219,9 +252,9 @@ def test_the_page_shows_settings_that_exist():
         ({"coordinator": "host:1", "process": 0}, "distributed.processes: expected a number"),
         ({"coordinator": "host:1", "processes": 2, "process": 2}, "distributed.process: expected 0 to 1, got 2"),
         ({"coordinator": "host:1", "processes": 0, "process": 0}, "distributed.processes: expected at least 1, got 0"),
-        ({"process": 1}, "distributed.process: expected with distributed.coordinator=HOST:PORT alone, got 1"),
-        ({"coordinator": "auto", "processes": 2}, "distributed.processes: expected with"),
-        ({"coordinator": "local", "processes": 2, "process": 0}, "distributed.process: expected with"),
+        ({"process": 1}, "distributed.process: not expected, got 1 with distributed.coordinator=''"),
+        ({"coordinator": "auto", "processes": 2}, "distributed.processes: not expected"),
+        ({"coordinator": "local", "processes": 2, "process": 0}, "distributed.process: not expected"),
         ({"coordinator": "local", "processes": 0}, "distributed.processes: expected at least 1, got 0"),
     ],
 )

@@ -116,6 +116,8 @@ def test_each_message_waits_for_the_one_before(case, monkeypatch):
     assert len(messages) == 2 * UPDATES + 1
     for before, message in itertools.pairwise(messages):
         assert message.outvars[0] in _made_of(before.outvars, program)
+    *_, metrics = program.outvars  # whose mean is sent next
+    assert metrics in _made_of(messages[-1].outvars, program)
 
 
 def _made_of(variables, program):

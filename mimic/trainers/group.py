@@ -16,13 +16,14 @@ import threading
 import jax
 
 from mimic import compat
-from mimic.trainers.local_processes import LocalProcesses, gpus
+from mimic.trainers.local_processes import LocalProcesses, gpus, told
 from mimic.trainers.signals import STOPPED_BY_SIGNAL, Signals
 
 AUTO, LOCAL = "auto", "local"
 _ENDED, _SIGNAL = "mimic/ended", "mimic/signal"  # keys of the coordination service
 _LOOK_S = 0.5
 _LEAVE_S = 60  # the last process to leave is waited for this long
+_GRACE_S = 3  # a process may fail of what another failed of, this much later
 _FAILED = 1
 
 
@@ -47,8 +48,7 @@ class DistributedConfig:
         for key, value in given.items():
             if value is not None and key not in takes:
                 raise ValueError(
-                    f"distributed.{key}: expected with distributed.coordinator=HOST:PORT alone, got {value} with "
-                    f"distributed.coordinator={self.coordinator!r}"
+                    f"distributed.{key}: not expected, got {value} with distributed.coordinator={self.coordinator!r}"
                 )
         if self.processes is not None and self.processes < 1:
             raise ValueError(f"distributed.processes: expected at least 1, got {self.processes}")
@@ -121,7 +121,9 @@ class Group:
             if ended := self._read(_ENDED):
                 process, exit_code = map(int, ended.split())
                 if 0 < exit_code < STOPPED_BY_SIGNAL:
-                    self._report(process)
+                    if self._others and self._left.wait(_GRACE_S):
+                        return  # what failed there failed here too, and was said
+                    _report(process, self._others)
                 _leave()
                 if self._others:
                     self._others.end()
@@ -131,14 +133,9 @@ class Group:
     def _end_if_one_is_lost(self) -> None:
         """Of those that this process started: JAX would wait for it."""
         if self._others and (gone := self._others.gone()):
-            self._report(gone)
+            _report(gone, self._others)
             self._others.end(patience_s=0)
             _exit(_FAILED)
-
-    def _report(self, failed: int) -> None:
-        """Says which process failed, or what it said of it itself."""
-        said = self._others.said(failed) if self._others and failed else ""
-        print(said or f"error: process {failed} of the training failed", file=sys.stderr)
 
     def _read(self, key: str) -> str:
         """What the processes were told; nothing where they were not."""
@@ -157,18 +154,22 @@ def join(config: DistributedConfig) -> Group | None:
     if not config.coordinator:
         return None
     jax.config.update("jax_enable_preemption_service", False)  # would take SIGTERM, which is ours
-    address, count, index, devices = config.coordinator, config.processes, config.process, None
-    others = None
+    address, count, index = config.coordinator, config.processes, config.process
+    others, how = None, {}
     if address == LOCAL:
-        others = LocalProcesses(count := processes_here(count))
-        address, index, devices = others.address, 0, [0]
+        if this := told():
+            address, count, index, _ = this
+        else:
+            others = LocalProcesses(count := processes_here(count))
+            address, index = others.address, 0
+            if lost := others.lost_at_start():
+                _report(lost, others)
+                others.end(patience_s=0)
+                _exit(_FAILED)
+        how = {"local_device_ids": [index], "coordinator_bind_address": address}
     try:
         jax.distributed.initialize(
-            None if address == AUTO else address,
-            count,
-            index,
-            local_device_ids=devices,
-            shutdown_timeout_seconds=_LEAVE_S,
+            None if address == AUTO else address, count, index, shutdown_timeout_seconds=_LEAVE_S, **how
         )
     except (RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
@@ -188,6 +189,13 @@ def processes_here(asked: int | None) -> int:
     if available and asked and asked > available:
         raise ValueError(f"distributed.processes: expected at most {available}, a GPU for each, got {asked}")
     return asked or available
+
+
+def _report(failed: int, others: LocalProcesses | None) -> None:
+    """Says which process failed, and what it said of it itself."""
+    print(f"error: process {failed} of the training failed", file=sys.stderr)
+    if others and failed and (said := others.said(failed)):
+        print(said, file=sys.stderr)
 
 
 def _exit(exit_code: int) -> None:

@@ -32,9 +32,6 @@ Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, valu
 Metrics = dict[str, Array]
 
 _AXIS = "devices"
-_UPDATES_IN_A_GRAPH = (
-    2  # CUDA graph: from one to the next a GPU pauses, which takes 5 % of the time if each is an update
-)
 
 
 @struct.dataclass
@@ -42,8 +39,8 @@ class Learning:
     """What goes from one call of the program that learns to the next.
 
     Attributes:
-      policy: what it has learned.
-      value: what it has learned.
+      policy: its parameters, and the state of their optimizer.
+      value: its parameters, and the state of their optimizer.
       statistics: running mean and deviation of the observations.
       episodes: of the environments, shared out among the devices.
       expert_states: of the environment.
@@ -152,7 +149,7 @@ def _learn(
     make_policy = ppo_networks.make_inference_fn(networks)
     rounds = config.batch_size * config.num_minibatches // config.num_envs  # type: ignore[operator]
     minibatch = config.batch_size // devices  # type: ignore[operator]
-    # A GPU pauses between CUDA graphs, each a pass of a loop. With one GPU alone, more to compile takes what it saves.
+    # A GPU pauses between CUDA graphs, and none goes beyond a pass of a loop. On one GPU compiling takes what it saves.
     updates_in_a_pass = 2 if devices > 1 else 1
 
     def unroll(learning: Learning, key: Array) -> tuple[Learning, Unrolls]:

@@ -4,17 +4,38 @@ import atexit
 import contextlib
 import ctypes
 import os
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
-from typing import IO
+import time
+from typing import IO, NamedTuple
 
-_LEAVE_S = 5  # they are given this long to end by themselves
+_TOLD = "MIMIC_LOCAL_PROCESS"  # variable by which a process is told who it is
+_PATIENCE_S = 5  # they are given this long to end by themselves
+_SHOWN = 2000  # bytes of what one of them said
+_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux's prctl
+
+
+class Told(NamedTuple):
+    """What the first process tells another.
+
+    Attributes:
+      address: HOST:PORT where all find each other.
+      count: of processes.
+      index: of this one.
+      first: the first one's process number in the system.
+    """
+
+    address: str
+    count: int
+    index: int
+    first: int
 
 
 class LocalProcesses:
-    """Copies of this process, each with the GPU of its number; where there is none, with the processor.
+    """Copies of this process.
 
     Attributes:
       address: HOST:PORT where all find each other.
@@ -32,34 +53,58 @@ class LocalProcesses:
         atexit.register(self.end)
         for index in range(1, count):
             self._stderr.append(tempfile.TemporaryFile())  # noqa: SIM115 (as long as the process)
-            found = f"coordinator={self.address}", f"processes={count}", f"process={index}"
+            told = " ".join(map(str, Told(self.address, count, index, os.getpid())))
             process = subprocess.Popen(
-                [sys.executable, *sys.orig_argv[1:], *(f"distributed.{setting}" for setting in found)],
-                env={**os.environ, "JAX_LOCAL_DEVICE_IDS": str(index)},
+                [sys.executable, *sys.orig_argv[1:]],
+                env={**os.environ, _TOLD: told},
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,  # closed by `told`, which says with it that it got that far
+                bufsize=0,
                 stderr=self._stderr[-1],
                 start_new_session=True,  # Ctrl-C goes to the first alone, which tells them
             )
             self._processes.append(process)
 
+    def lost_at_start(self) -> int | None:
+        """Waits until all look for each other; number of one that ended before, None where all do."""
+        for index, process in enumerate(self._processes, 1):
+            if not process.stdout.read(1):  # type: ignore[union-attr]
+                return index
+        return None
+
     def said(self, index: int) -> str:
         """What one of them wrote to stderr, the end of it."""
-        file = self._stderr[index - 1]
-        file.seek(0)
-        return file.read().decode(errors="replace")[-2000:].strip()
+        file = self._stderr[index - 1].fileno()  # shared with the process, which may still write
+        start = max(0, os.fstat(file).st_size - _SHOWN)
+        return os.pread(file, _SHOWN, start).decode(errors="replace").strip()
 
     def gone(self) -> int | None:
         """Number of one that has ended; None where all go on."""
         return next((index for index, process in enumerate(self._processes, 1) if process.poll() is not None), None)
 
-    def end(self, patience_s: float = _LEAVE_S) -> None:
+    def end(self, patience_s: float = _PATIENCE_S) -> None:
         """Waits for them, and kills those that do not end."""
+        until = time.monotonic() + patience_s
         for process in self._processes:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(patience_s)
+                process.wait(max(0, until - time.monotonic()))
             process.kill()
             process.wait()
+
+
+def told() -> Told | None:
+    """Who this process is, if another one started it, and it ends with that; None where it is the first."""
+    if _TOLD not in os.environ:
+        return None
+    address, *numbers = os.environ.pop(_TOLD).split()
+    this = Told(address, *map(int, numbers))
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+    if os.getppid() != this.first:
+        sys.exit(1)
+    os.write(1, b".")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return this
 
 
 def gpus() -> int:

@@ -50,8 +50,8 @@ def updated(
 ) -> tuple[Learner, Learner, Float[Array, " metrics"]]:
     """Policy and value after an update by each minibatch, and the means of `METRICS` on this device.
 
-    The policy's gradient is clipped by the norm of both, as by brax; the value's by its own norm, which is hardly
-    another: ten times the policy's and more.
+    The policy's gradient is clipped by the norm of both, as by brax; the value's by its own norm, which is most of that
+    of both.
 
     Args:
       policy: before.
@@ -105,7 +105,7 @@ def updated(
         given = statistics, unrolls.unpacked(rows[chosen])
         stepped, norm = policy_step(policy, message)
         policy = jax.tree.map(lambda old, new: jnp.where(first, old, new), policy, stepped)
-        policy = jax.lax.optimization_barrier(policy)  # the message is needed no more
+        policy = jax.lax.optimization_barrier(policy)  # else XLA copies the message before it sends it
         gradient, error, advantages = of_value(value, given)
         advantages += 0 * gradient[0]  # after the gradient: beside its message the policy's is computed
         mean = jax.lax.pmean(jnp.append(gradient, norm), axis)[:-1]
@@ -122,9 +122,12 @@ def updated(
     if not staggered:
         (policy, value), metrics = jax.lax.scan(at_once, (policy, value), inputs, unroll=unroll)
         return policy, value, metrics.mean(axis=0)
-    nothing = jnp.zeros_like(jnp.append(ravel_pytree(policy.params)[0], 0))
+    none = 0 * ravel_pytree(policy.params)[0]
+    after = 0 * ravel_pytree(statistics.mean)[0].sum()  # the statistics were sent before
+    nothing = jnp.append(none, after.astype(none.dtype))
     (policy, value, message), metrics = jax.lax.scan(in_turn, (policy, value, nothing), inputs, unroll=unroll)
-    return policy_step(policy, message)[0], value, metrics.mean(axis=0)
+    policy, norm = policy_step(policy, message)
+    return policy, value, metrics.mean(axis=0) + 0 * norm  # they may be sent next
 
 
 def _norm(vector: Array) -> Array:
