@@ -111,8 +111,10 @@ def there(process):
 
 
 @pytest.mark.slow
-def test_one_command_starts_all_processes_of_a_host(tmp_path):
-    ((code, shown),) = finish([alone(tmp_path, "distributed.processes=2", "run_dir=run")])
+@pytest.mark.parametrize("physics", ["fused", "mjx"])
+def test_one_command_starts_all_processes_of_a_host(tmp_path, physics):
+    found = ["distributed.processes=2", f"env.physics={physics}"]
+    ((code, shown),) = finish([alone(tmp_path, *found, "run_dir=run")])
     assert code == 0, shown[-2000:]
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert (report["hardware"]["devices"], report["hardware"]["processes"]) == (2, 2)

@@ -46,8 +46,8 @@ def make_advance(model: mujoco.MjModel, timestep: float, substeps: int, physics:
 
 
 def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advance:
-    mjx_model = mjx.put_model(model)
-    blank = mjx.make_data(model)
+    device = jax.local_devices()[0]  # else the first of all processes
+    mjx_model, blank = mjx.put_model(model, device=device), mjx.make_data(model, device=device)
 
     def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
         loaded = mjx_model.replace(
