@@ -34,10 +34,10 @@ class Case:
         self.optimizer = optax.adam(0.01)
 
     def on_device(self, staggered, unroll, unrolls, order, key):
-        """By mimic: policy, value, metrics."""
+        """By mimic: policy and value, metrics."""
         policy, value = (updates.begin(params, self.optimizer) for params in self.params)
-        given = self.statistics, unrolls, order, key, self.networks, self.config, self.optimizer
-        return updates.updated(policy, value, *given, axis="devices", staggered=staggered, unroll=unroll)
+        how = updates.Updates(self.networks, self.config, self.optimizer, "devices", staggered, unroll)
+        return updates.updated((policy, value), self.statistics, unrolls, order, key, how)
 
     def expected(self):
         """One update after the other, array by array, the means over the devices by hand."""
@@ -84,7 +84,7 @@ def case(x64):
 @pytest.mark.parametrize(("staggered", "unroll"), [(False, 1), (True, 1), (True, 2)])
 def test_updates_are_those_of_each_minibatch_in_turn(case, staggered, unroll):
     on_all = jax.jit(jax.vmap(functools.partial(case.on_device, staggered, unroll), axis_name="devices"))
-    *learners, metrics = on_all(case.unrolls, case.order, case.keys)
+    learners, metrics = on_all(case.unrolls, case.order, case.keys)
     params, expected_metrics = case.expected()
     np.testing.assert_allclose(metrics, expected_metrics, rtol=1e-5, atol=1e-7)
     for learner, expected, before in zip(learners, params, case.params, strict=True):

@@ -151,6 +151,7 @@ def _learn(
     minibatch = config.batch_size // devices  # type: ignore[operator]
     # A GPU pauses between CUDA graphs, and none goes beyond a pass of a loop. On one GPU compiling takes what it saves.
     updates_in_a_pass = 2 if devices > 1 else 1
+    how = updates.Updates(networks, config, optimizer, _AXIS, a_process_for_each_gpu(), updates_in_a_pass)
 
     def unroll(learning: Learning, key: Array) -> tuple[Learning, Unrolls]:
         """Steps of all arms, [time + 1, arms, ...]."""
@@ -179,10 +180,8 @@ def _learn(
         passes = jax.random.split(key_order, config.num_updates_per_batch)  # type: ignore[arg-type]
         count = len(unrolls.observation)
         order = jax.vmap(lambda key: jax.random.permutation(key, count))(passes).reshape(-1, minibatch)
-        policy, value, metrics = updates.updated(
-            learning.policy, learning.value, statistics, unrolls, order, key_loss, networks, config, optimizer,
-            _AXIS, staggered=a_process_for_each_gpu(), unroll=updates_in_a_pass,
-        )  # fmt: skip
+        learners = learning.policy, learning.value
+        (policy, value), metrics = updates.updated(learners, statistics, unrolls, order, key_loss, how)
         learning = learning.replace(policy=policy, value=value, statistics=statistics, key=key)  # type: ignore[attr-defined]
         return learning, metrics
 

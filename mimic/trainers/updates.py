@@ -1,5 +1,6 @@
 """PPO's updates of policy and value from what the arms did, over all devices."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -29,37 +30,18 @@ class Learner(NamedTuple):
     optimizer: optax.OptState
 
 
+Learners = tuple[Learner, Learner]  # policy, value
+
+
 def begin(params: Any, optimizer: optax.GradientTransformation) -> Learner:
     """A network that has not learned yet."""
     return Learner(params, optimizer.init(ravel_pytree(params)[0]))
 
 
-def updated(
-    policy: Learner,
-    value: Learner,
-    statistics: RunningStatisticsState,
-    unrolls: Unrolls,
-    order: Int[Array, "updates minibatch"],
-    key: Array,
-    networks: ppo_networks.PPONetworks,
-    config: PPOConfig,
-    optimizer: optax.GradientTransformation,
-    axis: str,
-    staggered: bool,
-    unroll: int,
-) -> tuple[Learner, Learner, Float[Array, " metrics"]]:
-    """Policy and value after an update by each minibatch, and the means of `METRICS` on this device.
+class Updates(NamedTuple):
+    """How policy and value are updated, the same for all of a run.
 
-    The policy's gradient is clipped by the norm of both, as by brax; the value's by its own norm, which is most of that
-    of both.
-
-    Args:
-      policy: before.
-      value: before.
-      statistics: of the observations.
-      unrolls: [unrolls, time + 1, ...] of this device.
-      order: which unrolls each update learns from.
-      key: of this device, for the entropy, which is estimated by a sample.
+    Attributes:
       networks: of the config.
       config: resolved.
       optimizer: of both.
@@ -69,65 +51,129 @@ def updated(
         their steps at once, after one message.
       unroll: updates in each pass of the compiled loop.
     """
+
+    networks: ppo_networks.PPONetworks
+    config: PPOConfig
+    optimizer: optax.GradientTransformation
+    axis: str
+    staggered: bool
+    unroll: int
+
+
+def updated(
+    learners: Learners,
+    statistics: RunningStatisticsState,
+    unrolls: Unrolls,
+    order: Int[Array, "updates minibatch"],
+    key: Array,
+    how: Updates,
+) -> tuple[Learners, Float[Array, " metrics"]]:
+    """Policy and value after an update by each minibatch, and the means of `METRICS` on this device.
+
+    The policy's gradient is clipped by the norm of both, as by brax; the value's by its own norm, which is most of that
+    of both.
+
+    Args:
+      learners: policy and value before.
+      statistics: of the observations.
+      unrolls: [unrolls, time + 1, ...] of this device.
+      order: which unrolls each update learns from.
+      key: of this device, for the entropy, which is estimated by a sample.
+      how: the rest.
+    """
     rows = unrolls.packed()
+    keys = jax.random.split(key, len(order))
 
-    def of_value(learner: Learner, given: Any) -> tuple[Array, Array, Array]:
-        differentiated = jax.value_and_grad(value_loss, has_aux=True)
-        (error, advantages), gradients = differentiated(learner.params, *given, networks, config)
-        return ravel_pytree(gradients)[0], error, advantages
+    def minibatch(chosen: Array) -> Unrolls:
+        return unrolls.unpacked(rows[chosen])
 
-    def of_policy(learner: Learner, given: Any, advantages: Array, key: Array) -> tuple[Array, Array]:
-        differentiated = jax.grad(policy_loss, has_aux=True)
-        gradients, metrics = differentiated(learner.params, *given, advantages, key, networks, config)
-        return ravel_pytree(gradients)[0], metrics
+    return (_staggered if how.staggered else _at_once)(learners, statistics, minibatch, order, keys, how)
 
-    def step(learner: Learner, gradient: Array, norm: Array) -> Learner:
-        clipped = gradient * jnp.minimum(1, config.max_grad_norm / norm)
-        change, state = optimizer.update(clipped, learner.optimizer)
-        unravel = ravel_pytree(learner.params)[1]
-        return Learner(optax.apply_updates(learner.params, unravel(change)), state)
 
-    def at_once(carry: Any, inputs: Any) -> Any:
-        policy, value = carry
-        chosen, key, _ = inputs
-        given = statistics, unrolls.unpacked(rows[chosen])
-        gradient, error, advantages = of_value(value, given)
-        policy_gradient, metrics = of_policy(policy, given, advantages, key)
-        mean = jax.lax.pmean(jnp.concatenate([policy_gradient, gradient]), axis)
+def _at_once(
+    learners: Learners,
+    statistics: RunningStatisticsState,
+    minibatch: Callable[[Array], Unrolls],
+    order: Array,
+    keys: Array,
+    how: Updates,
+) -> tuple[Learners, Array]:
+    def update(learners: Learners, inputs: tuple[Array, Array]) -> tuple[Learners, Array]:
+        policy, value = learners
+        chosen, key = inputs
+        seen = minibatch(chosen)
+        value_gradient, error, advantages = _value_gradient(value, statistics, seen, how)
+        policy_gradient, metrics = _policy_gradient(policy, statistics, seen, advantages, key, how)
+        mean = jax.lax.pmean(jnp.concatenate([policy_gradient, value_gradient]), how.axis)
         policy_mean, value_mean = mean[: len(policy_gradient)], mean[len(policy_gradient) :]
-        learners = step(policy, policy_mean, _norm(mean)), step(value, value_mean, _norm(value_mean))
-        return learners, jnp.append(error, metrics)
+        policy, value = _step(policy, policy_mean, _norm(mean), how), _step(value, value_mean, _norm(value_mean), how)
+        return (policy, value), jnp.append(error, metrics)
 
+    learners, metrics = jax.lax.scan(update, learners, (order, keys), unroll=how.unroll)
+    return learners, metrics.mean(axis=0)
+
+
+def _staggered(
+    learners: Learners,
+    statistics: RunningStatisticsState,
+    minibatch: Callable[[Array], Unrolls],
+    order: Array,
+    keys: Array,
+    how: Updates,
+) -> tuple[Learners, Array]:
     # NCCL must not be given two messages at once: each has the norm in it that comes of the one before.
-    def in_turn(carry: Any, inputs: Any) -> Any:
+    def update(carry: tuple[Learner, Learner, Array], inputs: tuple[Array, Array, Array]) -> Any:
         policy, value, message = carry
         chosen, key, first = inputs
-        given = statistics, unrolls.unpacked(rows[chosen])
+        seen = minibatch(chosen)
         stepped, norm = policy_step(policy, message)
         policy = jax.tree.map(lambda old, new: jnp.where(first, old, new), policy, stepped)
         policy = jax.lax.optimization_barrier(policy)  # else XLA copies the message before it sends it
-        gradient, error, advantages = of_value(value, given)
+        gradient, error, advantages = _value_gradient(value, statistics, seen, how)
         advantages += 0 * gradient[0]  # after the gradient: beside its message the policy's is computed
-        mean = jax.lax.pmean(jnp.append(gradient, norm), axis)[:-1]
+        mean = jax.lax.pmean(jnp.append(gradient, norm), how.axis)[:-1]
         value_norm = _norm(mean)
-        gradient, metrics = of_policy(policy, given, advantages, key)
-        return (policy, step(value, mean, value_norm), jnp.append(gradient, value_norm)), jnp.append(error, metrics)
+        gradient, metrics = _policy_gradient(policy, statistics, seen, advantages, key, how)
+        message = jnp.append(gradient, value_norm)
+        return (policy, _step(value, mean, value_norm, how), message), jnp.append(error, metrics)
 
     def policy_step(policy: Learner, message: Array) -> tuple[Learner, Array]:
-        mean = jax.lax.pmean(message, axis)
+        mean = jax.lax.pmean(message, how.axis)
         norm = _norm(mean[:-1])
-        return step(policy, mean[:-1], jnp.hypot(norm, mean[-1])), norm
+        return _step(policy, mean[:-1], jnp.hypot(norm, mean[-1]), how), norm
 
-    inputs = order, jax.random.split(key, len(order)), jnp.arange(len(order)) == 0
-    if not staggered:
-        (policy, value), metrics = jax.lax.scan(at_once, (policy, value), inputs, unroll=unroll)
-        return policy, value, metrics.mean(axis=0)
-    none = 0 * ravel_pytree(policy.params)[0]
+    none = 0 * ravel_pytree(learners[0].params)[0]
     after = 0 * ravel_pytree(statistics.mean)[0].sum()  # the statistics were sent before
     nothing = jnp.append(none, after.astype(none.dtype))
-    (policy, value, message), metrics = jax.lax.scan(in_turn, (policy, value, nothing), inputs, unroll=unroll)
+    first = jnp.arange(len(order)) == 0
+    (policy, value, message), metrics = jax.lax.scan(
+        update, (*learners, nothing), (order, keys, first), unroll=how.unroll
+    )
     policy, norm = policy_step(policy, message)
-    return policy, value, metrics.mean(axis=0) + 0 * norm  # they may be sent next
+    return (policy, value), metrics.mean(axis=0) + 0 * norm  # they may be sent next
+
+
+def _value_gradient(
+    value: Learner, statistics: RunningStatisticsState, seen: Unrolls, how: Updates
+) -> tuple[Array, Array, Array]:
+    differentiated = jax.value_and_grad(value_loss, has_aux=True)
+    (error, advantages), gradients = differentiated(value.params, statistics, seen, how.networks, how.config)
+    return ravel_pytree(gradients)[0], error, advantages
+
+
+def _policy_gradient(
+    policy: Learner, statistics: RunningStatisticsState, seen: Unrolls, advantages: Array, key: Array, how: Updates
+) -> tuple[Array, Array]:
+    differentiated = jax.grad(policy_loss, has_aux=True)
+    gradients, metrics = differentiated(policy.params, statistics, seen, advantages, key, how.networks, how.config)
+    return ravel_pytree(gradients)[0], metrics
+
+
+def _step(learner: Learner, gradient: Array, norm: Array, how: Updates) -> Learner:
+    clipped = gradient * jnp.minimum(1, how.config.max_grad_norm / norm)
+    change, state = how.optimizer.update(clipped, learner.optimizer)
+    unravel = ravel_pytree(learner.params)[1]
+    return Learner(optax.apply_updates(learner.params, unravel(change)), state)
 
 
 def _norm(vector: Array) -> Array:
