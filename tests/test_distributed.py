@@ -174,6 +174,7 @@ def test_other_processes_are_told_who_they_are(monkeypatch):
     assert others.gone() is None
     others.end(patience_s=0)
     assert others.gone() == others.lost_at_start() == 1
+    assert others.said(1) == "ended by SIGKILL"
 
 
 def test_who_is_told_nothing_is_the_first(monkeypatch):

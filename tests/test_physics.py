@@ -155,6 +155,15 @@ def test_both_physics_step_a_loaded_arm_as_mujoco_does(x64, kind):
         assert_near(np.asarray(values), reference)
 
 
+@pytest.mark.parametrize("kind", ["mjx", "fused"])
+def test_physics_brings_no_empty_array_into_a_program(kind):
+    """A program for several devices crashes XLA of jaxlib 0.11 with one."""
+    model = build_arm(ARMS["planar"]).model
+    state = [jnp.asarray(x[0]) for x in random_states(model)]
+    program = jax.jit(make_advance(model, 0.01, 3, kind)).lower(*state, LOAD).as_text()
+    assert "stablehlo.constant" in program and "constant dense<>" not in program
+
+
 @pytest.fixture(scope="module")
 def planar():
     """A small arm, which compiles quickly, and what it takes to step it: 5 states, and as many loads."""

@@ -47,9 +47,10 @@ def make_advance(model: mujoco.MjModel, timestep: float, substeps: int, physics:
 
 def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advance:
     device = jax.local_devices()[0]  # else the first of all processes
-    mjx_model, blank = mjx.put_model(model, device=device), mjx.make_data(model, device=device)
+    constants = jax.device_get((mjx.put_model(model, device=device), mjx.make_data(model, device=device)))
 
     def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
+        mjx_model, blank = jax.tree.map(_constant, constants)
         loaded = mjx_model.replace(
             body_mass=load.mass * mjx_model.body_mass,
             body_inertia=load.mass * mjx_model.body_inertia,
@@ -64,6 +65,14 @@ def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advan
         return _runge_kutta(acceleration, qpos, qvel, timestep, substeps)
 
     return advance
+
+
+def _constant(value: Any) -> Array:
+    """As a constant of a program; empty ones are made in it, for jaxlib 0.11 crashes on those that come from outside.
+
+    That is with a program for several devices, in Shardy.
+    """
+    return jnp.asarray(value) if value.size else jnp.zeros(value.shape, value.dtype)
 
 
 def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advance:

@@ -14,6 +14,7 @@ from typing import IO, NamedTuple
 
 _TOLD = "MIMIC_LOCAL_PROCESS"  # variable by which a process is told who it is
 _PATIENCE_S = 5  # they are given this long to end by themselves
+_DYING_S = 1  # between the end of its pipe and its exit code
 _SHOWN = 2000  # bytes of what one of them said
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux's prctl
 
@@ -73,10 +74,15 @@ class LocalProcesses:
         return None
 
     def said(self, index: int) -> str:
-        """What one of them wrote to stderr, the end of it."""
+        """What one of them wrote to stderr, the end of it, and which signal ended it if one did."""
         file = self._stderr[index - 1].fileno()  # shared with the process, which may still write
         start = max(0, os.fstat(file).st_size - _SHOWN)
-        return os.pread(file, _SHOWN, start).decode(errors="replace").strip()
+        wrote = os.pread(file, _SHOWN, start).decode(errors="replace").strip()
+        with contextlib.suppress(subprocess.TimeoutExpired):  # it may go on, and then no signal did
+            self._processes[index - 1].wait(_DYING_S)
+        code = self._processes[index - 1].returncode
+        ended = f"ended by {signal.Signals(-code).name}" if code is not None and code < 0 else ""
+        return "\n".join(filter(None, [wrote, ended]))
 
     def gone(self) -> int | None:
         """Number of one that has ended; None where all go on."""
