@@ -147,6 +147,7 @@ def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path, early):
     lost = time.monotonic()
     ((code, shown),) = finish([process])
     assert code == 1 and "error: process 1 of the training failed" in shown, shown[-2000:]
+    assert "ended by signal 9" in shown
     assert time.monotonic() - lost < 20
 
 
@@ -171,10 +172,10 @@ def test_other_processes_are_told_who_they_are(monkeypatch):
         assert said.endswith(str(Told(others.address, 3, index, os.getpid())))
     monkeypatch.setattr(sys, "orig_argv", ["python", "-c", "import time; time.sleep(100)"])
     others = LocalProcesses(3)
-    assert others.gone() is None
+    assert others.gone() is None and others.said(1) == ""
     others.end(patience_s=0)
     assert others.gone() == others.lost_at_start() == 1
-    assert others.said(1) == "ended by SIGKILL"
+    assert others.said(1) == "ended by signal 9 (Killed)"
 
 
 def test_who_is_told_nothing_is_the_first(monkeypatch):

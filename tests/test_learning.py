@@ -128,10 +128,10 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
 
 
 ON_TWO_DEVICES = """
-import jax, numpy as np, optax, mimic
+import sys, jax, numpy as np, optax, mimic
 from mimic.trainers import learning, ppo
 from mimic.trainers.config import PPOConfig
-env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
+env = mimic.make("planar4dof", physics=sys.argv[1], demonstrations={"count": 3, "held_out": 1})
 config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
                    hidden_layers=[8]).resolve("cpu", 2)
 networks = ppo.make_networks(config, env.observation_size, env.action_size)
@@ -149,11 +149,12 @@ assert not np.array_equal(*observed)
 """
 
 
-def test_devices_see_different_arms_and_learn_the_same():
+@pytest.mark.parametrize("physics", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_devices_see_different_arms_and_learn_the_same(physics):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     settings = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
     ended = subprocess.run(
-        [sys.executable, "-c", ON_TWO_DEVICES], env=settings, capture_output=True, text=True, check=False
+        [sys.executable, "-c", ON_TWO_DEVICES, physics], env=settings, capture_output=True, text=True, check=False
     )
     assert ended.returncode == 0, ended.stderr[-2000:]
 

@@ -36,7 +36,8 @@ class Case:
     def on_device(self, staggered, unroll, unrolls, order, key):
         """By mimic: policy and value, metrics."""
         policy, value = (updates.begin(params, self.optimizer) for params in self.params)
-        how = updates.Updates(self.networks, self.config, self.optimizer, "devices", staggered, unroll)
+        of_run = self.networks, self.config, self.optimizer
+        how = updates.Updating(*of_run, axis="devices", staggered=staggered, unroll=unroll)
         return updates.updated((policy, value), self.statistics, unrolls, order, key, how)
 
     def expected(self):

@@ -46,7 +46,7 @@ def make_advance(model: mujoco.MjModel, timestep: float, substeps: int, physics:
 
 
 def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advance:
-    device = jax.local_devices()[0]  # else the first of all processes
+    device = jax.local_devices()[0]  # MJX's own choice is process 0's, where no other may write
     constants = jax.device_get((mjx.put_model(model, device=device), mjx.make_data(model, device=device)))
 
     def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
@@ -68,10 +68,7 @@ def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advan
 
 
 def _constant(value: Any) -> Array:
-    """As a constant of a program; empty ones are made in it, for jaxlib 0.11 crashes on those that come from outside.
-
-    That is with a program for several devices, in Shardy.
-    """
+    """For a program. An empty one is computed: on a literal jaxlib 0.11.2 crashes, with several devices."""
     return jnp.asarray(value) if value.size else jnp.zeros(value.shape, value.dtype)
 
 

@@ -151,7 +151,9 @@ def _learn(
     minibatch = config.batch_size // devices  # type: ignore[operator]
     # A GPU pauses between CUDA graphs, and none goes beyond a pass of a loop. On one GPU compiling takes what it saves.
     updates_in_a_pass = 2 if devices > 1 else 1
-    how = updates.Updates(networks, config, optimizer, _AXIS, a_process_for_each_gpu(), updates_in_a_pass)
+    how = updates.Updating(
+        networks, config, optimizer, axis=_AXIS, staggered=a_process_for_each_gpu(), unroll=updates_in_a_pass
+    )
 
     def unroll(learning: Learning, key: Array) -> tuple[Learning, Unrolls]:
         """Steps of all arms, [time + 1, arms, ...]."""

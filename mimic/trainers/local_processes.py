@@ -70,18 +70,18 @@ class LocalProcesses:
         """Waits until all look for each other; number of one that ended before, None where all do."""
         for index, process in enumerate(self._processes, 1):
             if not process.stdout.read(1):  # type: ignore[union-attr]
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_DYING_S)
                 return index
         return None
 
     def said(self, index: int) -> str:
         """What one of them wrote to stderr, the end of it, and which signal ended it if one did."""
+        code = self._processes[index - 1].poll()  # before what it wrote, which is all of it then
         file = self._stderr[index - 1].fileno()  # shared with the process, which may still write
         start = max(0, os.fstat(file).st_size - _SHOWN)
         wrote = os.pread(file, _SHOWN, start).decode(errors="replace").strip()
-        with contextlib.suppress(subprocess.TimeoutExpired):  # it may go on, and then no signal did
-            self._processes[index - 1].wait(_DYING_S)
-        code = self._processes[index - 1].returncode
-        ended = f"ended by {signal.Signals(-code).name}" if code is not None and code < 0 else ""
+        ended = f"ended by signal {-code} ({signal.strsignal(-code)})" if code is not None and code < 0 else ""
         return "\n".join(filter(None, [wrote, ended]))
 
     def gone(self) -> int | None:

@@ -38,7 +38,7 @@ def begin(params: Any, optimizer: optax.GradientTransformation) -> Learner:
     return Learner(params, optimizer.init(ravel_pytree(params)[0]))
 
 
-class Updates(NamedTuple):
+class Updating(NamedTuple):
     """How policy and value are updated, the same for all of a run.
 
     Attributes:
@@ -66,7 +66,7 @@ def updated(
     unrolls: Unrolls,
     order: Int[Array, "updates minibatch"],
     key: Array,
-    how: Updates,
+    how: Updating,
 ) -> tuple[Learners, Float[Array, " metrics"]]:
     """Policy and value after an update by each minibatch, and the means of `METRICS` on this device.
 
@@ -79,7 +79,7 @@ def updated(
       unrolls: [unrolls, time + 1, ...] of this device.
       order: which unrolls each update learns from.
       key: of this device, for the entropy, which is estimated by a sample.
-      how: the rest.
+      how: what is the same for all of a run.
     """
     rows = unrolls.packed()
     keys = jax.random.split(key, len(order))
@@ -96,7 +96,7 @@ def _at_once(
     minibatch: Callable[[Array], Unrolls],
     order: Array,
     keys: Array,
-    how: Updates,
+    how: Updating,
 ) -> tuple[Learners, Array]:
     def update(learners: Learners, inputs: tuple[Array, Array]) -> tuple[Learners, Array]:
         policy, value = learners
@@ -119,7 +119,7 @@ def _staggered(
     minibatch: Callable[[Array], Unrolls],
     order: Array,
     keys: Array,
-    how: Updates,
+    how: Updating,
 ) -> tuple[Learners, Array]:
     # NCCL must not be given two messages at once: each has the norm in it that comes of the one before.
     def update(carry: tuple[Learner, Learner, Array], inputs: tuple[Array, Array, Array]) -> Any:
@@ -154,7 +154,7 @@ def _staggered(
 
 
 def _value_gradient(
-    value: Learner, statistics: RunningStatisticsState, seen: Unrolls, how: Updates
+    value: Learner, statistics: RunningStatisticsState, seen: Unrolls, how: Updating
 ) -> tuple[Array, Array, Array]:
     differentiated = jax.value_and_grad(value_loss, has_aux=True)
     (error, advantages), gradients = differentiated(value.params, statistics, seen, how.networks, how.config)
@@ -162,14 +162,14 @@ def _value_gradient(
 
 
 def _policy_gradient(
-    policy: Learner, statistics: RunningStatisticsState, seen: Unrolls, advantages: Array, key: Array, how: Updates
+    policy: Learner, statistics: RunningStatisticsState, seen: Unrolls, advantages: Array, key: Array, how: Updating
 ) -> tuple[Array, Array]:
     differentiated = jax.grad(policy_loss, has_aux=True)
     gradients, metrics = differentiated(policy.params, statistics, seen, advantages, key, how.networks, how.config)
     return ravel_pytree(gradients)[0], metrics
 
 
-def _step(learner: Learner, gradient: Array, norm: Array, how: Updates) -> Learner:
+def _step(learner: Learner, gradient: Array, norm: Array, how: Updating) -> Learner:
     clipped = gradient * jnp.minimum(1, how.config.max_grad_norm / norm)
     change, state = how.optimizer.update(clipped, learner.optimizer)
     unravel = ravel_pytree(learner.params)[1]
