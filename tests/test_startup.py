@@ -131,11 +131,13 @@ def test_what_is_prepared_is_made_once():
         failing()
 
 
-def test_options_for_gpus_are_known_to_jaxlib(monkeypatch):
+@pytest.mark.parametrize(("a_process_for_each", "count"), [(False, 2), (True, 3)])
+def test_options_for_gpus_are_known_to_jaxlib(monkeypatch, a_process_for_each, count):
     """Which takes them on CPUs too, and refuses a wrong name or value."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(prepared, "a_process_for_each_gpu", lambda: a_process_for_each)
     options = compiler_options()
-    assert len(options) == 2
+    assert len(options) == count
     assert jax.jit(lambda x: x + 1, compiler_options=options)(1.0) == 2.0
 
 
