@@ -10,7 +10,12 @@ from mimic import compat
 compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
 compat.import_mujoco()
 
-from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence  # noqa: E402
+from mimic.correspondence import (  # noqa: E402
+    arc_length_correspondence,
+    hard_correspondence,
+    overlap_correspondence,
+    soft_correspondence,
+)
 from mimic.distance import (  # noqa: E402
     PAPER_WEIGHTS,
     DistanceWeights,
@@ -62,6 +67,7 @@ __all__ = [
     "PoseImitation",
     "PoseMapper",
     "adaptive_weights",
+    "arc_length_correspondence",
     "body_twists",
     "build_arm",
     "candidate_points",

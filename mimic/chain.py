@@ -6,12 +6,15 @@ import logging
 import math
 import operator
 from collections.abc import Iterable, Mapping
+from typing import Literal
 
 import numpy as np
 
 _log = logging.getLogger(__name__)
 SHORTEST_LINK = 1e-6  # m; below this a link has no direction
 
+Links = Literal["kept", "merged"]
+LINKS = ("kept", "merged")
 Locked = str | int | Iterable[str | int] | Mapping[str | int, float]
 
 
@@ -31,19 +34,35 @@ class Joint:
     home: float = 0.0
 
 
+Segment = tuple[np.ndarray, np.ndarray]  # start and end [m]
+
+
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """A segment in the zero pose, in the base frame, and the joint that moves it (by index; -1: fixed to the base)."""
+    """A rigid part of the arm in the zero pose, in the base frame.
+
+    Attributes:
+      name: of the link; names of merged links are joined by "+".
+      start, end: [3] [m].
+      joint: index of the last joint that moves it; -1 for a link that is fixed to the base.
+      merged: segments of the arm's centre line that were merged into this link; empty for a link that is one segment.
+    """
 
     name: str
     start: np.ndarray
     end: np.ndarray
     joint: int
+    merged: tuple[Segment, ...] = ()
 
     @property
     def length(self) -> float:
         """From start to end [m]."""
         return float(np.linalg.norm(self.end - self.start))
+
+    @property
+    def segments(self) -> tuple[Segment, ...]:
+        """The part of the centre line that belongs to the link, base to tip."""
+        return self.merged or ((self.start, self.end),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,14 +122,20 @@ def _angle(name: str, value: float) -> float:
     return angle
 
 
-def lock(chain: Chain, locked: Mapping[str, float], merge: bool = True) -> Chain:
+def lock(chain: Chain, locked: Mapping[str, float], links: Links = "kept") -> Chain:
     """The chain that is left when joints are held at an angle.
 
     Args:
       chain: the free arm.
       locked: angle [rad] by joint name.
-      merge: the links that a locked joint connects become one link, first start to last end; else they stay apart.
+      links: "kept": a locked joint removes a joint and no link; "merged": the links that it connects become one, from
+        the start of the first to the end of the last (paper: as many links as joints).
+
+    Raises:
+      ValueError: an unknown value of `links`.
     """
+    if links not in LINKS:
+        raise ValueError(f"links: expected one of {', '.join(LINKS)}, got {links!r}")
     rotation, offset = np.eye(3), np.zeros(3)  # what the locked joints so far do to all that comes after them
     moved_by: dict[int, int] = {-1: -1}
     placement: dict[int, tuple[np.ndarray, np.ndarray]] = {-1: (rotation, offset)}
@@ -124,16 +149,29 @@ def lock(chain: Chain, locked: Mapping[str, float], merge: bool = True) -> Chain
             joints.append(dataclasses.replace(joint, axis=axis, anchor=anchor))
         moved_by[index] = len(joints) - 1
         placement[index] = rotation, offset
-    links: list[Link] = []
+    result: list[Link] = []
     previous_joint = None
     for link in chain.links:
-        turn, shift = placement[link.joint]
-        moved = Link(link.name, turn @ link.start + shift, turn @ link.end + shift, moved_by[link.joint])
-        if merge and links and links[-1].joint == moved.joint and link.joint != previous_joint:
-            moved = dataclasses.replace(moved, name=f"{links[-1].name}+{moved.name}", start=links.pop().start)
-        links.append(moved)
+        moved = _moved(link, *placement[link.joint], moved_by[link.joint])
+        if links == "merged" and result and result[-1].joint == moved.joint and link.joint != previous_joint:
+            moved = _merged(result.pop(), moved)
+        result.append(moved)
         previous_joint = link.joint
-    return Chain(tuple(joints), drop_zero_length(links))
+    return Chain(tuple(joints), drop_zero_length(result))
+
+
+def _moved(link: Link, rotation: np.ndarray, offset: np.ndarray, joint: int) -> Link:
+    def move(point: np.ndarray) -> np.ndarray:
+        return rotation @ point + offset
+
+    merged = tuple((move(start), move(end)) for start, end in link.merged)
+    return Link(link.name, move(link.start), move(link.end), joint, merged)
+
+
+def _merged(first: Link, second: Link) -> Link:
+    """One link from the start of the first to the end of the second."""
+    name = f"{first.name}+{second.name}"
+    return Link(name, first.start, second.end, second.joint, first.segments + second.segments)
 
 
 def drop_zero_length(links: Iterable[Link]) -> tuple[Link, ...]:

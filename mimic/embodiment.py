@@ -12,7 +12,7 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from mimic.chain import Chain, Joint, Link, Locked, lock, resolve_locked
+from mimic.chain import Chain, Joint, Link, Links, Locked, lock, resolve_locked
 from mimic.mjcf import read_chain
 from mimic.model_files import model_name, read_model
 
@@ -43,6 +43,9 @@ class Embodiment:
       joint_names: base to tip.
       link_names: base to tip; merged links are joined by "+".
       link_joint: index of the last joint that moves each link; -1 for a link that is fixed to the base.
+      segment_start, segment_end: [num_segments, 3] segments of the arm's centre line in the zero pose, base to tip [m];
+        one for each link, more where locked joints merged links into chords.
+      segment_link: index of the link that each segment belongs to.
     """
 
     joint_axis: Float[Any, "joints 3"]
@@ -54,10 +57,13 @@ class Embodiment:
     torque_limit: Float[Any, " joints"]
     velocity_limit: Float[Any, " joints"]
     home: Float[Any, " joints"]
+    segment_start: Float[Any, "segments 3"]
+    segment_end: Float[Any, "segments 3"]
     name: str = struct.field(pytree_node=False)
     joint_names: tuple[str, ...] = struct.field(pytree_node=False)
     link_names: tuple[str, ...] = struct.field(pytree_node=False)
     link_joint: tuple[int, ...] = struct.field(pytree_node=False)
+    segment_link: tuple[int, ...] = struct.field(pytree_node=False)
 
     @property
     def num_joints(self) -> int:
@@ -100,20 +106,21 @@ def panda_path() -> str:
     return str(importlib.resources.files("mimic") / "xml" / "panda.xml")
 
 
-def panda(*, locked: Locked = (), merge_locked: bool = True, limits: Limits = "none") -> Embodiment:
+def panda(*, locked: Locked = (), links: Links = "kept", limits: Limits = "none") -> Embodiment:
     """The 7-joint Panda, or what is left of it with joints locked.
 
     Args:
       locked: joint names ("joint3") or numbers (3), locked at 0, or at the ready pose under `limits="hardware"`; a
         mapping {"joint3": angle} gives the angles [rad].
-      merge_locked: a locked joint makes one link of the two that it connects (paper); else both stay.
+      links: "kept": a locked joint removes no link, so that a locked arm has more links than joints; "merged": it makes
+        one link of the two that it connects, a chord from start to end (paper).
       limits: "none" starts at the zero pose and lets every joint turn within [-pi, pi] (paper; the real arm cannot
         reach it); "hardware" has the maker's joint ranges and starts at the ready pose.
 
     Raises:
       ValueError: an unknown or duplicate joint, all joints locked, or an unknown `limits`.
     """
-    return load_arm(panda_path(), name="panda", locked=locked, merge_locked=merge_locked, limits=limits)[0]
+    return load_arm(panda_path(), name="panda", locked=locked, links=links, limits=limits)[0]
 
 
 def load_mjcf(
@@ -122,7 +129,7 @@ def load_mjcf(
     locked: Locked = (),
     base: str | None = None,
     tip: str | None = None,
-    merge_locked: bool = True,
+    links: Links = "kept",
 ) -> Embodiment:
     """A serial chain of hinges from any MJCF or URDF, with the joint ranges and limits that the model states.
 
@@ -135,7 +142,7 @@ def load_mjcf(
       locked: as for `panda`; locked at 0 where no angle is given.
       base: name of the body that the chain starts behind.
       tip: name of the body or site that the chain ends at.
-      merge_locked: as for `panda`.
+      links: as for `panda`.
 
     Raises:
       ValueError: a file that is missing or no model, no hinge, a branch, a loop, a name that the model lacks, or what
@@ -144,7 +151,7 @@ def load_mjcf(
     model = _model(path_or_model)
     chain = read_chain(model, base, tip)
     angles = resolve_locked(locked, tuple(joint.name for joint in chain.joints))
-    return _locked_embodiment(chain, angles, _name(path_or_model, model), merge_locked)
+    return _locked_embodiment(chain, angles, _name(path_or_model, model), links)
 
 
 def load_arm(
@@ -154,7 +161,7 @@ def load_arm(
     locked: Locked = (),
     base: str | None = None,
     tip: str | None = None,
-    merge_locked: bool = True,
+    links: Links = "kept",
     limits: Limits = "hardware",
 ) -> tuple[Embodiment, mujoco.MjModel, dict[str, float]]:
     """An embodiment, the model that it was read from, and the angles [rad] of its locked joints by name.
@@ -170,7 +177,7 @@ def load_arm(
         chain = Chain(tuple(free), chain.links)
     home = {joint.name: joint.home for joint in chain.joints}
     angles = resolve_locked(locked, tuple(home), home)
-    return _locked_embodiment(chain, angles, name or _name(path_or_model, model), merge_locked), model, angles
+    return _locked_embodiment(chain, angles, name or _name(path_or_model, model), links), model, angles
 
 
 def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
@@ -183,6 +190,7 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
         raise ValueError(f"frame_at: expected a share of the link in [0, 1], got {frame_at}")
     joints, links = chain.joints, chain.links
     directions = [(link.end - link.start) / link.length for link in links]
+    segments = [(start, end, index) for index, link in enumerate(links) for start, end in link.segments]
     return Embodiment(
         joint_axis=_snap(np.stack([joint.axis for joint in joints])),
         joint_anchor=_snap(np.stack([joint.anchor for joint in joints])),
@@ -193,10 +201,28 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
         torque_limit=np.array([joint.torque_limit for joint in joints]),
         velocity_limit=np.array([joint.velocity_limit for joint in joints]),
         home=np.array([joint.home for joint in joints]),
+        segment_start=np.stack([start for start, _, _ in segments]),
+        segment_end=np.stack([end for _, end, _ in segments]),
         name=name,
         joint_names=tuple(joint.name for joint in joints),
         link_names=tuple(link.name for link in links),
         link_joint=tuple(link.joint for link in links),
+        segment_link=tuple(index for _, _, index in segments),
+    )
+
+
+def segment_arm(arm: Embodiment) -> Embodiment:
+    """The arm with a link for each segment of its centre line, whose frame is where the segment starts."""
+    start, end = np.asarray(arm.segment_start), np.asarray(arm.segment_end)
+    lengths = np.linalg.norm(end - start, axis=1)
+    return dataclasses.replace(
+        arm,
+        link_position=_snap(start),
+        link_rotation=_snap(np.stack([_rotation_to(way) for way in (end - start) / lengths[:, None]])),
+        link_lengths=lengths,
+        link_names=tuple(f"segment{i + 1}" for i in range(len(lengths))),
+        link_joint=tuple(arm.link_joint[link] for link in arm.segment_link),
+        segment_link=tuple(range(len(lengths))),
     )
 
 
@@ -208,8 +234,8 @@ def _name(path_or_model: str | os.PathLike[str] | mujoco.MjModel, model: mujoco.
     return model_name(model, None if isinstance(path_or_model, mujoco.MjModel) else path_or_model)
 
 
-def _locked_embodiment(chain: Chain, angles: dict[str, float], name: str, merge: bool) -> Embodiment:
-    return from_chain(lock(chain, angles, merge), name="-".join([name, *angles]))
+def _locked_embodiment(chain: Chain, angles: dict[str, float], name: str, links: Links) -> Embodiment:
+    return from_chain(lock(chain, angles, links), name="-".join([name, *angles]))
 
 
 def _snap(values: np.ndarray) -> np.ndarray:

@@ -172,4 +172,6 @@ def _of_length_one(arm: Embodiment) -> Embodiment:
         joint_anchor=arm.joint_anchor / length,
         link_position=arm.link_position / length,
         link_lengths=arm.link_lengths / length,
+        segment_start=arm.segment_start / length,
+        segment_end=arm.segment_end / length,
     )

@@ -81,7 +81,7 @@ def test_panda_limits():
 
 
 def test_hardware_limits_lock_at_the_ready_pose():
-    locked = panda(locked=(4, "joint6"), merge_locked=False, limits="hardware")
+    locked = panda(locked=(4, "joint6"), links="kept", limits="hardware")
     full = panda(limits="hardware")
     np.testing.assert_allclose(locked.home, np.delete(full.home, [3, 5]))
     here, there = link_states(locked, locked.home), link_states(full, full.home)
@@ -103,7 +103,7 @@ def test_dissimilar_pandas_of_the_paper():
     np.testing.assert_allclose(four.link_lengths, np.linalg.norm(np.diff(ends[[0, 1, 3, 4, 7]], axis=0), axis=1))
     np.testing.assert_allclose(three.link_lengths, np.linalg.norm(np.diff(ends[[0, 3, 4, 7]], axis=0), axis=1))
     assert four.velocity_limit.tolist() == [2.175, 2.175, 2.175, 2.61]
-    apart = panda(locked=(3, 6, 7), merge_locked=False)
+    apart = panda(locked=(3, 6, 7), links="kept")
     assert (apart.num_joints, apart.link_joint) == (4, (0, 1, 1, 2, 3, 3, 3))
     assert apart.link_lengths.tolist() == panda().link_lengths.tolist()
 

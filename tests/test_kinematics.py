@@ -78,7 +78,7 @@ def test_random_arms_move_as_in_mujoco(dtype, seed):
 @pytest.mark.parametrize("seed", [3, 4])
 def test_long_arms_move_as_in_mujoco(x64, seed, locked):
     model = random_arms.random_arm(seed, hinges=LONG + 8)
-    arm = load_mjcf(model, locked=locked, merge_locked=False)
+    arm = load_mjcf(model, locked=locked, links="kept")
     assert arm.num_joints == LONG + 8 - len(locked) > LONG
     assert (-1 in arm.link_joint) == bool(locked)
     assert_moves_as_in_mujoco(arm, model, np.dtype("float64"), locked)
@@ -94,27 +94,27 @@ def test_long_arms_take_both_precisions_in_one_process():
             assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {dtype}
 
 
-@pytest.mark.parametrize("merge_locked", [True, False])
+@pytest.mark.parametrize("links", ["merged", "kept"])
 @pytest.mark.parametrize("locked", PANDA_LOCKED.values(), ids=PANDA_LOCKED)
-def test_panda_moves_as_in_mujoco(dtype, locked, merge_locked):
+def test_panda_moves_as_in_mujoco(dtype, locked, links):
     model = read_model(panda_path())
-    arm = panda(locked=locked, merge_locked=merge_locked)
+    arm = panda(locked=locked, links=links)
     assert_moves_as_in_mujoco(arm, model, dtype, dict(locked) if isinstance(locked, dict) else None)
 
 
 @pytest.mark.parametrize("seed", [4, 6, 17])
-@pytest.mark.parametrize("merge_locked", [True, False])
-def test_locked_random_arm_moves_as_in_mujoco(x64, seed, merge_locked):
+@pytest.mark.parametrize("links", ["merged", "kept"])
+def test_locked_random_arm_moves_as_in_mujoco(x64, seed, links):
     model = random_arms.random_arm(seed)
     rng = np.random.default_rng(seed)
     locked = {f"hinge{i + 1}": rng.uniform(-3, 3) for i in rng.permutation(model.njnt)[: model.njnt // 2]}
-    arm = load_mjcf(model, locked=locked, merge_locked=merge_locked)
+    arm = load_mjcf(model, locked=locked, links=links)
     assert arm.num_joints == model.njnt - len(locked)
-    if not merge_locked:
+    if links == "kept":
         assert_moves_as_in_mujoco(arm, model, jnp.dtype("float64"), locked)
         return
     qpos, qvel = motions(arm.num_joints)
-    apart = load_mjcf(model, locked=locked, merge_locked=False)
+    apart = load_mjcf(model, locked=locked, links="kept")
     merged, separate = (link_states(a, qpos[0], qvel[0], normalized=False) for a in (arm, apart))
     first = [apart.link_names.index(name.split("+")[0]) for name in arm.link_names]
     last = [apart.link_names.index(name.split("+")[-1]) for name in arm.link_names]
@@ -126,7 +126,7 @@ def test_locked_random_arm_moves_as_in_mujoco(x64, seed, merge_locked):
 
 def test_locked_panda_is_the_full_panda_at_the_locked_pose(x64):
     angles = {"joint3": 0.4, "joint5": -2.0, "joint7": 1.1}
-    full, locked = panda(), panda(locked=angles, merge_locked=False)
+    full, locked = panda(), panda(locked=angles, links="kept")
     (qpos, *_), (qvel, *_) = motions(locked.num_joints)
     motion = dict(zip(locked.joint_names, zip(qpos, qvel, strict=True), strict=True))
     full_qpos, full_qvel = np.array([motion.get(name, (angles.get(name), 0.0)) for name in full.joint_names]).T

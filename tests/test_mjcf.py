@@ -106,7 +106,7 @@ def test_only_a_locked_joint_merges_links():
     arm = model(hinge("a", inner=bent + hinge("b", pos="1 0.2 0", inner=site.format("link3", "0 0 0 0.5 0 0"))))
     assert load_mjcf(arm).link_names == ("link1", "link2", "link3")
     assert load_mjcf(arm, locked="b").link_names == ("link1", "link2+link3")
-    assert load_mjcf(arm, locked="b", merge_locked=False).link_names == ("link1", "link2", "link3")
+    assert load_mjcf(arm, locked="b", links="kept").link_names == ("link1", "link2", "link3")
 
 
 def test_limits_from_the_model():

@@ -20,7 +20,7 @@ PAIRS = {
     "planar": (EXPERT, LEARNER),
     "long": (planar_arm(np.linspace(0.1, 0.3, LONG + 3)), planar_arm(np.linspace(0.2, 0.1, LONG))),
     # Links 1 of the locked arms are fixed to the base.
-    "fixed links": (panda(locked=(1,), merge_locked=False), panda(locked=(1, 4), merge_locked=False)),
+    "fixed links": (panda(locked=(1,), links="kept"), panda(locked=(1, 4), links="kept")),
 }
 EVERY_WEIGHT = {"paper": PAPER_WEIGHTS, "static": DistanceWeights(rotation=1.0), "all": ALL_WEIGHTS}
 ALL_ARGUMENTS = (0, 1, 2, 3)

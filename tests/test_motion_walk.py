@@ -25,12 +25,12 @@ CASES = {
     "7 joints, 4": ((panda(), panda(locked=(3, 6, 7))), None, PAPER_WEIGHTS),
     # Links 1 of the locked arms are fixed to the base.
     "fixed links": (
-        (panda(locked=(1,), merge_locked=False), panda(locked=(1, 4), merge_locked=False)),
+        (panda(locked=(1,), links="kept"), panda(locked=(1, 4), links="kept")),
         None,
         ALL_WEIGHTS,
     ),
     "few pairs": ((panda(), panda(locked=(3, 6, 7))), SPARSE, ALL_WEIGHTS),
-    "links swapped": ((panda(locked=(1, 4), merge_locked=False), panda()), SWAPPED, PAPER_WEIGHTS),
+    "links swapped": ((panda(locked=(1, 4), links="kept"), panda()), SWAPPED, PAPER_WEIGHTS),
     "long and short": (LONG_ARMS, None, ALL_WEIGHTS),
     "rotation alone": (LONG_ARMS, None, DistanceWeights(rotation=1.0)),
 }
@@ -114,7 +114,7 @@ def test_joints_beyond_the_last_pair_are_not_walked():
 
 @pytest.mark.parametrize("pairs", [[], [(0, 1)]], ids=["no pair", "a link fixed to the base"])
 def test_nothing_is_walked_where_nothing_moves(x64, pairs):
-    arms = panda(locked=(1,), merge_locked=False), LONG_ARMS[0]
+    arms = panda(locked=(1,), links="kept"), LONG_ARMS[0]
     correspondence = np.zeros((7, LONG + 3))
     for pair in pairs:
         correspondence[pair] = 1.0

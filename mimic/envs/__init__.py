@@ -7,13 +7,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import compat
-from mimic.config import explain, schema
+from mimic.config import check_choice, explain, schema
 from mimic.envs.config import EnvConfig
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
 
 _PRESETS = importlib.resources.files("mimic") / "conf" / "env"
+_METRICS = importlib.resources.files("mimic") / "conf" / "metric"
 
 
 def environments() -> tuple[str, ...]:
@@ -27,7 +28,8 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     Args:
       name: one of `environments()`.
       overrides: fields of `EnvConfig`; a nested config takes a dict, as in `demonstrations={"count": 1}`, an arm
-        also its name or file alone, as in `learner="arm.xml"`.
+        also its name or file alone, as in `learner="arm.xml"`, and the metric its preset's name, as in
+        `metric="paper"`.
 
     Raises:
       ValueError: an unknown name or field, or a value of the wrong type or out of range.
@@ -37,12 +39,21 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     preset = OmegaConf.load(str(_PRESETS / f"{name}.yaml"))
     assert isinstance(preset, DictConfig)
     del preset["defaults"]  # Hydra's; the schema is merged here
+    presets = {"metric": _metric_preset(overrides["metric"])} if isinstance(overrides.get("metric"), str) else {}
     arms = {key: {"model": overrides[key]} for key in ("expert", "learner") if isinstance(overrides.get(key), str)}
     try:
-        merged = OmegaConf.merge(schema(EnvConfig), preset, {**overrides, **arms})
+        merged = OmegaConf.merge(schema(EnvConfig), preset, {**overrides, **arms, **presets})
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
     except OmegaConfBaseException as error:
         raise ValueError(explain(error)) from error
+
+
+def _metric_preset(name: str) -> DictConfig:
+    names = sorted(path.name.removesuffix(".yaml") for path in _METRICS.iterdir() if path.name.endswith(".yaml"))
+    check_choice("metric", name, names)
+    preset = OmegaConf.load(str(_METRICS / f"{name}.yaml"))
+    assert isinstance(preset, DictConfig)
+    return preset
 
 
 def make(name: str, **overrides: Any) -> "ImitationEnv":

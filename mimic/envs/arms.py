@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mimic.chain import Links
 from mimic.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
 from mimic.model_files import VELOCITY_LIMIT, read_spec
 from mimic.set_aside import set_aside
@@ -100,8 +101,13 @@ def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
     return read_spec(path)
 
 
-def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
+def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> Arm:
     """The arm that a config describes.
+
+    Args:
+      config: of the arm.
+      limits: see `EnvConfig`.
+      links: see `MetricConfig`.
 
     Raises:
       ValueError: what `panda`, `planar_arm` and `load_mjcf` refuse.
@@ -110,7 +116,11 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
         embodiment = planar_arm(config.link_lengths)
         source = _planar_spec(embodiment).compile()
         embodiment, source, angles = load_arm(
-            source, name=embodiment.name, locked=config.locked or (), limits=cast(Limits, limits)
+            source,
+            name=embodiment.name,
+            locked=config.locked or (),
+            links=cast(Links, links),
+            limits=cast(Limits, limits),
         )
         return with_rotors(Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config)
     is_panda = config.model == "panda"
@@ -120,6 +130,7 @@ def build_arm(config: ArmConfig, limits: str = "none") -> Arm:
         locked=config.locked or (),
         base=config.base,
         tip=config.tip,
+        links=cast(Links, links),
         limits=cast(Limits, limits),
     )
     notes = () if is_panda else set_aside(source, config.base, config.tip)

@@ -9,41 +9,51 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mimic.chain import LINKS
 from mimic.config import check_choice
-from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
+from mimic.correspondence import (
+    arc_length_correspondence,
+    hard_correspondence,
+    overlap_correspondence,
+    soft_correspondence,
+)
 from mimic.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
 from mimic.embodiment import LIMITS, Embodiment
 from mimic.envs.arms import ArmConfig
 from mimic.envs.recording import KINDS
 
-CORRESPONDENCES = ("overlap", "hard", "soft")
+CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")
 PHYSICS = ("mjx", "fused")
 
 
 @dataclasses.dataclass(frozen=True)
 class MetricConfig:
-    """The distance that is the reward.
+    """The distance that is the reward. The defaults were chosen by `benchmarks.similarity`: see docs/similarity.md.
 
     Attributes:
-      translation, rotation, linear_velocity, angular_velocity: weights (paper's values by default).
+      translation, rotation, linear_velocity, angular_velocity: weights; per chain length, rad, and their rates.
       adaptive: the paper's distance-dependent weights for translation and rotation instead.
       rotation_measure: "cosine" or "angle".
-      correspondence: "overlap" (static), "hard" or "soft" (by distance).
+      links: "kept" (a locked joint removes no link) or "merged" (it makes one chord of two links; paper).
+      correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance); "chord_overlap" is the overlap
+        of runs before links were kept.
       xi: sharpness of the soft correspondence, below 0.
       reduction: "mean" or "frobenius".
     """
 
-    translation: float = 0.0
+    translation: float = 0.5
     rotation: float = 1.0
     linear_velocity: float = 0.001
     angular_velocity: float = 0.01
     adaptive: bool = False
     rotation_measure: str = "cosine"
-    correspondence: str = "overlap"
+    correspondence: str = "arc_length"
     xi: float = -10.0
     reduction: str = "mean"
+    links: str = "kept"
 
     def __post_init__(self) -> None:
+        check_choice("links", self.links, LINKS)
         check_choice("correspondence", self.correspondence, CORRESPONDENCES)
         check_choice("rotation_measure", self.rotation_measure, ("cosine", "angle"))
         check_choice("reduction", self.reduction, ("mean", "frobenius"))
@@ -63,7 +73,9 @@ class MetricConfig:
     def make_correspondence(self, expert: Embodiment, learner: Embodiment) -> Correspondence:
         """W, or the function that makes it of the link distances."""
         made: dict[str, Callable[[], Correspondence]] = {
+            "arc_length": lambda: arc_length_correspondence(expert, learner),
             "overlap": lambda: overlap_correspondence(expert, learner),
+            "chord_overlap": lambda: overlap_correspondence(expert, learner, lengths="chord"),
             "hard": lambda: hard_correspondence,
             "soft": lambda: partial(soft_correspondence, xi=self.xi),
         }

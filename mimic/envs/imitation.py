@@ -75,7 +75,9 @@ class ImitationEnv(Env):
 
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
         self.config = config
-        expert, learner = build_arm(config.expert, config.limits), build_arm(config.learner, config.limits)
+        expert, learner = (
+            build_arm(arm, config.limits, config.metric.links) for arm in (config.expert, config.learner)
+        )
         self.expert, self.learner = expert.embodiment, learner.embodiment
         self.weights = config.metric.make_weights()
         self.correspondence = config.metric.make_correspondence(self.expert, self.learner)
@@ -205,8 +207,9 @@ class ImitationEnv(Env):
         """What a runaway costs a step: all corresponding links opposite, at opposite ends of the workspace, at rest."""
         metric, n, n_hat = self.config.metric, self.expert.num_links, self.learner.num_links
         per_pair = np.pi * metric.rotation + 2 * metric.translation + 4 * metric.adaptive
-        # The entries of W sum up to n + n_hat, and no Frobenius norm is above the sum.
-        return float(per_pair * (n + n_hat) / (n * n_hat if metric.reduction == "mean" else 1))
+        # No Frobenius norm is above the sum; the entries of hard and soft W sum up to n + n_hat.
+        total = n + n_hat if callable(self.correspondence) else np.asarray(self.correspondence).sum()
+        return float(per_pair * total / (n * n_hat if metric.reduction == "mean" else 1))
 
     def expert_at(self, demonstration: Array, step: Array) -> LinkStates:
         """The expert's link states at a step of a demonstration."""
@@ -268,7 +271,7 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
     Raises:
       ValueError: a file that cannot be read, does not fit the expert, asks more of it than it can, or holds too few.
     """
-    expert = expert or build_arm(config.expert, config.limits)
+    expert = expert or build_arm(config.expert, config.limits, config.metric.links)
     wanted = config.demonstrations
     if wanted.path:
         loaded = load_demonstrations(Path(wanted.path).expanduser())

@@ -149,7 +149,7 @@ def _portable(config: ExportConfig) -> Portable:
 
 
 def _arms(env: EnvConfig) -> tuple[Embodiment, Embodiment]:
-    expert, learner = (build_arm(arm, env.limits).embodiment for arm in (env.expert, env.learner))
+    expert, learner = (build_arm(arm, env.limits, env.metric.links).embodiment for arm in (env.expert, env.learner))
     return expert, learner
 
 
@@ -163,7 +163,10 @@ def _check_meant_for(name: str, expert: Embodiment, learner: Embodiment) -> None
 
 
 def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str, Any]) -> Portable:
-    arms = [build_arm(arm, trained.env.limits) for arm in (trained.env.expert, trained.env.learner)]
+    arms = [
+        build_arm(arm, trained.env.limits, trained.env.metric.links)
+        for arm in (trained.env.expert, trained.env.learner)
+    ]
     expert, learner = (arm.embodiment for arm in arms)
     layout = observation_layout(expert, learner, trained.env.preview)
     size = layout[-1]["stop"]

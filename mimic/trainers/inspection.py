@@ -34,7 +34,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     """
     out = _new_folder(config.out)
     env = EnvConfig(name="pair", expert=config.expert, learner=config.learner, limits=config.limits)
-    expert, learner = build_arm(config.expert, config.limits), build_arm(config.learner, config.limits)
+    expert, learner = (build_arm(arm, env.limits, env.metric.links) for arm in (env.expert, env.learner))
     joints, links = _joints(learner, config.learner, env), _links(expert, learner, env)
     notes = list(learner.notes)
     assumed, warned = list(assumptions(config.learner, learner)), list(doubts(config.learner, learner))

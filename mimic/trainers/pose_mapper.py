@@ -200,7 +200,7 @@ def make_model(env: EnvConfig, config: PoseMapperConfig) -> MapperModel:
     Raises:
       ValueError: arms that cannot be built.
     """
-    expert, learner = (build_arm(arm, env.limits).embodiment for arm in (env.expert, env.learner))
+    expert, learner = (build_arm(arm, env.limits, env.metric.links).embodiment for arm in (env.expert, env.learner))
     return MapperModel(expert, learner, env.metric, config)
 
 

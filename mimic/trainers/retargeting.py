@@ -166,7 +166,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
         raise ValueError("demonstrations: expected a file, as in demonstrations=FILE")
     out = new_file("out", config.out)
     env = env_config(config.learner, limits=config.limits)
-    expert, learner = (build_arm(arm, env.limits).embodiment for arm in (env.expert, env.learner))
+    expert, learner = (build_arm(arm, env.limits, env.metric.links).embodiment for arm in (env.expert, env.learner))
     loaded = load_demonstrations(Path(config.demonstrations).expanduser())
     _check(loaded, expert)
     mapper = PoseMapper.load(Path(config.mapper).expanduser()) if config.mapper else None

@@ -66,10 +66,20 @@ def load_config(run_dir: Path) -> TrainConfig:
         name = OmegaConf.select(content, "trainer.name")
         if name not in TRAINERS:
             raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
-        merged = OmegaConf.merge(run_schema(name), content)
+        merged = OmegaConf.merge(run_schema(name), _as_it_was(content))  # type: ignore[arg-type]
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own kinds
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
+
+
+def _as_it_was(content: DictConfig) -> DictConfig:
+    """The config of a run from before links were kept: with the metric that was the default then."""
+    if OmegaConf.select(content, "env.metric.links") is not None:
+        return content
+    was = {"translation": 0.0, "correspondence": "overlap", **(OmegaConf.select(content, "env.metric") or {})}
+    correspondence = "chord_overlap" if was["correspondence"] == "overlap" else was["correspondence"]
+    metric = {**was, "correspondence": correspondence, "links": "merged"}
+    return OmegaConf.merge(content, {"env": {"metric": metric}})  # type: ignore[return-value]
 
 
 def write_atomically(path: Path, text: str) -> None:

@@ -106,7 +106,7 @@ def learner_arm(env: EnvConfig, locked: tuple[str, ...]) -> Arm:
     unknown = set(locked) - set(start)
     if unknown:
         raise ValueError(f"locked: expected some of {', '.join(start)}, got {', '.join(sorted(unknown))}")
-    return build_arm(dataclasses.replace(env.learner, locked=locked_at), env.limits)
+    return build_arm(dataclasses.replace(env.learner, locked=locked_at), env.limits, env.metric.links)
 
 
 def home_angles(env: EnvConfig) -> Mapping[str, float]:
@@ -126,7 +126,7 @@ def compile_programs(env: EnvConfig, settings: Settings, mapper: Mapper | None =
     Raises:
       ValueError: joints that cannot be locked.
     """
-    expert = build_arm(env.expert, env.limits).embodiment
+    expert = build_arm(env.expert, env.limits, env.metric.links).embodiment
     arm = learner_arm(env, settings.locked)
     learner, metric = arm.embodiment, dataclasses.replace(env.metric, correspondence=settings.correspondence)
     correspondence = metric.make_correspondence(expert, learner)

@@ -61,7 +61,7 @@ class LiveSession:
     """
 
     def __init__(self, env: EnvConfig, mapper: Mapper | None = None):
-        self.expert: Embodiment = build_arm(env.expert, env.limits).embodiment
+        self.expert: Embodiment = build_arm(env.expert, env.limits, env.metric.links).embodiment
         self.settings: Settings = initial_settings(env)
         self._escape = mapper is None
         self._programs = ProgramCache(env, mapper)

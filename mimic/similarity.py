@@ -1,0 +1,188 @@
+"""How alike two arms look: measures on their centre lines and hands, which no metric and no trainer optimises.
+
+An arm's centre line is the polyline of its segments from base to tip, in units of its own length; its hand is the tip.
+So arms of different size and number of links compare, whatever metric the learner was moved by. Both base frames are
+taken to agree.
+"""
+
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from mimic.embodiment import Embodiment, segment_arm
+from mimic.kinematics import LinkStates, link_state_table, link_states
+
+SAMPLES = 64  # of a centre line
+MEASURES = ("centre_line_distance", "tangent_angle_deg", "frechet_distance", "hand_position_error", "hand_angle_deg")
+
+
+@struct.dataclass
+class CentreLine:
+    """An arm's centre line in one pose, or in many, in its base frame.
+
+    Attributes:
+      points: [*batch, samples, 3] in the middle of intervals of equal arc length, base to tip [chain lengths].
+      tangents: [*batch, samples, 3] unit directions of the centre line there.
+      hand_position: [*batch, 3] the tip [chain lengths].
+      hand_direction: [*batch, 3] unit direction of the last segment.
+    """
+
+    points: Float[Any, "*batch samples 3"]
+    tangents: Float[Any, "*batch samples 3"]
+    hand_position: Float[Any, "*batch 3"]
+    hand_direction: Float[Any, "*batch 3"]
+
+
+def centre_line(arm: Embodiment, qpos: Float[ArrayLike, " joints"], *, samples: int = SAMPLES) -> CentreLine:
+    """The centre line of an arm in one pose.
+
+    Args:
+      arm: the embodiment.
+      qpos: joint angles [rad].
+      samples: points at equal arc length.
+
+    Raises:
+      ValueError: `qpos` is not one angle for each joint, or fewer than one sample.
+    """
+    return _sampled(arm, link_states(segment_arm(arm), qpos, normalized=False), samples)
+
+
+def centre_line_table(
+    arm: Embodiment, qpos: Float[np.ndarray, "*batch joints"], *, samples: int = SAMPLES
+) -> CentreLine:
+    """The centre lines of an arm in many poses, by NumPy in single precision; see `centre_line`."""
+    segments = segment_arm(arm)
+    length = float(segments.chain_length)
+    states = link_state_table(segments, qpos, np.zeros_like(qpos))
+    return _sampled(arm, states.replace(position=states.position * np.float32(length)), samples)  # type: ignore[attr-defined]
+
+
+def _sampled(arm: Embodiment, segments: LinkStates, samples: int) -> CentreLine:
+    """The centre line, of where its segments start [m] and their directions."""
+    if samples < 1:
+        raise ValueError(f"samples: expected at least 1, got {samples}")
+    start, direction = segments.position, segments.direction
+    assert direction is not None
+    numpy = _library(start)
+    lengths = np.linalg.norm(np.asarray(arm.segment_end) - np.asarray(arm.segment_start), axis=1)
+    ends = np.cumsum(lengths)
+    arc = (np.arange(samples) + 0.5) / samples * ends[-1]
+    index = np.minimum(np.searchsorted(ends, arc), len(ends) - 1)
+    offset = (arc - (ends - lengths)[index]).astype(start.dtype)
+    points = start[..., index, :] + offset[:, None] * direction[..., index, :]
+    hand = start[..., -1, :] + numpy.asarray(lengths[-1], start.dtype) * direction[..., -1, :]
+    unit = numpy.asarray(1 / ends[-1], start.dtype)
+    return CentreLine(unit * points, direction[..., index, :], unit * hand, direction[..., -1, :])
+
+
+def centre_line_distance(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
+    """Mean distance of the points at equal arc length [chain lengths].
+
+    Args:
+      expert: of one arm.
+      learner: of the other, in as many samples.
+    """
+    return _norm(expert.points - learner.points).mean(axis=-1)
+
+
+def tangent_angle(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
+    """Mean angle between the tangents at equal arc length [rad], in [0, pi].
+
+    Args:
+      expert: of one arm.
+      learner: of the other, in as many samples.
+    """
+    return _angle(expert.tangents, learner.tangents).mean(axis=-1)
+
+
+def frechet_distance(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
+    """Discrete Frechet distance of the centre lines [chain lengths] (Eiter and Mannila 1994).
+
+    The shortest leash with which two walkers can go along both lines without turning back: it does not depend on how
+    the lines are parametrised, as the other measures do.
+
+    Args:
+      expert: of one arm.
+      learner: of the other, in any number of samples.
+    """
+    numpy = _library(expert.points)
+    rows = numpy.moveaxis(expert.points, -2, 0)  # [samples, *batch, 3]
+
+    def leash(before: Any, point: Any) -> Any:
+        """The next row of the table of leashes, [*batch, samples]."""
+        apart = _norm(point[..., None, :] - learner.points)
+        entered = numpy.concatenate([before[..., :1], numpy.minimum(before[..., 1:], before[..., :-1])], axis=-1)
+        if numpy is jnp:
+            return _running_clamp(apart, numpy.maximum(apart, entered))
+        row = numpy.maximum(apart, entered)
+        for column in range(1, row.shape[-1]):
+            least = numpy.minimum(entered[..., column], row[..., column - 1])
+            row[..., column] = numpy.maximum(apart[..., column], least)
+        return row
+
+    first = numpy.asarray(_norm(rows[0][..., None, :] - learner.points))
+    row: Any = jax.lax.cummax(first, axis=first.ndim - 1) if numpy is jnp else np.maximum.accumulate(first, axis=-1)
+    if numpy is jnp:
+        return jax.lax.scan(lambda before, point: (leash(before, point), None), row, rows[1:])[0][..., -1]
+    for point in rows[1:]:
+        row = leash(row, point)
+    return row[..., -1]
+
+
+def _running_clamp(low: Array, high: Array) -> Array:
+    """y_j = max(low_j, min(high_j, y_{j-1})) along the last axis, y_0 = high_0; high is nowhere below low."""
+
+    def compose(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
+        return jnp.clip(first[0], second[0], second[1]), jnp.clip(first[1], second[0], second[1])
+
+    return jax.lax.associative_scan(compose, (low, high), axis=low.ndim - 1)[1]
+
+
+def hand_position_error(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
+    """Distance of the tips [chain lengths]."""
+    return _norm(expert.hand_position - learner.hand_position)
+
+
+def hand_angle(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
+    """Angle between the directions of the last segments [rad], in [0, pi]."""
+    return _angle(expert.hand_direction, learner.hand_direction)
+
+
+def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, "*batch"]]:
+    """All measures by their names in `MEASURES`; 0 is alike, angles in degrees.
+
+    Args:
+      expert: of one arm.
+      learner: of the other, in as many samples.
+    """
+    degrees = 180 / np.pi
+    values = (
+        centre_line_distance(expert, learner),
+        degrees * tangent_angle(expert, learner),
+        frechet_distance(expert, learner),
+        hand_position_error(expert, learner),
+        degrees * hand_angle(expert, learner),
+    )
+    return dict(zip(MEASURES, values, strict=True))
+
+
+def _library(values: Any) -> ModuleType:
+    return np if isinstance(values, np.ndarray) else jnp
+
+
+def _norm(vectors: Any) -> Any:
+    """Length along the last axis, whose derivative at 0 is 0."""
+    numpy = _library(vectors)
+    square = (vectors * vectors).sum(axis=-1)
+    return numpy.where(square > 0, numpy.sqrt(numpy.where(square > 0, square, 1)), 0)
+
+
+def _angle(a: Any, b: Any) -> Any:
+    """Between unit vectors, by their difference and sum: exact at 0 and at pi."""
+    return 2 * _library(a).arctan2(_norm(a - b), _norm(a + b))
