@@ -112,36 +112,54 @@ def frechet_distance(expert: CentreLine, learner: CentreLine) -> Float[Any, "*ba
       learner: of the other, in any number of samples.
     """
     numpy = _library(expert.points)
-    rows = numpy.moveaxis(expert.points, -2, 0)  # [samples, *batch, 3]
+    # [3, samples, *batch]: whole batches lie in one piece, which is what NumPy is fast on.
+    a, b = (numpy.moveaxis(line.points, (-1, -2), (0, 1)) for line in (expert, learner))
+    return _longest_leash(a, b) if numpy is jnp else _longest_leash_numpy(a, np.ascontiguousarray(b))
 
-    def leash(before: Any, point: Any) -> Any:
-        """The next row of the table of leashes, [*batch, samples]."""
-        apart = _norm(point[..., None, :] - learner.points)
-        entered = numpy.concatenate([before[..., :1], numpy.minimum(before[..., 1:], before[..., :-1])], axis=-1)
-        if numpy is jnp:
-            return _running_clamp(apart, numpy.maximum(apart, entered))
-        row = numpy.maximum(apart, entered)
-        for column in range(1, row.shape[-1]):
-            least = numpy.minimum(entered[..., column], row[..., column - 1])
-            row[..., column] = numpy.maximum(apart[..., column], least)
-        return row
 
-    first = numpy.asarray(_norm(rows[0][..., None, :] - learner.points))
-    row: Any = jax.lax.cummax(first, axis=first.ndim - 1) if numpy is jnp else np.maximum.accumulate(first, axis=-1)
-    if numpy is jnp:
-        return jax.lax.scan(lambda before, point: (leash(before, point), None), row, rows[1:])[0][..., -1]
-    for point in rows[1:]:
-        row = leash(row, point)
-    return row[..., -1]
+def _longest_leash(a: Float[Array, "3 m *batch"], b: Float[Array, "3 n *batch"]) -> Float[Array, "*batch"]:
+    """By rows of the table of leashes [n, *batch]: the shortest leash up to a point of `a` and each point of `b`."""
+
+    def apart(point: Array) -> Array:
+        return _norm(jnp.moveaxis(point[:, None] - b, 0, -1))
+
+    def next_row(row: Array, point: Array) -> tuple[Array, None]:
+        low = apart(point)
+        return _running_clamp(low, jnp.maximum(low, _entered(row, jnp))), None
+
+    first = jax.lax.cummax(apart(a[:, 0]), axis=0)
+    return jax.lax.scan(next_row, first, jnp.moveaxis(a[:, 1:], 1, 0))[0][-1]
+
+
+def _longest_leash_numpy(
+    a: Float[np.ndarray, "3 m *batch"], b: Float[np.ndarray, "3 n *batch"]
+) -> Float[np.ndarray, "*batch"]:
+    row = None
+    for point in np.moveaxis(a, 1, 0):
+        low = np.sqrt(sum((x - y) ** 2 for x, y in zip(point, b, strict=True)))
+        if row is None:
+            row = np.maximum.accumulate(low, axis=0)
+            continue
+        entered = _entered(row, np)
+        row = np.maximum(low, entered)
+        for j in range(1, len(row)):
+            np.maximum(low[j], np.minimum(entered[j], row[j - 1]), out=row[j, ...])
+    assert row is not None
+    return row[-1]
+
+
+def _entered(row: Any, numpy: ModuleType) -> Any:
+    """The shorter leash of the two cells of the row before from which a cell can be entered."""
+    return numpy.concatenate([row[:1], numpy.minimum(row[1:], row[:-1])])
 
 
 def _running_clamp(low: Array, high: Array) -> Array:
-    """y_j = max(low_j, min(high_j, y_{j-1})) along the last axis, y_0 = high_0; high is nowhere below low."""
+    """y_j = max(low_j, min(high_j, y_{j-1})) along the first axis, y_0 = high_0; high is nowhere below low."""
 
     def compose(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
         return jnp.clip(first[0], second[0], second[1]), jnp.clip(first[1], second[0], second[1])
 
-    return jax.lax.associative_scan(compose, (low, high), axis=low.ndim - 1)[1]
+    return jax.lax.associative_scan(compose, (low, high))[1]
 
 
 def hand_position_error(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:

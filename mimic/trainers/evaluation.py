@@ -1,10 +1,11 @@
 """How good a controller is: every demonstration once, against the kinematic bound and against holding still."""
 
 import csv
+import functools
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +16,15 @@ from jaxtyping import Array, Float
 
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
-from mimic.imitation import kinematic_bound
+from mimic.imitation import closest_motion
 from mimic.kinematics import link_state_table
 from mimic.pose import pose_limits, shared_joints
-from mimic.trainers.measures import WORST, Table, gaps, measure
+from mimic.similarity import CentreLine, centre_line_table
+from mimic.trainers.measures import WORST, Table, gaps, measure, measure_similarity
 from mimic.trainers.prepared import Prepared, on_host
 
 Controller = Callable[[State], Array]  # state of the environment -> action
+Motions = Float[np.ndarray, "demonstrations time joints"]
 SPLITS = ("train", "held_out")
 
 
@@ -61,18 +64,18 @@ class Evaluator:
         self._references = Prepared(lambda: _references(self.env))
 
     def prepare(self) -> None:
-        """Begins to compute `lower_bound` and `hold_distance` in the background."""
+        """Begins to compute `lower_bound`, `hold_distance` and the baselines in the background."""
         self._references.start()
 
     @property
     def lower_bound(self) -> Float[np.ndarray, "demonstrations time"]:
         """The kinematic bound; computed when it is first asked for, if not before."""
-        return self._references()[0]
+        return self._references().bound
 
     @property
     def hold_distance(self) -> Float[np.ndarray, "demonstrations time"]:
         """Distance of the learner at rest in its home pose."""
-        return self._references()[1]
+        return self._references().hold
 
     def rollout(self, controller: Controller) -> Rollouts:
         """Runs a controller on every demonstration; the caller jits this, with the parameters inside."""
@@ -98,8 +101,37 @@ class Evaluator:
         """Which demonstrations are trained on, and which are held out."""
         return {"train": slice(0, self._num_train), "held_out": slice(self._num_train, None)}
 
+    @functools.cached_property
+    def _expert_line(self) -> CentreLine:
+        """Centre lines of the demonstrations after each step."""
+        steps = self.env.config.horizon
+        return centre_line_table(self.env.expert, self.env.demonstrations.qpos[:, 1 : steps + 1].astype(np.float32))
+
+    def similarity(self, qpos: Motions) -> Table:
+        """How alike a learner's motions look, one row for each demonstration: see `measure_similarity`."""
+        return measure_similarity(self._expert_line, self.env.learner, np.asarray(qpos, np.float32))
+
+    @functools.cached_property
+    def _baseline_similarity(self) -> dict[str, Table]:
+        return {name: self.similarity(qpos) for name, qpos in self._references().motions.items()}
+
+    def similarity_summary(self, rollouts: Rollouts, controller: str) -> dict[str, dict[str, dict[str, float]]]:
+        """Means by split of each measure of similarity, for a controller and for the baselines beside it.
+
+        The baselines: `nearest_poses` (where the kinematic bound is), `copied_joints` (the expert's angles in the
+        joints that both arms have by name) and `hold`.
+        """
+        tables = {controller: self.similarity(np.asarray(rollouts.qpos)), **self._baseline_similarity}
+        return {
+            name: {
+                key: {split: float(values[part].mean()) for split, part in self.parts.items()}
+                for key, values in table.items()
+            }
+            for name, table in tables.items()
+        }
+
     def table(self, rollouts: Rollouts) -> Table:
-        """One row for each demonstration: see `measure`; and mean distance, bound, holding still, and the gap."""
+        """One row for each demonstration: see `measure`; and mean distance, bound, holding the start pose, the gap."""
         qpos, qvel, torque = (np.asarray(x) for x in (rollouts.qpos, rollouts.qvel, rollouts.torque))
         states = link_state_table(self.env.learner, qpos, qvel)
         distances = np.asarray(rollouts.distance), self.lower_bound, self.hold_distance
@@ -121,7 +153,7 @@ class Evaluator:
 
         means = {key: by_split(table[key]) for key in ("mean_distance", "lower_bound", "hold_distance")}
         return {
-            "optimality_gap": {split: gaps(*(mean[split] for mean in means.values())) for split in SPLITS},
+            "optimality_gap": {split: float(gaps(*(mean[split] for mean in means.values()))) for split in SPLITS},
             **means,
             **{
                 key: by_split(values, np.sum if key.endswith("violations") else np.mean)
@@ -135,8 +167,8 @@ class Evaluator:
         gap = self.table(rollouts)["optimality_gap"]
         named = {}
         for split, part in self.parts.items():
-            order = np.argsort(-gap[part])[:WORST]
-            named[split] = {str(index): float(gap[part][index]) for index in order}
+            order = np.argsort(-gap[part])[:WORST]  # those without a gap come last
+            named[split] = {str(index): float(gap[part][index]) for index in order if np.isfinite(gap[part][index])}
         return named
 
     def save_curves(self, rollouts: Rollouts, out: Path) -> None:
@@ -152,7 +184,7 @@ class Evaluator:
 
     def save_table(self, rollouts: Rollouts, out: Path) -> None:
         """Writes the table as CSV, with the split and the number of each demonstration."""
-        table = self.table(rollouts)
+        table = {**self.table(rollouts), **self.similarity(np.asarray(rollouts.qpos))}
         numbers = [(split, i) for split, part in self.parts.items() for i in range(len(self.hold_distance[part]))]
         rows = [(*number, *row) for number, *row in zip(numbers, *table.values(), strict=True)]
         _write_csv(out, ["split", "demonstration", *table], rows)
@@ -168,25 +200,47 @@ def _write_csv(out: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) 
     os.replace(partial, out)
 
 
-def _references(env: ImitationEnv) -> tuple[np.ndarray, np.ndarray]:
-    """What a controller is measured against, each [demonstrations, time]: the kinematic bound, and holding still."""
+class References(NamedTuple):
+    """What a controller is measured against, over [demonstrations, time].
+
+    Attributes:
+      bound: the kinematic bound.
+      hold: distance of holding the start pose.
+      motions: the learner's angles [demonstrations, time, joints] [rad] by baseline; see
+        `Evaluator.similarity_summary`.
+    """
+
+    bound: Float[np.ndarray, "demonstrations time"]
+    hold: Float[np.ndarray, "demonstrations time"]
+    motions: dict[str, Motions]
+
+
+def _references(env: ImitationEnv) -> References:
     steps, home = env.config.horizon, np.asarray(env.learner.home)
     qpos, qvel = (x[:, 1 : steps + 1] for x in (env.demonstrations.qpos, env.demonstrations.qvel))
     own_qpos, own_qvel = (shared_joints(env.expert, env.learner, x) for x in (qpos, qvel))
     own_qpos = np.clip(own_qpos, *pose_limits(env.learner, float))
     expert = jax.tree.map(lambda x: np.asarray(x)[:, 1 : steps + 1], env.expert_states)
     distance = jax.jit(jax.vmap(jax.vmap(env.states_distance)))
-    still = link_state_table(env.learner, np.broadcast_to(home, own_qpos.shape), np.zeros_like(own_qvel))
-    own, hold = (np.asarray(distance(expert, x)) for x in (link_state_table(env.learner, own_qpos, own_qvel), still))
+    still = np.broadcast_to(home, own_qpos.shape)
+    own, hold = (
+        np.asarray(distance(expert, link_state_table(env.learner, *motion)))
+        for motion in ((own_qpos, own_qvel), (still, np.zeros_like(own_qvel)))
+    )
     # Where the learner can do just what the expert does there is nothing to search: no distance is below 0.
-    return (_lower_bound(env, qpos, qvel) if own.any() else own), hold
+    bound, nearest = _lower_bound(env, qpos, qvel) if own.any() else (own, own_qpos)
+    motions = {"nearest_poses": nearest, "copied_joints": own_qpos, "hold": still}
+    if not set(env.expert.joint_names) & set(env.learner.joint_names):
+        del motions["copied_joints"]
+    return References(bound, hold, motions)
 
 
-def _lower_bound(env: ImitationEnv, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+def _lower_bound(env: ImitationEnv, qpos: Motions, qvel: Motions) -> tuple[np.ndarray, Motions]:
+    """The kinematic bound [demonstrations, time], and the poses that have it."""
     metric = env.config.metric
 
-    def bound(qpos: Array, qvel: Array) -> Array:
-        return kinematic_bound(
+    def closest(qpos: Array, qvel: Array) -> tuple[Array, Array]:
+        found = closest_motion(
             env.expert,
             env.learner,
             qpos,
@@ -196,7 +250,9 @@ def _lower_bound(env: ImitationEnv, qpos: np.ndarray, qvel: np.ndarray) -> np.nd
             rotation=metric.rotation_measure,  # type: ignore[arg-type]
             reduction=metric.reduction,  # type: ignore[arg-type]
         )
+        return found.distance, found.qpos
 
     # On the host's processor where JAX may use it: there the program compiles several times faster, and it runs once.
     with on_host():
-        return np.asarray(jax.jit(jax.vmap(bound))(qpos.astype(np.float32), qvel.astype(np.float32)))
+        found = jax.jit(jax.vmap(closest))(qpos.astype(np.float32), qvel.astype(np.float32))
+        return np.asarray(found[0]), np.asarray(found[1])

@@ -81,9 +81,9 @@ class Job(abc.ABC):
     def rows(self, figures: Figures) -> list[Row]:
         """The figures as rows of the final table."""
 
-    def details(self, outcome: Any) -> Figures:
-        """What the report says beyond the figures."""
-        del outcome
+    def details(self, outcome: Any, controller: str = "policy") -> Figures:
+        """What a report says of a controller beyond the figures; `similarity` is shown as a table of its own."""
+        del outcome, controller
         return {}
 
     @abc.abstractmethod

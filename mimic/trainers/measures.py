@@ -1,18 +1,21 @@
-"""What is measured on each demonstration: how near, how smooth, and within which limits a controller moves."""
+"""What is measured on each demonstration: how near, how alike, how smooth, and within which limits a learner moves."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
+from mimic.embodiment import Embodiment
 from mimic.kinematics import LinkStates
 from mimic.pose import pose_limits
+from mimic.similarity import CentreLine, centre_line_table, similarity
 
 if TYPE_CHECKING:  # brax and MJX, which pose mappers need not
     from mimic.envs.imitation import ImitationEnv
 
 Table = dict[str, Float[np.ndarray, " demonstrations"]]
 WORST = 3  # demonstrations of each split that are named
+LEAST_SPAN = 0.25  # of the distance of holding the start pose, that a best motion must save for a gap to mean something
 _ROUNDING = 1e-5  # what float32 leaves of a torque at its limit, or of a joint at its stop; relative and in rad
 
 
@@ -67,6 +70,34 @@ def measure(
     }
 
 
+def measure_similarity(
+    expert: CentreLine, learner: Embodiment, qpos: Float[np.ndarray, "demonstrations time joints"]
+) -> Table:
+    """Columns of the measures of `mimic.similarity`, means over time.
+
+    Args:
+      expert: centre lines of the demonstrations, [demonstrations, time, samples, 3].
+      learner: the arm.
+      qpos: its joint angles at the same times [rad].
+    """
+    values = similarity(expert, centre_line_table(learner, qpos))
+    return {name: value.mean(axis=1, dtype=float) for name, value in values.items()}
+
+
 def gaps(distance: Any, bound: Any, hold: Any) -> Any:
-    """Optimality gap of distances, numbers or arrays: 0 at the kinematic bound, 1 at holding the start pose."""
-    return (distance - bound) / (hold - bound)
+    """Optimality gap of distances, numbers or arrays: 0 at the kinematic bound, 1 at holding the start pose.
+
+    NaN where `has_gap` says that it would mean nothing.
+    """
+    distance, bound, hold = (np.asarray(x, float) for x in (distance, bound, hold))
+    meaningful = has_gap(bound, hold)
+    return np.where(meaningful, (distance - bound) / np.where(meaningful, hold - bound, 1.0), np.nan)
+
+
+def has_gap(bound: Any, hold: Any) -> Any:
+    """Whether the best motion is clearly nearer than holding the start pose.
+
+    Else the optimality gap divides by next to nothing, and small motions that the learner cannot follow at all give
+    gaps of hundreds of percent.
+    """
+    return np.asarray(bound) <= (1 - LEAST_SPAN) * np.asarray(hold)

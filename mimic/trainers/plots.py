@@ -1,6 +1,7 @@
 """Pictures of a run: how it learned, and how near the learner stays to the expert."""
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 
 from mimic.trainers.measures import WORST  # noqa: E402
+from mimic.trainers.progress import SIMILARITY_HEADERS, SIMILARITY_NAMES  # noqa: E402
 from mimic.trainers.runs import METRICS  # noqa: E402
 
 if TYPE_CHECKING:
@@ -87,9 +89,28 @@ def plot_demonstrations(
         above.margins(y=0.12)  # for the numbers of the worst
         for axes in (above, below):
             axes.grid(alpha=0.3, axis="y")
-    rows[0, 0].set(ylabel="optimality gap [%]", ylim=(min(0, 100 * table["optimality_gap"].min()), None))
+    rows[0, 0].set(ylabel="optimality gap [%]", ylim=(min(0, 100 * np.nanmin([0.0, *table["optimality_gap"]])), None))
     rows[1, 0].set(ylabel="mean embodiment distance", ylim=(0, None))
     _finish(figure, rows[1, 0], f"{title}: {controller}, each demonstration; the worst by their numbers", out)
+
+
+def plot_similarity(similarity: Mapping[str, Mapping[str, Mapping[str, float]]], out: Path, *, title: str) -> None:
+    """Bars of each measure of similarity, for the controller and each baseline; training beside held-out data."""
+    names = list(similarity)
+    figure, all_axes = plt.subplots(
+        1, len(SIMILARITY_HEADERS), figsize=(12, 0.42 * len(names) + 1.6), sharey=True, layout="constrained"
+    )
+    place = np.arange(len(names))
+    for axes, (key, header) in zip(all_axes, SIMILARITY_HEADERS.items(), strict=True):
+        for offset, (split, colour) in zip((-0.2, 0.2), _COLOURS.items(), strict=True):
+            values = [similarity[name][key][split] for name in names]
+            axes.barh(place + offset, values, 0.4, color=colour, label=f"{_LABELS[split]} demonstrations")
+        unit = "deg" if key.endswith("_deg") else "chain lengths"
+        axes.set(title=header.replace("\n", " "), xlabel=unit)
+        axes.grid(alpha=0.3, axis="x")
+    all_axes[0].set_yticks(place, [SIMILARITY_NAMES.get(name, name.replace("_", " ")) for name in names])
+    all_axes[0].invert_yaxis()
+    _finish(figure, all_axes[0], f"{title}: how alike the motions look (0 is alike), beside ways without learning", out)
 
 
 def _finish(figure: Any, labelled: Any, title: str, out: Path) -> None:

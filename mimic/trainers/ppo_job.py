@@ -1,6 +1,7 @@
 """`trainer=ppo`: a policy that moves the learner like the expert, by torques."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from mimic.trainers import ppo, runs
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.evaluation import SPLITS, Evaluator, Rollouts
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
+from mimic.trainers.measures import LEAST_SPAN
 from mimic.trainers.prepared import Prepared, compiling
 from mimic.trainers.signals import Signals
 
@@ -106,15 +108,19 @@ class PPOJob(Job):
     def status(self, figures: Figures) -> str:
         """Distance and optimality gap."""
         gap, distance = figures["optimality_gap"], figures["mean_distance"]["train"]
-        return f"distance {distance:.4f}  gap {gap['train']:.1%}, held out {gap['held_out']:.1%}"
+        shown = {split: _text("{:.1%}", value) for split, value in gap.items()}
+        return f"distance {distance:.4f}  gap {shown['train']}, held out {shown['held_out']}"
 
     def good_enough(self, figures: Figures) -> bool:
         """At the target gap."""
         return figures["optimality_gap"]["train"] <= self.settings.target_gap
 
-    def details(self, outcome: Rollouts) -> Figures:
-        """The demonstrations that went worst."""
-        return {"worst_demonstrations": self.evaluator.worst(outcome)}
+    def details(self, outcome: Rollouts, controller: str = "policy") -> Figures:
+        """How alike the motions look, beside the baselines, and the demonstrations that went worst."""
+        return {
+            "similarity": self.evaluator.similarity_summary(outcome, controller),
+            "worst_demonstrations": self.evaluator.worst(outcome),
+        }
 
     def rows(self, figures: Figures) -> list[Row]:
         """The gap and what it is made of."""
@@ -122,7 +128,7 @@ class PPOJob(Job):
             ("optimality gap", "optimality_gap", "{:.2%}"),
             ("mean distance", "mean_distance", "{:.4f}"),
             ("  lower bound (gap 0)", "lower_bound", "{:.4f}"),
-            ("  holding still (1)", "hold_distance", "{:.4f}"),
+            ("  holding the start pose (gap 1)", "hold_distance", "{:.4f}"),
             ("angle to expert links", "link_angle_error_deg", "{:.1f} deg"),
             ("angular velocity error", "angular_velocity_error", "{:.2f} rad/s"),
             ("torque / largest, rms", "torque_rms", "{:.1%}"),
@@ -132,7 +138,11 @@ class PPOJob(Job):
             ("  above rated speed", "speed_violations", "{:.0f}"),
             ("  above torque limit", "torque_violations", "{:.0f}"),
         )
-        rows = [(label, *(form.format(figures[key][split]) for split in SPLITS)) for label, key, form in by_split]
+        rows = [(label, *(_text(form, figures[key][split]) for split in SPLITS)) for label, key, form in by_split]
+        if not all(math.isfinite(gap) for gap in figures["optimality_gap"].values()):
+            rows.insert(
+                1, ("  none: the best motion saves less than", f"{LEAST_SPAN:.0%} of holding", "the start pose")
+            )
         worst = figures["worst_demonstrations"]
         named = ("  ".join(f"{i}: {gap:.0%}" for i, gap in worst[split].items()) for split in SPLITS)
         return [*rows, ("worst (number: gap)", *named)]  # type: ignore[list-item]
@@ -146,7 +156,14 @@ class PPOJob(Job):
         names = {"controller": controller.replace("_", " "), "title": self._name}
         plots.plot_quality(self.evaluator, outcome, folder / "quality.png", **names)
         plots.plot_demonstrations(self.evaluator, outcome, folder / "demonstrations.png", **names)
+        plots.plot_similarity(
+            self.evaluator.similarity_summary(outcome, controller), folder / "similarity.png", title=self._name
+        )
         plots.plot_training(folder, "optimality_gap", "optimality gap [%]", of="demonstrations", title=self._name)
+
+
+def _text(form: str, value: float) -> str:
+    return form.format(value) if math.isfinite(value) else "none"
 
 
 def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:

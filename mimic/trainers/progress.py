@@ -4,11 +4,28 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from mimic.trainers.job import Job
+
+SIMILARITY_HEADERS = {  # positions in chain lengths
+    "centre_line_distance": "centre\nline",
+    "tangent_angle_deg": "tangent\nangle",
+    "frechet_distance": "Frechet\ndistance",
+    "hand_position_error": "hand\nposition",
+    "hand_angle_deg": "hand\nangle",
+}
+SPLIT_NAMES = {"train": "training", "held_out": "held out"}
+SIMILARITY_NAMES = {  # of what moves the learner, where the name is not said by its key
+    "nearest_poses": "nearest poses (metric)",
+    "copied_joints": "copied joints",
+    "hand_ik": "inverse kinematics of hand",
+    "aligned_segments": "aligned segments",
+    "hold": "holding the start pose",
+}
 
 
 class TrainingProgress:
@@ -47,6 +64,28 @@ class TrainingProgress:
 
 def _duration(seconds: float) -> str:
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+
+
+def similarity_table(similarity: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
+    """How alike motions look, for each way of moving the learner: means of the measures, a section for each split."""
+    title = "similarity, which nothing is optimised for; 0 is alike"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table.add_column("learner moved by", no_wrap=True)
+    for header in SIMILARITY_HEADERS.values():
+        table.add_column(header, justify="right", no_wrap=True)
+    splits = next(iter(next(iter(similarity.values())).values()))
+    for split in splits:
+        if len(splits) > 1:
+            table.add_row(f"[italic]{SPLIT_NAMES.get(split, split)}[/italic]")
+        for name, measures in similarity.items():
+            cells = (_similarity_cell(key, measures[key][split]) for key in SIMILARITY_HEADERS)
+            table.add_row(SIMILARITY_NAMES.get(name, name.replace("_", " ")), *cells)
+        table.add_section()
+    return table
+
+
+def _similarity_cell(key: str, value: float) -> str:
+    return f"{value:.1f} deg" if key.endswith("_deg") else f"{value:.3f}"
 
 
 def report_table(report: Mapping[str, Any], job: Job) -> Table:

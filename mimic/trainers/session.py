@@ -20,7 +20,7 @@ from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.group import Group
 from mimic.trainers.job import Job, Params
 from mimic.trainers.loggers import check_loggers, make_loggers
-from mimic.trainers.progress import TrainingProgress, report_table
+from mimic.trainers.progress import TrainingProgress, report_table, similarity_table
 from mimic.trainers.signals import Interrupted, Signals, noted_signals
 
 
@@ -92,10 +92,10 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         console = Console()
         with stopwatch.stage("evaluate"):
             outcome, controller = _outcome(job, params, config.controller)
-            figures = {**job.figures(outcome), **job.details(outcome)}
+            figures = {**job.figures(outcome), **job.details(outcome, config.controller)}
         report = _report(trained, job, figures, stopwatch, steps, 0)
         report |= {**controller, "evaluated": _conditions(trained, config)}
-        console.print(report_table(report, job))
+        _show(console, report, job)
         if out:
             out.mkdir()
             job.save_outcome(out, outcome, config.controller)
@@ -249,7 +249,7 @@ def _train(
         report = _report(config, job, figures, stopwatch, steps, steps - done_before)
         runs.write_report(run_dir, report)
         job.save_outcome(run_dir, outcome)
-    console.print(report_table(report, job))
+    _show(console, report, job)
     console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
     return 0
 
@@ -296,6 +296,12 @@ def _flat(figures: Mapping[str, Any]) -> dict[str, float]:
         else:
             flat[key] = value
     return flat
+
+
+def _show(console: Console, report: Mapping[str, Any], job: Job) -> None:
+    console.print(report_table(report, job))
+    if "similarity" in report:
+        console.print(similarity_table(report["similarity"]))
 
 
 def _report(
