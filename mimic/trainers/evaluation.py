@@ -20,7 +20,7 @@ from mimic.imitation import closest_motion
 from mimic.kinematics import link_state_table
 from mimic.pose import pose_limits, shared_joints
 from mimic.similarity import CentreLine, centre_line_table
-from mimic.trainers.measures import WORST, Table, gaps, measure, measure_similarity
+from mimic.trainers.measures import WORST, Table, gaps, means_by_split, measure, measure_similarity
 from mimic.trainers.prepared import Prepared, on_host
 
 Controller = Callable[[State], Array]  # state of the environment -> action
@@ -122,13 +122,7 @@ class Evaluator:
         joints that both arms have by name) and `hold`.
         """
         tables = {controller: self.similarity(np.asarray(rollouts.qpos)), **self._baseline_similarity}
-        return {
-            name: {
-                key: {split: float(values[part].mean()) for split, part in self.parts.items()}
-                for key, values in table.items()
-            }
-            for name, table in tables.items()
-        }
+        return means_by_split(tables, self.parts)
 
     def table(self, rollouts: Rollouts) -> Table:
         """One row for each demonstration: see `measure`; and mean distance, bound, holding the start pose, the gap."""

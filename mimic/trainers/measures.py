@@ -1,5 +1,6 @@
 """What is measured on each demonstration: how near, how alike, how smooth, and within which limits a learner moves."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -82,6 +83,17 @@ def measure_similarity(
     """
     values = similarity(expert, centre_line_table(learner, qpos))
     return {name: value.mean(axis=1, dtype=float) for name, value in values.items()}
+
+
+def means_by_split(tables: Mapping[str, Table], parts: Mapping[str, slice]) -> dict[str, dict[str, dict[str, float]]]:
+    """Means of each column of each table over each split of its rows: {table: {column: {split: mean}}}."""
+    return {
+        name: {
+            column: {split: float(values[part].mean()) for split, part in parts.items()}
+            for column, values in table.items()
+        }
+        for name, table in tables.items()
+    }
 
 
 def gaps(distance: Any, bound: Any, hold: Any) -> Any:

@@ -2,10 +2,12 @@
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
+
+from mimic.trainers.progress import SIMILARITY_HEADERS
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
 _BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)
@@ -69,15 +71,15 @@ def heat_maps(
     names = short_names(expert_links), short_names(learner_links)
     return (
         '<div style="display:flex;gap:10px;padding:0 12px">'
-        + heat_map(matrix, *names, "correspondence W", name="mimic-correspondence", largest=2.0)
+        + heat_map(matrix, *names, "correspondence W", name="mimic-correspondence")
         + heat_map(links, *names, "link distances", name="mimic-links", colour=_ORANGES)
         + '</div><div style="font-size:10px;color:#777;padding:2px 12px">rows: links of the expert, columns: of the '
         "learner</div>"
     )
 
 
-def numbers(distance: float, bound: float, note: str = "") -> str:
-    """Distance and bound, large; and what there is to say."""
+def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[str, float] | None = None) -> str:
+    """Distance and bound, large; a note; and the measures of `mimic.similarity`."""
 
     def one(name: str, label: str, value: float, colour: str) -> str:
         return (
@@ -91,8 +93,19 @@ def numbers(distance: float, bound: float, note: str = "") -> str:
         + one("mimic-distance", "embodiment distance", distance, LEARNER)
         + one("mimic-bound", "lower bound", bound, BOUND)
         + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px">'
-        f"{html.escape(note)}</div>"
+        f"{html.escape(note)}</div>{_measures(similarity or {})}"
     )
+
+
+def _measures(similarity: Mapping[str, float]) -> str:
+    """The measures of similarity in one line, each under its name."""
+    cells = "".join(
+        f'<div><div style="font-size:10px;color:#777">{html.escape(SIMILARITY_HEADERS[name].replace(chr(10), " "))}'
+        f'</div><div id="mimic-{name}" style="font-size:13px;font-variant-numeric:tabular-nums">'
+        f"{f'{value:.0f}°' if name.endswith('_deg') else f'{value:.3f}'}</div></div>"
+        for name, value in similarity.items()
+    )
+    return f'<div style="display:flex;gap:14px;padding:4px 12px">{cells}</div>' if cells else ""
 
 
 def chart(

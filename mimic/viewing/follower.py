@@ -18,6 +18,7 @@ from mimic.envs.arms import Arm, build_arm
 from mimic.envs.config import CORRESPONDENCES, EnvConfig, MetricConfig
 from mimic.kinematics import link_states
 from mimic.pose import imitate_pose, pose_limits
+from mimic.similarity import centre_line, similarity
 from mimic.spatial import safe_sqrt
 
 Mapper = Callable[[Array], Array]  # the expert's pose -> the learner's
@@ -31,7 +32,7 @@ class Settings:
 
     Attributes:
       locked: the learner's locked joints.
-      correspondence: "overlap", "hard" or "soft".
+      correspondence: see `MetricConfig`.
       translation, rotation: weights.
     """
 
@@ -68,11 +69,13 @@ class Measured(NamedTuple):
       distance: embodiment distance.
       matrix: correspondence W.
       links: weighted distance of every pair of links D'.
+      similarity: see `mimic.similarity`.
     """
 
     distance: Float[Any, ""]
     matrix: Float[Any, "expert learner"]
     links: Float[Any, "expert learner"]
+    similarity: Mapping[str, Any]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -147,7 +150,8 @@ def compile_programs(env: EnvConfig, settings: Settings, mapper: Mapper | None =
     def measure(qpos: Array, learner_qpos: Array, weights: Array) -> Measured:
         states = link_states(expert, qpos), link_states(learner, learner_qpos)
         links = link_distances(*states, weigh(weights), rotation=choice["rotation"])
-        return measured(links, correspondence, metric)
+        lines = centre_line(expert, qpos), centre_line(learner, learner_qpos)
+        return measured(links, correspondence, metric, similarity(*lines))
 
     def best(qpos: Array, weights: Array) -> tuple[Array, Array]:
         found = imitate_pose(expert, learner, qpos, correspondence, weigh(weights), **choice)
@@ -160,12 +164,14 @@ def compile_programs(env: EnvConfig, settings: Settings, mapper: Mapper | None =
     yield dataclasses.replace(moving, best=_compiled(best, q, w))
 
 
-def measured(links: Array, correspondence: Correspondence, metric: MetricConfig) -> Measured:
+def measured(
+    links: Array, correspondence: Correspondence, metric: MetricConfig, similarity: Mapping[str, Array]
+) -> Measured:
     """What is shown of the distances of all pairs of links."""
     matrix = jnp.asarray(correspondence(links) if callable(correspondence) else correspondence, links.dtype)
     weighted = matrix * links
     total = weighted.mean() if metric.reduction == "mean" else safe_sqrt(jnp.sum(weighted * weighted))
-    return Measured(total, matrix, links)
+    return Measured(total, matrix, links, similarity)
 
 
 def _compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:

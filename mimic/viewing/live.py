@@ -32,6 +32,7 @@ class Frame:
       bound: the least that the learner could have; NaN while it is not known.
       matrix: correspondence W.
       links: weighted distance of every pair of links D'.
+      similarity: measures of `mimic.similarity` by name.
     """
 
     expert: Mapping[str, float]
@@ -43,6 +44,7 @@ class Frame:
     bound: float
     matrix: Float[np.ndarray, "expert learner"]
     links: Float[np.ndarray, "expert learner"]
+    similarity: Mapping[str, float]
 
 
 class LiveSession:
@@ -184,6 +186,7 @@ class LiveSession:
             bound=min(bound, distance),  # many starts may miss what one path found
             matrix=np.asarray(shown.matrix),
             links=np.asarray(shown.links),
+            similarity={name: float(value) for name, value in shown.similarity.items()},
         )
 
     def _go_on(self, dt: float) -> None:

@@ -48,7 +48,7 @@ class Page:
         with self.server.atomic():
             self._arms[0].put(frame.expert, ())
             self._arms[1].put(frame.learner, frame.locked)
-            self._numbers.content = drawing.numbers(frame.distance, frame.bound, note)
+            self._numbers.content = drawing.numbers(frame.distance, frame.bound, note, frame.similarity)
             self._maps.content = drawing.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
             self._chart.content = chart
 

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from mimic.envs.arms import build_arm
 from mimic.envs.config import EnvConfig
+from mimic.similarity import centre_line_table, similarity
 from mimic.trainers import session
 from mimic.trainers.checkpoints import load_checkpoint
 from mimic.trainers.config import TrainConfig
@@ -19,6 +20,7 @@ from mimic.viewing import drawing
 from mimic.viewing.live import Frame
 
 FRAMES_PER_SECOND = 30
+_SAMPLES = 32  # of the centre lines that a frame is measured by: half the usual number, to be quick
 
 
 class Playback:
@@ -72,7 +74,14 @@ class Playback:
             bound=float(story.bound[step]),
             matrix=story.matrix[step],
             links=story.links[step],
+            similarity=self._similarity(story.expert[moment], story.learner[moment]),
         )
+
+    def _similarity(self, expert_qpos: np.ndarray, learner_qpos: np.ndarray) -> dict[str, float]:
+        env = self._evaluator.env
+        arms = (env.expert, expert_qpos), (env.learner, learner_qpos)
+        lines = (centre_line_table(arm, qpos, samples=_SAMPLES) for arm, qpos in arms)
+        return {name: float(value) for name, value in similarity(*lines).items()}
 
     def chart(self, split: str, demonstration: int, time: float) -> str:
         """The distance over the episode, with its bound, and where the time is."""
@@ -81,7 +90,7 @@ class Playback:
         curves = [
             ("policy", story.distance, drawing.LEARNER),
             ("bound", story.bound, drawing.BOUND),
-            ("holding still", story.hold, drawing.HOLD),
+            ("holding start pose", story.hold, drawing.HOLD),
         ]
         return drawing.chart(times, curves, now=max(time, story.dt))
 
@@ -89,6 +98,8 @@ class Playback:
         """How good the policy is on a demonstration as a whole."""
         story = self.story(split, demonstration)
         gap = float(gaps(*(x.mean(dtype=float) for x in (story.distance, story.bound, story.hold))))
+        if not np.isfinite(gap):
+            return "no optimality gap: the best motion is hardly nearer than holding the start pose"
         return f"optimality gap of this demonstration: {gap:.1%}"
 
     def duration(self, split: str, demonstration: int) -> float:
