@@ -9,7 +9,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from mimic.embodiment import Embodiment
+from mimic.embodiment import Embodiment, segment_arm
 from mimic.pose import pose_limits, shared_joints
 from mimic.segment_alignment import Poses, align_segments, checked_poses
 from mimic.similarity import centre_line_table
@@ -93,6 +93,12 @@ BASELINES: dict[str, Callable[[Embodiment, Embodiment, Poses], Poses | None]] = 
 }
 
 
+def baseline_poses(expert: Embodiment, learner: Embodiment, qpos: Poses) -> dict[str, Poses]:
+    """The learner's poses by each of `BASELINES` that applies to the two arms; arguments as for `copy_joints`."""
+    made = {name: pose(expert, learner, qpos) for name, pose in BASELINES.items()}
+    return {name: poses for name, poses in made.items() if poses is not None}
+
+
 class _HandSolver:
     """mink on a model of the learner's joints alone, in chain lengths."""
 
@@ -152,7 +158,7 @@ def _kinematic_model(arm: Embodiment) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     spec.compiler.autolimits = False
     spec.compiler.degree = False
-    unit = 1 / float(arm.chain_length)
+    unit = 1 / float(segment_arm(arm).chain_length)
     bodies = [(spec.worldbody, np.zeros(3))]
     lower, upper = pose_limits(arm, float)
     for name, axis, anchor, low, high in zip(

@@ -133,7 +133,7 @@ def _longest_leash(a: Float[Array, "3 m *batch"], b: Float[Array, "3 n *batch"])
 
 def _longest_leash_numpy(
     a: Float[np.ndarray, "3 m *batch"], b: Float[np.ndarray, "3 n *batch"]
-) -> Float[np.ndarray, "*batch"]:
+) -> Float[Any, "*batch"]:
     row = None
     for point in np.moveaxis(a, 1, 0):
         low = np.sqrt(sum((x - y) ** 2 for x, y in zip(point, b, strict=True)))

@@ -22,6 +22,7 @@ CORE = (
     "kinematics",
     "distance",
     "correspondence",
+    "similarity",
     "imitation",
     "objective",
     "pose",

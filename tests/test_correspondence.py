@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 import random_arms
 
-from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
-from mimic.distance import PAPER_WEIGHTS, link_distances
-from mimic.embodiment import load_mjcf, panda, planar_arm
+from mimic.chain import Chain, Joint, Link, lock
+from mimic.correspondence import (
+    arc_length_correspondence,
+    hard_correspondence,
+    overlap_correspondence,
+    soft_correspondence,
+)
+from mimic.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance, link_distances
+from mimic.embodiment import from_chain, load_mjcf, panda, planar_arm
 from mimic.kinematics import link_states
 
 
@@ -141,9 +147,71 @@ def test_overlap_ignores_the_size_of_an_arm():
 def test_overlap_under_jit_with_the_arms_as_arguments():
     arms = ARMS["panda"], ARMS["panda4dof"]
     known, given = overlap_correspondence(*arms), jax.jit(overlap_correspondence)(*arms)
-    assert known.shape == (7, 4)
+    assert known.shape == (7, 7)
     np.testing.assert_allclose(given, known, atol=1e-5)  # float32: differences of sums up to 1, over lengths of 0.04
     assert np.array_equal(np.asarray(given) > 0, np.asarray(known) > 0)
+
+
+def test_merged_links_overlap_by_their_path_or_their_chord():
+    """A chord across a right angle: 2 along the path, sqrt(2) straight, beside a link of 1."""
+    bent = merged_by_a_right_angle()
+    assert bent.link_lengths == pytest.approx([np.sqrt(2), 1.0])
+    twin = planar_arm([2.0, 1.0])
+    np.testing.assert_allclose(overlap_correspondence(bent, twin), 2 * np.eye(2), atol=1e-9)
+    chord_twin = planar_arm([np.sqrt(2), 1.0])
+    np.testing.assert_allclose(overlap_correspondence(bent, chord_twin, lengths="chord"), 2 * np.eye(2), atol=1e-9)
+    assert np.count_nonzero(overlap_correspondence(bent, chord_twin)) == 3
+    given = jax.jit(overlap_correspondence)(bent, twin)
+    np.testing.assert_allclose(given, 2 * np.eye(2), atol=1e-6)  # float32
+
+
+def merged_by_a_right_angle():
+    axis, points = np.array([0.0, 0.0, 1.0]), np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [2, 1, 0]])
+    joints = tuple(Joint(f"joint{i + 1}", axis, points[i]) for i in range(3))
+    links = tuple(Link(f"link{i + 1}", points[i], points[i + 1], i) for i in range(3))
+    return from_chain(lock(Chain(joints, links), {"joint2": 0.0}, "merged"), name="bent")
+
+
+# --- by common arc length ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_arc_length_of_an_arm_with_itself_counts_links_by_their_length(name):
+    arm = ARMS[name]
+    share = np.asarray(arm.link_lengths) / arm.link_lengths.sum()
+    expected = arm.num_links**2 * np.diag(share)
+    np.testing.assert_allclose(arc_length_correspondence(arm, arm), expected, rtol=1e-5)  # float32
+    assert np.asarray(arc_length_correspondence(arm, arm)).mean() == pytest.approx(1, rel=1e-6)
+
+
+def test_arc_length_does_not_see_a_straight_link_cut_in_two():
+    whole, cut, other = planar_arm([1.0, 2.0]), planar_arm([1.0, 0.5, 1.5]), planar_arm([1.5, 1.0, 0.5])
+    angles = np.array([0.3, -0.8, 0.5], np.float32)
+    states = link_states(other, angles), link_states(whole, angles[:2]), link_states(cut, np.array([0.3, -0.8, 0.0]))
+    rotation = DistanceWeights(translation=0.0, rotation=1.0)
+    by_whole = embodiment_distance(*states[:2], arc_length_correspondence(other, whole), rotation)
+    by_cut = embodiment_distance(states[0], states[2], arc_length_correspondence(other, cut), rotation)
+    np.testing.assert_allclose(by_whole, by_cut, rtol=1e-5)  # float32
+    overlaps = (overlap_correspondence(other, arm) for arm in (whole, cut))
+    by_overlap = [embodiment_distance(states[0], s, w, rotation) for s, w in zip(states[1:], overlaps, strict=True)]
+    assert abs(by_overlap[0] - by_overlap[1]) > 0.01  # what the paper's does
+
+
+def test_arc_length_is_the_integral_of_the_pair_distance():
+    """Two straight arms at an angle, one of them in links of any length: their mean angle is that angle."""
+    line, bent = planar_arm([1.0]), planar_arm([0.1, 0.6, 0.3])
+    angles = np.array([0.2, 0.5, -1.1], np.float32)
+    states = link_states(line, np.zeros(1)), link_states(bent, angles)
+    distance = embodiment_distance(
+        *states, arc_length_correspondence(line, bent), DistanceWeights(0.0, 1.0), rotation="angle"
+    )
+    np.testing.assert_allclose(distance, np.abs(np.cumsum(angles)) @ [0.1, 0.6, 0.3], rtol=1e-5)  # float32
+
+
+def test_arc_length_under_jit_with_the_arms_as_arguments():
+    arms = ARMS["panda"], ARMS["panda4dof"]
+    known, given = arc_length_correspondence(*arms), jax.jit(arc_length_correspondence)(*arms)
+    np.testing.assert_allclose(given, known, atol=1e-4)  # float32, entries up to 12
 
 
 def test_correspondences_agree_on_equal_arms_near_a_match():

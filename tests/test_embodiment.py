@@ -7,6 +7,7 @@ import random_arms
 
 from mimic.embodiment import load_mjcf, panda, panda_path, planar_arm
 from mimic.kinematics import forward_kinematics, link_states
+from mimic.similarity import centre_line
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
 
@@ -86,13 +87,13 @@ def test_hardware_limits_lock_at_the_ready_pose():
     np.testing.assert_allclose(locked.home, np.delete(full.home, [3, 5]))
     here, there = link_states(locked, locked.home), link_states(full, full.home)
     np.testing.assert_allclose(here.position, there.position, atol=1e-6)  # float32
-    free = panda(locked={4: -1.0, 6: 0.5}, limits="hardware")
+    free = panda(locked={4: -1.0, 6: 0.5}, links="merged", limits="hardware")
     assert free.joint_names == locked.joint_names  # angles that are given win over the ready pose
     assert abs(link_states(free, free.home).position - there.position[:5]).max() > 0.01
 
 
 def test_dissimilar_pandas_of_the_paper():
-    four, three = panda(locked=(3, 6, 7)), panda(locked=(2, 3, 6, 7))
+    four, three = panda(locked=(3, 6, 7), links="merged"), panda(locked=(2, 3, 6, 7), links="merged")
     assert four.joint_names == ("joint1", "joint2", "joint4", "joint5")
     assert four.link_names == ("link1", "link2+link3", "link4", "link5+link6+link7")
     assert four.link_joint == (0, 1, 2, 3)
@@ -103,9 +104,30 @@ def test_dissimilar_pandas_of_the_paper():
     np.testing.assert_allclose(four.link_lengths, np.linalg.norm(np.diff(ends[[0, 1, 3, 4, 7]], axis=0), axis=1))
     np.testing.assert_allclose(three.link_lengths, np.linalg.norm(np.diff(ends[[0, 3, 4, 7]], axis=0), axis=1))
     assert four.velocity_limit.tolist() == [2.175, 2.175, 2.175, 2.61]
-    apart = panda(locked=(3, 6, 7), links="kept")
-    assert (apart.num_joints, apart.link_joint) == (4, (0, 1, 1, 2, 3, 3, 3))
-    assert apart.link_lengths.tolist() == panda().link_lengths.tolist()
+
+
+def test_a_locked_joint_removes_no_link():
+    kept, merged = panda(locked=(3, 6, 7)), panda(locked=(3, 6, 7), links="merged")
+    assert (kept.num_joints, kept.link_joint) == (4, (0, 1, 1, 2, 3, 3, 3))
+    assert kept.link_lengths.tolist() == panda().link_lengths.tolist()
+    for arm in (kept, merged):  # the same centre line, however the metric groups it
+        assert [arm.link_joint[link] for link in arm.segment_link] == list(kept.link_joint)
+        np.testing.assert_allclose(arm.segment_start, ENDS[:-1], atol=1e-12)
+        np.testing.assert_allclose(arm.segment_end, ENDS[1:], atol=1e-12)
+    assert merged.segment_link == (0, 1, 1, 2, 3, 3, 3)
+
+
+def test_segments_follow_a_joint_that_is_locked_at_an_angle():
+    turned, free = (panda(locked={4: -1.0}, links=links) for links in ("kept", "merged"))
+    expected = centre_line(panda(), np.array([0.1, 0.2, 0.3, -1.0, 0.5, 0.6, 0.7], np.float32))
+    for arm in (turned, free):
+        actual = centre_line(arm, np.array([0.1, 0.2, 0.3, 0.5, 0.6, 0.7], np.float32))
+        np.testing.assert_allclose(actual.points, expected.points, atol=1e-6)  # float32
+
+
+def test_unknown_links_are_refused(unchecked):
+    with pytest.raises(ValueError, match="links: expected one of kept, merged, got 'none'"):
+        panda(locked=3, links="none")  # pyright: ignore[reportArgumentType]
 
 
 def test_locking_the_first_joint_leaves_a_link_on_the_base():

@@ -69,7 +69,7 @@ def test_errors_are_those_of_a_known_turn(evaluator, by, links):
 def test_angles_count_by_the_share_of_each_expert_link():
     """One learner link along x against expert links at 0 and at 90 degrees.
 
-    W has 1 + 3/4 and 1 + 1/4, the shares of the expert's links and of the learner's that overlap: 5/12 for the second.
+    By overlap W has 1 + 3/4 and 1 + 1/4, the fractions of the expert's links and of the learner's: 5/12 for the second.
     """
     config = mimic.env_config(
         "planar4dof",
@@ -78,6 +78,7 @@ def test_angles_count_by_the_share_of_each_expert_link():
         demonstrations={"count": 1, "held_out": 1},
         horizon=1,
         physics="fused",
+        metric={"correspondence": "overlap"},
     )
     given = training_and_held_out(config)[0]
     given.qpos[:], given.qvel[:] = [0, np.pi / 2], [0, 2.0]

@@ -16,7 +16,7 @@ from mimic.embodiment import load_arm
 from mimic.envs.arms import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale, with_rotors
 from mimic.envs.config import EnvConfig
 from mimic.envs.recording import record_demonstrations
-from mimic.imitation import kinematic_bound
+from mimic.imitation import closest_motion
 from mimic.kinematics import LinkStates, link_state_table
 
 _DEMONSTRATIONS, _EVERY = 2, 5  # few, and of them every fifth step: a rough value in seconds
@@ -35,10 +35,14 @@ class Nearness:
     Attributes:
       bound: embodiment distance that no controller can go below.
       hold: distance of the learner at rest in its home pose.
+      expert_qpos: [poses, 1, joints] the expert's poses that were looked at [rad].
+      nearest_qpos: [poses, 1, learner_joints] the learner's nearest poses [rad].
     """
 
     bound: float
     hold: float
+    expert_qpos: Float[np.ndarray, "poses 1 joints"]
+    nearest_qpos: Float[np.ndarray, "poses 1 learner_joints"]
 
 
 def nearness(expert: Arm, learner: Arm, config: EnvConfig) -> Nearness:
@@ -62,10 +66,12 @@ def nearness(expert: Arm, learner: Arm, config: EnvConfig) -> Nearness:
     home = np.broadcast_to(np.asarray(learner.embodiment.home), (len(qpos), learner.embodiment.num_joints))
     still = link_state_table(learner.embodiment, home, np.zeros_like(home))
     hold = jax.jit(jax.vmap(distance))(link_state_table(expert.embodiment, qpos, qvel), still)
-    bound = jax.jit(lambda qpos, qvel: kinematic_bound(*pair, qpos, qvel, correspondence, weights, **measure))(
+    found = jax.jit(lambda qpos, qvel: closest_motion(*pair, qpos, qvel, correspondence, weights, **measure))(
         qpos, qvel
     )
-    return Nearness(float(jnp.mean(bound)), float(jnp.mean(hold)))
+    return Nearness(
+        float(jnp.mean(found.distance)), float(jnp.mean(hold)), qpos[:, None], np.asarray(found.qpos)[:, None]
+    )
 
 
 def random_torque_speed(arm: Arm, config: EnvConfig) -> float:

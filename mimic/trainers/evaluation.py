@@ -19,6 +19,7 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.imitation import closest_motion
 from mimic.kinematics import link_state_table
 from mimic.pose import pose_limits, shared_joints
+from mimic.pose_baselines import baseline_poses
 from mimic.similarity import CentreLine, centre_line_table
 from mimic.trainers.measures import WORST, Table, gaps, means_by_split, measure, measure_similarity
 from mimic.trainers.prepared import Prepared, on_host
@@ -118,8 +119,7 @@ class Evaluator:
     def similarity_summary(self, rollouts: Rollouts, controller: str) -> dict[str, dict[str, dict[str, float]]]:
         """Means by split of each measure of similarity, for a controller and for the baselines beside it.
 
-        The baselines: `nearest_poses` (where the kinematic bound is), `copied_joints` (the expert's angles in the
-        joints that both arms have by name) and `hold`.
+        Beside it: `nearest_poses`, where the kinematic bound is, and `mimic.pose_baselines.BASELINES`.
         """
         tables = {controller: self.similarity(np.asarray(rollouts.qpos)), **self._baseline_similarity}
         return means_by_split(tables, self.parts)
@@ -223,9 +223,7 @@ def _references(env: ImitationEnv) -> References:
     )
     # Where the learner can do just what the expert does there is nothing to search: no distance is below 0.
     bound, nearest = _lower_bound(env, qpos, qvel) if own.any() else (own, own_qpos)
-    motions = {"nearest_poses": nearest, "copied_joints": own_qpos, "hold": still}
-    if not set(env.expert.joint_names) & set(env.learner.joint_names):
-        del motions["copied_joints"]
+    motions = {"nearest_poses": nearest, **baseline_poses(env.expert, env.learner, qpos)}
     return References(bound, hold, motions)
 
 

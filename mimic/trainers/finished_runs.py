@@ -151,7 +151,8 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     numbers = _numbers(report)
     missing = [key for split in SPLITS if (key := f"{figure.key}.{split}") not in numbers]
     if missing:
-        return LeftOut(name, f"diverged, or of another version ({version}): {runs.REPORT} has no number {missing[0]}")
+        reason = f"diverged, without a meaningful gap, or of another version ({version})"
+        return LeftOut(name, f"{reason}: {runs.REPORT} has no number {missing[0]}")
     settings = _flat(to_dict(config))
     return FinishedRun(
         name=name,

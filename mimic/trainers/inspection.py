@@ -21,6 +21,8 @@ from mimic.envs.arms import Arm, ArmConfig, build_arm, effective_inertia, rated_
 from mimic.envs.config import EnvConfig, InspectConfig  # noqa: E402
 from mimic.envs.preflight import assumptions, calmed, doubts, joint_ranges, nearness  # noqa: E402
 from mimic.rendering import ArmScene  # noqa: E402
+from mimic.trainers.measures import pose_similarity  # noqa: E402
+from mimic.trainers.progress import similarity_table  # noqa: E402
 
 _PICTURE, _FINDINGS = "arms.png", "inspection.json"
 _SCENE = 800, 640  # pixels
@@ -42,6 +44,9 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     warned += [why] if why else []
     command = train_command(dataclasses.replace(config, learner=calm))
     near = nearness(expert, learner, env) if config.bound else None
+    alike = near and pose_similarity(
+        expert.embodiment, learner.embodiment, near.expert_qpos, {"nearest_poses": near.nearest_qpos}
+    )
     scene = (
         ArmScene([config.expert, config.learner], limits=config.limits, width=_SCENE[0], height=_SCENE[1])
         if out
@@ -56,8 +61,9 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
         for title, lines in (("set aside", notes), ("assumed", assumed), ("mind", warned)):
             for line in lines:
                 console.print(f"{title}: {escape(line)}", highlight=False, soft_wrap=True)
-        if near is not None:
+        if near is not None and alike is not None:
             console.print(_nearness_line(near.bound, near.hold, expert), highlight=False, soft_wrap=True)
+            console.print(similarity_table(alike))
         if out and scene:
             out.mkdir()
             with scene:
@@ -74,6 +80,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
                 "mind": warned,
                 "bound": near and near.bound,
                 "hold": near and near.hold,
+                "similarity": alike,
                 "train": command,
             }
             (out / _FINDINGS).write_text(json.dumps(findings, indent=2) + "\n")
@@ -190,7 +197,7 @@ def _headline(expert: Arm, learner: Arm) -> str:
 def _nearness_line(bound: float, hold: float, expert: Arm) -> str:
     return (
         f"on random demonstrations of {expert.embodiment.name}, distance of the best poses: {bound:.3f}, of holding "
-        f"still: {hold:.3f}; {1 - bound / hold:.0%} of it can be imitated"
+        f"the start pose: {hold:.3f}; {1 - bound / hold:.0%} of it can be imitated"
     )
 
 

@@ -15,12 +15,14 @@ from mimic.pose import imitate_pose
 from mimic.trainers import mapper_training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
+from mimic.trainers.measures import pose_similarity
 from mimic.trainers.pose_mapper import make_model
 from mimic.trainers.prepared import Prepared, compiling
 from mimic.trainers.signals import Signals
 
 # Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.
 _TRAINING, _VALIDATION, _HELD_OUT, _CHANCE = range(4)
+_SIMILARITY_POSES = 500  # held-out poses that look is measured on: inverse kinematics takes a millisecond each
 
 
 class _Judged(NamedTuple):
@@ -202,6 +204,16 @@ class MapperJob(Job):
             "ij,pij->pj", model.metric.shares(model.expert, model.learner), _angle(expert[:, :, None], learner[:, None])
         )
         return np.median(to_expert, axis=0), np.median(_angle(learner, optimum), axis=0)
+
+    def details(self, outcome: _Judged, controller: str = "mapper") -> Figures:
+        """How alike held-out poses look, beside the optimiser's and the baselines'; of the first of them."""
+        model, count = self._model, min(_SIMILARITY_POSES, self.settings.held_out_poses)
+        expert, mapped, optimum = (
+            self._by_split(np.asarray(qpos))["held_out"][:count, None]  # motions of one sample
+            for qpos in (self._every, outcome.qpos, self._reference.optimum.qpos)
+        )
+        poses = {"mapper": mapped, "nearest_poses": optimum}
+        return {"similarity": pose_similarity(model.expert, model.learner, expert, poses, split="held_out")}
 
     def status(self, figures: Figures) -> str:
         """Distance and quality."""

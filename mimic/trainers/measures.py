@@ -9,6 +9,7 @@ from jaxtyping import Float
 from mimic.embodiment import Embodiment
 from mimic.kinematics import LinkStates
 from mimic.pose import pose_limits
+from mimic.pose_baselines import baseline_poses
 from mimic.similarity import CentreLine, centre_line_table, similarity
 
 if TYPE_CHECKING:  # brax and MJX, which pose mappers need not
@@ -94,6 +95,30 @@ def means_by_split(tables: Mapping[str, Table], parts: Mapping[str, slice]) -> d
         }
         for name, table in tables.items()
     }
+
+
+def pose_similarity(
+    expert: Embodiment,
+    learner: Embodiment,
+    expert_qpos: Float[np.ndarray, "motions time joints"],
+    poses: Mapping[str, Float[np.ndarray, "motions time learner_joints"]],
+    *,
+    split: str = "all",
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Mean similarity of the learner's poses by name, and of the baselines beside them.
+
+    Args:
+      expert: n joints.
+      learner: n_hat joints.
+      expert_qpos: its poses [rad].
+      poses: the learner's at the same times [rad], by what moves it.
+      split: what all of these poses are called.
+    """
+    expert_qpos = np.asarray(expert_qpos, np.float32)
+    line = centre_line_table(expert, expert_qpos)
+    poses = {**poses, **baseline_poses(expert, learner, expert_qpos)}
+    tables = {name: measure_similarity(line, learner, np.asarray(qpos, np.float32)) for name, qpos in poses.items()}
+    return means_by_split(tables, {split: slice(None)})
 
 
 def gaps(distance: Any, bound: Any, hold: Any) -> Any:

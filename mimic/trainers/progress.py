@@ -21,10 +21,10 @@ SIMILARITY_HEADERS = {  # positions in chain lengths
 SPLIT_NAMES = {"train": "training", "held_out": "held out"}
 SIMILARITY_NAMES = {  # of what moves the learner, where the name is not said by its key
     "nearest_poses": "nearest poses (metric)",
-    "copied_joints": "copied joints",
-    "hand_ik": "inverse kinematics of hand",
-    "aligned_segments": "aligned segments",
-    "hold": "holding the start pose",
+    "copy_joints": "copying shared joints",
+    "hand_ik": "IK of the scaled hand",
+    "align_segments": "aligning segments",
+    "hold_home": "holding start pose",
 }
 
 

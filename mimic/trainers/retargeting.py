@@ -19,7 +19,9 @@ from mimic.envs.arms import build_arm, rated_speed
 from mimic.envs.config import MetricConfig, RetargetConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.pose import PoseImitation, imitate_trajectory, pose_limits
+from mimic.trainers.measures import pose_similarity
 from mimic.trainers.pose_mapper import PoseMapper
+from mimic.trainers.progress import similarity_table
 
 
 def retarget(
@@ -45,7 +47,8 @@ def retarget(
 
     Returns:
       The learner's motions, and a report: `distance`, mean of all; `largest_jump` [rad] of a joint between two times;
-      `settled`, the share of poses at a minimum, or at one that the mapper proposes.
+      `settled`, the fraction of poses at a minimum, or at one that the mapper proposes; `similarity` of the motions and
+      of `mimic.pose_baselines.BASELINES`, means of the measures of `mimic.similarity`.
 
     Raises:
       ValueError: demonstrations of another arm, poses outside its range, or a mapper between other arms.
@@ -74,6 +77,7 @@ def retarget(
         "distance": float(np.mean(distance)),
         "largest_jump": float(np.abs(np.diff(qpos, axis=1)).max()),
         "settled": float(np.mean(settled)),
+        "similarity": pose_similarity(expert, learner, demonstrations.qpos, {"retargeted": qpos}),
     }
     return motions, report
 
@@ -179,6 +183,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
             motions, report = retarget(loaded, expert, learner, env.metric, mapper=mapper, seed=config.seed)
         motions.save(out)
         console.print(_table(motions, report))
+        console.print(similarity_table(report["similarity"]))
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
