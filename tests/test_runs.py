@@ -3,6 +3,11 @@
 import csv
 import json
 
+import pytest
+from omegaconf import OmegaConf
+from run_directories import write_run
+
+from mimic.envs.config import MetricConfig
 from mimic.trainers import runs
 
 
@@ -25,3 +30,26 @@ def test_metrics_of_another_version_keep_their_columns(tmp_path):
     assert rows[0] == {"step": "1", "old": "0.5", "wall_time_s": "2.0", "new": ""}
     assert rows[2] == {"step": "3", "old": "", "wall_time_s": "4.0", "new": "30.0"}
     assert {path.name for path in tmp_path.iterdir()} == {"metrics.csv", "tensorboard"}
+
+
+@pytest.mark.parametrize(
+    ("saved", "expected"),
+    [
+        ({"translation": 0.0, "correspondence": "overlap"}, ("merged", "chord_overlap", 0.0)),
+        ({"translation": 0.3, "correspondence": "soft"}, ("merged", "soft", 0.3)),
+        (None, ("merged", "chord_overlap", 0.0)),
+    ],
+)
+def test_a_run_from_before_links_were_kept_has_the_metric_of_its_time(tmp_path, saved, expected):
+    run_dir = write_run(tmp_path / "run", [0.1], env="panda4dof")
+    content = OmegaConf.to_container(OmegaConf.load(run_dir / runs.CONFIG))
+    assert isinstance(content, dict)
+    content["env"]["metric"] = saved or {}
+    OmegaConf.save(OmegaConf.create(content), run_dir / runs.CONFIG)
+    metric = runs.load_config(run_dir).env.metric
+    assert (metric.links, metric.correspondence, metric.translation) == expected
+
+
+def test_a_run_of_today_keeps_its_metric(tmp_path):
+    metric = runs.load_config(write_run(tmp_path / "run", [0.1], env="panda4dof")).env.metric
+    assert metric == MetricConfig() and metric.links == "kept"
