@@ -6,7 +6,6 @@ steps is badly conditioned; here each update is a feedback law around the last r
 Only one control step is differentiated, forwards, so that it compiles in seconds.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ from mimic.spatial import safe_sqrt
 _STEPS = (1.0, 0.5, 0.2, 0.05, 0.01)  # of the full update; all are rolled out, and the best one is taken
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-6, 1e3  # added to the curvature by the action
 _LESS, _MORE = 0.3, 4.0  # factors of the damping after an update that was taken in full, and after one that was not
-_ACTIVE_SETS = 3  # rounds in which actions at their bound are found
+_ACTIVE_SETS = 4  # rounds in which actions at their bound are found
 # A norm |r| has curvature 1 / |r| across r, which is infinite at a match: |r| counts as this at least, in the units of
 # `PairDistances`.
 _LEAST_NORM = {"translation": 1e-3, "linear_velocity": 1e-2, "angular_velocity": 1e-2}
@@ -137,9 +136,7 @@ class TrajectoryDescent:
         kept = episodes._replace(damping=damping)
         return jax.tree.map(lambda x, y: jnp.where(better.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, kept)
 
-    def _rollout(
-        self, task: Task, law: Callable[..., Array], over_time: Any, count: int
-    ) -> tuple[Array, Array, Array]:
+    def _rollout(self, task: Task, law: Callable[..., Array], over_time: Any, count: int) -> tuple[Array, Array, Array]:
         """Joint states [count, T + 1, joints] and actions [count, T, joints] of a law (now, qpos, qvel) -> action."""
         home = jnp.broadcast_to(jnp.asarray(self._env.learner.home, jnp.float32), (count, self._env.action_size))
 
@@ -262,17 +259,19 @@ def _bounded_law(
 ) -> tuple[Float[Array, " joints"], Float[Array, "joints states"]]:
     """Minimum of x.matrix.x / 2 + gradient.x between bounds, and how it follows a state on which it depends by `mixed`.
 
-    The components beyond a bound are put there and left out, a few times over. They follow nothing.
+    By rounds of Newton's method on the components that no bound holds (Bertsekas, "Projected Newton Methods", 1982). A
+    component that is held follows nothing.
     """
     identity = jnp.eye(len(gradient), dtype=gradient.dtype)
-    free, change = jnp.ones(len(gradient), bool), jnp.zeros_like(gradient)
+    change = jnp.zeros_like(gradient)
     for _ in range(_ACTIVE_SETS):
+        slope = gradient + matrix @ change
+        held = ((change <= lower) & (slope > 0)) | ((change >= upper) & (slope < 0))
+        free = ~held
         kept = jnp.where(free, 0.0, change)
         reduced = jnp.where(free[:, None] & free[None, :], matrix, identity)
         sides = jnp.concatenate([(gradient + matrix @ kept)[:, None], mixed], axis=1)
         factor = jax.scipy.linalg.cho_factor(reduced)
         solved = -jax.scipy.linalg.cho_solve(factor, jnp.where(free[:, None], sides, 0.0))
-        change, gain = jnp.where(free, solved[:, 0], kept), solved[:, 1:]
-        free = free & (change > lower) & (change < upper)
-        change = jnp.clip(change, lower, upper)
+        change, gain = jnp.clip(jnp.where(free, solved[:, 0], kept), lower, upper), solved[:, 1:]
     return change, gain
