@@ -20,8 +20,8 @@ from mimic.trainers.trajectory_descent import Task, TrajectoryDescent
 
 _NOISE = 0.3  # standard deviation of what is added to a policy's actions for further starts
 _NOISE_STEPS = 5  # that a noise is held for, so that the arm leaves its way
-# Control steps that are differentiated at a time: by measurement; on a GPU all that memory allows.
-_CHUNK = {"cpu": 4_000, "gpu": 100_000}
+# Control steps that are differentiated at a time: what fits a cache, and the memory of a small GPU.
+_CHUNK = {"cpu": 4_000, "gpu": 25_000}
 
 NOISY_POLICY = "noisy_policy"
 
@@ -114,7 +114,7 @@ def _descend(
     episodes = descent.start(task, jnp.asarray(action, jnp.float32))
     for done in range(iterations + 1):
         least = np.asarray(episodes.objective).reshape(-1, count).min(axis=0)
-        on_update(done, f"mean distance {np.mean(least):.4f}")
+        on_update(done, f"objective {np.mean(least):.5f}")
         if done < iterations:
             episodes = descent.improve(task, episodes)
     return np.asarray(episodes.action)

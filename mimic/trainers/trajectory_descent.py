@@ -105,9 +105,8 @@ class TrajectoryDescent:
 
     def _improve(self, task: Task, episodes: Episodes) -> Episodes:
         """One update of each sequence; those that it would make worse stay as they are, with more damping."""
-        count, horizon = episodes.action.shape[:2]
-        sequences = max(min(self._chunk // horizon, count), 1)
-        model = jax.lax.map(lambda given: self._linearized(*given), (task, episodes), batch_size=sequences)
+        count = len(episodes.action)
+        model = self._linearize(task, episodes)
         change, gain = jax.vmap(_backward)(model, episodes.action, episodes.damping)
         sizes = jnp.asarray(_STEPS, change.dtype)
         tried = jax.tree.map(lambda x: jnp.concatenate([x] * len(_STEPS)), task)
@@ -167,6 +166,17 @@ class TrajectoryDescent:
     def _penalty(self, qpos: Array, qvel: Array) -> Array:
         weight = self._env.limit_penalty_weight
         return weight * self._env.limit_excess(qpos, qvel) if weight else jnp.zeros(())
+
+    def _linearize(self, task: Task, episodes: Episodes) -> _Model:
+        """Of all sequences, a few at a time."""
+        count, horizon = episodes.action.shape[:2]
+        rounds = min(-(-count * horizon // self._chunk), count)
+        size = -(-count // rounds)
+        # Rounds of one size, the last one filled up: what is left over would be compiled by itself.
+        rows = jnp.minimum(jnp.arange(rounds * size), count - 1)
+        given = jax.tree.map(lambda x: x[rows], (task, episodes))
+        model = jax.lax.map(lambda one: self._linearized(*one), given, batch_size=size)
+        return jax.tree.map(lambda x: x[:count], model)
 
     def _linearized(self, task: Task, episodes: Episodes) -> _Model:
         """Of one sequence."""
