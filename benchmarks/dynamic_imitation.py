@@ -163,6 +163,7 @@ def evaluation_tasks(chosen: Sequence[Case], folder: Path, unseen: Mapping[str, 
         if arm in names:
             for controller in ("hold", "pd", "computed_torque"):
                 evaluate(f"{arm}-0", controller, f"controller={controller}")
+            evaluate(f"{arm}-0", "searched", "controller=searched")  # how near any torques come, as far as is known
             evaluate(f"{arm}-0", "mjx", "physics=mjx")
             evaluate(f"{arm}-0", "reaches", f"demonstrations={unseen['reach']}")
         if f"{arm}-reach" in names:

@@ -169,7 +169,7 @@ class ImitationEnv(Env):
             "torque_saturation": jnp.any(jnp.abs(command) > 0.99).astype(jnp.float32),
             "runaway": runaway.astype(jnp.float32),
         }
-        reward = -(distance + self._limit_weight * excess) * steps
+        reward = -(distance + self.limit_penalty_weight * excess) * steps
         obs = self._seen(states, after)
         return state.replace(pipeline_state=after, obs=obs, reward=reward, done=done, metrics=metrics)
 
@@ -199,7 +199,8 @@ class ImitationEnv(Env):
         return 0.5 * jnp.mean(jnp.clip(position / _FAR, 0, 1) + jnp.clip(speed / _FAR, 0, 1))
 
     @property
-    def _limit_weight(self) -> float:
+    def limit_penalty_weight(self) -> float:
+        """What `limit_excess` counts for in the reward."""
         return self.config.limit_weight if self.config.limits == "hardware" else 0.0
 
     @property

@@ -10,7 +10,7 @@ from mimic.config import check_choice
 from mimic.envs.config import PHYSICS, EnvConfig
 from mimic.trainers.group import DistributedConfig
 
-CONTROLLERS = ("policy", "hold", "pd", "computed_torque")
+CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "searched")
 EXPORT_FORMATS = ("onnx", "jax")
 LOGGERS = ("local", "wandb", "mlflow")
 
@@ -361,13 +361,34 @@ class TrainConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class SearchConfig:
+    """A search for the best torques: see `search_torques`.
+
+    Attributes:
+      iterations: updates of each sequence of torques.
+      starts: sequences for each demonstration: of the policy, computed_torque, pd and hold in this order, then of the
+        policy with noise.
+    """
+
+    iterations: int = 40
+    starts: int = 8
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "starts"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"search.{name}: expected at least 1, got {getattr(self, name)}")
+
+
+@dataclasses.dataclass(frozen=True)
 class EvaluateConfig:
     """An evaluation of a trained policy, or of another controller in its place.
 
     Attributes:
       run: the run directory.
       checkpoint: environment steps of the checkpoint; the last one where None.
-      controller: "policy", or what a user would do without it: see `run_controller`.
+      controller: "policy", what a user would do without it (see `run_controller`), or "searched" (see
+        `search_torques`).
+      search: how long "searched" searches.
       demonstrations: file of demonstrations to evaluate on in place of the held-out ones.
       physics: see `EnvConfig`; the run's where empty.
       mass, damping, torque_noise: how the arm differs from its model, see `RandomizationConfig`; as in training where
@@ -379,6 +400,7 @@ class EvaluateConfig:
     run: str = ""
     checkpoint: int | None = None
     controller: str = "policy"
+    search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
     demonstrations: str = ""
     physics: str = ""
     mass: float | None = None

@@ -12,7 +12,7 @@ from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate,
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.trainers import ppo, runs
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.evaluation import SPLITS, Evaluator, Rollouts
+from mimic.trainers.evaluation import SPLITS, Controller, Evaluator, Rollouts
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
 from mimic.trainers.measures import LEAST_SPAN
 from mimic.trainers.prepared import Prepared, compiling
@@ -63,11 +63,13 @@ class PPOJob(Job):
         """Observation statistics, policy and value network."""
         return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
 
-    def _compile(self) -> Callable[[Params], Rollouts]:
-        controller = ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)
+    def controller(self, params: Params) -> Controller:
+        """The deterministic policy of these parameters."""
+        return ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)(params)
 
+    def _compile(self) -> Callable[[Params], Rollouts]:
         def rollouts(params: Params) -> Rollouts:
-            return self.evaluator.rollout(controller(params))
+            return self.evaluator.rollout(self.controller(params))
 
         template = jax.eval_shape(self.params_template)
         return compiling(rollouts, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template))()

@@ -1,4 +1,4 @@
-"""What a person sees of a run: a progress bar while it trains, a table at its end."""
+"""What a person sees of a run: a progress bar while it trains or searches, a table at its end."""
 
 import time
 from collections.abc import Mapping
@@ -60,6 +60,36 @@ class TrainingProgress:
         self._bar.update(self._task, completed=min(step, self._total), status=status)
         if not self._console.is_terminal:
             self._console.print(f"step {step:>11,}  {status}", soft_wrap=True, highlight=False)
+
+
+class SearchProgress:
+    """A bar over the updates of a search; without a terminal, ten lines."""
+
+    def __init__(self, console: Console, total: int):
+        self._console, self._total = console, total
+        self._bar = Progress(
+            TextColumn("[bold]searching"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[status]}"),
+            TimeElapsedColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("search", total=total, status="compiling")
+
+    def __enter__(self) -> "SearchProgress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self._bar.stop()
+
+    def update(self, done: int, status: str) -> None:
+        """Shows the state after an update."""
+        self._bar.update(self._task, completed=done, status=status)
+        if not self._console.is_terminal and (done % max(self._total // 10, 1) == 0 or done == self._total):
+            self._console.print(f"searching {done:>4} of {self._total}  {status}", soft_wrap=True, highlight=False)
 
 
 def _duration(seconds: float) -> str:

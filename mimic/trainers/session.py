@@ -91,7 +91,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
     def run() -> None:
         console = Console()
         with stopwatch.stage("evaluate"):
-            outcome, controller = _outcome(job, params, config.controller)
+            outcome, controller = _outcome(job, params, config, console)
             figures = {**job.figures(outcome), **job.details(outcome, config.controller)}
         report = _report(trained, job, figures, stopwatch, steps, 0)
         report |= {**controller, "evaluated": _conditions(trained, config)}
@@ -142,16 +142,23 @@ def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
     }
 
 
-def _outcome(job: Job, params: Params, controller: str) -> tuple[Any, dict[str, Any]]:
+def _outcome(job: Job, params: Params, config: EvaluateConfig, console: Console) -> tuple[Any, dict[str, Any]]:
     """What a controller did, and what the report says of the controller."""
-    if controller == "policy":
+    if config.controller == "policy":
         return job.evaluate(params), {}
     from mimic.trainers.ppo_job import PPOJob
-    from mimic.trainers.tracking import run_controller
 
     assert isinstance(job, PPOJob)
-    outcome, frequency = run_controller(job.evaluator, controller)
-    return outcome, {"trainer": controller, "frequency_rad_s": frequency}
+    if config.controller == "searched":
+        from mimic.trainers.searched_torques import search_torques
+
+        policy = job.controller(params)
+        outcome, starts = search_torques(job.evaluator, policy, config.search, console)
+        return outcome, {"trainer": "searched", "search": dataclasses.asdict(config.search), "starts": starts}
+    from mimic.trainers.tracking import run_controller
+
+    outcome, frequency = run_controller(job.evaluator, config.controller)
+    return outcome, {"trainer": config.controller, "frequency_rad_s": frequency}
 
 
 def make_job(config: TrainConfig, run_dir: Path | None) -> Job:

@@ -1,0 +1,155 @@
+"""How near a learner can come: torques searched for each demonstration, with all of the motion known beforehand."""
+
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+from jaxtyping import Array, Float
+from rich.console import Console
+
+from mimic.envs.imitation import ArmState, ImitationEnv
+from mimic.envs.physics import Load
+from mimic.trainers.config import SearchConfig
+from mimic.trainers.evaluation import Controller, Evaluator, Rollouts
+from mimic.trainers.measures import gaps
+from mimic.trainers.progress import SearchProgress
+from mimic.trainers.tracking import run_controller
+from mimic.trainers.trajectory_descent import Task, TrajectoryDescent
+
+_NOISE = 0.3  # standard deviation of what is added to a policy's actions for further starts
+_NOISE_STEPS = 5  # that a noise is held for, so that the arm leaves its way
+# Control steps that are differentiated at a time: what fits a cache, and the memory of a small GPU.
+_CHUNK = {"cpu": 4_000, "gpu": 25_000}
+
+NOISY_POLICY = "noisy_policy"
+
+
+def search_torques(
+    evaluator: Evaluator, policy: Controller, config: SearchConfig, console: Console
+) -> tuple[Rollouts, dict[str, dict[str, dict[str, float]]]]:
+    """The best torques that are found for each demonstration, by descent from several starts.
+
+    A start is the sequence of torques of a policy, of a controller (see `run_controller`), or of the policy with noise
+    on its actions. Each is improved by `TrajectoryDescent` through the "fused" physics, and what is found is rolled out
+    open loop in the environment's own. Of the starts and of what is found from them, the best for each demonstration is
+    taken: nothing is worse than the best start. The objective is the reward's: distance and limit penalty.
+
+    This is no bound: a better local minimum may exist.
+
+    Args:
+      evaluator: of the environment and its demonstrations.
+      policy: the first start.
+      config: see `SearchConfig`.
+      console: for the progress.
+
+    Returns:
+      Rollouts of the best torques; and by the name of a start, the optimality gap of itself ("start") and of what is
+      found from it ("found") by split.
+    """
+    env = evaluator.env
+    starts = _starts(evaluator, policy, config)
+    scale = np.asarray(env.torque_scale)
+    actions = np.concatenate([np.asarray(start.torque) / scale for start in starts.values()])
+    with SearchProgress(console, config.iterations) as progress:
+        searched = _descend(evaluator, actions, config.iterations, progress.update)
+    searched = searched.reshape(len(starts), env.demonstrations.count, *searched.shape[1:])
+    replay = jax.jit(lambda action: evaluator.rollout(_replay(action)))
+    found = dict(zip(starts, map(replay, searched), strict=True))
+    objective = np.stack([_objective(env, rollouts) for rollouts in (*found.values(), *starts.values())])
+    best = objective.argmin(axis=0)
+    chosen = jax.tree.map(
+        lambda *each: np.stack([np.asarray(x) for x in each])[best, np.arange(len(best))],
+        *found.values(),
+        *starts.values(),
+    )
+    return chosen, _by_start(evaluator, starts, found)
+
+
+def _starts(evaluator: Evaluator, policy: Controller, config: SearchConfig) -> dict[str, Rollouts]:
+    """Rollouts by name: as many as the config asks for."""
+    names = ["policy", "computed_torque", "pd", "hold"]
+    names += [f"{NOISY_POLICY}_{i}" for i in range(1, config.starts - len(names) + 1)]
+    noisy = jax.jit(lambda key: evaluator.rollout(_with_noise(evaluator.env, policy, key)))
+
+    def make(name: str) -> Rollouts:
+        if name == "policy":
+            return jax.jit(lambda: evaluator.rollout(policy))()
+        if name.startswith(NOISY_POLICY):
+            return noisy(jax.random.fold_in(jax.random.PRNGKey(0), names.index(name)))
+        return run_controller(evaluator, name)[0]
+
+    return {name: make(name) for name in names[: config.starts]}
+
+
+def _with_noise(env: ImitationEnv, policy: Controller, key: Array) -> Controller:
+    shape = env.demonstrations.count, env.config.horizon, env.action_size
+    noise = jnp.repeat(_NOISE * jax.random.normal(key, shape), _NOISE_STEPS, axis=1)
+
+    def controller(state: State) -> Array:
+        arm: ArmState = state.pipeline_state  # type: ignore[assignment]
+        return policy(state) + noise[arm.demonstration, arm.step]
+
+    return controller
+
+
+def _replay(action: Float[Array, "demonstrations time joints"]) -> Controller:
+    """Open loop."""
+
+    def controller(state: State) -> Array:
+        arm: ArmState = state.pipeline_state  # type: ignore[assignment]
+        return action[arm.demonstration, arm.step]
+
+    return controller
+
+
+def _descend(
+    evaluator: Evaluator, action: np.ndarray, iterations: int, on_update: Callable[[int, str], None]
+) -> Float[np.ndarray, "sequences time joints"]:
+    """Sequences, demonstration by demonstration for one start after the other, after a number of updates."""
+    descent = TrajectoryDescent(evaluator.env, _CHUNK["cpu" if jax.default_backend() == "cpu" else "gpu"])
+    count = evaluator.env.demonstrations.count
+    task = _task(evaluator.env, np.tile(np.arange(count), len(action) // count))
+    episodes = descent.start(task, jnp.asarray(action, jnp.float32))
+    for done in range(iterations + 1):
+        least = np.asarray(episodes.objective).reshape(-1, count).min(axis=0)
+        on_update(done, f"objective {np.mean(least):.5f}")
+        if done < iterations:
+            episodes = descent.improve(task, episodes)
+    return np.asarray(episodes.action)
+
+
+def _task(env: ImitationEnv, demonstrations: np.ndarray) -> Task:
+    """Of the demonstrations of all sequences, as `Evaluator.rollout` begins them; without the noise on torques."""
+
+    def load(demonstration: Array) -> Load | None:
+        return env.start(jax.random.fold_in(jax.random.PRNGKey(0), demonstration), demonstration).load
+
+    loads = jax.vmap(load)(jnp.asarray(demonstrations))
+    if loads is None:
+        same = env.config.randomization
+        loads = Load(*(jnp.full(len(demonstrations), factor[0]) for factor in (same.mass, same.damping)))
+    expert = jax.tree.map(lambda table: table[demonstrations, 1 : env.config.horizon + 1], env.expert_states)
+    return Task(expert, loads)
+
+
+def _objective(env: ImitationEnv, rollouts: Rollouts) -> Float[np.ndarray, " demonstrations"]:
+    """Mean over time of distance and limit penalty; infinite where that is not a number."""
+    value = np.asarray(rollouts.distance)
+    if env.limit_penalty_weight:
+        excess = jax.jit(jax.vmap(jax.vmap(env.limit_excess)))(rollouts.qpos, rollouts.qvel)
+        value = value + env.limit_penalty_weight * np.asarray(excess)
+    return np.nan_to_num(value.mean(axis=1), nan=np.inf)
+
+
+def _by_start(
+    evaluator: Evaluator, starts: Mapping[str, Rollouts], found: Mapping[str, Rollouts]
+) -> dict[str, dict[str, dict[str, float]]]:
+    def gap(rollouts: Rollouts) -> dict[str, float]:
+        curves = np.asarray(rollouts.distance), evaluator.lower_bound, evaluator.hold_distance
+        return {
+            name: float(gaps(*(x[part].mean(dtype=float) for x in curves))) for name, part in evaluator.parts.items()
+        }
+
+    return {name: {"start": gap(starts[name]), "found": gap(found[name])} for name in starts}
