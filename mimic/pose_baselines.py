@@ -1,0 +1,184 @@
+"""Ways to pose a learner like an expert without a metric and without training: what imitation has to beat.
+
+Each is a function of (expert, learner, qpos [..., time, n]) that gives the learner's qpos [..., time, n_hat], or None
+where it does not apply to the two arms. Poses that are no motion are motions of one sample: [poses, 1, n].
+"""
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from mimic.embodiment import Embodiment
+from mimic.pose import pose_limits, shared_joints
+from mimic.segment_alignment import Poses, align_segments, checked_poses
+from mimic.similarity import centre_line_table
+
+IK_EVERY = 5  # samples of a motion of which inverse kinematics solves one; a solve takes 0.1 ms
+_TRACKING_STEPS = 6  # from the solution of the sample before
+_FIRST_STEPS = 40
+_RANDOM_STARTS = 3  # beside the home pose, of the first sample
+_DIRECTION_COST = 0.1  # chain lengths per radian: a hand off by 0.1 costs as much as one turned by 57 degrees
+_DAMPING, _STEP_DAMPING = 1e-6, 0.1  # constant, and per squared error
+_CONVERGED = 1e-4  # rad, the largest change of a joint in a step
+_HAND = "hand"
+
+
+def copy_joints(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses | None:
+    """The expert's angles in the joints that both arms have by name, 0 in the others, within the learner's range.
+
+    Args:
+      expert: n joints.
+      learner: n_hat joints.
+      qpos: the expert's poses [rad].
+
+    Returns:
+      The learner's poses [rad]; None where no joint name is common.
+    """
+    qpos = checked_poses(expert, qpos)
+    if not set(expert.joint_names) & set(learner.joint_names):
+        return None
+    lower, upper = pose_limits(learner, qpos.dtype)
+    return np.clip(shared_joints(expert, learner, qpos), lower, upper)
+
+
+def hold_home(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses:
+    """The learner's home pose at all times; arguments as for `copy_joints`."""
+    shape = checked_poses(expert, qpos).shape[:-1]
+    return np.broadcast_to(np.asarray(learner.home, qpos.dtype), (*shape, learner.num_joints)).copy()
+
+
+def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int = IK_EVERY) -> Poses:
+    """Inverse kinematics of the hand with mink: the tip where the expert's is in chain lengths, its direction second.
+
+    The objective is |p - p*|^2 + (0.1 angle(e, e*))^2 with the tip p in chain lengths and the direction e of the last
+    segment, within the joint range. The first sample is the best of several starts, the home pose among them; each
+    later one starts from the one before. Of a motion, every fifth sample and the last one are solved, and joint angles
+    between them are interpolated.
+
+    Args:
+      expert: n joints.
+      learner: n_hat joints.
+      qpos: the expert's poses [rad].
+      every: samples of a motion of which one is solved; 1 solves all.
+
+    Raises:
+      ValueError: `qpos` is not [..., time, n], or `every` is less than 1.
+    """
+    qpos = checked_poses(expert, qpos)
+    if every < 1:
+        raise ValueError(f"every: expected at least 1, got {every}")
+    time = qpos.shape[-2]
+    solved = np.unique(np.append(np.arange(0, time, every), time - 1))
+    hands = centre_line_table(expert, qpos.reshape(-1, time, expert.num_joints)[:, solved], samples=1)
+    solver = _HandSolver(learner)
+    motions = [
+        solver.follow(*motion)
+        for motion in zip(hands.hand_position.astype(float), hands.hand_direction.astype(float), strict=True)
+    ]
+    result = np.empty((len(motions), time, learner.num_joints), qpos.dtype)
+    before = np.searchsorted(solved, np.arange(time), side="right") - 1
+    after = np.minimum(before + 1, len(solved) - 1)
+    share = (np.arange(time) - solved[before]) / np.maximum(solved[after] - solved[before], 1)
+    for row, motion in zip(result, motions, strict=True):
+        row[:] = motion[before] + share[:, None] * (motion[after] - motion[before])
+    return result.reshape(*qpos.shape[:-1], learner.num_joints)
+
+
+BASELINES: dict[str, Callable[[Embodiment, Embodiment, Poses], Poses | None]] = {
+    "copy_joints": copy_joints,
+    "hand_ik": hand_ik,
+    "align_segments": align_segments,
+    "hold_home": hold_home,
+}
+
+
+class _HandSolver:
+    """mink on a model of the learner's joints alone, in chain lengths."""
+
+    def __init__(self, learner: Embodiment):
+        import mink  # half a second, and few need it
+
+        self._mink = mink
+        self._model = _kinematic_model(learner)
+        self._configuration = mink.Configuration(self._model, np.array(learner.home, float))
+        # The hand's x-axis is its direction, so that a turn about it costs nothing.
+        self._task = mink.FrameTask(
+            _HAND, "site", 1.0, orientation_cost=[0.0, _DIRECTION_COST, _DIRECTION_COST], lm_damping=_STEP_DAMPING
+        )
+        self._limits = [mink.ConfigurationLimit(self._model)]
+        lower, upper = np.asarray(learner.joint_range, float).T
+        random = np.random.default_rng(0).uniform(lower, upper, (_RANDOM_STARTS, learner.num_joints))
+        self._starts = np.concatenate([np.asarray(learner.home, float)[None], random])
+        self._firsts: dict[bytes, np.ndarray] = {}  # demonstrations start alike
+
+    def follow(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Joint angles [time, joints] for hands [time, 3]."""
+        key = positions[0].tobytes() + directions[0].tobytes()
+        if key not in self._firsts:
+            ends = [self._descend(start, positions[0], directions[0], _FIRST_STEPS) for start in self._starts]
+            self._firsts[key] = min(ends, key=lambda end: end[1])[0]
+        path = [self._firsts[key]]
+        for target in zip(positions[1:], directions[1:], strict=True):
+            path.append(self._descend(path[-1], *target, _TRACKING_STEPS)[0])
+        return np.stack(path)
+
+    def _descend(
+        self, start: np.ndarray, position: np.ndarray, direction: np.ndarray, steps: int
+    ) -> tuple[np.ndarray, float]:
+        """Angles, and the objective there."""
+        configuration, mink = self._configuration, self._mink
+        configuration.update(start)
+        for _ in range(steps):
+            frame = self._frame()
+            turned = _shortest_turn(frame[:, 0], direction) @ frame
+            self._task.set_target(mink.SE3.from_rotation_and_translation(mink.SO3.from_matrix(turned), position))
+            change = mink.solve_ik(
+                configuration, [self._task], 1.0, solver="daqp", damping=_DAMPING, limits=self._limits
+            )
+            configuration.integrate_inplace(change, 1.0)
+            if np.abs(change).max() < _CONVERGED:
+                break
+        miss = self._configuration.data.site(_HAND).xpos - position
+        angle = np.arccos(np.clip(self._frame()[:, 0] @ direction, -1, 1))
+        return configuration.q.copy(), float(miss @ miss + (_DIRECTION_COST * angle) ** 2)
+
+    def _frame(self) -> np.ndarray:
+        return self._configuration.data.site(_HAND).xmat.reshape(3, 3).copy()
+
+
+def _kinematic_model(arm: Embodiment) -> mujoco.MjModel:
+    """A MuJoCo model of an embodiment's joints and hand, in chain lengths; masses mean nothing."""
+    spec = mujoco.MjSpec()
+    spec.compiler.autolimits = False
+    spec.compiler.degree = False
+    unit = 1 / float(arm.chain_length)
+    bodies = [(spec.worldbody, np.zeros(3))]
+    lower, upper = pose_limits(arm, float)
+    for name, axis, anchor, low, high in zip(
+        arm.joint_names, arm.joint_axis, unit * np.asarray(arm.joint_anchor), lower, upper, strict=True
+    ):
+        parent, origin = bodies[-1]
+        body = parent.add_body(pos=anchor - origin, mass=1.0, inertia=np.ones(3), explicitinertial=True)
+        limited = bool(np.isfinite(low))
+        joint_range = [low, high] if limited else [0.0, 0.0]
+        body.add_joint(name=name, axis=axis, range=joint_range, limited=limited)
+        bodies.append((body, anchor))
+    start, end = unit * np.asarray(arm.segment_start[-1]), unit * np.asarray(arm.segment_end[-1])
+    rotation = _shortest_turn(np.array([1.0, 0.0, 0.0]), (end - start) / np.linalg.norm(end - start))
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    body, origin = bodies[arm.link_joint[arm.segment_link[-1]] + 1]
+    body.add_site(name=_HAND, pos=end - origin, quat=quaternion)
+    return spec.compile()
+
+
+def _shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The smallest rotation that takes a unit vector onto another, [3, 3]; about any axis where they are opposite."""
+    middle = a + b
+    square = middle @ middle
+    if square < 1e-12:
+        across = np.cross(a, np.eye(3)[np.abs(a).argmin()])
+        across /= np.linalg.norm(across)
+        return 2 * np.outer(across, across) - np.eye(3)
+    return np.eye(3) - 2 * np.outer(middle, middle) / square + 2 * np.outer(b, a)

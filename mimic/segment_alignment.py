@@ -1,0 +1,378 @@
+"""Poses a learner so that upper arm, forearm and hand point where the expert's do, joint by joint in closed form.
+
+The idea is that of SEW-Mimic (arXiv 2602.01632), for any serial chain of revolute joints. Shoulder, elbow, wrist and
+hand are vertices of the centre line; the three parts of an arm lie between them.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.embodiment import Embodiment
+from mimic.kinematics import joint_frames
+from mimic.pose import pose_limits
+
+Poses = Float[np.ndarray, "*batch time joints"]
+Vectors = Float[np.ndarray, "poses 3"]
+Angles = Float[np.ndarray, " poses"]
+
+_PARTS = 3  # upper arm, forearm, hand
+_SWEEPS = 3  # repeated for joints whose axis does not pass through the start of their part
+_LEAST_TURN = 0.05  # rad; a joint that turns a part by less for each rad does not orient it
+_ROLL = np.cos(np.radians(30))  # a joint whose axis is nearer than that to its part rolls it, and orients the next one
+_PARALLEL = 1e-3  # sine between axes that are one axis
+_RIGID = 0.1  # of its length, what an upper arm or forearm may change by when joints move
+_LEAST_SHARE = 0.5  # of the arm's length from the shoulder on, for upper arm and forearm
+_BEYOND_RANGE = 1e3  # rad; a solution within the joint range comes before any beyond it
+_GENERIC_POSES = 32  # random poses in which it is measured what a joint turns
+
+
+class Landmarks(NamedTuple):
+    """Vertices of the centre line, by number from the base (0) to the tip."""
+
+    shoulder: int
+    elbow: int
+    wrist: int
+    hand: int
+
+
+class PartJoints(NamedTuple):
+    """At most two joints, base to tip, that orient a part; the first may roll the part before about itself."""
+
+    joints: tuple[int, ...]
+    takes_roll: bool
+
+
+class Placement(NamedTuple):
+    """An arm in some poses: its joints' axes and anchors, and the vertices of its centre line, base frame, [m]."""
+
+    axes: Float[np.ndarray, "joints poses 3"]
+    anchors: Float[np.ndarray, "joints poses 3"]
+    vertices: Float[np.ndarray, "vertices poses 3"]
+
+
+def align_segments(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses | None:
+    """Upper arm, forearm and hand point where the expert's do, as nearly as the learner's joints allow.
+
+    From base to tip, the joints that orient a part take it to the expert's direction: two of them by Paden and Kahan's
+    subproblem 2 with its least-squares extension, one by subproblem 1. A joint that rolls a part about itself orients
+    the next one; then both parts are solved together. Joints of a part beyond these stay at home. Of several solutions
+    the one within the joint range, then the one nearest to home is taken, and angles are clipped to the range.
+
+    Args:
+      expert: n joints.
+      learner: n_hat joints.
+      qpos: the expert's poses [rad].
+
+    Returns:
+      The learner's poses [rad]; None where an arm has no elbow: fewer than three segments that a joint turns.
+
+    Raises:
+      ValueError: `qpos` is not [..., time, n], or not finite.
+    """
+    qpos = checked_poses(expert, qpos)
+    expert_marks = landmarks(expert)
+    learner_marks = expert_marks if _same_segments(expert, learner) else landmarks(learner)
+    if expert_marks is None or learner_marks is None:
+        return None
+    directions = part_directions(expert, expert_marks, qpos.reshape(-1, expert.num_joints))
+    solved = np.tile(np.asarray(learner.home, float), (directions.shape[1], 1))
+    steps = _steps(part_joints(learner, learner_marks))
+    for _ in range(_SWEEPS):
+        near = solved.copy()  # at first the home pose
+        for part, joints in steps:
+            solve = _orient_two_parts if len(joints) == 4 else _orient
+            goals = directions[part : part + 2]
+            solved[:, joints] = solve(learner, solved, learner_marks[part : part + 3], joints, goals, near)
+    lower, upper = pose_limits(learner, float)
+    return np.clip(solved, lower, upper).reshape(*qpos.shape[:-1], learner.num_joints).astype(qpos.dtype)
+
+
+def landmarks(arm: Embodiment) -> Landmarks | None:
+    """Shoulder, elbow, wrist and hand of an arm; None where fewer than three of its segments can be turned.
+
+    The hand is the tip. Shoulder, elbow and wrist are the vertices with the largest product of upper arm and forearm
+    (in the zero pose) whose lengths no joint changes, from the first segment on that a joint turns. Where such parts
+    are short beside the arm, as of a snake, lengths may change.
+    """
+    points = _zero_vertices(arm)
+    first = next((i for i in range(len(points) - 1) if _is_turned(arm, i)), len(points))
+    triples = list(itertools.combinations(range(first, len(points) - 1), 3))
+    if not triples:
+        return None
+    spans = _spans(_placement(arm, _generic_poses(arm)).vertices)
+    zero = np.linalg.norm(points[:, None] - points, axis=-1)
+    reach = np.linalg.norm(np.diff(points[first:], axis=0), axis=1).sum()
+
+    def is_rigid(triple: tuple[int, int, int]) -> bool:
+        shoulder, elbow, wrist = triple
+        parts = [(shoulder, elbow), (elbow, wrist)]
+        lengths = [zero[part] for part in parts]
+        steady = all(spans[part] <= _RIGID * length for part, length in zip(parts, lengths, strict=True))
+        return steady and sum(lengths) >= _LEAST_SHARE * reach
+
+    candidates = [triple for triple in triples if is_rigid(triple)] or [t for t in triples if t[0] == first]
+    return Landmarks(*max(candidates, key=lambda t: float(zero[t[0], t[1]] * zero[t[1], t[2]])), len(points) - 1)
+
+
+def part_directions(
+    arm: Embodiment, marks: Landmarks, qpos: Float[np.ndarray, "poses joints"]
+) -> Float[np.ndarray, "3 poses 3"]:
+    """Unit directions of upper arm, forearm and hand, from landmark to landmark."""
+    vertices = _placement(arm, np.asarray(qpos, float)).vertices
+    return np.stack([_unit(vertices[end] - vertices[start]) for start, end in zip(marks[:-1], marks[1:], strict=True)])
+
+
+def part_joints(arm: Embodiment, marks: Landmarks) -> list[PartJoints]:
+    """The joints that are to orient each part, base to tip."""
+    placement = _placement(arm, _generic_poses(arm))
+    result: list[PartJoints] = []
+    used: set[int] = set()
+    roll: int | None = None  # of the part before
+    for part in range(_PARTS):
+        start, end = marks[part : part + 2]
+        free = [joint for joint in range(arm.num_joints) if joint not in used]
+        turning = [joint for joint in free if _turn_rate(arm, placement, joint, start, end) > _LEAST_TURN]
+        rolls_this = bool(turning) and part + 1 < _PARTS and _is_roll(placement, turning[-1], start, end)
+        next_roll = turning.pop() if rolls_this else None
+        chosen: list[int] = []
+        for joint in turning:
+            if not any(_are_parallel(placement, joint, other) for other in chosen):
+                chosen.append(joint)
+        joints = tuple(chosen[:2])
+        result.append(PartJoints(joints, bool(joints) and joints[0] == roll))
+        used |= set(turning)  # those that are left over stay at home
+        if roll is not None:
+            used.add(roll)
+        # A joint that rolls two parts in line turns neither: nothing between them bends.
+        roll = None if next_roll == roll else next_roll
+    return result
+
+
+def _steps(parts: list[PartJoints]) -> list[tuple[int, list[int]]]:
+    """Which part is oriented by which joints; with four joints, that part and the next."""
+    steps, taken = [], False
+    for part, (joints, _) in enumerate(parts):
+        following = parts[part + 1] if part + 1 < len(parts) else PartJoints((), False)
+        both = not taken and following.takes_roll and len(joints) == len(following.joints) == 2
+        if not taken and joints:
+            steps.append((part, [*joints, *(following.joints if both else ())]))
+        taken = both
+    return steps
+
+
+def checked_poses(arm: Embodiment, qpos: Poses) -> Poses:
+    """The poses as floating-point numbers.
+
+    Raises:
+      ValueError: they are not [..., time, joints], or not finite.
+    """
+    qpos = np.asarray(qpos)
+    if qpos.ndim < 2 or qpos.shape[-1] != arm.num_joints:
+        raise ValueError(f"qpos: expected shape [..., time, {arm.num_joints}] for {arm.name}, got {qpos.shape}")
+    if not np.all(np.isfinite(qpos)):
+        raise ValueError("qpos: expected finite angles [rad], got some that are not")
+    return qpos if np.issubdtype(qpos.dtype, np.floating) else qpos.astype(float)
+
+
+def _orient(
+    arm: Embodiment,
+    qpos: np.ndarray,
+    marks: Sequence[int],
+    joints: list[int],
+    goals: Float[np.ndarray, "parts poses 3"],
+    near: np.ndarray,
+) -> np.ndarray:
+    """Angles [poses, joints] of one or two joints that take a part to the first goal."""
+    placement = _placement(arm, qpos)
+    part = _unit(placement.vertices[marks[1]] - placement.vertices[marks[0]])
+    axes = [placement.axes[joint] for joint in joints]
+    if len(joints) == 1:
+        return _wrapped(arm, qpos[:, joints] + rotate_onto(axes[0], part, goals[0])[:, None], joints)
+    changes = rotate_onto_by_two(axes[0], axes[1], part, goals[0])
+    return _nearest(arm, qpos, joints, [np.stack(change, axis=1) for change in changes], near)
+
+
+def _orient_two_parts(
+    arm: Embodiment,
+    qpos: np.ndarray,
+    marks: Sequence[int],
+    joints: list[int],
+    goals: Float[np.ndarray, "parts poses 3"],
+    near: np.ndarray,
+) -> np.ndarray:
+    """Angles [poses, 4] of shoulder (two), roll and elbow that take two parts to their goals.
+
+    The elbow makes the angle between the parts. The rotation that then takes both parts to their goals is that of the
+    other three joints: the shoulder takes the roll axis to where that rotation has it, the roll joint does the rest.
+    """
+    placement = _placement(arm, qpos)
+    points = [placement.vertices[mark] for mark in marks]
+    upper, lower = _unit(points[1] - points[0]), _unit(points[2] - points[1])
+    first, second, roll, elbow = (placement.axes[joint] for joint in joints)
+    goal = _frame(goals[0], goals[1])
+    changes = []
+    for bend in bend_to_angle(elbow, lower, upper, _dot(goals[0], goals[1])):
+        bent = _rotated(elbow, bend, lower)
+        rotation = goal @ _frame(upper, bent).swapaxes(1, 2)
+        turned_axis = np.einsum("nij,nj->ni", rotation, roll)
+        for a, b in rotate_onto_by_two(first, second, roll, turned_axis):
+            back = _rotated(second, -b, _rotated(first, -a, goals[1]))
+            changes.append(np.stack([a, b, rotate_onto(roll, bent, back), bend], axis=1))
+    return _nearest(arm, qpos, joints, changes, near)
+
+
+def _nearest(
+    arm: Embodiment, qpos: np.ndarray, joints: list[int], changes: list[np.ndarray], near: np.ndarray
+) -> np.ndarray:
+    """Of the solutions [poses, joints], the one least beyond the joint range, then the one nearest to other angles."""
+    solutions = np.stack([_wrapped(arm, qpos[:, joints] + change, joints) for change in changes])
+    lower, upper = (limit[joints] for limit in pose_limits(arm, float))
+    beyond = np.maximum(np.maximum(lower - solutions, solutions - upper), 0).sum(axis=-1)
+    cost = _BEYOND_RANGE * beyond + (_wrapped(arm, solutions - near[:, joints], joints) ** 2).sum(axis=-1)
+    return np.take_along_axis(solutions, cost.argmin(axis=0)[None, :, None], axis=0)[0]
+
+
+def rotate_onto(axis: Vectors, vector: Vectors, goal: Vectors) -> Angles:
+    """Angle [rad] about an axis that brings a vector nearest to the direction of another (subproblem 1)."""
+    return np.arctan2(_dot(axis, np.cross(vector, goal)), _dot(vector, goal) - _dot(axis, vector) * _dot(axis, goal))
+
+
+def rotate_onto_by_two(
+    first: Vectors, second: Vectors, vector: Vectors, goal: Vectors
+) -> tuple[tuple[Angles, Angles], tuple[Angles, Angles]]:
+    """Angles [rad] so that R(first, a) R(second, b) vector is nearest to the goal (subproblem 2): both solutions.
+
+    Both cones, of the vector about the second axis and of the goal about the first, meet in two directions. Where they
+    do not, both solutions are the one that brings them nearest: in the plane of the axes.
+
+    Args:
+      first: unit axis of the proximal joint.
+      second: unit axis of the distal joint, not parallel.
+      vector: unit vector that is turned.
+      goal: unit vector.
+    """
+    cosine = _dot(first, second)
+    across = np.cross(first, second)
+    square = np.maximum(_dot(across, across), _PARALLEL**2)
+    along_first, along_second = _dot(first, goal), _dot(second, vector)
+    in_plane = ((along_first - cosine * along_second) / square)[:, None] * first + (
+        (along_second - cosine * along_first) / square
+    )[:, None] * second
+    height = np.sqrt(np.maximum(1 - _dot(in_plane, in_plane), 0) / square)[:, None] * across
+    meets = in_plane + height, in_plane - height
+    return tuple((-rotate_onto(first, goal, meet), rotate_onto(second, vector, meet)) for meet in meets)  # type: ignore[return-value]
+
+
+def bend_to_angle(axis: Vectors, vector: Vectors, other: Vectors, cosine: Angles) -> tuple[Angles, Angles]:
+    """Angles [rad] about an axis that give a vector an angle to another, or the nearest to it: both solutions."""
+    along = _dot(axis, vector)[:, None] * axis
+    a, b = _dot(other, vector - along), _dot(other, np.cross(axis, vector))
+    amplitude = np.maximum(np.hypot(a, b), np.finfo(float).tiny)
+    apart = np.arccos(np.clip((cosine - _dot(other, along)) / amplitude, -1, 1))
+    return np.arctan2(b, a) + apart, np.arctan2(b, a) - apart
+
+
+def _frame(x: Vectors, y: Vectors) -> Float[np.ndarray, "poses 3 3"]:
+    """Rotations whose first column is x and whose third is across x and y; any that is, where they are parallel."""
+    across = np.cross(x, y)
+    any_across = np.cross(x, np.eye(3)[np.abs(x).argmin(axis=1)])
+    is_parallel = np.linalg.norm(across, axis=1, keepdims=True) < _PARALLEL**2
+    z = _unit(np.where(is_parallel, any_across, across))
+    return np.stack([x, np.cross(z, x), z], axis=2)
+
+
+def _rotated(axis: Vectors, angle: Angles, vector: Vectors) -> Vectors:
+    """Rodrigues' formula."""
+    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    along = _dot(axis, vector)[:, None] * axis
+    return along + cosine * (vector - along) + sine * np.cross(axis, vector)
+
+
+def _generic_poses(arm: Embodiment) -> Float[np.ndarray, "poses joints"]:
+    lower, upper = np.asarray(arm.joint_range, float).T
+    return np.random.default_rng(0).uniform(lower, upper, (_GENERIC_POSES, arm.num_joints))
+
+
+def _spans(vertices: Float[np.ndarray, "vertices poses 3"]) -> Float[np.ndarray, "vertices vertices"]:
+    """How much the distance of each pair of vertices changes over the poses [m]."""
+    distances = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1)
+    return distances.max(axis=-1) - distances.min(axis=-1)
+
+
+def _placement(arm: Embodiment, qpos: Float[np.ndarray, "poses joints"]) -> Placement:
+    frames = joint_frames(arm, list(qpos.T), None)
+    shape = (len(qpos), 3)
+
+    def rows(vector: tuple) -> np.ndarray:
+        return np.stack(np.broadcast_arrays(*vector, qpos[:, 0])[:3], axis=1)
+
+    rotations = [np.stack([rows(row) for row in frame.rotation], axis=1) for frame in frames]
+    anchors = [np.broadcast_to(rows(frame.anchor), shape) for frame in frames]
+    zero_anchors = np.concatenate([np.zeros((1, 3)), np.asarray(arm.joint_anchor)])
+    axes = [rotation @ axis for rotation, axis in zip(rotations[1:], np.asarray(arm.joint_axis), strict=True)]
+    vertices = [
+        anchors[mover + 1] + rotations[mover + 1] @ (point - zero_anchors[mover + 1])
+        for mover, point in zip(_movers(arm), _zero_vertices(arm), strict=True)
+    ]
+    return Placement(np.stack(axes), np.stack(anchors[1:]), np.stack(vertices))
+
+
+def _movers(arm: Embodiment) -> list[int]:
+    """The last joint that moves each vertex of the centre line; -1 for none."""
+    movers = [arm.link_joint[link] for link in arm.segment_link]
+    return [-1, *movers]
+
+
+def _zero_vertices(arm: Embodiment) -> Float[np.ndarray, "vertices 3"]:
+    return np.concatenate([np.asarray(arm.segment_start)[:1], np.asarray(arm.segment_end)])
+
+
+def _same_segments(expert: Embodiment, learner: Embodiment) -> bool:
+    """Whether the centre lines are of the same segments, as with joints locked; names of links do not tell."""
+    a, b = (np.linalg.norm(arm.segment_end - arm.segment_start, axis=1) for arm in (expert, learner))
+    return len(a) == len(b) and bool(np.allclose(a, b))
+
+
+def _is_turned(arm: Embodiment, segment: int) -> bool:
+    """Whether a joint changes the direction of a segment: not one about the segment itself."""
+    way = _unit(np.asarray(arm.segment_end[segment] - arm.segment_start[segment]))
+    axes = np.asarray(arm.joint_axis)[: _movers(arm)[segment + 1] + 1]
+    return bool(np.any(np.linalg.norm(np.cross(axes, way), axis=-1) > _PARALLEL))
+
+
+def _turn_rate(arm: Embodiment, placement: Placement, joint: int, start: int, end: int) -> float:
+    """How fast a joint turns the direction from one vertex to another [rad/rad], root mean square over the poses."""
+    axis, anchor = placement.axes[joint], placement.anchors[joint]
+    points = placement.vertices[start], placement.vertices[end]
+    moved = [mover >= joint for mover in (_movers(arm)[start], _movers(arm)[end])]
+    rates = [np.cross(axis, point - anchor) * moves for point, moves in zip(points, moved, strict=True)]
+    way = points[1] - points[0]
+    return float(np.sqrt(np.mean(np.sum(np.cross(way, rates[1] - rates[0]) ** 2, axis=1) / _dot(way, way) ** 2)))
+
+
+def _is_roll(placement: Placement, joint: int, start: int, end: int) -> bool:
+    """Whether a joint's axis is along a part, in all poses."""
+    part = _unit(placement.vertices[end] - placement.vertices[start])
+    return bool(np.all(np.abs(_dot(part, placement.axes[joint])) > _ROLL))
+
+
+def _are_parallel(placement: Placement, joint: int, other: int) -> bool:
+    return bool(np.all(np.linalg.norm(np.cross(placement.axes[joint], placement.axes[other]), axis=1) < _PARALLEL))
+
+
+def _wrapped(arm: Embodiment, angles: np.ndarray, joints: list[int]) -> np.ndarray:
+    """Angles in [-pi, pi], or the turn of them nearest to the middle of a joint's range."""
+    middle = np.asarray(arm.joint_range, float)[joints].mean(axis=1)
+    return angles - 2 * np.pi * np.round((angles - middle) / (2 * np.pi))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.sum(a * b, axis=-1)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -1,0 +1,196 @@
+"""Baselines for poses do what their closed forms promise, and stay within what the learner can do."""
+
+import numpy as np
+import pytest
+
+from mimic.embodiment import Embodiment, panda, planar_arm
+from mimic.pose_baselines import BASELINES, copy_joints, hand_ik, hold_home
+from mimic.segment_alignment import (
+    Landmarks,
+    align_segments,
+    bend_to_angle,
+    landmarks,
+    part_directions,
+    part_joints,
+    rotate_onto,
+    rotate_onto_by_two,
+)
+from mimic.similarity import centre_line_table, similarity
+
+PANDA = panda()
+PANDA_MARKS = Landmarks(1, 3, 5, 7)  # (0,0,.333), (.0825,0,.649), (0,0,1.033) and the tip
+ROUNDING = 1e-6  # rad, of angles near 0 by way of a cosine in double precision (1e-8), and of float32 (1e-7)
+
+
+def motion(arm: Embodiment, count: int, time: int = 1, spread: float = np.pi) -> np.ndarray:
+    """Random poses, each held; or random walks from them."""
+    rng = np.random.default_rng(0)
+    first = rng.uniform(-spread, spread, (count, 1, arm.num_joints))
+    steps = rng.normal(0, 0.05, (count, time, arm.num_joints))
+    steps[:, 0] = 0
+    return first + np.cumsum(steps, axis=1)
+
+
+def part_angles(expert: Embodiment, learner: Embodiment, marks: Landmarks, qpos, learner_qpos) -> np.ndarray:
+    """Angles between the directions of upper arm, forearm and hand, [3, poses]."""
+    pair = ((expert, qpos), (learner, learner_qpos))
+    a, b = (part_directions(arm, marks, q.reshape(-1, arm.num_joints)) for arm, q in pair)
+    return 2 * np.arcsin(np.clip(np.linalg.norm(a - b, axis=-1) / 2, 0, 1))
+
+
+def test_copying_takes_shared_joints_by_name():
+    learner = panda(locked=(3, 6))
+    qpos = motion(PANDA, 3)
+    np.testing.assert_array_equal(copy_joints(PANDA, learner, qpos), qpos[..., [0, 1, 3, 4, 6]])
+
+
+def test_copying_stays_within_limits():
+    learner = panda(limits="hardware")
+    copied = copy_joints(PANDA, learner, motion(PANDA, 50))
+    assert copied is not None
+    assert np.all((copied >= learner.joint_range[:, 0]) & (copied <= learner.joint_range[:, 1]))
+
+
+def test_copying_is_not_available_without_a_common_joint():
+    other = planar_arm([0.5, 0.5])
+    renamed = other.replace(joint_names=("a", "b"))  # type: ignore[attr-defined]
+    assert copy_joints(PANDA, renamed, motion(PANDA, 2)) is None
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_shapes_and_dtype(name):
+    learner = panda(locked=(2, 4))
+    qpos = motion(PANDA, 6, time=4).reshape(2, 3, 4, 7).astype(np.float32)
+    found = BASELINES[name](PANDA, learner, qpos)
+    assert found is not None
+    assert found.shape == (2, 3, 4, 5)
+    assert found.dtype == np.float32
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_bad_poses_are_refused(name):
+    with pytest.raises(ValueError, match=r"expected shape \[\.\.\., time, 7\]"):
+        BASELINES[name](PANDA, PANDA, np.zeros(7))
+    with pytest.raises(ValueError, match="finite"):
+        BASELINES[name](PANDA, PANDA, np.full((1, 7), np.nan))
+
+
+def test_holding_is_the_home_pose():
+    learner = panda(limits="hardware")
+    held = hold_home(PANDA, learner, motion(PANDA, 2, 3))
+    np.testing.assert_allclose(held, np.broadcast_to(learner.home, (2, 3, 7)))
+
+
+def test_hand_ik_of_an_equal_arm_reaches_the_hand():
+    qpos = motion(PANDA, 8, time=11)
+    hands = [centre_line_table(PANDA, q) for q in (qpos, hand_ik(PANDA, PANDA, qpos, every=1))]
+    miss = similarity(*hands)
+    # Steps end at 1e-4 rad, and four starts do not all find the pose: seven of eight motions must.
+    reached = (miss["hand_position_error"] < 1e-3) & (miss["hand_angle_deg"] < 0.1)
+    assert reached.all(axis=1).sum() >= 7
+
+
+def test_hand_ik_keeps_to_the_joint_range():
+    learner = panda(limits="hardware")
+    found = hand_ik(PANDA, learner, motion(PANDA, 4, time=11))
+    slack = 1e-6  # rad: the solver's tolerance on constraints
+    assert np.all((found >= learner.joint_range[:, 0] - slack) & (found <= learner.joint_range[:, 1] + slack))
+
+
+def test_hand_ik_interpolates_between_solved_samples():
+    qpos = motion(PANDA, 1, time=8, spread=1.0)
+    found = hand_ik(PANDA, PANDA, qpos, every=5)[0]  # samples 0, 5 and 7 are solved
+    np.testing.assert_allclose(found[6], (found[5] + found[7]) / 2, atol=1e-12)
+    np.testing.assert_allclose(np.diff(found[:6], axis=0), np.tile((found[5] - found[0]) / 5, (5, 1)), atol=1e-12)
+    with pytest.raises(ValueError, match="every"):
+        hand_ik(PANDA, PANDA, qpos, every=0)
+
+
+def test_landmarks_of_the_panda():
+    assert landmarks(PANDA) == PANDA_MARKS
+    assert [part.joints for part in part_joints(PANDA, PANDA_MARKS)] == [(0, 1), (2, 3), (4, 5)]
+
+
+def test_an_arm_without_elbow_has_no_landmarks():
+    assert landmarks(planar_arm([0.5, 0.5])) is None
+    assert align_segments(PANDA, planar_arm([0.5, 0.5]), motion(PANDA, 2)) is None
+
+
+def test_the_panda_aligns_with_itself():
+    qpos = motion(PANDA, 300)
+    found = align_segments(PANDA, PANDA, qpos)
+    assert part_angles(PANDA, PANDA, PANDA_MARKS, qpos, found).max() < ROUNDING
+
+
+@pytest.mark.parametrize("locked", [(1,), (2,), (3,), (4,), (5,), (6,), (7,), (3, 6, 7), (2, 3, 6, 7), (1, 4)])
+def test_locked_pandas_do_no_worse_than_not_moving_a_part(locked):
+    """Each part, with the joints that orient it put back to the home pose."""
+    learner = panda(locked=locked)
+    qpos = motion(PANDA, 200)
+    found = align_segments(PANDA, learner, qpos)
+    angles = part_angles(PANDA, learner, PANDA_MARKS, qpos, found)
+    parts = part_joints(learner, PANDA_MARKS)
+    assert found is not None and any(part.joints for part in parts)
+    for part, (joints, _) in enumerate(parts[1:], start=1):  # the forearm's roll joint may move the upper arm
+        unmoved = found.copy()
+        unmoved[..., list(joints)] = 0
+        still = part_angles(PANDA, learner, PANDA_MARKS, qpos, unmoved)[part]
+        assert np.all(angles[part] <= still + ROUNDING)
+
+
+def test_solutions_within_the_joint_range_come_first():
+    learner = panda(limits="hardware")
+    lower, upper = learner.joint_range.T
+    qpos = np.random.default_rng(0).uniform(lower, upper, (300, 1, 7))
+    found = align_segments(learner, learner, qpos)
+    assert found is not None and np.all((found >= lower) & (found <= upper))
+    angles = part_angles(learner, learner, PANDA_MARKS, qpos, found)
+    # The expert's own pose is within the range. The upper arm and forearm are solved with four joints, and of their
+    # four solutions one is within it; the hand's two joints are chosen after them, which may leave it none.
+    assert np.mean(angles[:2].max(axis=0) < ROUNDING) > 0.99
+
+
+@pytest.mark.parametrize("reachable", [True, False])
+def test_subproblem_2_is_the_least_angle(reachable):
+    """Against a grid over both angles."""
+    rng = np.random.default_rng(1)
+    first, second, vector, goal = rng.normal(size=(4, 40, 3))
+    first, second, vector, goal = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (first, second, vector, goal))
+    if not reachable:
+        second = first + 0.2 * second
+        second /= np.linalg.norm(second, axis=1, keepdims=True)
+
+    def turned(a, b):
+        return rotated(first, a, rotated(second, b, vector))
+
+    grid = np.linspace(-np.pi, np.pi, 181)
+    best = np.max([np.sum(turned(a, b) * goal, axis=1) for a in grid for b in grid], axis=0)
+    for a, b in rotate_onto_by_two(first, second, vector, goal):
+        reached = np.sum(turned(a[:, None], b[:, None]) * goal, axis=1)
+        assert np.all(reached >= best - 1e-12)
+    if not reachable:
+        assert np.any(best < 0.99)
+
+
+def test_subproblem_1_is_the_least_angle():
+    rng = np.random.default_rng(2)
+    axis, vector, goal = rng.normal(size=(3, 40, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    reached = np.sum(rotated(axis, rotate_onto(axis, vector, goal)[:, None], vector) * goal, axis=1)
+    best = np.max([np.sum(rotated(axis, a, vector) * goal, axis=1) for a in np.linspace(-np.pi, np.pi, 1001)], axis=0)
+    assert np.all(reached >= best - 1e-12)
+
+
+def test_bending_makes_the_angle():
+    rng = np.random.default_rng(3)
+    axis, vector, other = rng.normal(size=(3, 40, 3))
+    axis, vector, other = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (axis, vector, other))
+    wanted = np.sum(rotated(axis, 0.7, vector) * other, axis=1)  # so that it can be reached
+    for bend in bend_to_angle(axis, vector, other, wanted):
+        np.testing.assert_allclose(np.sum(rotated(axis, bend[:, None], vector) * other, axis=1), wanted, atol=1e-12)
+
+
+def rotated(axis, angle, vector):
+    """Rodrigues' formula, [n, 3]."""
+    along = np.sum(axis * vector, axis=1, keepdims=True) * axis
+    return along + np.cos(angle) * (vector - along) + np.sin(angle) * np.cross(axis, vector)
