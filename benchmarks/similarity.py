@@ -7,18 +7,19 @@ metric (links kept or merged, correspondence, translation weight beside a rotati
 of `mimic.similarity` say how alike the arms look; beside them those of the baselines of `mimic.pose_baselines`.
 FOLDER holds an unpacked wheel of robosuite, for arms other than the Panda; without it they are left out.
 
-Poses are optimised as by `imitate_pose`, with the same starts and iterations. One compiled function serves all locked
-Pandas, whose locked joints are joints with a range of zero, and all experts, whose link states are data.
+Poses are optimised as by `imitate_pose`, but all pairs share one compiled function: see `benchmarks.similarity_poses`.
+Hard and soft correspondence, by `imitate_pose` itself, take most of the time and are run on a few pairs, unless --all.
 """
 
 import argparse
 import dataclasses
 import functools
 import itertools
+import json
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,29 +30,25 @@ import numpy as np
 import mimic
 from benchmarks import similarity_summary
 from benchmarks.record import write_results
-from mimic.descent import newton
+from benchmarks.similarity_poses import arm_data, best_poses
 from mimic.embodiment import Embodiment
 from mimic.envs.arms import ArmConfig, build_arm
 from mimic.envs.config import MetricConfig
-from mimic.kinematics import LinkStates, link_state_table, link_states
-from mimic.objective import pose_objective
-from mimic.pose import pose_limits, shared_joints
+from mimic.kinematics import link_state_table
+from mimic.pose import shared_joints
 from mimic.pose_baselines import BASELINES
 from mimic.similarity import CentreLine, centre_line_table, similarity
 
 TRANSLATIONS = 0.0, 0.25, 0.5, 1.0, 2.0, 4.0  # with a rotation weight of 1
 STATE_DEPENDENT = 0.0, 0.5, 2.0  # translation weights of hard and soft correspondence
 MERGED = {"chord_overlap": (0.0,), "overlap": (0.0, 0.5, 2.0), "arc_length": (0.0, 0.5, 2.0)}
-SUBSET = ("panda -3,6,7", "panda -2,3,6,7", "panda -5")  # of hard, soft and merged, unless --all
+SUBSET = ("panda -3,6,7", "panda -5")  # of hard and soft, unless --all
 FULL = "panda -3,6,7"  # the environment panda4dof: always on 40 demonstrations, every fifth sample
-STARTS, RANDOM_POSES = 6, 264  # twelve starts lower the mean distance by 0.03 % and take twice the time
-ROUGH, MORE, KEPT = 5, 11, 2  # Newton steps from every start, then more from the best two
 FULL_DEMONSTRATIONS, FULL_EVERY = 40, 5
 ROBOSUITE = {
     "UR5e": "ur5e", "IIWA": "iiwa", "Kinova3": "kinova3", "Sawyer": "sawyer", "Jaco": "jaco", "xArm7": "xarm7",
 }  # fmt: skip
 WANTED = "UR10e", *ROBOSUITE
-_MAX_LINKS = 7  # of an expert; link states are padded to so many
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,80 +103,35 @@ def expert_motions(model: str, tip: str | None, count: int, random: int) -> dict
     return motions
 
 
-Solver = Callable[..., Any]
-
-
-def make_solver(learner: Embodiment, state_dependent: str | None = None) -> Solver:
-    """A compiled function of (expert states, W, translation weight, own angles, random poses, lower, upper) -> qpos.
-
-    Args:
-      learner: its joints are optimised.
-      state_dependent: "hard" or "soft" correspondence; else it is the argument W.
-    """
-    metric = MetricConfig(correspondence=state_dependent) if state_dependent else None
-
-    @jax.jit
-    def solve(
-        states: LinkStates, matrix: Any, translation: Any, own: Any, random: Any, lower: Any, upper: Any
-    ) -> jax.Array:
-        correspondence = metric.make_correspondence(learner, learner) if metric else matrix
-        weights = mimic.DistanceWeights(translation, 1.0)
-        objective = pose_objective(learner, correspondence, weights, "cosine", "mean")
-        random_states = jax.vmap(jax.vmap(lambda q: link_states(learner, q)))(random)
-
-        def one(states: LinkStates, own: Any) -> jax.Array:
-            target = objective.target(states)
-            tried = jax.vmap(jax.vmap(lambda s: objective.value(target, s)))(random_states)
-            nearest = jnp.take_along_axis(random, jnp.argmin(tried, axis=1)[:, None, None], axis=1)[:, 0]
-            descend = functools.partial(newton, functools.partial(objective.derivatives, target))
-            first = jnp.concatenate([own[None], nearest])
-            ends = jax.vmap(lambda start: descend(start, (lower, upper), ROUGH))(first)
-            best = jax.lax.top_k(-ends.value, KEPT)[1]
-            ends = jax.vmap(lambda start: descend(start, (lower, upper), MORE))(ends.qpos[best])
-            return ends.qpos[jnp.argmin(ends.value)]
-
-        return jax.vmap(one)(states, own)
-
-    return solve
-
-
-@functools.lru_cache(maxsize=4)
-def cached_solver(model: str, tip: str | None, locked: tuple[int, ...], links: str, kind: str | None) -> Any:
-    """The learner that is optimised, and its solver."""
-    arm = build_arm(ArmConfig(model=model, tip=tip, locked=list(locked)), links=links).embodiment
-    return arm, make_solver(arm, kind)
-
-
 def optimal_poses(
     expert: Embodiment, pair: Pair, links: str, correspondence: str, translations: tuple[float, ...], qpos: np.ndarray
 ) -> Iterator[tuple[float, Embodiment, np.ndarray]]:
     """For each translation weight, the arm that was optimised and its poses."""
-    kind = correspondence if correspondence in ("hard", "soft") else None
-    as_range = bool(pair.locked) and links == "kept"
-    locked = () if as_range else pair.locked
-    learner, solve = cached_solver(pair.learner.model, pair.learner.tip, locked, links, kind)
-    lower, upper = pose_limits(learner, np.float32)
-    low, high = (np.asarray(x, np.float32) for x in learner.joint_range.T)
-    if as_range:
-        held = [joint - 1 for joint in pair.locked]
-        for values in (lower, upper, low, high):
-            values[held] = 0
-    shape = STARTS, RANDOM_POSES // STARTS, learner.num_joints
-    random = np.random.default_rng(1).uniform(low, high, shape).astype(np.float32)
-    own = np.clip(shared_joints(expert, learner, qpos.astype(np.float32)), lower, upper)
-    states, matrix = (
-        link_state_table(expert, qpos, np.zeros_like(qpos)),
-        np.zeros((expert.num_links, learner.num_links)),
-    )
-    if kind is None:
-        matrix = np.asarray(MetricConfig(correspondence=correspondence).make_correspondence(expert, learner))
-        extra = _MAX_LINKS - expert.num_links  # links that correspond to none
-        states = jax.tree.map(lambda x: np.pad(x, ((0, 0), (0, extra), (0, 0))), states)
-        matrix = np.pad(matrix, ((0, extra), (0, 0)))
+    learner = build_arm(pair.learner, links=links).embodiment
+    own = shared_joints(expert, learner, qpos.astype(np.float32))
+    metric = MetricConfig(correspondence=correspondence, links=links)
+    matrix = metric.make_correspondence(expert, learner)
+    if callable(matrix):
+        yield from _state_dependent(expert, learner, matrix, translations, qpos)
+        return
+    data, states = arm_data(learner), link_state_table(expert, qpos, np.zeros_like(qpos))
     for translation in translations:
-        weight = jnp.float32(translation)
-        found = solve(states, jnp.asarray(matrix, jnp.float32), weight, own, random, lower, upper)
-        yield translation, learner, np.asarray(found)
+        found = best_poses(data, states, matrix, translation, own)
+        yield translation, learner, found[:, : learner.num_joints]
+
+
+def _state_dependent(
+    expert: Embodiment, learner: Embodiment, correspondence: Any, translations: tuple[float, ...], qpos: np.ndarray
+) -> Iterator[tuple[float, Embodiment, np.ndarray]]:
+    """By `imitate_pose`, compiled once for all weights."""
+
+    @jax.jit
+    def solve(qpos: jax.Array, translation: jax.Array) -> jax.Array:
+        weights = mimic.DistanceWeights(translation, 1.0)
+        return mimic.imitate_pose(expert, learner, qpos, correspondence, weights).qpos
+
+    for translation in translations:
+        yield translation, learner, np.asarray(solve(jnp.asarray(qpos, jnp.float32), jnp.float32(translation)))
 
 
 def measured(expert_line: CentreLine, learner: Embodiment, qpos: np.ndarray) -> dict[str, list[float]]:
@@ -220,12 +172,22 @@ def candidates(pair: Pair, everything: bool) -> Iterator[tuple[str, str, tuple[f
     """Links, correspondence and translation weights."""
     for correspondence in ("arc_length", "overlap"):
         yield "kept", correspondence, TRANSLATIONS
+    if pair.locked:  # nothing is merged where nothing is locked
+        for correspondence, translations in MERGED.items():
+            yield "merged", correspondence, translations
     if everything or pair.name in SUBSET:
         for correspondence in ("hard", "soft"):
             yield "kept", correspondence, STATE_DEPENDENT
-        if pair.locked:  # nothing is merged where nothing is locked
-            for correspondence, translations in MERGED.items():
-                yield "merged", correspondence, translations
+
+
+def _rows_so_far(path: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """Of a file of results; exits where it was made with other settings."""
+    if not path.is_file():
+        return []
+    content = json.loads(path.read_text())
+    if content["settings"] != settings:
+        sys.exit(f"error: {path} was made with {content['settings']}, not with {settings}")
+    return content["rows"]
 
 
 def main() -> None:
@@ -238,28 +200,26 @@ def main() -> None:
     parser.add_argument("--demonstrations", type=int, default=20, help="of each kind")
     parser.add_argument("--every", type=int, default=10, help="samples of a demonstration of which one is taken")
     parser.add_argument("--random", type=int, default=120, help="random poses")
-    parser.add_argument("--all", action="store_true", help="hard, soft and merged on all pairs")
+    parser.add_argument("--all", action="store_true", help="hard and soft on all pairs")
+    parser.add_argument("--resume", action="store_true", help="keep the pairs that the file of results has")
     parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
     options = parser.parse_args()
     logging.getLogger("mimic").setLevel(logging.ERROR)
     others, missing = other_arms(options.arms)
-    # Pairs of one learner one after the other: it is compiled once.
-    pairs = sorted(
-        [*locked_pandas(), *others],
-        key=lambda pair: (pair.name != FULL, not pair.locked, pair.learner.model != "panda"),
-    )
+    pairs = [*locked_pandas(), *others]
     unknown = set(options.pair or ()) - {pair.name for pair in pairs}
     if unknown:
         sys.exit(f"error: unknown pair {min(unknown)!r}; valid are {', '.join(pair.name for pair in pairs)}")
-    rows: list[dict[str, Any]] = []
+    settings = {name: getattr(options, name) for name in ("demonstrations", "every", "random", "all")}
+    rows = _rows_so_far(options.out, settings) if options.resume else []
+    measured_pairs = {row["pair"] for row in rows}
     for pair in pairs:
-        if options.pair and pair.name not in options.pair:
+        if (options.pair and pair.name not in options.pair) or pair.name in measured_pairs:
             continue
         began = time.perf_counter()
         rows += run_pair(pair, options)
         print(f"{pair.name}: {time.perf_counter() - began:.0f} s", flush=True)
         summary = similarity_summary.summarise(rows)
-        settings = {name: getattr(options, name) for name in ("demonstrations", "every", "random", "all")}
         content = {"settings": settings, "not_found": missing, "summary": summary, "rows": rows}
         write_results(options.out, "similarity", options.commit, **content)
     similarity_summary.print_tables(rows)

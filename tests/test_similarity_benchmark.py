@@ -1,13 +1,17 @@
 """`python -m benchmarks.similarity`: its optimiser is `imitate_pose`'s, and its tables say what the rows say."""
 
+import functools
+
+import jax
 import numpy as np
 import pytest
 
 import mimic
 from benchmarks import similarity as benchmark
+from benchmarks import similarity_poses as poses
 from benchmarks import similarity_summary as summary
 from mimic.kinematics import link_state_table
-from mimic.pose import pose_limits, shared_joints
+from mimic.pose import shared_joints
 from mimic.similarity import MEASURES
 
 
@@ -24,29 +28,50 @@ def test_arms_that_are_not_there_are_named(tmp_path):
 
 
 def test_the_optimiser_finds_what_imitate_pose_finds():
-    expert, learner = mimic.planar_arm([0.25] * 4), mimic.planar_arm([0.5, 0.3, 0.2])
+    expert, learner = mimic.planar_arm([0.25] * 4), mimic.planar_arm([1.0, 0.6, 0.4])  # of other size too
     qpos = np.random.default_rng(0).uniform(-np.pi, np.pi, (20, 4)).astype(np.float32)
     matrix = mimic.arc_length_correspondence(expert, learner)
     weights = mimic.DistanceWeights(0.5, 1.0)
     best = mimic.imitate_pose(expert, learner, qpos, matrix, weights)
-    lower, upper = pose_limits(learner, np.float32)
-    random = np.random.default_rng(1).uniform(-np.pi, np.pi, (12, 22, 3)).astype(np.float32)
     states = link_state_table(expert, qpos, np.zeros_like(qpos))
-    solve = benchmark.make_solver(learner)
-    found = solve(states, matrix, np.float32(0.5), shared_joints(expert, learner, qpos), random, lower, upper)
+    found = poses.best_poses(poses.arm_data(learner), states, matrix, 0.5, shared_joints(expert, learner, qpos))
+    assert not np.any(found[:, 3:])  # padding
 
     def distance(pose, learner_pose):
         states = mimic.link_states(expert, pose), mimic.link_states(learner, learner_pose)
         return float(mimic.embodiment_distance(*states, matrix, weights))
 
-    left = [distance(*pair) for pair in zip(qpos, found, strict=True)]
+    left = [distance(*pair) for pair in zip(qpos, found[:, :3], strict=True)]
     # The random starts differ, so a pose may end in another minimum: on average that must not matter.
     assert np.mean(left) < 1.01 * float(best.distance.mean())
 
 
-def row(pair, method, values, poses="pd"):
+def test_closed_form_derivatives(x64):
+    """Against automatic differentiation, for an arm with fewer links than joints and one link that nothing moves."""
+    expert, learner = mimic.panda(), mimic.panda(locked=(1, 4), links="merged")
+    rng = np.random.default_rng(0)
+    data = jax.tree.map(lambda x: x.astype(float) if x.dtype == np.float32 else x, poses.arm_data(learner))
+    states = link_state_table(expert, rng.uniform(-3, 3, 7), np.zeros(7))
+    matrix = np.pad(np.asarray(mimic.overlap_correspondence(expert, learner)), ((0, 0), (0, 7 - learner.num_links)))
+    pair = (np.asarray(x, float) for x in (states.position, states.direction))
+    derivatives = functools.partial(poses._derivatives, data, *pair, matrix, 0.7)
+    qpos = np.pad(rng.uniform(-3, 3, 5), (0, 2))
+    found, value = derivatives(qpos), lambda q: derivatives(q).value
+    np.testing.assert_allclose(found.gradient, jax.grad(value)(qpos), atol=1e-12)
+    hessian = jax.hessian(value)(qpos)
+    for i, entries in enumerate(found.hessian):
+        np.testing.assert_allclose(entries, hessian[i, : i + 1], atol=1e-10)
+    weights = mimic.DistanceWeights(0.7, 1.0)
+    exact = mimic.embodiment_distance(
+        states, mimic.link_states(learner, qpos[:5]), matrix[:, : learner.num_links], weights
+    )
+    # Float32 arm data and link states, and the smoothed kink of positions.
+    np.testing.assert_allclose(found.value / (7 * learner.num_links), exact, rtol=1e-4)
+
+
+def row(pair, method, values, kind="pd"):
     measures = {name: [value, 2 * value] for name, value in zip(MEASURES, values, strict=True)}
-    return {"pair": pair, "set": poses, "method": method, "measures": measures}
+    return {"pair": pair, "set": kind, "method": method, "measures": measures}
 
 
 ROWS = [
