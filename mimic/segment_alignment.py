@@ -14,16 +14,14 @@ from jaxtyping import Float
 from mimic.embodiment import Embodiment
 from mimic.kinematics import joint_frames
 from mimic.pose import pose_limits
+from mimic.subproblems import PARALLEL, bend_to_angle, dot, frame_of, rotate_onto, rotate_onto_by_two, rotated, unit
 
 Poses = Float[np.ndarray, "*batch time joints"]
-Vectors = Float[np.ndarray, "poses 3"]
-Angles = Float[np.ndarray, " poses"]
 
 _PARTS = 3  # upper arm, forearm, hand
 _SWEEPS = 3  # repeated for joints whose axis does not pass through the start of their part
 _LEAST_TURN = 0.05  # rad; a joint that turns a part by less for each rad does not orient it
 _ROLL = np.cos(np.radians(30))  # a joint whose axis is nearer than that to its part rolls it, and orients the next one
-_PARALLEL = 1e-3  # sine between axes that are one axis
 _RIGID = 0.1  # of its length, what an upper arm or forearm may change by when joints move
 _LEAST_SHARE = 0.5  # of the arm's length from the shoulder on, for upper arm and forearm
 _BEYOND_RANGE = 1e3  # rad; a solution within the joint range comes before any beyond it
@@ -123,7 +121,7 @@ def part_directions(
 ) -> Float[np.ndarray, "3 poses 3"]:
     """Unit directions of upper arm, forearm and hand, from landmark to landmark."""
     vertices = _placement(arm, np.asarray(qpos, float)).vertices
-    return np.stack([_unit(vertices[end] - vertices[start]) for start, end in zip(marks[:-1], marks[1:], strict=True)])
+    return np.stack([unit(vertices[end] - vertices[start]) for start, end in zip(marks[:-1], marks[1:], strict=True)])
 
 
 def part_joints(arm: Embodiment, marks: Landmarks) -> list[PartJoints]:
@@ -188,7 +186,7 @@ def _orient(
 ) -> np.ndarray:
     """Angles [poses, joints] of one or two joints that take a part to the first goal."""
     placement = _placement(arm, qpos)
-    part = _unit(placement.vertices[marks[1]] - placement.vertices[marks[0]])
+    part = unit(placement.vertices[marks[1]] - placement.vertices[marks[0]])
     axes = [placement.axes[joint] for joint in joints]
     if len(joints) == 1:
         return _wrapped(arm, qpos[:, joints] + rotate_onto(axes[0], part, goals[0])[:, None], joints)
@@ -211,16 +209,16 @@ def _orient_two_parts(
     """
     placement = _placement(arm, qpos)
     points = [placement.vertices[mark] for mark in marks]
-    upper, lower = _unit(points[1] - points[0]), _unit(points[2] - points[1])
+    upper, lower = unit(points[1] - points[0]), unit(points[2] - points[1])
     first, second, roll, elbow = (placement.axes[joint] for joint in joints)
-    goal = _frame(goals[0], goals[1])
+    goal = frame_of(goals[0], goals[1])
     changes = []
-    for bend in bend_to_angle(elbow, lower, upper, _dot(goals[0], goals[1])):
-        bent = _rotated(elbow, bend, lower)
-        rotation = goal @ _frame(upper, bent).swapaxes(1, 2)
+    for bend in bend_to_angle(elbow, lower, upper, dot(goals[0], goals[1])):
+        bent = rotated(elbow, bend, lower)
+        rotation = goal @ frame_of(upper, bent).swapaxes(1, 2)
         turned_axis = np.einsum("nij,nj->ni", rotation, roll)
         for a, b in rotate_onto_by_two(first, second, roll, turned_axis):
-            back = _rotated(second, -b, _rotated(first, -a, goals[1]))
+            back = rotated(second, -b, rotated(first, -a, goals[1]))
             changes.append(np.stack([a, b, rotate_onto(roll, bent, back), bend], axis=1))
     return _nearest(arm, qpos, joints, changes, near)
 
@@ -234,62 +232,6 @@ def _nearest(
     beyond = np.maximum(np.maximum(lower - solutions, solutions - upper), 0).sum(axis=-1)
     cost = _BEYOND_RANGE * beyond + (_wrapped(arm, solutions - near[:, joints], joints) ** 2).sum(axis=-1)
     return np.take_along_axis(solutions, cost.argmin(axis=0)[None, :, None], axis=0)[0]
-
-
-def rotate_onto(axis: Vectors, vector: Vectors, goal: Vectors) -> Angles:
-    """Angle [rad] about an axis that brings a vector nearest to the direction of another (subproblem 1)."""
-    return np.arctan2(_dot(axis, np.cross(vector, goal)), _dot(vector, goal) - _dot(axis, vector) * _dot(axis, goal))
-
-
-def rotate_onto_by_two(
-    first: Vectors, second: Vectors, vector: Vectors, goal: Vectors
-) -> tuple[tuple[Angles, Angles], tuple[Angles, Angles]]:
-    """Angles [rad] so that R(first, a) R(second, b) vector is nearest to the goal (subproblem 2): both solutions.
-
-    Both cones, of the vector about the second axis and of the goal about the first, meet in two directions. Where they
-    do not, both solutions are the one that brings them nearest: in the plane of the axes.
-
-    Args:
-      first: unit axis of the proximal joint.
-      second: unit axis of the distal joint, not parallel.
-      vector: unit vector that is turned.
-      goal: unit vector.
-    """
-    cosine = _dot(first, second)
-    across = np.cross(first, second)
-    square = np.maximum(_dot(across, across), _PARALLEL**2)
-    along_first, along_second = _dot(first, goal), _dot(second, vector)
-    in_plane = ((along_first - cosine * along_second) / square)[:, None] * first + (
-        (along_second - cosine * along_first) / square
-    )[:, None] * second
-    height = np.sqrt(np.maximum(1 - _dot(in_plane, in_plane), 0) / square)[:, None] * across
-    meets = in_plane + height, in_plane - height
-    return tuple((-rotate_onto(first, goal, meet), rotate_onto(second, vector, meet)) for meet in meets)  # type: ignore[return-value]
-
-
-def bend_to_angle(axis: Vectors, vector: Vectors, other: Vectors, cosine: Angles) -> tuple[Angles, Angles]:
-    """Angles [rad] about an axis that give a vector an angle to another, or the nearest to it: both solutions."""
-    along = _dot(axis, vector)[:, None] * axis
-    a, b = _dot(other, vector - along), _dot(other, np.cross(axis, vector))
-    amplitude = np.maximum(np.hypot(a, b), np.finfo(float).tiny)
-    apart = np.arccos(np.clip((cosine - _dot(other, along)) / amplitude, -1, 1))
-    return np.arctan2(b, a) + apart, np.arctan2(b, a) - apart
-
-
-def _frame(x: Vectors, y: Vectors) -> Float[np.ndarray, "poses 3 3"]:
-    """Rotations whose first column is x and whose third is across x and y; any that is, where they are parallel."""
-    across = np.cross(x, y)
-    any_across = np.cross(x, np.eye(3)[np.abs(x).argmin(axis=1)])
-    is_parallel = np.linalg.norm(across, axis=1, keepdims=True) < _PARALLEL**2
-    z = _unit(np.where(is_parallel, any_across, across))
-    return np.stack([x, np.cross(z, x), z], axis=2)
-
-
-def _rotated(axis: Vectors, angle: Angles, vector: Vectors) -> Vectors:
-    """Rodrigues' formula."""
-    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    along = _dot(axis, vector)[:, None] * axis
-    return along + cosine * (vector - along) + sine * np.cross(axis, vector)
 
 
 def _generic_poses(arm: Embodiment) -> Float[np.ndarray, "poses joints"]:
@@ -339,9 +281,9 @@ def _same_segments(expert: Embodiment, learner: Embodiment) -> bool:
 
 def _is_turned(arm: Embodiment, segment: int) -> bool:
     """Whether a joint changes the direction of a segment: not one about the segment itself."""
-    way = _unit(np.asarray(arm.segment_end[segment] - arm.segment_start[segment]))
+    way = unit(np.asarray(arm.segment_end[segment] - arm.segment_start[segment]))
     axes = np.asarray(arm.joint_axis)[: _movers(arm)[segment + 1] + 1]
-    return bool(np.any(np.linalg.norm(np.cross(axes, way), axis=-1) > _PARALLEL))
+    return bool(np.any(np.linalg.norm(np.cross(axes, way), axis=-1) > PARALLEL))
 
 
 def _turn_rate(arm: Embodiment, placement: Placement, joint: int, start: int, end: int) -> float:
@@ -351,28 +293,20 @@ def _turn_rate(arm: Embodiment, placement: Placement, joint: int, start: int, en
     moved = [mover >= joint for mover in (_movers(arm)[start], _movers(arm)[end])]
     rates = [np.cross(axis, point - anchor) * moves for point, moves in zip(points, moved, strict=True)]
     way = points[1] - points[0]
-    return float(np.sqrt(np.mean(np.sum(np.cross(way, rates[1] - rates[0]) ** 2, axis=1) / _dot(way, way) ** 2)))
+    return float(np.sqrt(np.mean(np.sum(np.cross(way, rates[1] - rates[0]) ** 2, axis=1) / dot(way, way) ** 2)))
 
 
 def _is_roll(placement: Placement, joint: int, start: int, end: int) -> bool:
     """Whether a joint's axis is along a part, in all poses."""
-    part = _unit(placement.vertices[end] - placement.vertices[start])
-    return bool(np.all(np.abs(_dot(part, placement.axes[joint])) > _ROLL))
+    part = unit(placement.vertices[end] - placement.vertices[start])
+    return bool(np.all(np.abs(dot(part, placement.axes[joint])) > _ROLL))
 
 
 def _are_parallel(placement: Placement, joint: int, other: int) -> bool:
-    return bool(np.all(np.linalg.norm(np.cross(placement.axes[joint], placement.axes[other]), axis=1) < _PARALLEL))
+    return bool(np.all(np.linalg.norm(np.cross(placement.axes[joint], placement.axes[other]), axis=1) < PARALLEL))
 
 
 def _wrapped(arm: Embodiment, angles: np.ndarray, joints: list[int]) -> np.ndarray:
     """Angles in [-pi, pi], or the turn of them nearest to the middle of a joint's range."""
     middle = np.asarray(arm.joint_range, float)[joints].mean(axis=1)
     return angles - 2 * np.pi * np.round((angles - middle) / (2 * np.pi))
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.sum(a * b, axis=-1)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

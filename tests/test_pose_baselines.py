@@ -8,14 +8,12 @@ from mimic.pose_baselines import BASELINES, copy_joints, hand_ik, hold_home
 from mimic.segment_alignment import (
     Landmarks,
     align_segments,
-    bend_to_angle,
     landmarks,
     part_directions,
     part_joints,
-    rotate_onto,
-    rotate_onto_by_two,
 )
 from mimic.similarity import centre_line_table, similarity
+from mimic.subproblems import bend_to_angle, rotate_onto, rotate_onto_by_two
 
 PANDA = panda()
 PANDA_MARKS = Landmarks(1, 3, 5, 7)  # (0,0,.333), (.0825,0,.649), (0,0,1.033) and the tip
