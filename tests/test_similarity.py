@@ -1,5 +1,6 @@
 """Measures of similarity: closed forms of planar arms, invariances, and the two implementations against each other."""
 
+import dataclasses
 import functools
 
 import jax
@@ -118,7 +119,7 @@ def test_frechet_distance_is_that_of_its_definition():
     rng = np.random.default_rng(0)
     qpos = random_poses(panda(), 4), random_poses(panda(), 4, seed=1)
     lines = [centre_line_table(panda(), q, samples=n) for q, n in zip(qpos, (20, 13), strict=True)]
-    shaken = [line.replace(points=line.points + rng.normal(0, 0.1, line.points.shape)) for line in lines]
+    shaken = [dataclasses.replace(line, points=line.points + rng.normal(0, 0.1, line.points.shape)) for line in lines]
     for first, second in (lines, shaken):
         expected = [leash_by_recursion(a, b) for a, b in zip(first.points, second.points, strict=True)]
         np.testing.assert_allclose(similarity.frechet_distance(first, second), expected, rtol=1e-5)
