@@ -424,14 +424,19 @@ class FiguresConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RenderConfig:
-    """A video of a trained policy.
+    """A video of a trained policy, of a pose mapper, or of retargeted motions.
 
     Attributes:
-      run: the run directory.
-      checkpoint: environment steps of the checkpoint; the last one where None.
-      split: "held_out" or "train".
-      demonstration: which one of these, from 0.
-      out: the file; videos/SPLIT-N.mp4 in the run directory where empty.
+      run: the run directory of a policy or a pose mapper.
+      checkpoint: steps of the checkpoint; the last one where None.
+      split: "held_out" or "train": demonstrations of a policy's run.
+      demonstration: which one of these, of those in a file, or of those that are recorded for a pose mapper, from 0.
+      demonstrations: file of the expert's; for a pose mapper they are recorded, as its environment says, where empty.
+      seed: of the recorded ones.
+      retargeted: file of the learner's motions that `mimic.retarget` made of `demonstrations`.
+      learner: name of the environment that these were retargeted for.
+      limits: see `EnvConfig`; those that they were retargeted with.
+      out: the file; a name in DIR/videos of the run directory where empty.
       gif: whether to make a GIF too.
       compilation_cache: see `TrainConfig`.
     """
@@ -440,6 +445,11 @@ class RenderConfig:
     checkpoint: int | None = None
     split: str = "held_out"
     demonstration: int = 0
+    demonstrations: str = ""
+    seed: int = 0
+    retargeted: str = ""
+    learner: str = ""
+    limits: str = "none"
     out: str = ""
     gif: bool = False
     compilation_cache: str = "~/.cache/mimic/jax"
