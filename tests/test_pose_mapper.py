@@ -1,6 +1,7 @@
 """The pose mapper: what it learns, keeps, repeats and refuses."""
 
 import json
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from mimic.trainers.mapper_job import MapperJob
 from mimic.trainers.pose_mapper import make_model
 
 SMALL = {"samples": 8192, "batch_size": 256, "epochs": 40, "evaluations": 2, "hidden_layers": [64, 64]}
+SHORT: dict[str, Any] = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1}
 FEW = {"validation_poses": 64, "held_out_poses": 256}
 REPORT_KEYS = {
     "env", "trainer", "seed", "quality", "mean_distance", "optimal_distance", "random_distance",
@@ -185,13 +187,12 @@ def test_units_are_dropped_in_training_alone():
 
 
 def test_a_regularised_run_differs_in_training_and_repeats_its_report(tmp_path):
-    few = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1}
     plain, regularised = (
-        train(tmp_path / name, **few, **settings)
+        train(tmp_path / name, **SHORT, **settings)
         for name, settings in (("plain", {}), ("regularised", {"dropout": 0.3, "weight_decay": 0.1}))
     )
     assert plain["quality"] != regularised["quality"]
-    job = MapperJob(run_config(tmp_path, **few, dropout=0.3))
+    job = MapperJob(run_config(tmp_path, dropout=0.3, **SHORT))
     mapper = mimic.PoseMapper.load(tmp_path / "regularised")
     assert job.figures(job.evaluate(mapper.params))["quality"] == pytest.approx(regularised["quality"], rel=1e-5)
 

@@ -1,9 +1,11 @@
 """Videos of pose mappers and of retargeted motions: what they show, and what is rejected."""
 
 import dataclasses
+from typing import Any
 
 import imageio_ffmpeg
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -67,11 +69,11 @@ def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
     np.testing.assert_allclose(expert[::EVERY], recorded.qpos[1], atol=1e-6)
     np.testing.assert_allclose(learner, mapper(expert.astype(np.float32)), atol=ROUNDING)
     shown = curves(clip)
-    expected = jax.vmap(mapper.model.distance)(expert, learner)
+    expected = jax.vmap(mapper.model.distance)(jnp.asarray(expert), jnp.asarray(learner))
     np.testing.assert_allclose(shown["pose mapper"], expected, atol=ROUNDING)
     np.testing.assert_allclose(clip.bars.sum(axis=1), shown["pose mapper"], atol=ROUNDING)
     assert np.all(shown["optimal poses"] <= np.minimum(shown["pose mapper"], shown["holding the start pose"]) + 1e-3)
-    stretched = mapper.model.distance(np.zeros(7), np.zeros(4))
+    stretched = mapper.model.distance(jnp.zeros(7), jnp.zeros(4))
     assert shown["holding the start pose"][0] == pytest.approx(float(stretched), abs=ROUNDING)
 
 
@@ -104,7 +106,7 @@ def test_a_video_has_all_frames(files, tmp_path):
     prepare_video(RenderConfig(**files, out=str(out), gif=True))()
     assert imageio_ffmpeg.count_frames_and_secs(str(out))[0] == EVERY * STEPS + 1
     with Image.open(out.with_suffix(".gif")) as gif:
-        assert gif.n_frames == 5  # every third
+        assert gif.n_frames == 5  # type: ignore[attr-defined]  # every third
     with pytest.raises(ValueError, match="exists; name a new file"):
         prepare_video(RenderConfig(**files, out=str(out)))
 
@@ -141,12 +143,13 @@ def test_motions_of_another_length_are_rejected(files, tmp_path):
 
 
 def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
-    for changes, message in (
+    bad: list[tuple[dict[str, Any], str]] = [
         ({"split": "train"}, "split: does not go with a run of trainer=pose_mapper"),
         ({"seed": -1}, "demonstration, seed: expected at least 0"),
         ({"checkpoint": 7}, "checkpoint"),
         ({"demonstrations": files["retargeted"]}, "demonstrations: expected motions of planar7"),
         ({"demonstrations": files["demonstrations"], "demonstration": 3}, "expected 0 to 1"),
-    ):
+    ]
+    for changes, message in bad:
         with pytest.raises(ValueError, match=message):
             prepare_clip(RenderConfig(run=str(mapper_run), **changes))
