@@ -22,10 +22,11 @@ from benchmarks import study_results
 from benchmarks.processes import Task, run_tasks
 from benchmarks.record import write_results
 from mimic.envs.arms import ArmConfig, build_arm
+from mimic.envs.config import MetricConfig
 from mimic.envs.recording import KINDS, record_demonstrations
 
 ARMS = ("panda7dof", "panda4dof", "panda3dof")
-_PAPER = ("env.preview=0", "trainer.discounting=0.4", "trainer.crossovers=0")  # its weights are ours too
+_PAPER = ("metric=paper", "env.preview=0", "trainer.discounting=0.4", "trainer.crossovers=0")
 _ONE = ("env=panda7dof", "env.demonstrations.count=1")
 _RANDOM = (
     "env.randomization.mass=[0.8,1.2]",
@@ -94,10 +95,15 @@ def cases(preset: Preset) -> list[Case]:
         "discount0.4": ("trainer.discounting=0.4",),
         "discount0.8": ("trainer.discounting=0.8",),
         "discount0.9": ("trainer.discounting=0.9",),
-        "directions_only": ("env.metric.linear_velocity=0", "env.metric.angular_velocity=0"),
-        "positions_too": ("env.metric.translation=1",),
+        "no_velocities": ("env.metric.linear_velocity=0", "env.metric.angular_velocity=0"),
+        "no_positions": ("env.metric.translation=0",),
+        "positions_x4": (f"env.metric.translation={4 * MetricConfig().translation}",),
         "velocities_x10": ("env.metric.linear_velocity=0.01", "env.metric.angular_velocity=0.1"),
         "adaptive": ("env.metric.adaptive=true",),
+        "overlap": ("env.metric.correspondence=overlap",),
+        "hard": ("env.metric.correspondence=hard",),
+        "soft": ("env.metric.correspondence=soft",),
+        "paper_metric": ("metric=paper",),  # links merged, W by overlap, directions and velocities
         "reference": (),
     }
     return [

@@ -1,4 +1,4 @@
-"""`python -m mimic.render run=DIR`: a video of expert and learner, from a checkpoint alone."""
+"""`python -m mimic.render run=DIR`: a video of expert and learner: a policy, a pose mapper, or retargeted motions."""
 
 from mimic import cli, compat
 from mimic.trainers.config import RenderConfig

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from mimic.embodiment import planar_arm
 from mimic.envs.arms import ArmConfig
 from mimic.rendering import ArmScene
+from mimic.trainers import point_figures
+from mimic.trainers.arm_drawing import joint_points
 from mimic.trainers.config import FiguresConfig
 from mimic.trainers.figure_session import prepare_figures
 
@@ -37,9 +40,29 @@ def test_planar_arms_are_seen_from_above():
     assert changed[:, :80].any() and not changed[:, 80:].any()  # the expert stands on the left here too
 
 
+def test_points_and_frames_disagree_on_what_is_perfect():
+    expert, mirrored, parallel = point_figures.poses().values()
+    itself, same_hand, same_directions = (point_figures.distances(expert, arm) for arm in (expert, mirrored, parallel))
+    rounding = 1e-6  # of float32, for lengths and angles of about 1
+    assert max(itself.values()) < rounding
+    assert same_hand["points"] < rounding and same_hand["frames"] > 1.5  # rad; a right angle is pi / 2
+    assert same_directions["frames"] < rounding and same_directions["points"] > 0.3  # chain lengths
+    tips = [joint_points(posed.arm, posed.qpos)[-1] for posed in (expert, parallel)]
+    assert same_directions["points"] == pytest.approx(np.linalg.norm(tips[0] - tips[1]), abs=rounding)
+
+
+def test_a_planar_arm_is_drawn_through_its_joints_wherever_its_frames_sit():
+    pose = np.array([0.5, -1.2])
+    first = np.array([np.cos(0.5), np.sin(0.5)])
+    drawn = np.stack([np.zeros(2), 0.25 * first, 0.25 * first + 0.75 * np.array([np.cos(-0.7), np.sin(-0.7)])])
+    for frame_at in (0.0, 0.5, 1.0):
+        points = joint_points(planar_arm([0.5, 1.5], frame_at=frame_at), pose)
+        np.testing.assert_allclose(points, drawn, atol=1e-6)  # float32
+
+
 @pytest.mark.slow
 def test_figures_without_a_mapper(tmp_path):
-    names = ["links", "correspondence", "weights", "contours"]
+    names = ["links", "correspondence", "points", "weights", "contours"]
     assert prepare_figures(FiguresConfig(out=str(tmp_path), only=names))() == 0
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
     with pytest.raises(ValueError, match="exists; name another folder"):
@@ -52,7 +75,7 @@ def test_figures_without_a_mapper(tmp_path):
         (FiguresConfig(), "out: expected a folder"),
         (
             FiguresConfig(out="new", only=["contour"]),
-            "expected some of links, correspondence, weights, contours, planar, panda",
+            "expected some of links, correspondence, points, weights, contours, planar, panda",
         ),
         (FiguresConfig(out=__file__), "is a file"),
     ],

@@ -1,6 +1,7 @@
 """The pose mapper: what it learns, keeps, repeats and refuses."""
 
 import json
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,13 @@ import pytest
 import mimic
 from mimic.envs import env_config
 from mimic.envs.config import RetargetConfig
-from mimic.trainers import retargeting, session
+from mimic.trainers import mapper_training, retargeting, session
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.mapper_job import MapperJob
 from mimic.trainers.pose_mapper import make_model
 
 SMALL = {"samples": 8192, "batch_size": 256, "epochs": 40, "evaluations": 2, "hidden_layers": [64, 64]}
+SHORT: dict[str, Any] = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1}
 FEW = {"validation_poses": 64, "held_out_poses": 256}
 REPORT_KEYS = {
     "env", "trainer", "seed", "quality", "mean_distance", "optimal_distance", "random_distance",
@@ -154,6 +156,59 @@ def test_limited_joints_stay_within_their_limits():
     assert np.all((found >= lower - 1e-5) & (found <= upper + 1e-5))
     with pytest.raises(ValueError, match="joint1 at 3.0000 rad is outside of its range"):
         mapper(np.array([3.0, 0, 0, -1, 0, 1, 0]))
+
+
+def test_weights_decay_and_biases_do_not():
+    settings = {**SMALL, "learning_rate": 1e-2, "final_learning_rate": 1.0, "weight_decay": 0.5}
+    model = make_model(env_config("planar4dof"), PoseMapperConfig(**settings).resolve())
+    params = jax.tree.map(jnp.ones_like, model.init(jax.random.key(0)))
+    optimiser = mapper_training._optimiser(model, 0)
+    change, _ = optimiser.update(jax.tree.map(jnp.zeros_like, params), optimiser.init(params), params)
+    for path, value in jax.tree_util.tree_leaves_with_path(change):
+        expected = -1e-2 * 0.5 if "kernel" in jax.tree_util.keystr(path) else 0.0
+        np.testing.assert_allclose(value, expected, rtol=1e-6)  # float32
+
+
+def test_units_are_dropped_in_training_alone():
+    models = [
+        make_model(env_config("planar4dof"), PoseMapperConfig(**SMALL, dropout=dropout).resolve())
+        for dropout in (0.0, 0.5)
+    ]
+    whole, dropping = models
+    params, qpos = whole.init(jax.random.key(0)), jnp.full(7, 0.3)
+    np.testing.assert_array_equal(dropping(params, qpos), whole(params, qpos))  # evaluation, and the same parameters
+    key, other = jax.random.split(jax.random.key(1))
+    trained = [np.asarray(dropping.candidates(params, qpos, dropout_key=k)) for k in (key, key, other)]
+    np.testing.assert_array_equal(trained[0], trained[1])
+    assert not np.allclose(trained[0], trained[2]) and not np.allclose(trained[0], dropping.candidates(params, qpos))
+    np.testing.assert_array_equal(
+        whole.candidates(params, qpos, dropout_key=key), whole.candidates(params, qpos)
+    )  # none at 0
+
+
+def test_a_regularised_run_differs_in_training_and_repeats_its_report(tmp_path):
+    plain, regularised = (
+        train(tmp_path / name, **SHORT, **settings)
+        for name, settings in (("plain", {}), ("regularised", {"dropout": 0.3, "weight_decay": 0.1}))
+    )
+    assert plain["quality"] != regularised["quality"]
+    job = MapperJob(run_config(tmp_path, dropout=0.3, **SHORT))
+    mapper = mimic.PoseMapper.load(tmp_path / "regularised")
+    assert job.figures(job.evaluate(mapper.params))["quality"] == pytest.approx(regularised["quality"], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"dropout": 1.0}, r"trainer.dropout: expected a fraction in \[0, 1\), got 1.0"),
+        ({"dropout": float("nan")}, "trainer.dropout"),
+        ({"weight_decay": -0.1}, "trainer.weight_decay: expected a finite number of at least 0, got -0.1"),
+        ({"weight_decay": float("inf")}, "trainer.weight_decay"),
+    ],
+)
+def test_bad_regularisation_is_rejected(settings, message):
+    with pytest.raises(ValueError, match=message):
+        PoseMapperConfig(**settings).resolve()
 
 
 @pytest.mark.parametrize(

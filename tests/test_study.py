@@ -11,6 +11,7 @@ from benchmarks import dynamic_imitation as study
 from benchmarks import study_results
 from benchmarks.processes import Task, run_tasks
 from mimic import cli
+from mimic.envs.config import MetricConfig
 
 GROUPS = {case.group for case in study.cases(study.PRESETS["paper"])}
 
@@ -43,6 +44,20 @@ def test_the_sweep_locks_every_joint_and_every_pair():
     names = {case.name for case in study.cases(study.PRESETS["paper"]) if case.group == "locked"}
     assert len(names) == 7 + 21 and {"locked-1", "locked-6-7"} <= names
     assert "locked" in GROUPS
+
+
+def test_the_variants_change_the_metric_as_they_are_named(compose):
+    cases = {case.name: case for case in study.cases(study.PRESETS["paper"]) if case.group == "variants"}
+    reference = MetricConfig()
+    for name, correspondence, links in (
+        ("hard", "hard", "kept"),
+        ("soft", "soft", "kept"),
+        ("overlap", "overlap", "kept"),
+        ("paper_metric", "overlap", "merged"),
+        ("reference", reference.correspondence, reference.links),
+    ):
+        metric = compose("train", list(cases[f"variant-{name}"].arguments)).env.metric
+        assert (metric.correspondence, metric.links, metric.xi) == (correspondence, links, reference.xi)
 
 
 WRITE = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'report.json').write_text('{}')"

@@ -14,9 +14,8 @@ EXPERT_COLOUR, LEARNER_COLOUR = "tab:blue", "tab:orange"
 
 def joint_points(arm: Embodiment, qpos: Any) -> Float[np.ndarray, "points 2"]:
     """Base, joints and tip of a planar arm, of chain length 1."""
-    frames = forward_kinematics(arm, jnp.asarray(qpos))
-    middle, direction = np.asarray(frames.position)[:, :2], np.asarray(frames.rotation)[:, :2, 0]
-    ends = middle + direction * np.asarray(arm.link_lengths)[:, None] / 2
+    direction = np.asarray(forward_kinematics(arm, jnp.asarray(qpos)).rotation)[:, :2, 0]
+    ends = np.cumsum(direction * np.asarray(arm.link_lengths)[:, None], axis=0)
     return np.concatenate([np.zeros((1, 2)), ends]) / float(arm.chain_length)
 
 

@@ -238,6 +238,10 @@ class PoseMapperConfig(TrainerConfig):
       epochs: how long to train.
       learning_rate: of Adam, after a warm-up.
       final_learning_rate: as a share of it at the end; the decay is a cosine. 1 is a constant rate without warm-up.
+      dropout: fraction of the hidden units of each layer that is dropped for a training pose, in [0, 1). The paper
+        names it against overfitting and does without; so do the presets.
+      weight_decay: of AdamW: each update takes the fraction learning_rate * weight_decay from every weight, and nothing
+        from biases. As dropout.
       patience: evaluations without a better distance on the validation poses after which training stops; 0 never.
       target_quality: training ends early once the quality on validation poses is no larger; 0 never.
       evaluations: how often the mapper is evaluated and saved.
@@ -260,6 +264,8 @@ class PoseMapperConfig(TrainerConfig):
     epochs: int | None = None
     learning_rate: float | None = None
     final_learning_rate: float | None = None
+    dropout: float = 0.0
+    weight_decay: float = 0.0
     patience: int | None = None
     target_quality: float = 0.0
     evaluations: int | None = None
@@ -295,6 +301,10 @@ class PoseMapperConfig(TrainerConfig):
             raise ValueError(
                 f"trainer.final_learning_rate: expected a number in [0, 1], got {self.final_learning_rate}"
             )
+        if not 0 <= self.dropout < 1:
+            raise ValueError(f"trainer.dropout: expected a fraction in [0, 1), got {self.dropout}")
+        if not 0 <= self.weight_decay < math.inf:
+            raise ValueError(f"trainer.weight_decay: expected a finite number of at least 0, got {self.weight_decay}")
         if self.patience < 0 or not self.target_quality >= 0:  # type: ignore[operator]
             raise ValueError(
                 f"trainer: expected patience and target_quality of at least 0, got {self.patience}, "
@@ -436,14 +446,19 @@ class FiguresConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RenderConfig:
-    """A video of a trained policy.
+    """A video of a trained policy, of a pose mapper, or of retargeted motions.
 
     Attributes:
-      run: the run directory.
-      checkpoint: environment steps of the checkpoint; the last one where None.
-      split: "held_out" or "train".
-      demonstration: which one of these, from 0.
-      out: the file; videos/SPLIT-N.mp4 in the run directory where empty.
+      run: the run directory of a policy or a pose mapper.
+      checkpoint: steps of the checkpoint; the last one where None.
+      split: "held_out" or "train": demonstrations of a policy's run.
+      demonstration: which one of these, of those in a file, or of those that are recorded for a pose mapper, from 0.
+      demonstrations: file of the expert's; for a pose mapper they are recorded, as its environment says, where empty.
+      seed: of the recorded ones.
+      retargeted: file of the learner's motions that `mimic.retarget` made of `demonstrations`.
+      learner: name of the environment that these were retargeted for.
+      limits: see `EnvConfig`; those that they were retargeted with.
+      out: the file; a name in DIR/videos of the run directory where empty.
       gif: whether to make a GIF too.
       compilation_cache: see `TrainConfig`.
     """
@@ -452,6 +467,11 @@ class RenderConfig:
     checkpoint: int | None = None
     split: str = "held_out"
     demonstration: int = 0
+    demonstrations: str = ""
+    seed: int = 0
+    retargeted: str = ""
+    learner: str = ""
+    limits: str = "none"
     out: str = ""
     gif: bool = False
     compilation_cache: str = "~/.cache/mimic/jax"

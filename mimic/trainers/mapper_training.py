@@ -101,7 +101,7 @@ def train(
 
 
 def _optimiser(model: MapperModel, done_epochs: int) -> optax.GradientTransformation:
-    """Adam; its rate rises, then falls along a cosine where the config says so."""
+    """AdamW; its rate rises, then falls along a cosine where the config says so. Biases do not decay."""
     config = model.config
     updates_per_epoch = int(config.samples or 0) // int(config.batch_size or 1)
     updates, rate = int(config.epochs or 0) * updates_per_epoch, float(config.learning_rate or 0.0)
@@ -110,7 +110,14 @@ def _optimiser(model: MapperModel, done_epochs: int) -> optax.GradientTransforma
     if config.final_learning_rate == 1:
         schedule = optax.constant_schedule(rate)
     offset = done_epochs * updates_per_epoch
-    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(lambda count: schedule(count + offset), b2=0.99))
+    adam = optax.adamw(
+        lambda count: schedule(count + offset), b2=0.99, weight_decay=config.weight_decay, mask=_is_matrix
+    )
+    return optax.chain(optax.clip_by_global_norm(1.0), adam)
+
+
+def _is_matrix(params: Params) -> Any:
+    return jax.tree.map(lambda x: x.ndim > 1, params)
 
 
 def _stretch(
@@ -123,26 +130,29 @@ def _stretch(
     config = model.config
     samples, batch_size = int(config.samples or 0), int(config.batch_size or 1)
 
-    def loss(params: Params, poses: Poses) -> Array:
-        distances = _distances(model, params, poses)
+    def loss(params: Params, poses: Poses, dropout_key: Array | None) -> Array:
+        distances = _distances(model, params, poses, dropout_key)
         nearest = distances.min(axis=1).mean()
         return (1 - _SHARED) * nearest + _SHARED * distances.mean()
 
-    def update(carry: Any, poses: Poses) -> tuple[Any, Array]:
+    def update(carry: Any, batch: tuple[Poses, Array]) -> tuple[Any, Array]:
         params, state = carry
-        value, gradient = jax.value_and_grad(loss)(params, poses)
+        poses, key = batch
+        value, gradient = jax.value_and_grad(loss)(params, poses, key if config.dropout else None)
         change, state = optimiser.update(gradient, state, params)
         return (optax.apply_updates(params, change), state), value
 
     def run(carry: Any, seed: Any, done: Any, training: Poses) -> tuple[Any, Array]:
-        key_epochs = _keys(seed)[1]
+        _, key_epochs, key_dropout = _keys(seed)
 
         def epoch(carry: Any, number: Array) -> tuple[Any, Array]:
             own = jax.random.fold_in(key_epochs, number)
             poses = (
                 random_poses(model, own, samples) if config.fresh else training[jax.random.permutation(own, samples)]
             )
-            carry, losses = jax.lax.scan(update, carry, poses.reshape(-1, batch_size, poses.shape[-1]))
+            batches = poses.reshape(-1, batch_size, poses.shape[-1])
+            keys = jax.random.split(jax.random.fold_in(key_dropout, number), len(batches))
+            carry, losses = jax.lax.scan(update, carry, (batches, keys))
             return carry, losses.mean()
 
         carry, losses = jax.lax.scan(epoch, carry, done + jnp.arange(epochs))
@@ -152,8 +162,8 @@ def _stretch(
 
 
 def _keys(seed: Any) -> Array:
-    """For the network, and for the epochs."""
-    return jax.random.split(jax.random.key(seed))
+    """For the network, for the epochs, and for dropout."""
+    return jax.random.split(jax.random.key(seed), 3)
 
 
 def random_poses(model: MapperModel, key: Array, count: int) -> Poses:
@@ -167,8 +177,14 @@ def poses_shape(model: MapperModel, count: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((count, model.expert.num_joints), jnp.float32)
 
 
-def _distances(model: MapperModel, params: Params, poses: Poses) -> Float[Array, "poses heads"]:
-    def one(qpos: Array) -> Array:
-        return jax.vmap(lambda candidate: model.distance(qpos, candidate))(model.candidates(params, qpos))
+def _distances(
+    model: MapperModel, params: Params, poses: Poses, dropout_key: Array | None = None
+) -> Float[Array, "poses heads"]:
+    """Of what each head proposes; every pose drops its own hidden units where there is a key."""
 
-    return jax.vmap(one)(poses)
+    def one(qpos: Array, key: Array | None) -> Array:
+        candidates = model.candidates(params, qpos, dropout_key=key)
+        return jax.vmap(lambda candidate: model.distance(qpos, candidate))(candidates)
+
+    keys = None if dropout_key is None else jax.random.split(dropout_key, len(poses))
+    return jax.vmap(one, (0, None if keys is None else 0))(poses, keys)

@@ -21,7 +21,7 @@ from mimic.envs import env_config  # noqa: E402
 from mimic.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.pose import imitate_pose  # noqa: E402
 from mimic.rendering import ArmScene  # noqa: E402
-from mimic.trainers import metric_figures, similarity_figures  # noqa: E402
+from mimic.trainers import metric_figures, point_figures, similarity_figures  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 from mimic.trainers.pose_mapper import PoseMapper  # noqa: E402
 
@@ -127,6 +127,7 @@ FIGURES: dict[str, Callable[[LoadMapper], Any]] = {
     "links": lambda _: metric_figures.draw_links(),
     "correspondence": lambda _: metric_figures.draw_correspondence(),
     "similarity": lambda _: similarity_figures.draw_similarity(),
+    "points": lambda _: point_figures.draw_points(),
     "weights": draw_weights,
     "contours": draw_contours,
     "planar": draw_planar,

@@ -34,16 +34,18 @@ _LIMIT_TOLERANCE = 1e-4  # rad: what rounding to float32 takes a pose over its l
 
 
 class _Network(nn.Module):
-    """A fully connected network."""
+    """A fully connected network, with dropout after each hidden layer."""
 
     hidden_layers: tuple[int, ...]
     outputs: int
     activation: str
+    dropout: float
 
     @nn.compact
-    def __call__(self, x: Array) -> Array:
+    def __call__(self, x: Array, *, training: bool = False) -> Array:
         for width in self.hidden_layers:
             x = _ACTIVATIONS[self.activation](nn.Dense(width)(x))
+            x = nn.Dropout(self.dropout, deterministic=not training)(x)
         return nn.Dense(self.outputs)(x)
 
 
@@ -66,7 +68,8 @@ class MapperModel:
     @functools.cached_property
     def _network(self) -> _Network:
         outputs = int(self.config.heads or 1) * self.learner.num_joints * 2
-        return _Network(tuple(self.config.hidden_layers or ()), outputs, str(self.config.activation))
+        hidden_layers, activation = tuple(self.config.hidden_layers or ()), str(self.config.activation)
+        return _Network(hidden_layers, outputs, activation, self.config.dropout)
 
     @functools.cached_property
     def correspondence(self) -> Correspondence:
@@ -97,10 +100,20 @@ class MapperModel:
         """Random parameters."""
         return self._network.init(key, self._inputs(jnp.zeros(self.expert.num_joints)))
 
-    def candidates(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, "heads learner_joints"]:
-        """The pose that each head proposes."""
+    def candidates(
+        self, params: Params, qpos: Float[Array, " joints"], *, dropout_key: Array | None = None
+    ) -> Float[Array, "heads learner_joints"]:
+        """The pose that each head proposes.
+
+        Args:
+          params: of the network.
+          qpos: the expert's pose [rad].
+          dropout_key: of the hidden units that are dropped, in training; none is where None.
+        """
         config = self.config
-        outputs = self._network.apply(params, self._inputs(qpos))
+        training = dropout_key is not None
+        rngs = {"dropout": dropout_key} if training else None
+        outputs = self._network.apply(params, self._inputs(qpos), training=training, rngs=rngs)
         outputs = jnp.reshape(outputs, (config.heads, self.learner.num_joints, 2))  # type: ignore[arg-type]
         lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.learner.joint_range).T)
         within = (lower + upper) / 2 + (upper - lower) / 2 * jnp.tanh(outputs[..., 0])

@@ -68,8 +68,8 @@ class Story:
         span = slice(0, horizon + 1)
         self.dt = dt
         self.time = np.arange(0, horizon * dt + 1e-9, 1 / frames_per_second)
-        self.expert = _between(demonstrations.qpos[index, span], demonstrations.qvel[index, span], dt, self.time)
-        self.learner = _between(qpos, qvel, dt, self.time)
+        self.expert = interpolate(demonstrations.qpos[index, span], demonstrations.qvel[index, span], dt, self.time)
+        self.learner = interpolate(qpos, qvel, dt, self.time)
         self.distance = np.asarray(rollouts.distance[index])
         self.bound, self.hold = evaluator.lower_bound[index], evaluator.hold_distance[index]
         self.links, self.matrix = _links(evaluator, index, qpos[1:], qvel[1:])
@@ -78,7 +78,7 @@ class Story:
         self.num_frames = len(self.time)
 
 
-def _between(
+def interpolate(
     qpos: Float[np.ndarray, "samples joints"], qvel: Float[np.ndarray, "samples joints"], dt: float, time: np.ndarray
 ) -> Float[np.ndarray, "frames joints"]:
     """Angles at any time: cubics through angles and velocities."""

@@ -1,4 +1,4 @@
-"""What `python -m mimic.render` does: a policy's rollout as a video, with the distance and its bound beside it."""
+"""What `python -m mimic.render` does: two arms that move, as a video, with the distance over time beside them."""
 
 import os
 import warnings
@@ -19,12 +19,9 @@ from rich.progress import track  # noqa: E402
 
 from mimic.rendering import ArmScene  # noqa: E402
 from mimic.trainers import session  # noqa: E402
-from mimic.trainers.checkpoints import load_checkpoint  # noqa: E402
+from mimic.trainers.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
 from mimic.trainers.config import RenderConfig  # noqa: E402
-from mimic.trainers.ppo_job import PPOJob  # noqa: E402
-from mimic.trainers.story import Story, demonstration_index, policy_run  # noqa: E402
 
-_FRAMES_PER_SECOND = 30
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760  # pixels of the width that show the arms
 _GIF_EVERY, _GIF_SCALE = 3, 0.5
@@ -34,37 +31,21 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
     """What renders a video.
 
     Raises:
-      ValueError: no run directory of PPO, no such checkpoint or demonstration, an `out` that exists, or no OpenGL.
+      ValueError: what `prepare_clip` rejects, an `out` that exists, none for retargeted motions, or no OpenGL.
     """
     session.use_compilation_cache(config.compilation_cache)
-    run_dir, trained = policy_run(config.run, config.checkpoint)
-    name = f"{config.split}-{config.demonstration}.mp4"
-    out = Path(config.out).expanduser() if config.out else run_dir / "videos" / name
-    if out.suffix != ".mp4":
-        raise ValueError(f"out: expected a file that ends in .mp4, got {str(out)!r}")
-    for path in (out, out.with_suffix(".gif")):
-        if path.exists():
-            raise ValueError(f"out: {str(path)!r} exists; name a new file")
-    if config.out and not out.parent.is_dir():
-        raise ValueError(f"out: there is no folder {str(out.parent)!r}")
-    env = trained.env
+    env, own_out, make_clip = prepare_clip(config)
+    out = _new_video(config, own_out)
     scene = ArmScene([env.expert, env.learner], limits=env.limits, width=_SCENE, height=_SIZE[1])
-    job = session.make_job(trained, run_dir)
-    assert isinstance(job, PPOJob)
-    index = demonstration_index(job.evaluator, config.split, config.demonstration)
-    _, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
 
     def run() -> None:
         console = Console()
-        with console.status("running the policy"):
-            rollouts = job.evaluate(params)
-            story = Story(job.evaluator, rollouts, index, _FRAMES_PER_SECOND)
+        with console.status("computing the motion and its distances"):
+            clip = make_clip()
         out.parent.mkdir(exist_ok=True)
         with scene:
-            frames = _frames(
-                scene, story, f"{env.name}, {config.split.replace('_', '-')} demonstration {config.demonstration}"
-            )
-            kept = _write_video(out, track(frames, total=story.num_frames, description="rendering"))
+            frames = draw_frames(scene, clip)
+            kept = _write_video(out, track(frames, total=len(clip.time), description="rendering"))
         if config.gif:
             _write_gif(out.with_suffix(".gif"), kept)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
@@ -72,42 +53,55 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
     return run
 
 
-def _frames(scene: ArmScene, story: Story, title: str) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def _new_video(config: RenderConfig, own_out: Path | None) -> Path:
+    """Where the video goes: `out`, or the run directory's own place for it."""
+    if not config.out and own_out is None:
+        raise ValueError("out: expected a file, as in out=FILE.mp4")
+    out = Path(config.out or own_out or "").expanduser()
+    if out.suffix != ".mp4":
+        raise ValueError(f"out: expected a file that ends in .mp4, got {str(out)!r}")
+    for path in (out, out.with_suffix(".gif")):
+        if path.exists():
+            raise ValueError(f"out: {str(path)!r} exists; name a new file")
+    if config.out and not out.parent.is_dir():
+        raise ValueError(f"out: there is no folder {str(out.parent)!r}")
+    return out
+
+
+def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """The pictures of a video. What never changes is drawn once: drawing all of it costs as much as rendering."""
     figure = plt.figure(figsize=(_SIZE[0] / _DPI, _SIZE[1] / _DPI), dpi=_DPI)
     share = _SCENE / _SIZE[0]
     room = figure.add_axes((0, 0, share, 1))
     room.axis("off")
-    picture = room.imshow(scene.image([story.expert[0], story.learner[0]]), interpolation="nearest")
+    picture = room.imshow(scene.image([poses[0] for poses in clip.poses]), interpolation="nearest")
     texts = [
         room.text(place, 0.04, label, transform=room.transAxes, ha="center", fontsize=13)
-        for place, label in ((0.27, "expert"), (0.73, "learner"))
+        for place, label in zip((0.27, 0.73), clip.labels, strict=True)
     ]
-    texts.append(room.text(0.02, 0.95, title, transform=room.transAxes, fontsize=12))
+    texts.append(room.text(0.02, 0.95, clip.title, transform=room.transAxes, fontsize=12))
     over_time = figure.add_axes((share + 0.07, 0.57, 1 - share - 0.09, 0.36))
-    steps = story.dt * np.arange(1, len(story.distance) + 1)
-    over_time.plot(steps, story.hold, ":", color="grey", label="holding still")
-    over_time.plot(steps, story.distance, color="tab:blue", label="policy")
-    over_time.plot(steps, story.bound, "k--", lw=1, label="lower bound")
+    for curve in clip.curves:
+        over_time.plot(clip.curve_time, curve.values, label=curve.label, **curve.style)
     now = over_time.axvline(0, color="tab:red", lw=1)
-    over_time.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, steps[-1]))
+    over_time.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, clip.curve_time[-1]))
     over_time.legend(fontsize="small", loc="upper left")
     over_time.grid(alpha=0.3)
     links = figure.add_axes((share + 0.07, 0.09, 1 - share - 0.09, 0.32))
-    bars = links.bar(range(len(story.link_names)), story.by_link[0], color="tab:blue")
-    links.set_xticks(range(len(story.link_names)), [name.replace("link", "") for name in story.link_names])
-    links.set(title="by link of the learner", ylim=(0, 1.05 * story.by_link.max()))
+    bars = links.bar(range(len(clip.bar_names)), clip.bars[0], color="tab:blue")
+    links.set_xticks(range(len(clip.bar_names)), [name.replace("link", "") for name in clip.bar_names])
+    links.set(title="by link of the learner", ylim=(0, 1.05 * clip.bars.max()))
     moving = [picture, *texts, now, *bars]
     for artist in moving:
         artist.set_animated(True)
     canvas: Any = figure.canvas
     canvas.draw()
     background = canvas.copy_from_bbox(figure.bbox)
-    for frame, time in enumerate(story.time):
-        step = min(int(time / story.dt), len(story.distance) - 1)
-        picture.set_data(scene.image([story.expert[frame], story.learner[frame]]))
+    for frame, time in enumerate(clip.time):
+        sample = min(int(np.searchsorted(clip.curve_time, time - 1e-9)), len(clip.curve_time) - 1)
+        picture.set_data(scene.image([poses[frame] for poses in clip.poses]))
         now.set_xdata([time, time])
-        for bar, height in zip(bars, story.by_link[step], strict=True):
+        for bar, height in zip(bars, clip.bars[sample], strict=True):
             bar.set_height(height)
         canvas.restore_region(background)
         for artist in moving:
@@ -119,7 +113,7 @@ def _frames(scene: ArmScene, story: Story, title: str) -> Iterator[UInt8[np.ndar
 def _write_video(out: Path, frames: Any) -> list[Image.Image]:
     """Encodes the frames; the file has its name only when it is whole. Gives small copies of some."""
     partial = out.with_name(f".{out.stem}.partial.mp4")
-    writer = imageio_ffmpeg.write_frames(str(partial), _SIZE, fps=_FRAMES_PER_SECOND, quality=7, macro_block_size=2)
+    writer = imageio_ffmpeg.write_frames(str(partial), _SIZE, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=2)
     with warnings.catch_warnings():  # JAX warns of forks; this one only starts the encoder
         warnings.filterwarnings("ignore", message=".*os.fork", category=RuntimeWarning)
         writer.send(None)
@@ -138,7 +132,7 @@ def _write_video(out: Path, frames: Any) -> list[Image.Image]:
 
 def _write_gif(out: Path, frames: list[Image.Image]) -> None:
     partial = out.with_name(f".{out.stem}.partial.gif")
-    duration = 1000 * _GIF_EVERY // _FRAMES_PER_SECOND
+    duration = 1000 * _GIF_EVERY // FRAMES_PER_SECOND
     colours = [frame.quantize(128, dither=Image.Dither.NONE) for frame in frames]
     colours[0].save(partial, save_all=True, append_images=colours[1:], duration=duration, loop=0)
     os.replace(partial, out)
