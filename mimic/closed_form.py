@@ -23,6 +23,7 @@ from mimic import spatial
 from mimic.descent import Derivatives
 from mimic.spatial import Rotation, Scalar, Vector
 
+ROUGH = 1e-2
 SMOOTHING = 1e-3  # of the distance of two positions [chain lengths]
 
 Symmetric = tuple[Scalar, ...]  # xx, xy, xz, yy, yz, zz of a symmetric 3x3 matrix
@@ -72,13 +73,14 @@ class _Load(NamedTuple):
     angular: Symmetric = _NONE
 
 
-def smoothed_length(square: Scalar) -> Scalar:
+def smoothed_length(square: Scalar, smoothing: float = SMOOTHING) -> Scalar:
     """A length as the distance counts it, of its square [chain lengths^2]."""
-    return square / (jnp.sqrt(square + SMOOTHING**2) + SMOOTHING)
+    return square / (jnp.sqrt(square + smoothing**2) + smoothing)
 
 
 def static_derivatives(
-    axes: Sequence[Vector], anchors: Sequence[Vector], links: Sequence[Body], pulls: Sequence[Pull]
+    axes: Sequence[Vector], anchors: Sequence[Vector], links: Sequence[Body], pulls: Sequence[Pull],
+    smoothing: float = SMOOTHING,
 ) -> Derivatives:
     """Derivatives of the static distance; its value up to a constant of the pulls.
 
@@ -98,7 +100,7 @@ def static_derivatives(
     for joint in reversed(range(len(axes))):
         for link, pull in zip(links, pulls, strict=True):
             if link.joint == joint:
-                load = _add_position(_add_direction(load, link.direction, pull), link.position, pull)
+                load = _add_position(_add_direction(load, link.direction, pull), link.position, pull, smoothing)
         axis, moment = axes[joint], moments[joint]
         local = spatial.add_outer(load.moment, spatial.scale(-1.0, anchors[joint]), load.force)
         gradient.append(spatial.dot(axis, _twice_antisymmetric(local)))
@@ -119,16 +121,16 @@ def _add_direction(load: _Load, direction: Vector, pull: Pull) -> _Load:
     return load._replace(value=spatial.plus(load.value, value), moment=moment)
 
 
-def _add_position(load: _Load, position: Vector, pull: Pull) -> _Load:
+def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: float) -> _Load:
     if all(isinstance(x, float) for x in position):  # on the axis of all joints that could move it
         return load
     value, force, stiffness = load.value, spatial.ZERO, _NONE
     for point, weight in zip(pull.points, pull.weights, strict=True):
         apart = spatial.subtract(position, point)
         square = spatial.dot(apart, apart)
-        inverse = 1 / jnp.sqrt(square + SMOOTHING**2)
+        inverse = 1 / jnp.sqrt(square + smoothing**2)
         tension = weight * inverse
-        value = spatial.plus(value, weight * smoothed_length(square))
+        value = spatial.plus(value, weight * smoothed_length(square, smoothing))
         force = spatial.add(force, spatial.scale(tension, apart))
         # tension (I - u u^T), u = apart * inverse
         unit = spatial.scale(inverse, apart)

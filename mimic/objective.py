@@ -1,6 +1,7 @@
 """The embodiment distance as a function of the learner's pose, with its first two derivatives."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int
 
-from mimic import spatial
+from mimic import closed_form, spatial
 from mimic.closed_form import Body, Pull, smoothed_length, static_derivatives
 from mimic.descent import Derivatives, Scalars
 from mimic.distance import Correspondence, DistanceWeights, Reduction, RotationMeasure, Weights, embodiment_distance
@@ -35,6 +36,7 @@ class PoseObjective:
     target: Callable[[LinkStates], Target]
     value: Callable[[Target, LinkStates], Array]
     derivatives: Callable[[Target, Scalars], Derivatives]
+    rough_derivatives: Callable[[Target, Scalars], Derivatives]
 
 
 def pose_objective(
@@ -70,7 +72,7 @@ def _differentiated(learner: Embodiment, distance: Callable[[LinkStates, LinkSta
         hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
         return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
 
-    return PoseObjective(distance, lambda states: states, distance, derivatives)
+    return PoseObjective(distance, lambda states: states, distance, derivatives, derivatives)
 
 
 class StaticTarget(NamedTuple):
@@ -123,7 +125,7 @@ def _static(
         apart = states.position[pairs[:, 1]] - target.points
         return jnp.sum(target.weights * smoothed_length(jnp.sum(apart * apart, axis=-1))) - aligned
 
-    def derivatives(target: StaticTarget, qpos: Scalars) -> Derivatives:
+    def derivatives(target: StaticTarget, qpos: Scalars, smoothing=None) -> Derivatives:
         frames = joint_frames(arm, qpos, None)
         links = [
             Body(joint, link.direction, link.position)
@@ -133,14 +135,14 @@ def _static(
             spatial.rotate(frame.rotation, spatial.vector(axis))
             for frame, axis in zip(frames[1:], arm.joint_axis, strict=True)
         ]
-        return static_derivatives(axes, [frame.anchor for frame in frames[1:]], links, target.pulls)
+        return static_derivatives(axes, [frame.anchor for frame in frames[1:]], links, target.pulls, closed_form.SMOOTHING if smoothing is None else closed_form.ROUGH)
 
-    return PoseObjective(distance, target, value, derivatives)
+    return PoseObjective(distance, target, value, derivatives, functools.partial(derivatives,smoothing=True))
 
 
 def _pair_weights(correspondence: Any, weight: Any, links: int) -> Any:
     """W o weight, divided by the number of pairs: [expert, learner]; by NumPy where both are known."""
-    known = not any(isinstance(x, jax.Array) for x in (correspondence, weight))
+    known = not any(isinstance(x, Tracer) for x in (correspondence, weight))
     numpy = np if known else jnp
     matrix = numpy.asarray(correspondence)
     return numpy.broadcast_to(numpy.asarray(weight), matrix.shape) * matrix / matrix.size

@@ -111,7 +111,8 @@ def imitate_pose(
             first = _starts(objective, expert, learner, target, pose, random_poses if starts else None)
             first = first if warm is None else warm[None]
             of_qpos = functools.partial(objective.derivatives, target)
-            ends = jax.vmap(lambda start: descend(of_qpos, start, limits, rough))(first)
+            rough_of_qpos = of_qpos if kept is None else functools.partial(objective.rough_derivatives, target)
+            ends = jax.vmap(lambda start: descend(rough_of_qpos, start, limits, rough))(first)
             if kept is not None:
                 chosen = jax.lax.top_k(-ends.value, min(kept, len(first)))[1]
                 ends = jax.vmap(lambda start: descend(of_qpos, start, limits, count - rough))(ends.qpos[chosen])
