@@ -1,21 +1,21 @@
 """First and second derivatives of the static distance by the learner's joint angles, in closed form.
 
-Each link of the learner is pulled by the expert: its direction e towards a unit vector t with strength c, its position p
-towards points p_i with weights w_i. Up to a constant of the expert, the distance is the sum over the links of
+Each link of the learner is pulled by the expert: its direction e towards a unit vector t with strength c, its position
+p towards points p_i with weights w_i. Up to a constant of the expert, the distance is the sum over the links of
 
-    c (1 - e . t) + sum_i w_i s(|p - p_i|)        with a smoothed length, s(d) = sqrt(d^2 + SMOOTHING^2) - SMOOTHING.
+    c (1 - e . t) + sum_i w_i h(|p - p_i|)        with a smoothed length, h(d) = sqrt(d^2 + s^2) - s.
 
 A length has a kink at 0, where Newton's method would divide by it, and a sum of lengths often has its minimum there, at
-links that match exactly. Smoothed, it is 0 with derivative 0 at a match, and nowhere off by more than SMOOTHING.
+links that match exactly. Smoothed, it is 0 with derivative 0 at a match, and nowhere off by more than s.
 
 All is done on scalar components (see `mimic.spatial`). Rotating joint k moves all distal links: with its axis a and a
 point c on it, a link's position by J = a x (p - c) = m + a x p, m = c x a. Sums over the distal links are accumulated
-from tip to base, as for a composite rigid body: the force g = grad s, the moments M of force and pull, and the
+from tip to base, as for a composite rigid body: the force g = grad h, the moments M of force and pull, and the
 stiffness of position.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -23,11 +23,14 @@ from mimic import spatial
 from mimic.descent import Derivatives
 from mimic.spatial import Rotation, Scalar, Vector
 
-ROUGH = 1e-2
-SMOOTHING = 1e-3  # of the distance of two positions [chain lengths]
+# s [chain lengths]. Newton's steps overshoot a kink that is far away in units of s, so a descent begins with the rough
+# one. Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone
+# leaves more than 1e-4 of distance on 55 % of them, both on 3 %; with 1e-4 alone 89 % converge.
+ROUGH_SMOOTHING, SMOOTHING = 1e-2, 1e-3
 
 Symmetric = tuple[Scalar, ...]  # xx, xy, xz, yy, yz, zz of a symmetric 3x3 matrix
 _NONE: Symmetric = (0.0,) * 6
+_ZEROS: Rotation = (spatial.ZERO, spatial.ZERO, spatial.ZERO)
 
 
 class Pull(NamedTuple):
@@ -65,22 +68,25 @@ class _Load(NamedTuple):
         force K m + B a, torque C a + B^T m.
     """
 
-    value: Scalar = 0.0
+    value: Any = 0.0
     force: Vector = spatial.ZERO
-    moment: Rotation = (spatial.ZERO,) * 3
+    moment: Rotation = _ZEROS
     linear: Symmetric = _NONE
-    coupling: Rotation = (spatial.ZERO,) * 3
+    coupling: Rotation = _ZEROS
     angular: Symmetric = _NONE
 
 
-def smoothed_length(square: Scalar, smoothing: float = SMOOTHING) -> Scalar:
-    """A length as the distance counts it, of its square [chain lengths^2]."""
+def smoothed_length(square: Scalar, smoothing: float) -> Scalar:
+    """The smoothed length h [chain lengths], of the square of the length; without cancellation at 0."""
     return square / (jnp.sqrt(square + smoothing**2) + smoothing)
 
 
 def static_derivatives(
-    axes: Sequence[Vector], anchors: Sequence[Vector], links: Sequence[Body], pulls: Sequence[Pull],
-    smoothing: float = SMOOTHING,
+    axes: Sequence[Vector],
+    anchors: Sequence[Vector],
+    links: Sequence[Body],
+    pulls: Sequence[Pull],
+    smoothing: float,
 ) -> Derivatives:
     """Derivatives of the static distance; its value up to a constant of the pulls.
 
@@ -94,6 +100,7 @@ def static_derivatives(
       anchors: a point on each axis [chain lengths].
       links: of the learner.
       pulls: on each link.
+      smoothing: s [chain lengths].
     """
     moments = [spatial.cross(anchor, axis) for anchor, axis in zip(anchors, axes, strict=True)]
     load, gradient, rows = _Load(), [], []
@@ -122,7 +129,7 @@ def _add_direction(load: _Load, direction: Vector, pull: Pull) -> _Load:
 
 
 def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: float) -> _Load:
-    if all(isinstance(x, float) for x in position):  # on the axis of all joints that could move it
+    if not pull.points or all(isinstance(x, float) for x in position):  # such a position cannot move
         return load
     value, force, stiffness = load.value, spatial.ZERO, _NONE
     for point, weight in zip(pull.points, pull.weights, strict=True):
@@ -132,12 +139,9 @@ def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: float) -
         tension = weight * inverse
         value = spatial.plus(value, weight * smoothed_length(square, smoothing))
         force = spatial.add(force, spatial.scale(tension, apart))
-        # tension (I - u u^T), u = apart * inverse
-        unit = spatial.scale(inverse, apart)
-        stiffness = tuple(map(spatial.plus, stiffness, _projection(tension, unit)))
-    if not pull.points:
-        return load
-    coupling = tuple(spatial.cross(position, row) for row in _rows(stiffness))
+        stiffness = tuple(map(spatial.plus, stiffness, _projection(tension, spatial.scale(inverse, apart))))
+    x, y, z = _rows(stiffness)
+    coupling = spatial.cross(position, x), spatial.cross(position, y), spatial.cross(position, z)
     columns = [spatial.cross(position, column) for column in spatial.transpose(coupling)]
     angular = (columns[0][0], columns[1][0], columns[2][0], columns[1][1], columns[2][1], columns[2][2])
     return _Load(
@@ -145,16 +149,20 @@ def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: float) -
         force=spatial.add(load.force, force),
         moment=spatial.add_outer(load.moment, position, force),
         linear=tuple(map(spatial.plus, load.linear, stiffness)),
-        coupling=tuple(map(spatial.add, load.coupling, coupling)),
+        coupling=_sum(load.coupling, coupling),
         angular=tuple(map(spatial.plus, load.angular, angular)),
     )
 
 
 def _projection(factor: Scalar, unit: Vector) -> Symmetric:
-    """factor (I - u u^T)."""
+    """The matrix factor (I - u u^T)."""
     x, y, z = unit
     u, v, w = (spatial.times(-factor, component) for component in unit)
     return factor + u * x, u * y, u * z, factor + v * y, v * z, factor + w * z
+
+
+def _sum(a: Rotation, b: Rotation) -> Rotation:
+    return spatial.add(a[0], b[0]), spatial.add(a[1], b[1]), spatial.add(a[2], b[2])
 
 
 def _rows(matrix: Symmetric) -> Rotation:

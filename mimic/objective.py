@@ -11,8 +11,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int
 
-from mimic import closed_form, spatial
-from mimic.closed_form import Body, Pull, smoothed_length, static_derivatives
+from mimic import spatial
+from mimic.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
 from mimic.descent import Derivatives, Scalars
 from mimic.distance import Correspondence, DistanceWeights, Reduction, RotationMeasure, Weights, embodiment_distance
 from mimic.embodiment import Embodiment
@@ -30,6 +30,7 @@ class PoseObjective:
       target: of the expert's link states.
       value: of the target and the learner's link states: the distance, up to a constant of the target.
       derivatives: of the target and the learner's joint angles: of the distance, its value up to a constant too.
+      rough_derivatives: the same of a smoother function, with minima nearby: what a descent begins with.
     """
 
     distance: Callable[[LinkStates, LinkStates], Array]
@@ -53,8 +54,8 @@ def pose_objective(
             expert_states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
         )
 
-    static = not callable(correspondence) and isinstance(weights, DistanceWeights)
-    if static and rotation == "cosine" and reduction == "mean":
+    static = not callable(correspondence) and rotation == "cosine" and reduction == "mean"
+    if static and isinstance(weights, DistanceWeights):
         return _static(learner, correspondence, weights, distance)
     return _differentiated(learner, distance)
 
@@ -123,9 +124,9 @@ def _static(
         assert states.direction is not None
         aligned = jnp.vdot(target.strength[:, None] * target.unit, states.direction)
         apart = states.position[pairs[:, 1]] - target.points
-        return jnp.sum(target.weights * smoothed_length(jnp.sum(apart * apart, axis=-1))) - aligned
+        return jnp.sum(target.weights * smoothed_length(jnp.sum(apart * apart, axis=-1), SMOOTHING)) - aligned
 
-    def derivatives(target: StaticTarget, qpos: Scalars, smoothing=None) -> Derivatives:
+    def derivatives(smoothing: float, target: StaticTarget, qpos: Scalars) -> Derivatives:
         frames = joint_frames(arm, qpos, None)
         links = [
             Body(joint, link.direction, link.position)
@@ -135,9 +136,10 @@ def _static(
             spatial.rotate(frame.rotation, spatial.vector(axis))
             for frame, axis in zip(frames[1:], arm.joint_axis, strict=True)
         ]
-        return static_derivatives(axes, [frame.anchor for frame in frames[1:]], links, target.pulls, closed_form.SMOOTHING if smoothing is None else closed_form.ROUGH)
+        return static_derivatives(axes, [frame.anchor for frame in frames[1:]], links, target.pulls, smoothing)
 
-    return PoseObjective(distance, target, value, derivatives, functools.partial(derivatives,smoothing=True))
+    rough, fine = (functools.partial(derivatives, smoothing) for smoothing in (ROUGH_SMOOTHING, SMOOTHING))
+    return PoseObjective(distance, target, value, fine, rough if len(pairs) else fine)
 
 
 def _pair_weights(correspondence: Any, weight: Any, links: int) -> Any:

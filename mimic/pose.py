@@ -185,21 +185,35 @@ def imitate_trajectory(
         states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
         targets = jax.vmap(objective.target)(states)
 
-        def at(time: Array) -> Callable[[Scalars], Derivatives]:
-            return functools.partial(objective.derivatives, jax.tree.map(lambda x: x[time], targets))
+        def at(derivatives: Callable[..., Derivatives], time: Array) -> Callable[[Scalars], Derivatives]:
+            return functools.partial(derivatives, jax.tree.map(lambda x: x[time], targets))
+
+        def near(derivatives: Callable[..., Derivatives], previous: Array, start: Array, time: Array) -> End:
+            reach = jnp.maximum(lower, previous - jump), jnp.minimum(upper, previous + jump)
+            return newton(at(derivatives, time), start, reach, _TRACKING_ITERATIONS)
 
         def track(anchor: Array, start: Array) -> End:
-            begin = newton(at(anchor), start, limits, _ITERATIONS["newton"]).qpos
+            rough = objective.rough_derivatives
+            begin = newton(at(rough, anchor), start, limits, _ITERATIONS["newton"]).qpos
 
             def follow(pose: Array, time: Array) -> tuple[Array, End]:
-                reach = jnp.maximum(lower, pose - jump), jnp.minimum(upper, pose + jump)
-                end = newton(at(time), pose, reach, _TRACKING_ITERATIONS)
+                end = near(rough, pose, pose, time)
                 return end.qpos, end
 
             # Forth from the anchor to the end, then back over all: what lies before the anchor is reached that way too.
-            forth = jnp.maximum(jnp.arange(last + 1), anchor)
-            turned, _ = jax.lax.scan(follow, begin, forth)
-            return jax.lax.scan(follow, turned, jnp.arange(last + 1), reverse=True)[1]
+            times = jnp.arange(last + 1)
+            ends = jax.lax.scan(follow, begin, jnp.concatenate([jnp.maximum(times, anchor), times[::-1]]))[1]
+            return jax.tree.map(lambda x: x[:last:-1], ends)
+
+        def refined(rough: End) -> End:
+            """The same track, by the derivatives that count."""
+
+            def follow(pose: Array, at_time: tuple[Array, Array]) -> tuple[Array, End]:
+                start, time = at_time
+                end = near(objective.derivatives, pose, start, time)
+                return end.qpos, end
+
+            return jax.lax.scan(follow, rough.qpos[0], (rough.qpos, jnp.arange(last + 1)))[1]
 
         def from_anchor(anchor: Array) -> End:
             target = jax.tree.map(lambda x: x[anchor], targets)
@@ -210,6 +224,8 @@ def imitate_trajectory(
         tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
         best = jnp.argmin(tracks.value.mean(axis=1))
         found: End = jax.tree.map(lambda x: x[best], tracks)
+        if objective.rough_derivatives is not objective.derivatives:
+            found = refined(found)
         left = jax.vmap(lambda state, q: objective.distance(state, link_states(learner, q)))(states, found.qpos)
         shift = _wrapped(found.qpos[0], limits) - found.qpos[0]
         return PoseImitation(found.qpos + shift, left, found.slope <= _FLAT * scale)

@@ -88,7 +88,7 @@ def test_arrays_of_weights_and_a_correspondence_known_only_at_run_time():
 
 
 def test_a_match_has_no_slope_and_a_finite_curvature(dtype):
-    """Where the lengths have their kink. Rounding moves a position by 1e-7 chain lengths, SMOOTHING is 1e4 times that."""
+    """At the kink of the lengths. 1e-4: rounding moves a position by 1e-7 chain lengths, and SMOOTHING is 1e-3."""
     arm = panda()
     closed = pose_objective(arm, arc_length_correspondence(arm, arm), DEFAULT, "cosine", "mean")
     for qpos in (np.zeros(7), np.linspace(-2, 2, 7)):
@@ -100,7 +100,7 @@ def test_a_match_has_no_slope_and_a_finite_curvature(dtype):
 
 
 def test_smoothing_changes_the_distance_by_less_than_its_own_size(dtype):
-    """Of arc length W the entries sum to n n_hat, so the mean of the lengths is off by SMOOTHING at most, times a_tr."""
+    """Arc length W has entries that sum to n n_hat: the mean length is off by SMOOTHING at most; 1e-5 for float32."""
     expert, learner = panda(), panda(locked=(3, 6, 7))
     matrix = arc_length_correspondence(expert, learner)
     closed = pose_objective(learner, matrix, DEFAULT, "cosine", "mean")
@@ -113,7 +113,7 @@ def test_smoothing_changes_the_distance_by_less_than_its_own_size(dtype):
         return derivatives.value, embodiment_distance(states, own, matrix, DEFAULT)
 
     smoothed, exact = values(qpos)
-    # Directions that agree with each other, as all in arc_length W of a locked arm, leave no constant.
+    # A diagonal W: one pull for each direction, so the value has no constant.
     apart = exact - smoothed
     assert np.all(apart > -1e-5) and np.all(apart <= DEFAULT.translation * SMOOTHING + 1e-5)
 
