@@ -16,7 +16,7 @@ from mimic.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_l
 from mimic.descent import Derivatives, Scalars
 from mimic.distance import Correspondence, DistanceWeights, Reduction, RotationMeasure, Weights, embodiment_distance
 from mimic.embodiment import Embodiment
-from mimic.kinematics import LinkStates, joint_frames, link_states, link_vectors
+from mimic.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
 
 Target = Any  # what of the expert's pose counts: a pytree
 
@@ -58,10 +58,6 @@ def pose_objective(
     if static and isinstance(weights, DistanceWeights):
         return _static(learner, correspondence, weights, distance)
     return _differentiated(learner, distance)
-
-
-def _is_zero(weight: Any) -> bool:
-    return not isinstance(weight, Tracer) and not np.any(np.asarray(weight))
 
 
 def _differentiated(learner: Embodiment, distance: Callable[[LinkStates, LinkStates], Array]) -> PoseObjective:
@@ -128,15 +124,10 @@ def _static(
 
     def derivatives(smoothing: float, target: StaticTarget, qpos: Scalars) -> Derivatives:
         frames = joint_frames(arm, qpos, None)
-        links = [
-            Body(joint, link.direction, link.position)
-            for joint, link in zip(arm.link_joint, link_vectors(arm, frames), strict=True)
-        ]
-        axes = [
-            spatial.rotate(frame.rotation, spatial.vector(axis))
-            for frame, axis in zip(frames[1:], arm.joint_axis, strict=True)
-        ]
-        return static_derivatives(axes, [frame.anchor for frame in frames[1:]], links, target.pulls, smoothing)
+        moved = zip(arm.link_joint, link_vectors(arm, frames), strict=True)
+        links = [Body(joint, link.direction, link.position) for joint, link in moved]
+        anchors = [frame.anchor for frame in frames[1:]]
+        return static_derivatives(joint_axes(arm, frames), anchors, links, target.pulls, smoothing)
 
     rough, fine = (functools.partial(derivatives, smoothing) for smoothing in (ROUGH_SMOOTHING, SMOOTHING))
     return PoseObjective(distance, target, value, fine, rough if len(pairs) else fine)
@@ -152,7 +143,7 @@ def _pair_weights(correspondence: Any, weight: Any, links: int) -> Any:
 
 def _counting_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 2"]:
     """Pairs of links whose positions count; all of them where W is known only when the program runs."""
-    counts = np.full(np.shape(correspondence), not _is_zero(weight))
+    counts = np.full(np.shape(correspondence), True)
     if not isinstance(correspondence, Tracer):
         counts &= np.asarray(correspondence) != 0
     if not isinstance(weight, Tracer):

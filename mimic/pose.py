@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from mimic.descent import Derivatives, End, Scalars, gradient_descent, newton
 from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights
 from mimic.embodiment import Embodiment
-from mimic.kinematics import link_states
+from mimic.kinematics import LinkStates, link_states
 from mimic.objective import PoseObjective, Target, pose_objective
 
 Method = Literal["newton", "gradient_descent"]
@@ -34,7 +34,8 @@ class PoseImitation(NamedTuple):
     Attributes:
       qpos: [*batch, learner_joints] angles [rad].
       distance: [*batch] embodiment distance that is left.
-      converged: [*batch] whether the gradient vanishes there, but for joints that are held at a limit.
+      converged: [*batch] whether the gradient vanishes there, but for joints that are held at a limit. Where positions
+        match, a kink of the distance, it is the gradient of the smoothed one (see `mimic.closed_form`).
     """
 
     qpos: Float[Array, "*batch learner_joints"]
@@ -102,13 +103,13 @@ def imitate_pose(
     descend = newton if method == "newton" else gradient_descent
 
     def solve(poses: Array, warm: Array | None) -> PoseImitation:
-        random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
-        scale = _typical_distance(objective, expert, learner, poses, random_poses)
+        tried = _random_poses(learner, key, max(starts, 1), poses.dtype)
+        scale = _typical_distance(objective, expert, poses, tried)
 
         def one(pose: Array, warm: Array | None) -> PoseImitation:
             states = link_states(expert, pose)
             target = objective.target(states)
-            first = _starts(objective, expert, learner, target, pose, random_poses if starts else None)
+            first = _starts(objective, expert, learner, target, pose, tried if starts else None)
             first = first if warm is None else warm[None]
             of_qpos = functools.partial(objective.derivatives, target)
             rough_of_qpos = of_qpos if kept is None else functools.partial(objective.rough_derivatives, target)
@@ -180,8 +181,8 @@ def imitate_trajectory(
     anchors = np.unique(np.linspace(0, last, _ANCHORS).round().astype(int))
 
     def solve(poses: Array) -> PoseImitation:
-        random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
-        scale = _typical_distance(objective, expert, learner, poses, random_poses)
+        tried = _random_poses(learner, key, max(starts, 1), poses.dtype)
+        scale = _typical_distance(objective, expert, poses, tried)
         states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
         targets = jax.vmap(objective.target)(states)
 
@@ -217,7 +218,7 @@ def imitate_trajectory(
 
         def from_anchor(anchor: Array) -> End:
             target = jax.tree.map(lambda x: x[anchor], targets)
-            first = _starts(objective, expert, learner, target, poses[anchor], random_poses if starts else None)
+            first = _starts(objective, expert, learner, target, poses[anchor], tried if starts else None)
             return jax.vmap(lambda start: track(anchor, start))(first)
 
         tracks = jax.vmap(from_anchor)(jnp.asarray(anchors))
@@ -260,19 +261,31 @@ def _checked_poses(arm: Embodiment, values: ArrayLike, name: str) -> Array:
     return poses
 
 
-def _random_poses(arm: Embodiment, key: Array, sets: int, dtype: Any) -> Float[Array, "sets poses joints"]:
+class RandomPoses(NamedTuple):
+    """Poses of the learner that are compared, without a descent.
+
+    Attributes:
+      qpos: [sets, poses, joints] [rad].
+      states: their link states, [sets, poses, links, 3] each.
+    """
+
+    qpos: Float[Array, "sets poses joints"]
+    states: LinkStates
+
+
+def _random_poses(arm: Embodiment, key: Array, sets: int, dtype: Any) -> RandomPoses:
     lower, upper = jnp.asarray(arm.joint_range, dtype).T
     shape = (sets, -(-_POSES // sets), arm.num_joints)
-    return jax.random.uniform(key, shape, dtype, minval=lower, maxval=upper)
+    qpos = jax.random.uniform(key, shape, dtype, minval=lower, maxval=upper)
+    return RandomPoses(qpos, jax.vmap(jax.vmap(lambda q: link_states(arm, q)))(qpos))
 
 
 def _typical_distance(
-    objective: PoseObjective, expert: Embodiment, learner: Embodiment, poses: Array, random_poses: Array
+    objective: PoseObjective, expert: Embodiment, poses: Array, tried: RandomPoses
 ) -> Float[Array, ""]:
     """Mean distance of random poses to one of the expert's: the scale of the metric."""
     states = link_states(expert, poses.reshape(-1, expert.num_joints)[0])
-    tried = random_poses.reshape(-1, learner.num_joints)
-    return jax.vmap(lambda q: objective.distance(states, link_states(learner, q)))(tried).mean()
+    return jax.vmap(jax.vmap(lambda own: objective.distance(states, own)))(tried.states).mean()
 
 
 def _starts(
@@ -281,14 +294,14 @@ def _starts(
     learner: Embodiment,
     target: Target,
     expert_qpos: Array,
-    random_poses: Float[Array, "sets poses joints"] | None,
+    tried: RandomPoses | None,
 ) -> Float[Array, "starts joints"]:
     """The expert's angles in the joints that both arms have by name, then the nearest of each set of random poses."""
     own = shared_joints(expert, learner, expert_qpos)
-    if random_poses is None:
+    if tried is None:
         return own[None]
-    tried = jax.vmap(jax.vmap(lambda q: objective.value(target, link_states(learner, q))))(random_poses)
-    nearest = jnp.take_along_axis(random_poses, jnp.argmin(tried, axis=1)[:, None, None], axis=1)[:, 0]
+    values = jax.vmap(jax.vmap(lambda states: objective.value(target, states)))(tried.states)
+    nearest = jnp.take_along_axis(tried.qpos, jnp.argmin(values, axis=1)[:, None, None], axis=1)[:, 0]
     return jnp.concatenate([own[None], nearest])
 
 
