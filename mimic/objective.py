@@ -98,9 +98,7 @@ def _static(
 
     Of the directions all that counts of the expert is one pull for each link of the learner, t_j = sum_i W_ij e_i.
     """
-    directions, positions = (
-        _pair_weights(correspondence, weight, learner.num_links) for weight in (weights.rotation, weights.translation)
-    )
+    directions, positions = (_pair_weights(correspondence, w) for w in (weights.rotation, weights.translation))
     pairs = _counting_pairs(correspondence, weights.translation)
     arm = _of_chain_length_one(learner)
 
@@ -133,7 +131,7 @@ def _static(
     return PoseObjective(distance, target, value, fine, rough if len(pairs) else fine)
 
 
-def _pair_weights(correspondence: Any, weight: Any, links: int) -> Any:
+def _pair_weights(correspondence: Any, weight: Any) -> Any:
     """W o weight, divided by the number of pairs: [expert, learner]; by NumPy where both are known."""
     known = not any(isinstance(x, Tracer) for x in (correspondence, weight))
     numpy = np if known else jnp
