@@ -223,18 +223,12 @@ def _inverse_adjoint(rotation: Rotation, position: Vector, omega: Vector, v: Vec
     return spatial.rotate(back, omega), spatial.rotate(back, spatial.add(v, spatial.cross(omega, position)))
 
 
-def axes_and_directions(arm: Embodiment, qpos: Sequence[spatial.Scalar]) -> tuple[list[Vector], list[Vector]]:
-    """The joints' axes and the links' directions in the base frame, as scalar components.
-
-    Args:
-      arm: the embodiment.
-      qpos: an angle [rad] for each joint.
-    """
-    frames = joint_frames(arm, qpos, None)
-    turns = [frame.rotation for frame in frames]
-    axes = [spatial.rotate(turn, spatial.vector(axis)) for turn, axis in zip(turns, arm.joint_axis, strict=False)]
-    links = zip(arm.link_joint, arm.link_rotation, strict=True)
-    return axes, [spatial.rotate(turns[joint + 1], spatial.vector(frame[:, 0])) for joint, frame in links]
+def joint_axes(arm: Embodiment, frames: Sequence[JointFrame]) -> list[Vector]:
+    """The joints' unit axes in the base frame, of the frames that `joint_frames` gives."""
+    return [
+        spatial.rotate(frame.rotation, spatial.vector(axis))
+        for frame, axis in zip(frames[1:], arm.joint_axis, strict=True)
+    ]
 
 
 def joint_frames(

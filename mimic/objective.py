@@ -1,20 +1,22 @@
 """The embodiment distance as a function of the learner's pose, with its first two derivatives."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Int
 
 from mimic import spatial
+from mimic.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
 from mimic.descent import Derivatives, Scalars
 from mimic.distance import Correspondence, DistanceWeights, Reduction, RotationMeasure, Weights, embodiment_distance
 from mimic.embodiment import Embodiment
-from mimic.kinematics import LinkStates, axes_and_directions, link_states
+from mimic.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
 
 Target = Any  # what of the expert's pose counts: a pytree
 
@@ -28,12 +30,14 @@ class PoseObjective:
       target: of the expert's link states.
       value: of the target and the learner's link states: the distance, up to a constant of the target.
       derivatives: of the target and the learner's joint angles: of the distance, its value up to a constant too.
+      rough_derivatives: the same of a smoother function, with minima nearby: what a descent begins with.
     """
 
     distance: Callable[[LinkStates, LinkStates], Array]
     target: Callable[[LinkStates], Target]
     value: Callable[[Target, LinkStates], Array]
     derivatives: Callable[[Target, Scalars], Derivatives]
+    rough_derivatives: Callable[[Target, Scalars], Derivatives]
 
 
 def pose_objective(
@@ -43,21 +47,17 @@ def pose_objective(
     rotation: RotationMeasure,
     reduction: Reduction,
 ) -> PoseObjective:
-    """In closed form for the static rotational measure; any other is differentiated automatically."""
+    """In closed form for the static measure, see `_static`; any other is differentiated automatically."""
 
     def distance(expert_states: LinkStates, learner_states: LinkStates) -> Array:
         return embodiment_distance(
             expert_states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
         )
 
-    static = not callable(correspondence) and isinstance(weights, DistanceWeights)
-    if static and rotation == "cosine" and reduction == "mean" and _is_zero(weights.translation):
-        return _directional(learner, jnp.asarray(correspondence) * weights.rotation, distance)
+    static = not callable(correspondence) and rotation == "cosine" and reduction == "mean"
+    if static and isinstance(weights, DistanceWeights):
+        return _static(learner, correspondence, weights, distance)
     return _differentiated(learner, distance)
-
-
-def _is_zero(weight: Any) -> bool:
-    return not isinstance(weight, Tracer) and not np.any(np.asarray(weight))
 
 
 def _differentiated(learner: Embodiment, distance: Callable[[LinkStates, LinkStates], Array]) -> PoseObjective:
@@ -69,68 +69,93 @@ def _differentiated(learner: Embodiment, distance: Callable[[LinkStates, LinkSta
         hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
         return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
 
-    return PoseObjective(distance, lambda states: states, distance, derivatives)
+    return PoseObjective(distance, lambda states: states, distance, derivatives, derivatives)
 
 
-def _directional(
+class StaticTarget(NamedTuple):
+    """What of the expert counts for the static measure: one pull on each direction of the learner, and positions.
+
+    Attributes:
+      unit, strength: [links, 3], [links] of the pull on the learner's directions, see `mimic.closed_form`.
+      points, weights: [pairs, 3], [pairs] of the pulls on its positions.
+      pulls: the same on each link, as scalar components.
+    """
+
+    unit: Array
+    strength: Array
+    points: Array
+    weights: Array
+    pulls: tuple[Pull, ...]
+
+
+def _static(
     learner: Embodiment,
-    matrix: Float[Array, "expert learner"],
+    correspondence: Any,
+    weights: DistanceWeights,
     distance: Callable[[LinkStates, LinkStates], Array],
 ) -> PoseObjective:
-    """The static rotational measure, the mean of W_ij (pi/2) (1 - e_i . e^_j).
+    """Constant W and weights, cosines and the mean: sums of W_ij (pi/2) (1 - e_i . e^_j) and W_ij |p_i - p^_j|.
 
-    All that counts of the expert is one pull for each link of the learner, t_j = sum_i W_ij e_i: up to a constant, the
-    distance is c sum_j |t_j| (1 - e^_j . t_j / |t_j|), c = pi / (2 n n^). Turning joint k moves all links behind it
-    about its axis a_k, so with M_k = c sum_{j >= k} e^_j t_j^T
-
-        d/dq_k         = -c a_k . sum_{j >= k} e^_j x t_j
-        d^2/dq_k dq_l  = -a_k . (M_l a_l - tr(M_l) a_l)                for k <= l.
+    Of the directions all that counts of the expert is one pull for each link of the learner, t_j = sum_i W_ij e_i.
     """
-    factor = np.pi / 2 / matrix.size
+    directions, positions = (_pair_weights(correspondence, w) for w in (weights.rotation, weights.translation))
+    pairs = _counting_pairs(correspondence, weights.translation)
+    arm = _of_chain_length_one(learner)
 
-    def target(states: LinkStates) -> tuple[Array, Array]:
+    def target(states: LinkStates) -> StaticTarget:
         assert states.direction is not None
+        dtype = states.direction.dtype
         # Elementwise: TF32 never touches it.
-        pull = factor * jnp.sum(matrix[:, :, None] * states.direction[:, None, :], axis=0)
+        pull = np.pi / 2 * jnp.sum(directions[:, :, None] * states.direction[:, None, :], axis=0)
         strength = spatial.safe_sqrt(jnp.sum(pull * pull, axis=-1))
         unit = pull / jnp.maximum(strength, jnp.finfo(pull.dtype).tiny)[:, None]
-        return unit.astype(states.direction.dtype), strength.astype(states.direction.dtype)
+        weight = jnp.asarray(positions[pairs[:, 0], pairs[:, 1]], dtype)
+        unit, strength, points = unit.astype(dtype), strength.astype(dtype), states.position[pairs[:, 0]]
+        pulls = tuple(_pull(unit[j], strength[j], points, weight, pairs[:, 1] == j) for j in range(learner.num_links))
+        return StaticTarget(unit, strength, points, weight, pulls)
 
-    def value(target: tuple[Array, Array], states: LinkStates) -> Array:
+    def value(target: StaticTarget, states: LinkStates) -> Array:
         assert states.direction is not None
-        unit, strength = target
-        return -jnp.vdot(strength[:, None] * unit, states.direction)
+        aligned = jnp.vdot(target.strength[:, None] * target.unit, states.direction)
+        apart = states.position[pairs[:, 1]] - target.points
+        return jnp.sum(target.weights * smoothed_length(jnp.sum(apart * apart, axis=-1), SMOOTHING)) - aligned
 
-    def derivatives(target: tuple[Array, Array], qpos: Scalars) -> Derivatives:
-        axes, directions = axes_and_directions(learner, qpos)
-        return _directional_derivatives(learner.link_joint, axes, directions, *target)
+    def derivatives(smoothing: float, target: StaticTarget, qpos: Scalars) -> Derivatives:
+        frames = joint_frames(arm, qpos, None)
+        moved = zip(arm.link_joint, link_vectors(arm, frames), strict=True)
+        links = [Body(joint, link.direction, link.position) for joint, link in moved]
+        anchors = [frame.anchor for frame in frames[1:]]
+        return static_derivatives(joint_axes(arm, frames), anchors, links, target.pulls, smoothing)
 
-    return PoseObjective(distance, target, value, derivatives)
+    rough, fine = (functools.partial(derivatives, smoothing) for smoothing in (ROUGH_SMOOTHING, SMOOTHING))
+    return PoseObjective(distance, target, value, fine, rough if len(pairs) else fine)
 
 
-def _directional_derivatives(
-    link_joint: tuple[int, ...],
-    axes: list[spatial.Vector],
-    directions: list[spatial.Vector],
-    unit: Float[Array, "links 3"],
-    strength: Float[Array, " links"],
-) -> Derivatives:
-    # Sums over the links behind a joint.
-    value, turning = 0.0, spatial.ZERO
-    outer: spatial.Rotation = (spatial.ZERO, spatial.ZERO, spatial.ZERO)
-    gradient, moments = [], []
-    for joint in reversed(range(len(axes))):
-        for link in (link for link, own in enumerate(link_joint) if own == joint):
-            direction, goal = directions[link], spatial.vector(unit[link])
-            apart = spatial.subtract(direction, goal)  # |e - t|^2 / 2 = 1 - e . t, to the last digit at a match
-            value = spatial.plus(value, 0.5 * strength[link] * spatial.dot(apart, apart))
-            pull = spatial.scale(strength[link], goal)
-            turning = spatial.add(turning, spatial.cross(direction, pull))
-            outer = spatial.add_outer(outer, direction, pull)
-        axis = axes[joint]
-        trace = spatial.plus(spatial.plus(outer[0][0], outer[1][1]), outer[2][2])
-        gradient.append(-spatial.dot(axis, turning))
-        moments.append(spatial.subtract(spatial.rotate(outer, axis), spatial.scale(trace, axis)))
-    gradient, moments = gradient[::-1], moments[::-1]
-    hessian = [[-spatial.dot(axes[k], moments[i]) for k in range(i + 1)] for i in range(len(axes))]
-    return Derivatives(value, tuple(gradient), hessian)
+def _pair_weights(correspondence: Any, weight: Any) -> Any:
+    """W o weight, divided by the number of pairs: [expert, learner]; by NumPy where both are known."""
+    known = not any(isinstance(x, Tracer) for x in (correspondence, weight))
+    numpy = np if known else jnp
+    matrix = numpy.asarray(correspondence)
+    return numpy.broadcast_to(numpy.asarray(weight), matrix.shape) * matrix / matrix.size
+
+
+def _counting_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 2"]:
+    """Pairs of links whose positions count; all of them where W is known only when the program runs."""
+    counts = np.full(np.shape(correspondence), True)
+    if not isinstance(correspondence, Tracer):
+        counts &= np.asarray(correspondence) != 0
+    if not isinstance(weight, Tracer):
+        counts &= np.asarray(weight) != 0
+    return np.argwhere(counts)
+
+
+def _pull(unit: Array, strength: Array, points: Array, weights: Array, own: Bool[np.ndarray, " pairs"]) -> Pull:
+    """On one link, as scalars: taken out of their arrays once, not in each step of a descent."""
+    mine = np.flatnonzero(own)
+    return Pull(spatial.vector(unit), strength, [spatial.vector(points[i]) for i in mine], [weights[i] for i in mine])
+
+
+def _of_chain_length_one(arm: Embodiment) -> Embodiment:
+    """The arm with its lengths in chain lengths."""
+    unit = 1 / arm.chain_length
+    return dataclasses.replace(arm, joint_anchor=unit * arm.joint_anchor, link_position=unit * arm.link_position)

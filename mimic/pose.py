@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from mimic.descent import Derivatives, End, Scalars, gradient_descent, newton
 from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights
 from mimic.embodiment import Embodiment
-from mimic.kinematics import link_states
+from mimic.kinematics import LinkStates, link_states
 from mimic.objective import PoseObjective, Target, pose_objective
 
 Method = Literal["newton", "gradient_descent"]
@@ -34,7 +34,8 @@ class PoseImitation(NamedTuple):
     Attributes:
       qpos: [*batch, learner_joints] angles [rad].
       distance: [*batch] embodiment distance that is left.
-      converged: [*batch] whether the gradient vanishes there, but for joints that are held at a limit.
+      converged: [*batch] whether the gradient vanishes there, but for joints that are held at a limit. Where positions
+        match, a kink of the distance, it is the gradient of the smoothed one (see `mimic.closed_form`).
     """
 
     qpos: Float[Array, "*batch learner_joints"]
@@ -102,16 +103,17 @@ def imitate_pose(
     descend = newton if method == "newton" else gradient_descent
 
     def solve(poses: Array, warm: Array | None) -> PoseImitation:
-        random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
-        scale = _typical_distance(objective, expert, learner, poses, random_poses)
+        tried = _random_poses(learner, key, max(starts, 1), poses.dtype)
+        scale = _typical_distance(objective, expert, poses, tried)
 
         def one(pose: Array, warm: Array | None) -> PoseImitation:
             states = link_states(expert, pose)
             target = objective.target(states)
-            first = _starts(objective, expert, learner, target, pose, random_poses if starts else None)
+            first = _starts(objective, expert, learner, target, pose, tried if starts else None)
             first = first if warm is None else warm[None]
             of_qpos = functools.partial(objective.derivatives, target)
-            ends = jax.vmap(lambda start: descend(of_qpos, start, limits, rough))(first)
+            rough_of_qpos = of_qpos if kept is None else functools.partial(objective.rough_derivatives, target)
+            ends = jax.vmap(lambda start: descend(rough_of_qpos, start, limits, rough))(first)
             if kept is not None:
                 chosen = jax.lax.top_k(-ends.value, min(kept, len(first)))[1]
                 ends = jax.vmap(lambda start: descend(of_qpos, start, limits, count - rough))(ends.qpos[chosen])
@@ -179,36 +181,52 @@ def imitate_trajectory(
     anchors = np.unique(np.linspace(0, last, _ANCHORS).round().astype(int))
 
     def solve(poses: Array) -> PoseImitation:
-        random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
-        scale = _typical_distance(objective, expert, learner, poses, random_poses)
+        tried = _random_poses(learner, key, max(starts, 1), poses.dtype)
+        scale = _typical_distance(objective, expert, poses, tried)
         states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
         targets = jax.vmap(objective.target)(states)
 
-        def at(time: Array) -> Callable[[Scalars], Derivatives]:
-            return functools.partial(objective.derivatives, jax.tree.map(lambda x: x[time], targets))
+        def at(derivatives: Callable[..., Derivatives], time: Array) -> Callable[[Scalars], Derivatives]:
+            return functools.partial(derivatives, jax.tree.map(lambda x: x[time], targets))
+
+        def near(derivatives: Callable[..., Derivatives], previous: Array, start: Array, time: Array) -> End:
+            reach = jnp.maximum(lower, previous - jump), jnp.minimum(upper, previous + jump)
+            return newton(at(derivatives, time), start, reach, _TRACKING_ITERATIONS)
 
         def track(anchor: Array, start: Array) -> End:
-            begin = newton(at(anchor), start, limits, _ITERATIONS["newton"]).qpos
+            rough = objective.rough_derivatives
+            begin = newton(at(rough, anchor), start, limits, _ITERATIONS["newton"]).qpos
 
             def follow(pose: Array, time: Array) -> tuple[Array, End]:
-                reach = jnp.maximum(lower, pose - jump), jnp.minimum(upper, pose + jump)
-                end = newton(at(time), pose, reach, _TRACKING_ITERATIONS)
+                end = near(rough, pose, pose, time)
                 return end.qpos, end
 
             # Forth from the anchor to the end, then back over all: what lies before the anchor is reached that way too.
-            forth = jnp.maximum(jnp.arange(last + 1), anchor)
-            turned, _ = jax.lax.scan(follow, begin, forth)
-            return jax.lax.scan(follow, turned, jnp.arange(last + 1), reverse=True)[1]
+            times = jnp.arange(last + 1)
+            ends = jax.lax.scan(follow, begin, jnp.concatenate([jnp.maximum(times, anchor), times[::-1]]))[1]
+            return jax.tree.map(lambda x: x[:last:-1], ends)
+
+        def refined(rough: End) -> End:
+            """The same track, by the derivatives that count."""
+
+            def follow(pose: Array, at_time: tuple[Array, Array]) -> tuple[Array, End]:
+                start, time = at_time
+                end = near(objective.derivatives, pose, start, time)
+                return end.qpos, end
+
+            return jax.lax.scan(follow, rough.qpos[0], (rough.qpos, jnp.arange(last + 1)))[1]
 
         def from_anchor(anchor: Array) -> End:
             target = jax.tree.map(lambda x: x[anchor], targets)
-            first = _starts(objective, expert, learner, target, poses[anchor], random_poses if starts else None)
+            first = _starts(objective, expert, learner, target, poses[anchor], tried if starts else None)
             return jax.vmap(lambda start: track(anchor, start))(first)
 
         tracks = jax.vmap(from_anchor)(jnp.asarray(anchors))
         tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
         best = jnp.argmin(tracks.value.mean(axis=1))
         found: End = jax.tree.map(lambda x: x[best], tracks)
+        if objective.rough_derivatives is not objective.derivatives:
+            found = refined(found)
         left = jax.vmap(lambda state, q: objective.distance(state, link_states(learner, q)))(states, found.qpos)
         shift = _wrapped(found.qpos[0], limits) - found.qpos[0]
         return PoseImitation(found.qpos + shift, left, found.slope <= _FLAT * scale)
@@ -243,19 +261,31 @@ def _checked_poses(arm: Embodiment, values: ArrayLike, name: str) -> Array:
     return poses
 
 
-def _random_poses(arm: Embodiment, key: Array, sets: int, dtype: Any) -> Float[Array, "sets poses joints"]:
+class RandomPoses(NamedTuple):
+    """Poses of the learner that are compared, without a descent.
+
+    Attributes:
+      qpos: [sets, poses, joints] [rad].
+      states: their link states, [sets, poses, links, 3] each.
+    """
+
+    qpos: Float[Array, "sets poses joints"]
+    states: LinkStates
+
+
+def _random_poses(arm: Embodiment, key: Array, sets: int, dtype: Any) -> RandomPoses:
     lower, upper = jnp.asarray(arm.joint_range, dtype).T
     shape = (sets, -(-_POSES // sets), arm.num_joints)
-    return jax.random.uniform(key, shape, dtype, minval=lower, maxval=upper)
+    qpos = jax.random.uniform(key, shape, dtype, minval=lower, maxval=upper)
+    return RandomPoses(qpos, jax.vmap(jax.vmap(lambda q: link_states(arm, q)))(qpos))
 
 
 def _typical_distance(
-    objective: PoseObjective, expert: Embodiment, learner: Embodiment, poses: Array, random_poses: Array
+    objective: PoseObjective, expert: Embodiment, poses: Array, tried: RandomPoses
 ) -> Float[Array, ""]:
     """Mean distance of random poses to one of the expert's: the scale of the metric."""
     states = link_states(expert, poses.reshape(-1, expert.num_joints)[0])
-    tried = random_poses.reshape(-1, learner.num_joints)
-    return jax.vmap(lambda q: objective.distance(states, link_states(learner, q)))(tried).mean()
+    return jax.vmap(jax.vmap(lambda own: objective.distance(states, own)))(tried.states).mean()
 
 
 def _starts(
@@ -264,14 +294,14 @@ def _starts(
     learner: Embodiment,
     target: Target,
     expert_qpos: Array,
-    random_poses: Float[Array, "sets poses joints"] | None,
+    tried: RandomPoses | None,
 ) -> Float[Array, "starts joints"]:
     """The expert's angles in the joints that both arms have by name, then the nearest of each set of random poses."""
     own = shared_joints(expert, learner, expert_qpos)
-    if random_poses is None:
+    if tried is None:
         return own[None]
-    tried = jax.vmap(jax.vmap(lambda q: objective.value(target, link_states(learner, q))))(random_poses)
-    nearest = jnp.take_along_axis(random_poses, jnp.argmin(tried, axis=1)[:, None, None], axis=1)[:, 0]
+    values = jax.vmap(jax.vmap(lambda states: objective.value(target, states)))(tried.states)
+    nearest = jnp.take_along_axis(tried.qpos, jnp.argmin(values, axis=1)[:, None, None], axis=1)[:, 0]
     return jnp.concatenate([own[None], nearest])
 
 

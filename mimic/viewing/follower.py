@@ -138,7 +138,7 @@ def compile_programs(env: EnvConfig, settings: Settings, mapper: Mapper | None =
     def weigh(weights: Array) -> Weights:
         if metric.adaptive:
             return metric.make_weights()
-        # A weight that is known to be 0 costs nothing: the optimiser then has its derivatives in closed form.
+        # A weight that is known to be 0 costs nothing: the optimiser's derivatives are then much simpler.
         return DistanceWeights(0.0 if settings.translation == 0 else weights[0], weights[1])
 
     def follow(qpos: Array, present: Array, weights: Array) -> Array:
