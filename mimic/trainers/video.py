@@ -88,7 +88,7 @@ def _frames(scene: ArmScene, story: Story, title: str) -> Iterator[UInt8[np.ndar
     steps = story.dt * np.arange(1, len(story.distance) + 1)
     over_time.plot(steps, story.hold, ":", color="grey", label="holding still")
     over_time.plot(steps, story.distance, color="tab:blue", label="policy")
-    over_time.plot(steps, story.bound, "k--", lw=1, label="lower bound")
+    over_time.plot(steps, story.bound, "k--", lw=1, label="kinematic bound")
     now = over_time.axvline(0, color="tab:red", lw=1)
     over_time.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, steps[-1]))
     over_time.legend(fontsize="small", loc="upper left")
