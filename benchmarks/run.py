@@ -25,6 +25,7 @@ BENCHMARKS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "kernel": ((), ()),
     "rollout": ((), ()),
     "physics": ((), ()),
+    "bound": ((), ()),
     "pose": ((), ("--batch", "200000", "--poses", "10000")),
     "pose_mapper": ((), ()),
     "training": ((), ()),

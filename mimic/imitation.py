@@ -1,8 +1,7 @@
-"""The best that an arm can do: the motion of the learner that is nearest to a pose and velocity of the expert."""
+"""The best that is known of an arm: the motion of the learner that is nearest to a pose and velocity of the expert."""
 
-import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +13,17 @@ from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, 
 from mimic.embodiment import Embodiment
 from mimic.kinematics import LinkStates, link_states
 from mimic.pose import pose_limits, shared_joints
+from mimic.quasi_newton import Descent, bfgs
 
-_POSES = 256  # random poses that are tried, without a descent, to find the starts
-_SEARCH_STEP, _POLISH_STEP = 0.1, 0.03  # first step of a descent [rad, and times the expert's speed]
-_LEAST_SPEED = 1e-2  # rad/s
-_FAST, _SLOW = 0.9, 0.99  # decay of the running means of gradient and squared gradient
+_POSES = 256  # random poses that are compared, without a descent, to find the initial guesses
+_LEAST_SPEED = 1e-2  # rad/s, of the unit that the velocities are optimised in
+# One round of exchange each: how many steps before and after it a time takes the motion of. The long ones spread a
+# minimum quickly, the short ones track it.
+_SHIFTS = (1, 2, 4, 1, 8, 1, 2, 1, 1, 1, 1, 1)
+_HOPS, _HOP = 2, 1.0  # random steps from the best motion that each round tries, and their standard deviation [rad]
+_VARIETY = 32  # after so many steps the random numbers recur, so that a long motion makes no large constants
 
-
-_Motion = tuple[Array, Array]  # angles and velocities
+_Distance = Callable[[LinkStates, LinkStates], Array]
 
 
 class ClosestMotion(NamedTuple):
@@ -48,11 +50,15 @@ def kinematic_bound(
     *,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
-    starts: int = 4,
-    iterations: int = 40,
+    starts: int = 5,
+    iterations: int = 20,
     seed: int = 0,
 ) -> Float[Array, " time"]:
-    """What no controller can go below at each step: the distance of the `closest_motion`; same arguments."""
+    """Least distance that is known at each step, whatever the controller: that of the `closest_motion`; same arguments.
+
+    The best of a search, so an upper estimate of the true minimum: a controller can go below it where the search
+    missed. How often that is: see `closest_motion`.
+    """
     return closest_motion(
         expert,
         learner,
@@ -78,34 +84,36 @@ def closest_motion(
     *,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
-    starts: int = 4,
-    iterations: int = 40,
+    starts: int = 5,
+    iterations: int = 20,
     seed: int = 0,
 ) -> ClosestMotion:
     """Minimises the embodiment distance over the learner's joint angles and velocities, at each step by itself.
 
     The metric has local minima, so this searches. Many random poses are compared with the expert, and the nearest of
-    each share of them starts a descent; one more starts at the expert's own angles in the joints that both arms have by
-    name. Then the best end and those of the neighbouring times are refined: what is found at one time is found at all.
-    A descent is Adam with a step that shrinks along a cosine. It needs no more of the metric than a gradient, so any
-    weights and correspondence will do, and it copes with the kinks that norms have at a match. The best point that was
-    seen is returned, with its true distance.
+    each subset is an initial guess; one more is the expert's own angles in the joints that both arms have by name. All
+    descend. Then each of twelve rounds refines the best motion of a step beside those of an earlier and a later step
+    and two random hops from it, and keeps the best: a minimum that is found at one time is tracked in both directions.
+    A descent is BFGS, see `bfgs`. It needs a gradient of the metric and nothing else, so any weights and correspondence
+    will do.
 
-    Angles stay within the joint range where that is less than a full turn; velocities are free, so that this is a bound
-    for any actuation.
+    The result is an upper estimate of the true minimum. MISS
+
+    Angles stay within the joint range where that is less than a full turn; velocities are free, so that no actuation
+    is assumed.
 
     Args:
       expert: n joints.
       learner: its n_hat joints are optimised.
-      qpos: [T, n] the expert's joint angles [rad].
+      qpos: [T, n] the expert's joint angles [rad]; successive times share what they find, so they should be in order.
       qvel: [T, n] the expert's joint velocities [rad/s].
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
-      starts: descents for each step, besides the one from the expert's own angles.
-      iterations: gradient steps of a descent; the refinement takes twice as many.
-      seed: of the random poses.
+      starts: random initial guesses for each step, besides the expert's own angles.
+      iterations: steps of the first descents; each round takes half as many.
+      seed: of the random poses and hops.
 
     Raises:
       ValueError: `qpos` or `qvel` is not [T, n], or fewer than one start or iteration.
@@ -123,81 +131,92 @@ def closest_motion(
             states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
         )
 
-    def descend(states: LinkStates, starts: _Motion, speed: Array, count: int, step: float) -> ClosestMotion:
-        objective = lambda motion: distance(states, link_states(learner, motion[0], speed * motion[1]))  # noqa: E731
-        descent = jax.vmap(lambda *start: _descend(objective, start, learner, count, step))
-        ends = descent(starts[0], starts[1] / speed)
-        end_qpos, end_qvel, end_distance = jax.tree.map(lambda x: x[jnp.argmin(ends.distance)], ends)
-        return ClosestMotion(end_qpos, speed * end_qvel, end_distance)
-
     def solve(qpos: Array, qvel: Array) -> ClosestMotion:
+        rng = np.random.default_rng(seed)
         states = jax.vmap(lambda *motion: link_states(expert, *motion))(qpos, qvel)
-        speed = jnp.maximum(jnp.abs(qvel).max(axis=1), _LEAST_SPEED)  # a descent's unit of velocity
-        first = jax.vmap(_starts(distance, expert, learner, starts, seed))(states, qpos, qvel)
-        search = functools.partial(descend, count=iterations, step=_SEARCH_STEP)
-        refine = functools.partial(descend, count=2 * iterations, step=_POLISH_STEP)
-        found = jax.vmap(search)(states, first, speed)
-        return jax.vmap(refine)(states, (_with_neighbours(found.qpos), _with_neighbours(found.qvel)), speed)
+        speed = jnp.maximum(jnp.abs(qvel).max(axis=1), _LEAST_SPEED)
+        own_qpos, own_qvel = (shared_joints(expert, learner, values) for values in (qpos, qvel))
+        guesses = _initial_poses(distance, learner, states, own_qpos, starts, rng)
+        own_speed = jnp.broadcast_to((own_qvel / speed[:, None])[:, None], guesses.shape)
+        points = jnp.concatenate([guesses, own_speed], axis=-1)
+        descend = _descents(distance, learner, states, speed)
+        found = _search(descend, points, iterations, rng)
+        end_qpos, end_qvel = jnp.split(found.point, 2, axis=-1)
+        return ClosestMotion(end_qpos, speed[:, None] * end_qvel, found.value)
 
     return jax.jit(solve)(qpos, qvel)
 
 
-def _starts(
-    distance: Callable[[LinkStates, LinkStates], Array], expert: Embodiment, learner: Embodiment, starts: int, seed: int
-) -> Callable[[LinkStates, Array, Array], _Motion]:
-    """A function of the expert's states and motion that gives [starts + 1, joints] angles and velocities."""
-
-    def choose(states: LinkStates, expert_qpos: Array, expert_qvel: Array) -> _Motion:
-        poses = _random_poses(learner, -(-_POSES // starts) * starts, seed, expert_qpos.dtype)
-        pose_states = jax.vmap(lambda pose: link_states(learner, pose))(poses)
-        tried = jax.vmap(lambda pose: distance(states, pose))(pose_states).reshape(starts, -1)
-        chosen = poses.reshape(starts, -1, learner.num_joints)[jnp.arange(starts), jnp.argmin(tried, axis=1)]
-        own_qpos, own_qvel = (shared_joints(expert, learner, values) for values in (expert_qpos, expert_qvel))
-        start_qpos = jnp.concatenate([own_qpos[None], chosen])
-        return start_qpos, jnp.broadcast_to(own_qvel, start_qpos.shape)
-
-    return choose
-
-
-def _with_neighbours(values: Float[Array, "time joints"]) -> Float[Array, "time 3 joints"]:
-    """Each time's values, with those before and after it."""
-    before, after = jnp.concatenate([values[:1], values[:-1]]), jnp.concatenate([values[1:], values[-1:]])
-    return jnp.stack([values, before, after], axis=1)
-
-
-def _descend(
-    distance: Callable[[_Motion], Array],
-    start: _Motion,
+def _initial_poses(
+    distance: _Distance,
     learner: Embodiment,
+    states: LinkStates,
+    own: Float[Array, "time joints"],
+    starts: int,
+    rng: np.random.Generator,
+) -> Float[Array, "time guesses joints"]:
+    """The given angles, then the nearest of each of `starts` subsets of random poses; other subsets at each time."""
+    count, times = -(-_POSES // starts) * starts, len(own)
+    lower, upper = np.asarray(learner.joint_range).T
+    poses = jnp.asarray(rng.uniform(lower, upper, (count, learner.num_joints)), own.dtype)
+    pose_states = jax.vmap(lambda pose: link_states(learner, pose))(poses)
+    tried = jax.vmap(lambda state: jax.vmap(lambda pose: distance(state, pose))(pose_states))(states)
+    orders = np.stack([rng.permutation(count) for _ in range(min(_VARIETY, times))]).reshape(
+        -1, starts, count // starts
+    )
+    subsets = jnp.asarray(orders)[np.arange(times) % _VARIETY]
+    distances = jnp.take_along_axis(tried[:, None], subsets, axis=2)
+    nearest = jnp.take_along_axis(subsets, jnp.argmin(distances, axis=2)[..., None], axis=2)[..., 0]
+    return jnp.concatenate([own[:, None], poses[nearest]], axis=1)
+
+
+def _descents(
+    distance: _Distance, learner: Embodiment, states: LinkStates, speed: Float[Array, " time"]
+) -> Callable[[Array, Array, int], Descent]:
+    """A function of [T, candidates, 2 joints] points and their inverse Hessians: each time's best end.
+
+    A point is the learner's angles, then its velocities in units of the expert's speed.
+    """
+    lower, upper = pose_limits(learner, speed.dtype)
+    infinite = np.full_like(upper, np.inf)
+    limits = np.concatenate([lower, -infinite]), np.concatenate([upper, infinite])
+
+    def descend(points: Array, inverses: Array, iterations: int) -> Descent:
+        def at_time(state: LinkStates, speed: Array, points: Array, inverses: Array) -> Descent:
+            def objective(point: Array) -> Array:
+                qpos, unit_qvel = jnp.split(point, 2)
+                return distance(state, link_states(learner, qpos, speed * unit_qvel))
+
+            descent = jax.vmap(lambda point, inverse: bfgs(objective, point, inverse, limits, iterations))
+            ends = descent(points, inverses)
+            return jax.tree.map(lambda x: x[jnp.argmin(ends.value)], ends)
+
+        return jax.vmap(at_time)(states, speed, points, inverses)
+
+    return descend
+
+
+def _search(
+    descend: Callable[[Array, Array, int], Descent],
+    points: Float[Array, "time guesses coordinates"],
     iterations: int,
-    first_step: float,
-) -> ClosestMotion:
-    """Adam with a step that shrinks to zero along a cosine, keeping the best point."""
-    lower, upper = pose_limits(learner, start[0].dtype)
+    rng: np.random.Generator,
+) -> Descent:
+    """Descents from all guesses, then the rounds of exchange between times and of random hops."""
+    times, _, size = points.shape
+    present = np.arange(times)
+    unknown = jnp.zeros((*points.shape, size), points.dtype)
+    hops = _HOP * rng.normal(size=(len(_SHIFTS), min(_VARIETY, times), _HOPS, size // 2))
+    hops = jnp.asarray(np.pad(hops, [(0, 0)] * 3 + [(0, size // 2)]), points.dtype)  # angles alone hop
 
-    def iterate(carry: Any, count: Array) -> tuple[Any, None]:
-        motion, mean, square, best = carry
-        value, gradient = jax.value_and_grad(distance)(motion)
-        better = value < best.distance
-        best = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old), ClosestMotion(motion[0], motion[1], value), best
-        )
-        mean = jax.tree.map(lambda m, g: _FAST * m + (1 - _FAST) * g, mean, gradient)
-        square = jax.tree.map(lambda s, g: _SLOW * s + (1 - _SLOW) * g * g, square, gradient)
-        size = 0.5 * first_step * (1 + jnp.cos(jnp.pi * count / iterations))
-        bias = jnp.sqrt(1 - _SLOW ** (count + 1)) / (1 - _FAST ** (count + 1))
-        qpos, qvel = jax.tree.map(
-            lambda x, m, s: x - size * bias * m / (jnp.sqrt(s) + jnp.finfo(s.dtype).tiny ** 0.25), motion, mean, square
-        )
-        return ((jnp.clip(qpos, lower, upper), qvel), mean, square, best), None
+    def exchange(best: Descent, settings: tuple[Array, Array]) -> tuple[Descent, None]:
+        shift, hop = settings
+        taken = jnp.stack([jnp.clip(present + way * shift, 0, times - 1) for way in (0, -1, 1)], axis=1)
+        hopped = best.point[:, None] + hop[present % _VARIETY]
+        candidates = jnp.concatenate([best.point[taken], hopped], axis=1)
+        # The curvature at a neighbour's minimum is nearly that of one's own: it saves most of the iterations.
+        inverses = jnp.concatenate([best.inverse_hessian[taken], unknown[:, :1].repeat(_HOPS, axis=1)], axis=1)
+        return descend(candidates, inverses, max(iterations // 2, 1)), None
 
-    zero = jax.tree.map(jnp.zeros_like, start)
-    start = jnp.clip(start[0], lower, upper), start[1]
-    best = ClosestMotion(*start, jnp.asarray(jnp.inf, start[0].dtype))
-    counts = jnp.arange(iterations, dtype=start[0].dtype)
-    return jax.lax.scan(iterate, (start, zero, zero, best), counts)[0][3]
-
-
-def _random_poses(arm: Embodiment, count: int, seed: int, dtype: Any) -> Float[Array, "count joints"]:
-    lower, upper = np.asarray(arm.joint_range).T
-    return jnp.asarray(np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)), dtype)
+    best = descend(points, unknown, iterations)
+    return jax.lax.scan(exchange, best, (jnp.asarray(_SHIFTS), hops))[0]

@@ -70,7 +70,10 @@ class Evaluator:
 
     @property
     def lower_bound(self) -> Float[np.ndarray, "demonstrations time"]:
-        """The kinematic bound; computed when it is first asked for, if not before."""
+        """The kinematic bound, which is the best of a search and so an upper estimate of the true minimum.
+
+        Computed when it is first asked for, if not before. Reports have called it `lower_bound` since they exist.
+        """
         return self._references().bound
 
     @property

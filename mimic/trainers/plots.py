@@ -53,7 +53,7 @@ def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, con
         axes.plot(time, evaluator.hold_distance[part].mean(axis=0), ":", color="grey", label="holding the start pose")
         axes.plot(time, distance.mean(axis=0), color=_COLOURS[split], label=f"{controller}, mean")
         axes.fill_between(time, low, high, color=_COLOURS[split], alpha=0.2, lw=0, label=f"{controller}, 10 to 90 %")
-        axes.plot(time, evaluator.lower_bound[part].mean(axis=0), "k--", lw=1, label="lower bound")
+        axes.plot(time, evaluator.lower_bound[part].mean(axis=0), "k--", lw=1, label="kinematic bound")
         axes.set(xlabel="time [s]", title=f"{_LABELS[split]} demonstrations: {len(distance)}")
         axes.grid(alpha=0.3)
     all_axes[0].set(ylabel="embodiment distance", ylim=(0, None))  # shared, so after all is drawn
@@ -82,7 +82,7 @@ def plot_demonstrations(
         below.vlines(place, bound, hold, color="lightgrey", lw=1)
         below.plot(place, hold, "_", color="grey", markersize=4, label="holding the start pose")
         below.plot(place, distance, ".", color=_COLOURS[split], label=controller)
-        below.plot(place, bound, "k_", markersize=4, label="lower bound")
+        below.plot(place, bound, "k_", markersize=4, label="kinematic bound")
         above.set(title=f"{_LABELS[split]}: {count}")
         below.set(xlabel="place, worst gap first", xlim=(0, count + 1))
         below.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(7, integer=True, min_n_ticks=1))

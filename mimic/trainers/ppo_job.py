@@ -129,8 +129,8 @@ class PPOJob(Job):
         by_split = (
             ("optimality gap", "optimality_gap", "{:.2%}"),
             ("mean distance", "mean_distance", "{:.4f}"),
-            ("  lower bound (gap 0)", "lower_bound", "{:.4f}"),
-            ("  holding the start pose (gap 1)", "hold_distance", "{:.4f}"),
+            ("  kinematic bound (gap 0)", "lower_bound", "{:.4f}"),
+            ("  holding start pose (1)", "hold_distance", "{:.4f}"),
             ("angle to expert links", "link_angle_error_deg", "{:.1f} deg"),
             ("angular velocity error", "angular_velocity_error", "{:.2f} rad/s"),
             ("torque / largest, rms", "torque_rms", "{:.1%}"),
