@@ -41,7 +41,7 @@ class MetricConfig:
       reduction: "mean" or "frobenius".
     """
 
-    translation: float = 0.5
+    translation: float = 1.0
     rotation: float = 1.0
     linear_velocity: float = 0.001
     angular_velocity: float = 0.01
