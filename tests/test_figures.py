@@ -39,7 +39,7 @@ def test_planar_arms_are_seen_from_above():
 
 @pytest.mark.slow
 def test_figures_without_a_mapper(tmp_path):
-    names = ["links", "correspondence", "weights", "contours"]
+    names = ["links", "correspondence", "similarity", "weights", "contours"]
     assert prepare_figures(FiguresConfig(out=str(tmp_path), only=names))() == 0
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
     with pytest.raises(ValueError, match="exists; name another folder"):
@@ -52,7 +52,7 @@ def test_figures_without_a_mapper(tmp_path):
         (FiguresConfig(), "out: expected a folder"),
         (
             FiguresConfig(out="new", only=["contour"]),
-            "expected some of links, correspondence, weights, contours, planar, panda",
+            "expected some of links, correspondence, similarity, weights, contours, planar, panda",
         ),
         (FiguresConfig(out=__file__), "is a file"),
     ],
