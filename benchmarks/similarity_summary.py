@@ -150,7 +150,8 @@ def save_plot(rows: Rows, path: Path) -> None:
     for method in compared:
         if method not in BASELINES:
             families.setdefault(method.rsplit(" ", 1)[0], []).append(method)
-    for axes, (x, y) in zip(panels, axes_of, strict=True):
+    # Labels of the family that is nearest to the origin go below its points, where no other line is.
+    for axes, (x, y), below in zip(panels, axes_of, ("kept arc_length", "kept overlap"), strict=True):
         for family, methods in families.items():
             points = np.array([[compared[method][name]["ratio"] for name in (x, y)] for method in methods])
             (line,) = axes.plot(*points.T, "-", lw=1, label=family.replace("_", " "))
@@ -158,7 +159,7 @@ def save_plot(rows: Rows, path: Path) -> None:
                 on_front = method in front
                 fill = line.get_color() if on_front else "white"
                 axes.plot(*point, "o", ms=7, color=line.get_color(), mfc=fill)
-                _label(axes, method, point, line.get_color())
+                _label(axes, method.rsplit(" ", 1)[1], point, line.get_color(), below=family == below)
         for method, (marker, label) in _REFERENCES.items():
             if method in compared:
                 point = [compared[method][name]["ratio"] for name in (x, y)]
@@ -176,10 +177,8 @@ def save_plot(rows: Rows, path: Path) -> None:
     plt.close(figure)
 
 
-def _label(axes: Any, method: str, point: np.ndarray, colour: str) -> None:
-    """The translation weight beside a point; of the overlap below it, where the other lines' labels are not."""
-    family, weight = method.rsplit(" ", 1)
-    below = family == "kept overlap"
+def _label(axes: Any, weight: str, point: np.ndarray, colour: str, *, below: bool) -> None:
+    """The translation weight beside a point."""
     offset, align = ((-5, -5), ("right", "top")) if below else ((5, 5), ("left", "bottom"))
     style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": colour}
     axes.annotate(weight, point, xytext=offset, ha=align[0], va=align[1], **style)
