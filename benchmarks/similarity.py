@@ -187,7 +187,7 @@ def _rows_so_far(path: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
     content = json.loads(path.read_text())
     if content["settings"] != settings:
         sys.exit(f"error: {path} was made with {content['settings']}, not with {settings}")
-    return content["rows"]
+    return similarity_summary.from_lines(content["rows"])
 
 
 def main() -> None:
@@ -220,7 +220,12 @@ def main() -> None:
         rows += run_pair(pair, options)
         print(f"{pair.name}: {time.perf_counter() - began:.0f} s", flush=True)
         summary = similarity_summary.summarise(rows)
-        content = {"settings": settings, "not_found": missing, "summary": summary, "rows": rows}
+        content = {
+            "settings": settings,
+            "not_found": missing,
+            "summary": summary,
+            "rows": similarity_summary.to_lines(rows),
+        }
         write_results(options.out, "similarity", options.commit, **content)
     similarity_summary.print_tables(rows)
     if options.plot:

@@ -21,6 +21,34 @@ SHORT = dict(zip(MEASURES, ("centre line", "tangents", "Frechet", "hand pos.", "
 DEMONSTRATIONS = "pd", "reach"
 
 
+def to_lines(rows: Rows) -> list[str]:
+    """Rows as lines of a table, which take a quarter of the space of nested JSON; the first names the columns.
+
+    Each measure has its mean and 90 % quantile; a set of poses that could not be made has the reason as its method.
+    """
+    columns = [f"{name}{suffix}" for name in MEASURES for suffix in ("", " q90")]
+    lines = [";".join(["pair", "set", "poses", "method", *columns])]
+    for row in rows:
+        values = [] if "failed" in row else [f"{value:g}" for name in MEASURES for value in row["measures"][name]]
+        words = [row["pair"], row["set"], str(row.get("poses", 0)), row.get("failed", row.get("method"))]
+        lines.append(";".join([*words, *values]))
+    return lines
+
+
+def from_lines(lines: Sequence[str]) -> Rows:
+    """The rows that `to_lines` wrote."""
+    rows = []
+    for line in lines[1:]:
+        pair, poses_set, poses, method, *numbers = line.split(";")
+        if numbers:
+            values = list(map(float, numbers))
+            measures = {name: values[2 * i : 2 * i + 2] for i, name in enumerate(MEASURES)}
+            rows.append({"pair": pair, "set": poses_set, "poses": int(poses), "method": method, "measures": measures})
+        else:
+            rows.append({"pair": pair, "set": poses_set, "failed": method})
+    return rows
+
+
 def is_lock(row: dict[str, Any]) -> bool:
     """Of a Panda with one or two joints locked: the 28 that a default is chosen on."""
     return row["pair"].startswith("panda -") and row["pair"].count(",") <= 1
@@ -122,7 +150,8 @@ def save_plot(rows: Rows, path: Path) -> None:
     for method in compared:
         if method not in BASELINES:
             families.setdefault(method.rsplit(" ", 1)[0], []).append(method)
-    for axes, (x, y) in zip(panels, axes_of, strict=True):
+    # Labels of the family that is nearest to the origin go below its points, where no other line is.
+    for axes, (x, y), below in zip(panels, axes_of, ("kept arc_length", "kept overlap"), strict=True):
         for family, methods in families.items():
             points = np.array([[compared[method][name]["ratio"] for name in (x, y)] for method in methods])
             (line,) = axes.plot(*points.T, "-", lw=1, label=family.replace("_", " "))
@@ -130,7 +159,7 @@ def save_plot(rows: Rows, path: Path) -> None:
                 on_front = method in front
                 fill = line.get_color() if on_front else "white"
                 axes.plot(*point, "o", ms=7, color=line.get_color(), mfc=fill)
-                axes.annotate(method.rsplit(" ", 1)[1], point, xytext=(5, 5), textcoords="offset points", fontsize=8)
+                _label(axes, method.rsplit(" ", 1)[1], point, line.get_color(), below=family == below)
         for method, (marker, label) in _REFERENCES.items():
             if method in compared:
                 point = [compared[method][name]["ratio"] for name in (x, y)]
@@ -146,6 +175,13 @@ def save_plot(rows: Rows, path: Path) -> None:
     )
     figure.savefig(path, dpi=130)
     plt.close(figure)
+
+
+def _label(axes: Any, weight: str, point: np.ndarray, colour: str, *, below: bool) -> None:
+    """The translation weight beside a point."""
+    offset, align = ((-5, -5), ("right", "top")) if below else ((5, 5), ("left", "bottom"))
+    style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "color": colour}
+    axes.annotate(weight, point, xytext=offset, ha=align[0], va=align[1], **style)
 
 
 _REFERENCES = {"align_segments": ("s", "align segments"), "hand_ik": ("D", "hand IK")}

@@ -62,7 +62,7 @@ def test_a_planar_arm_is_drawn_through_its_joints_wherever_its_frames_sit():
 
 @pytest.mark.slow
 def test_figures_without_a_mapper(tmp_path):
-    names = ["links", "correspondence", "points", "weights", "contours"]
+    names = ["links", "correspondence", "points", "similarity", "weights", "contours"]
     assert prepare_figures(FiguresConfig(out=str(tmp_path), only=names))() == 0
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}
     with pytest.raises(ValueError, match="exists; name another folder"):
@@ -75,7 +75,7 @@ def test_figures_without_a_mapper(tmp_path):
         (FiguresConfig(), "out: expected a folder"),
         (
             FiguresConfig(out="new", only=["contour"]),
-            "expected some of links, correspondence, points, weights, contours, planar, panda",
+            "expected some of links, correspondence, points, similarity, weights, contours, planar, panda",
         ),
         (FiguresConfig(out=__file__), "is a file"),
     ],

@@ -86,6 +86,11 @@ ROWS = [
 ]
 
 
+def test_rows_are_read_as_they_are_written():
+    rows = [{**entry, "poses": 3} for entry in ROWS] + [{"pair": "a to panda", "set": "pd", "failed": "no goal"}]
+    assert summary.from_lines(summary.to_lines(rows)) == rows
+
+
 def test_ratios_and_cases_lost():
     compared = summary.compare(ROWS, summary.is_lock, "copy_joints", ("pd",))
     assert list(compared) == ["copy_joints", "kept overlap 1", "kept overlap 2"]
