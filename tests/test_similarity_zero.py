@@ -15,8 +15,8 @@ from mimic.pose import imitate_pose
 
 # Every set of locked joints but all seven: 127.
 LOCKS = [joints for count in range(7) for joints in itertools.combinations(range(1, 8), count)]
-HANDFUL = [(), (3, 6, 7), (2, 3, 6, 7), (1, 2, 3, 4, 5, 6)]
-METRIC = MetricConfig()
+HANDFUL = [(3, 6, 7), (2, 3, 6, 7), (1, 2, 3, 4, 5, 6)]
+METRIC, DIRECTIONS = MetricConfig(), MetricConfig(correspondence="overlap", translation=0.0)
 
 
 def zero_states(arm):
@@ -28,7 +28,7 @@ def test_there_are_127_locked_pandas():
     assert len(LOCKS) == 127
 
 
-@pytest.mark.parametrize("metric", [METRIC, MetricConfig(correspondence="overlap", translation=0.0)], ids=str)
+@pytest.mark.parametrize("metric", [METRIC, DIRECTIONS], ids=["default", "directions"])
 def test_the_distance_is_zero_at_the_zero_pose(metric):
     """1e-6: what issue 23 asks for; float32 rounds positions to 1e-7 chain lengths."""
     expert = panda()
@@ -55,21 +55,22 @@ def test_the_distance_is_not_zero_elsewhere():
         assert embodiment_distance(expert_states, learner_states, matrix, weights) > 1e-3
 
 
-def stays(joints):
+def stays(joints, **options):
     expert, learner = panda(), panda(locked=joints)
     correspondence = METRIC.make_correspondence(expert, learner)
-    found = imitate_pose(expert, learner, np.zeros(7, np.float32), correspondence, METRIC.make_weights())
-    states = link_states(expert, np.zeros(7, np.float32)), link_states(learner, found.qpos)
+    pose = np.zeros(7, np.float32)
+    found = imitate_pose(expert, learner, pose, correspondence, METRIC.make_weights(), **options)
+    states = link_states(expert, pose), link_states(learner, found.qpos)
     # The pose itself need not be 0: where joints are collinear, as 1, 3 and 5 are there, only their sum counts.
     return found.distance <= 1e-6 and found.converged and np.allclose(*(x.position for x in states), atol=1e-5)
 
 
-@pytest.mark.parametrize("joints", HANDFUL)
+@pytest.mark.parametrize("joints", HANDFUL, ids=str)
 def test_the_optimiser_stays_at_the_zero_pose(joints):
     assert stays(joints)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("joints", sorted(set(LOCKS) - set(HANDFUL)))
+@pytest.mark.parametrize("joints", sorted(set(LOCKS) - set(HANDFUL)), ids=str)
 def test_the_optimiser_stays_at_the_zero_pose_whatever_is_locked(joints):
-    assert stays(joints)
+    assert stays(joints, kept=None)  # which takes half as long to compile
