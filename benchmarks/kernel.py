@@ -32,12 +32,15 @@ from benchmarks import kernel_peers
 from benchmarks.kernel_figure import plot
 from benchmarks.record import write_results
 from benchmarks.timing import Timing, compiled, time_call
+from mimic.envs.config import MetricConfig
 
 BATCHES = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
 LINKS = (3, 4, 7, 16, 32, 64)
 METHODS = ("torch", "torch.compile", "mimic", "composition", "matrices")  # JAX keeps the memory that it took
 QUANTITIES = {"value": (), "gradient": (2, 3), "all": (0, 1, 2, 3)}  # what is differentiated by
-WEIGHTS = mimic.PAPER_WEIGHTS
+METRIC = MetricConfig()
+WEIGHTS = METRIC.make_weights()
+assert isinstance(WEIGHTS, mimic.DistanceWeights)  # constants, in the default metric
 PATIENCE = 1.0  # s a call; the next case is about ten times as large
 JUDGED = 1000  # pairs that are compared with double precision
 TWO_TO = {"copy": 26, "multiply_add": 22}  # numbers that the limits are measured with
@@ -63,7 +66,7 @@ def planar_pair(links: int) -> Arms:
 
 def jax_distance(method: str, arms: Arms) -> Function:
     """Of one sample."""
-    correspondence = mimic.overlap_correspondence(arms.expert, arms.learner)
+    correspondence = METRIC.make_correspondence(arms.expert, arms.learner)
     if method == "mimic":
         return mimic.motion_distance(arms.expert, arms.learner, correspondence, WEIGHTS)
     if method == "matrices":
@@ -130,7 +133,7 @@ def run_torch(method: str, arms: Arms, batch: int, quantity: str) -> dict[str, A
     by = QUANTITIES[quantity]
     for index in by:
         inputs[index].requires_grad_()
-    matrix = np.asarray(mimic.overlap_correspondence(arms.expert, arms.learner))
+    matrix = np.asarray(METRIC.make_correspondence(arms.expert, arms.learner))
     distance = kernel_peers.torch_distance(arms.expert, arms.learner, matrix, WEIGHTS, device)
     if method == "torch.compile":
         distance = torch.compile(distance)

@@ -26,8 +26,9 @@ from rich.table import Table
 import mimic
 from benchmarks.record import write_results
 from mimic.envs.arms import Arm, ArmConfig, build_arm
+from mimic.envs.config import MetricConfig
 
-DIRECTIONS = mimic.DistanceWeights(translation=0.0, rotation=1.0)
+METRIC = MetricConfig()
 REPEATS = 5
 EXHAUSTIVE = {"starts": 512, "iterations": 60}
 CHUNK = 500  # poses that are searched exhaustively at once
@@ -53,12 +54,12 @@ PAIRS = {
 
 def optimiser(expert: Arm, learner: Arm, method: Any, **options: Any) -> _Solver:
     """`imitate_pose`, compiled once."""
-    correspondence = mimic.overlap_correspondence(expert.embodiment, learner.embodiment)
+    correspondence = METRIC.make_correspondence(expert.embodiment, learner.embodiment)
 
     @jax.jit
     def solve(qpos: jax.Array) -> jax.Array:
         pair = expert.embodiment, learner.embodiment
-        return mimic.imitate_pose(*pair, qpos, correspondence, DIRECTIONS, method=method, **options).qpos
+        return mimic.imitate_pose(*pair, qpos, correspondence, METRIC.make_weights(), method=method, **options).qpos
 
     return lambda qpos: np.asarray(solve(jnp.asarray(qpos)))
 
@@ -66,8 +67,7 @@ def optimiser(expert: Arm, learner: Arm, method: Any, **options: Any) -> _Solver
 def with_mink(expert: Arm, learner: Arm) -> _Solver:
     """mink: orientation tasks on corresponding links, one pose after the other."""
     model, arm = learner.model, learner.embodiment
-    overlap = np.asarray(mimic.overlap_correspondence(expert.embodiment, arm))
-    partner = overlap.argmax(axis=0)
+    partner = np.asarray(METRIC.make_correspondence(expert.embodiment, arm)).argmax(axis=0)
     zero = mujoco.MjData(model)
     mujoco.mj_forward(model, zero)
     frames = jax.jit(jax.vmap(lambda q: mimic.forward_kinematics(expert.embodiment, q).rotation))
@@ -130,13 +130,13 @@ def measure(solver: _Solver, qpos: np.ndarray, repeats: int) -> dict[str, Any]:
 def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> dict[str, Any]:
     """All methods on one pair of arms."""
     expert, learner = map(build_arm, PAIRS[name])
-    correspondence = mimic.overlap_correspondence(expert.embodiment, learner.embodiment)
+    correspondence = METRIC.make_correspondence(expert.embodiment, learner.embodiment)
 
     @jax.jit
     @jax.vmap
     def distance(qpos: jax.Array, learner_qpos: jax.Array) -> jax.Array:
         states = mimic.link_states(expert.embodiment, qpos), mimic.link_states(learner.embodiment, learner_qpos)
-        return mimic.embodiment_distance(*states, correspondence, DIRECTIONS)
+        return mimic.embodiment_distance(*states, correspondence, METRIC.make_weights())
 
     rng = np.random.default_rng(0)
 

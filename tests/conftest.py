@@ -25,6 +25,7 @@ CORE = (
     "similarity",
     "imitation",
     "objective",
+    "closed_form",
     "pose",
     "motion",
 )
