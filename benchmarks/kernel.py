@@ -19,7 +19,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -39,8 +39,7 @@ LINKS = (3, 4, 7, 16, 32, 64)
 METHODS = ("torch", "torch.compile", "mimic", "composition", "matrices")  # JAX keeps the memory that it took
 QUANTITIES = {"value": (), "gradient": (2, 3), "all": (0, 1, 2, 3)}  # what is differentiated by
 METRIC = MetricConfig()
-WEIGHTS = METRIC.make_weights()
-assert isinstance(WEIGHTS, mimic.DistanceWeights)  # constants, in the default metric
+WEIGHTS = cast(mimic.DistanceWeights, METRIC.make_weights())  # constants, in the default metric
 PATIENCE = 1.0  # s a call; the next case is about ten times as large
 JUDGED = 1000  # pairs that are compared with double precision
 TWO_TO = {"copy": 26, "multiply_add": 22}  # numbers that the limits are measured with
