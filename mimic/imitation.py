@@ -20,7 +20,7 @@ _LEAST_SPEED = 1e-2  # rad/s, of the unit that the velocities are optimised in
 # One round of exchange each: how many steps before and after it a time takes the motion of. The long ones spread a
 # minimum quickly, the short ones track it.
 _SHIFTS = (1, 2, 4, 1, 8, 1, 2, 1, 1, 1, 1, 1)
-_HOPS, _HOP = 2, 1.0  # random steps from the best motion that each round tries, and their standard deviation [rad]
+_HOPS, _HOP = 1, 1.0  # random steps from the best motion that each round tries, and their standard deviation [rad]
 _VARIETY = 32  # after so many steps the random numbers recur, so that a long motion makes no large constants
 
 _Distance = Callable[[LinkStates, LinkStates], Array]
@@ -93,7 +93,7 @@ def closest_motion(
     The metric has local minima, so this searches. Many random poses are compared with the expert, and the nearest of
     each subset is an initial guess; one more is the expert's own angles in the joints that both arms have by name. All
     descend. Then each of twelve rounds refines the best motion of a step beside those of an earlier and a later step
-    and two random hops from it, and keeps the best: a minimum that is found at one time is tracked in both directions.
+    and a random hop from it, and keeps the best: a minimum that is found at one time is tracked in both directions.
     A descent is BFGS, see `bfgs`. It needs a gradient of the metric and nothing else, so any weights and correspondence
     will do.
 
