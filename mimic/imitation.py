@@ -99,7 +99,7 @@ def closest_motion(
 
     The result is the best of this search, an upper estimate of the true minimum. Against a reference of three searches,
     the longest of them from 64 random poses, at none of 6600 steps of ten pairs of arm and metric it was off by more
-    than 1e-3, and at 19 by more than 0.1 %, at most 2.4e-4 (`benchmarks.bound`, benchmarks/results/bound_cpu.json).
+    than 1e-3, and at 21 by more than 0.1 %, at most 2.6e-4 (`benchmarks.bound`, benchmarks/results/bound_cpu.json).
 
     Angles stay within the joint range where that is less than a full turn; velocities are free, so that no actuation
     is assumed.
