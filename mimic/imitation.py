@@ -20,7 +20,7 @@ _LEAST_SPEED = 1e-2  # rad/s, of the unit that the velocities are optimised in
 # One round of exchange each: how many steps before and after it a time takes the motion of. The long ones spread a
 # minimum quickly, the short ones track it.
 _SHIFTS = (1, 2, 4, 1, 8, 1, 2, 1, 1, 1, 1, 1)
-_HOPS, _HOP = 2, 1.0  # random steps from the best motion that each round tries, and their standard deviation [rad]
+_HOPS, _HOP = 1, 1.0  # random steps from the best motion that each round tries, and their standard deviation [rad]
 _VARIETY = 32  # after so many steps the random numbers recur, so that a long motion makes no large constants
 
 _Distance = Callable[[LinkStates, LinkStates], Array]
@@ -93,11 +93,13 @@ def closest_motion(
     The metric has local minima, so this searches. Many random poses are compared with the expert, and the nearest of
     each subset is an initial guess; one more is the expert's own angles in the joints that both arms have by name. All
     descend. Then each of twelve rounds refines the best motion of a step beside those of an earlier and a later step
-    and two random hops from it, and keeps the best: a minimum that is found at one time is tracked in both directions.
+    and a random hop from it, and keeps the best: a minimum that is found at one time is tracked in both directions.
     A descent is BFGS, see `bfgs`. It needs a gradient of the metric and nothing else, so any weights and correspondence
     will do.
 
-    The result is an upper estimate of the true minimum. MISS
+    The result is the best of this search, an upper estimate of the true minimum. Against a reference of three searches,
+    the longest of them from 64 random poses, at none of 6600 steps of ten pairs of arm and metric it was off by more
+    than 1e-3, and at 21 by more than 0.1 %, at most 2.6e-4 (`benchmarks.bound`, benchmarks/results/bound_cpu.json).
 
     Angles stay within the joint range where that is less than a full turn; velocities are free, so that no actuation
     is assumed.
