@@ -35,12 +35,18 @@ def collect(folder: Path) -> dict[str, Any]:
         if not match[3]:
             gap = _history(path.parent)
             entry |= {"best_gap": min(gap), "final_gap": gap[-1], "env_steps": report["env_steps"]}
-        if report.get("frequency_rad_s"):
-            entry["frequency_rad_s"] = report["frequency_rad_s"]
+        entry |= {key: report[key] for key in ("frequency_rad_s", "starts") if report.get(key)}
+        if "similarity" in report:
+            entry["similarity"] = _rounded(report["similarity"])
         if (path.parent / "quality.csv").is_file() and (match[1] in _SIMULATIONS[:2] and match[2] == "0"):
             entry["curves"] = _curves(path.parent / "quality.csv")
         found[match[1] + (match[3] or "")].append(entry)
     return {name: sorted(entries, key=lambda entry: entry["seed"]) for name, entries in found.items()}
+
+
+def _rounded(values: Any) -> Any:
+    """Nested numbers with four digits behind the point, which is more than the measures mean."""
+    return round(values, 4) if isinstance(values, float) else {key: _rounded(value) for key, value in values.items()}
 
 
 def _history(run: Path) -> list[float]:
