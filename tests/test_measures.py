@@ -14,7 +14,8 @@ from mimic.envs.imitation import training_and_held_out
 from mimic.kinematics import link_state_table
 from mimic.trainers import plots
 from mimic.trainers.evaluation import Evaluator, Rollouts
-from mimic.trainers.measures import measure
+from mimic.trainers.measures import gaps, has_gap, measure
+from mimic.trainers.ppo_job import PPOJob
 from mimic.trainers.tracking import run_controller
 
 COUNT, HELD_OUT, HORIZON = 5, 4, 30
@@ -152,6 +153,46 @@ def test_the_worst_are_named_by_their_number_in_the_split(evaluator):
     assert list(worst["held_out"].values()) == pytest.approx([0.9, 0.8, 0.7], rel=1e-5)
 
 
+def test_similarity_of_a_turned_arm_is_in_the_report(evaluator):
+    """The second link, 0.4 of the chain, is turned by 0.5 rad: all in closed form. Tolerances of float32."""
+    summary = evaluator.similarity_summary(rollouts(evaluator, turned=(0.0, 0.5)), "policy")
+    assert list(summary) == ["policy", "nearest_poses", "copy_joints", "hand_ik", "hold_home"]  # two links are no elbow
+    expected = {
+        "centre_line_distance": 0.4 * np.sin(0.25) * 0.4,
+        "tangent_angle_deg": np.degrees(0.5) * 26 / 64,  # 26 of 64 samples lie on the second link
+        "hand_position_error": 2 * np.sin(0.25) * 0.4,
+        "hand_angle_deg": np.degrees(0.5),
+    }
+    for split in SPLITS:
+        for key, value in expected.items():
+            assert summary["policy"][key][split] == pytest.approx(value, rel=2e-3)  # 64 samples of the centre line
+        for exact in ("nearest_poses", "copy_joints"):  # the learner is the expert's equal
+            assert all(summary[exact][key][split] < 1e-5 for key in expected)
+        assert summary["hold_home"]["centre_line_distance"][split] > 0.05
+        assert summary["hand_ik"]["hand_position_error"][split] < 0.05  # interpolated between every fifth sample
+
+
+def test_a_gap_that_would_mean_nothing_is_not_given():
+    distance, bound, hold = np.array([[0.2, 0.2, 0.0], [0.087, 0.075, 0.0], [0.101, 0.1, 0.0]])
+    found = gaps(distance, bound, hold)
+    assert np.isnan(found[[0, 2]]).all() and found[1] == pytest.approx(5.0)
+    assert has_gap(0.075, 0.1) and not has_gap(0.0751, 0.1)
+
+
+def test_a_report_says_why_there_is_no_gap(evaluator):
+    """The bound is raised to where it saves less than a quarter of the distance of holding the start pose."""
+    close = copy.copy(evaluator)
+    references = evaluator._references()
+    close._references = lambda: references._replace(bound=0.9 * references.hold)  # pyright: ignore
+    ran = rollouts(evaluator, distance=2 * references.hold)
+    figures = {**close.summary(ran), "worst_demonstrations": close.worst(ran)}
+    assert all(np.isnan(gap) for gap in figures["optimality_gap"].values())
+    assert figures["worst_demonstrations"] == {"train": {}, "held_out": {}}
+    rows = PPOJob.rows(object.__new__(PPOJob), figures)
+    assert rows[0] == ("optimality gap", "none", "none") and "saves less than" in rows[1][0]
+    assert rows[2][0] == "mean distance" and float(rows[2][1]) > 0
+
+
 def test_the_table_as_a_file(evaluator, tmp_path):
     ran = between(evaluator, np.linspace(0.1, 0.9, COUNT + HELD_OUT))
     evaluator.save_table(ran, tmp_path / "demonstrations.csv")
@@ -160,7 +201,7 @@ def test_the_table_as_a_file(evaluator, tmp_path):
         rows = list(csv.DictReader(file))
     numbers = [("train", str(i)) for i in range(COUNT)] + [("held_out", str(i)) for i in range(HELD_OUT)]
     assert [(row["split"], row["demonstration"]) for row in rows] == numbers
-    for key, values in evaluator.table(ran).items():
+    for key, values in {**evaluator.table(ran), **evaluator.similarity(ran.qpos)}.items():
         written = np.array([row[key] for row in rows], values.dtype)  # digits enough for its precision
         np.testing.assert_array_equal(written, values)
 
@@ -189,10 +230,12 @@ def test_holding_is_what_the_gap_is_measured_against(evaluator):
 
 def test_exact_dynamics_track_better_than_none(evaluator):
     feedback, exact = (run_controller(evaluator, name)[0] for name in ("pd", "computed_torque"))
-    gaps = [evaluator.summary(ran)["optimality_gap"] for ran in (exact, feedback)]
+    found = [evaluator.summary(ran)["optimality_gap"] for ran in (exact, feedback)]
     for split in SPLITS:
-        assert gaps[0][split] < 1e-3  # 1e-4 by measurement: a torque is held for 0.1 s while the dynamics go on
-        assert 5 * gaps[0][split] < gaps[1][split] < 0.05  # 4e-3 by measurement: it does without the coupling of joints
+        # 1.3e-3 by measurement: a torque is held for 0.1 s while the dynamics go on, and near a match the distance of
+        # positions grows with the error itself, not with its square.
+        assert found[0][split] < 3e-3
+        assert 5 * found[0][split] < found[1][split] < 0.1  # it does without the coupling of joints
 
 
 def test_controllers_that_ask_for_too_much_get_the_largest_torque(evaluator):

@@ -137,4 +137,5 @@ def has_gap(bound: Any, hold: Any) -> Any:
     Else the optimality gap divides by next to nothing, and small motions that the learner cannot follow at all give
     gaps of hundreds of percent.
     """
-    return np.asarray(bound) <= (1 - LEAST_SPAN) * np.asarray(hold)
+    bound, hold = np.asarray(bound), np.asarray(hold)
+    return (bound <= (1 - LEAST_SPAN) * hold) & (hold > 0)
