@@ -30,7 +30,7 @@ def test_there_are_127_locked_pandas():
 
 @pytest.mark.parametrize("metric", [METRIC, DIRECTIONS], ids=["default", "directions"])
 def test_the_distance_is_zero_at_the_zero_pose(metric):
-    """1e-6: what issue 23 asks for; float32 rounds positions to 1e-7 chain lengths."""
+    """1e-6: float32 rounds positions to 1e-7 chain lengths."""
     expert = panda()
 
     @jax.jit  # once for all: each of the arms has the expert's seven links
