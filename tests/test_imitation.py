@@ -205,7 +205,7 @@ def test_bad_input_is_named(unchecked):
     bound = functools.partial(
         kinematic_bound, arm, arm, correspondence=overlap_correspondence(arm, arm), weights=PAPER_WEIGHTS
     )
-    for qpos, qvel in ((good[0], good[0]), (good[:, :1], good[:, :1]), (good, good[:2])):
+    for qpos, qvel in ((good[0], good[0]), (good[:, :1], good[:, :1]), (good, good[:2]), (good[:0], good[:0])):
         with pytest.raises(ValueError, match="qpos, qvel: expected shape"):
             bound(qpos, qvel)
     with pytest.raises(ValueError, match="starts, iterations: expected at least 1, got 0"):
