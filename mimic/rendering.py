@@ -74,6 +74,15 @@ class ArmScene:
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
 
+    def flattened(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+        """Points as the camera sees them from afar: to its right and upwards, in their own units."""
+        azimuth, elevation = np.radians([self._camera.azimuth, self._camera.elevation])
+        forward = np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+        return points @ np.stack([right, np.cross(right, forward)], axis=1)
+
     def __enter__(self) -> "ArmScene":
         return self
 

@@ -54,6 +54,28 @@ def test_drawings_hold_their_numbers():
     table = drawing.heat_maps(np.eye(2), np.array([[0.25, 3.0], [0, 1]]), ["link1", "<b>"], ["link1+link2", "tip"])
     assert all(text in table for text in (">1.00<", ">0.25<", ">3.00<", ">1+2<", "&lt;b&gt;")) and "<b>" not in table
     assert ">0.1235<" in drawing.numbers(0.12345, 0.1) and "…" in drawing.numbers(0.1, float("nan"))
+    assert ">12.9<" in drawing.heat_maps(np.array([[12.94]]), np.eye(1), ["link1"], ["link1"])  # five do not fit
+    mixed = {"hand_angle_deg": 4.0, "centre_line_distance": 0.01, "tangent_angle_deg": 2.0}  # as jit sorts them
+    shown = drawing.numbers(0.1, 0.1, similarity=mixed)
+    assert shown.index("centre line") < shown.index("tangent angle") < shown.index("hand angle")
     time_s, unknown = np.linspace(0, 1, 5), np.array([np.nan, np.nan, 0.1, 0.1, 0.1])
     svg = drawing.chart(time_s, [("distance", time_s, "red"), ("bound", unknown, "black")], now=0.5)
     assert svg.count("<polyline") == 2 and "nan" not in svg
+    level = drawing.chart(time_s, [("distance", np.zeros(5), "red")])
+    assert ">0.000<" in level and ">0.005<" in level and ">0.010<" in level  # three different ones
+
+
+def test_the_chart_is_level_while_the_arms_rest(monkeypatch):
+    from mimic.viewing import viewer
+    from mimic.viewing.live import Frame
+
+    now = iter([0.0, 1.0, 1.03, 9.0, 9.03])
+    monkeypatch.setattr(viewer.time, "perf_counter", lambda: next(now))
+    drawn = {}
+    monkeypatch.setattr(drawing, "chart", lambda time, curves: drawn.update(time=time, distance=curves[0][1]) or "")
+    history = viewer.History()
+    for distance in (0.0, 0.0, 0.4, 0.2):
+        history.add(Frame({}, {}, (), (), (), distance, 0.0, np.eye(1), np.eye(1), {}))
+    history.chart()
+    assert np.interp(8.9, drawn["time"], drawn["distance"]) == 0  # at rest until 9 s, no ramp from 1 s on
+    assert list(drawn["distance"]) == [0.0, 0.0, 0.0, 0.4, 0.2]

@@ -235,7 +235,8 @@ class InspectConfig:
       expert: what it shall imitate.
       limits: see `EnvConfig`.
       bound: whether to say how near the learner can come, which takes a minute.
-      out: new folder for a picture of both arms with their correspondence, and for what was found as JSON.
+      out: new folder for a picture of both arms with their correspondence, one of poses of the expert with the
+        learner's nearest ones (where `bound`), and for what was found as JSON.
     """
 
     learner: ArmConfig = dataclasses.field(default_factory=ArmConfig)

@@ -19,12 +19,13 @@ from rich.table import Table  # noqa: E402
 
 from mimic.envs.arms import Arm, ArmConfig, build_arm, effective_inertia, rated_speed, torque_scale  # noqa: E402
 from mimic.envs.config import EnvConfig, InspectConfig  # noqa: E402
-from mimic.envs.preflight import assumptions, calmed, doubts, joint_ranges, nearness  # noqa: E402
+from mimic.envs.preflight import Nearness, assumptions, calmed, doubts, joint_ranges, nearness  # noqa: E402
 from mimic.rendering import ArmScene  # noqa: E402
 from mimic.trainers.measures import pose_similarity  # noqa: E402
+from mimic.trainers.pose_picture import PosePairs, nearest_poses, readable_poses, save_poses  # noqa: E402
 from mimic.trainers.progress import similarity_table  # noqa: E402
 
-_PICTURE, _FINDINGS = "arms.png", "inspection.json"
+_PICTURE, _POSES, _FINDINGS = "arms.png", "poses.png", "inspection.json"
 _SCENE = 800, 640  # pixels
 
 
@@ -47,6 +48,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     alike = near and pose_similarity(
         expert.embodiment, learner.embodiment, near.expert_qpos, {"nearest_poses": near.nearest_qpos}
     )
+    pairs = out and near and _pose_pairs(expert, learner, env, near)
     scene = (
         ArmScene([config.expert, config.learner], limits=config.limits, width=_SCENE[0], height=_SCENE[1])
         if out
@@ -70,6 +72,8 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
                 _save_picture(
                     out / _PICTURE, scene.image([expert.embodiment.home, learner.embodiment.home]), expert, learner, env
                 )
+            if pairs:
+                save_poses(out / _POSES, expert, learner, env, pairs)
             findings = {
                 "arm": learner.embodiment.name,
                 "expert": expert.embodiment.name,
@@ -81,6 +85,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
                 "bound": near and near.bound,
                 "hold": near and near.hold,
                 "similarity": alike,
+                "poses": pairs.as_json() if pairs else None,
                 "train": command,
             }
             (out / _FINDINGS).write_text(json.dumps(findings, indent=2) + "\n")
@@ -88,6 +93,11 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
         console.print(f"train it: {command}", soft_wrap=True, highlight=False, markup=False)
 
     return run
+
+
+def _pose_pairs(expert: Arm, learner: Arm, env: EnvConfig, near: Nearness) -> PosePairs:
+    poses = readable_poses(env.expert, expert, near.expert_qpos[:, 0])
+    return nearest_poses(expert, learner, env.metric, poses)
 
 
 def train_command(config: InspectConfig) -> str:

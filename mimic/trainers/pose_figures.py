@@ -24,6 +24,7 @@ from mimic.rendering import ArmScene  # noqa: E402
 from mimic.trainers import metric_figures, point_figures, similarity_figures  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 from mimic.trainers.pose_mapper import PoseMapper  # noqa: E402
+from mimic.trainers.pose_picture import PANDA_POSES  # noqa: E402
 
 LoadMapper = Callable[[str], PoseMapper]  # by the name of the environment
 
@@ -31,15 +32,7 @@ _TWO_LINKS = planar_arm([0.5, 0.5])
 _CONTOUR_POSE = np.array([1.5, -1.5])  # the expert's in the paper's figure 2 d-f
 _WEIGHTS_POSE = np.array([2.3, -2.0])
 _OTHER_TWO_LINKS = planar_arm([0.25, 0.75])  # equal arms would match whatever the weights are
-# What the Panda's joints are turned by [rad]: three poses that show the whole arm.
-_PANDA_POSES = np.array(
-    [
-        [0.6, 0.7, -0.5, -1.3, 0.5, 1.6, 0.4],
-        [-0.9, 0.5, 0.9, -1.8, -0.6, 1.2, 0.0],
-        [0.3, -0.6, 0.4, -1.5, 1.2, 2.2, 0.8],
-    ],
-    np.float32,
-)
+_SHOWN = PANDA_POSES[:3]
 _PIXELS = 420
 
 
@@ -110,12 +103,12 @@ def draw_panda(load_mapper: LoadMapper) -> Any:
     """What trained mappers make of unseen poses of the Panda; locked joints are red (paper, Fig. 4)."""
     names = ("panda7dof", "panda4dof", "panda3dof")
     expert = env_config(names[0]).expert
-    figure, rows = plt.subplots(len(names) + 1, len(_PANDA_POSES), figsize=(7.6, 10.2), layout="constrained")
+    figure, rows = plt.subplots(len(names) + 1, len(_SHOWN), figsize=(7.6, 10.2), layout="constrained")
     with ArmScene([expert], width=_PIXELS, height=_PIXELS) as scene:
-        _show_row(rows[0], [scene.image([pose]) for pose in _PANDA_POSES], "expert, 7 joints")
+        _show_row(rows[0], [scene.image([pose]) for pose in _SHOWN], "expert, 7 joints")
     for name, row in zip(names, rows[1:], strict=True):
         mapper = load_mapper(name)
-        mapped, _, excess = _mapped_and_optimal(mapper, _PANDA_POSES)
+        mapped, _, excess = _mapped_and_optimal(mapper, _SHOWN)
         with ArmScene([env_config(name).learner], width=_PIXELS, height=_PIXELS) as scene:
             _show_row(row, [scene.image([pose]) for pose in mapped], f"learner, {mapper.learner.num_joints} joints")
         for axes, percent in zip(row, excess, strict=True):

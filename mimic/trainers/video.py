@@ -85,7 +85,7 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
         over_time.plot(clip.curve_time, curve.values, label=curve.label, **curve.style)
     now = over_time.axvline(0, color="tab:red", lw=1)
     over_time.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, clip.curve_time[-1]))
-    over_time.legend(fontsize="small", loc="upper left")
+    over_time.legend(fontsize="small", loc="best")  # never over a curve where there is room
     over_time.grid(alpha=0.3)
     links = figure.add_axes((share + 0.07, 0.09, 1 - share - 0.09, 0.32))
     bars = links.bar(range(len(clip.bar_names)), clip.bars[0], color="tab:blue")

@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from mimic.similarity import MEASURES
 from mimic.trainers.progress import SIMILARITY_HEADERS
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
 _BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 120, 34, 18, 8  # pixels of a chart and its margins
+_LEAST_TOP = 0.01  # of a chart's scale, so that an arm at distance 0 has a scale that can be read
 
 
 def short_names(names: Sequence[str]) -> list[str]:
@@ -57,7 +59,7 @@ def _cell(value: float, scale: float, colour: tuple[int, int, int]) -> str:
     share = min(max(value / scale, 0.0), 1.0)
     mixed = ",".join(str(round(255 + share * (channel - 255))) for channel in colour)
     ink = "#fff" if share > 0.55 else "#333"
-    text = f"{value:.2f}" if value >= 0.005 else ""
+    text = "" if value < 0.005 else f"{value:.2f}" if value < 9.995 else f"{value:.1f}"  # four characters fit
     return f'<td style="background:rgb({mixed});color:{ink};text-align:center;height:15px">{text}</td>'
 
 
@@ -103,7 +105,7 @@ def _measures(similarity: Mapping[str, float]) -> str:
         f'<div><div style="font-size:10px;color:#777">{html.escape(SIMILARITY_HEADERS[name].replace(chr(10), " "))}'
         f'</div><div id="mimic-{name}" style="font-size:13px;font-variant-numeric:tabular-nums">'
         f"{f'{value:.0f}°' if name.endswith('_deg') else f'{value:.3f}'}</div></div>"
-        for name, value in similarity.items()
+        for name, value in ((name, similarity[name]) for name in MEASURES if name in similarity)  # jit sorts names
     )
     return f'<div style="display:flex;gap:14px;padding:4px 12px">{cells}</div>' if cells else ""
 
@@ -123,7 +125,7 @@ def chart(
     """
     first, last = (float(time[0]), float(time[-1])) if len(time) else (0.0, 1.0)
     span = max(last - first, 1e-6)
-    top = max([float(np.nanmax(values)) for _, values, _ in curves if np.isfinite(values).any()] + [1e-3]) * 1.08
+    top = max([float(np.nanmax(values)) for _, values, _ in curves if np.isfinite(values).any()] + [_LEAST_TOP]) * 1.08
     inner = _WIDTH - _LEFT - 6, _HEIGHT - _BOTTOM - _TOP
 
     def x(t: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 RATE = 30.0  # updates a second, as many as a video has
 _LONGEST_STEP = 0.1  # s: after a pause of the process, arms go on instead of jumping
 _HISTORY = 15.0  # s of the chart
+_PAUSE = 0.5  # s without an update: the arms were at rest, and the chart shall be level there
 _NEAR = 1e-3  # of the distance: what counts as the bound itself
 
 
@@ -40,6 +41,8 @@ class History:
     def add(self, frame: Frame) -> None:
         """Appends what is shown now."""
         now = time.perf_counter() - self._began
+        if self._moments and now - self._moments[-1][0] > _PAUSE:  # nothing changed until just before
+            self._moments.append((now - 1 / RATE, *self._moments[-1][1:]))
         self._moments.append((now, frame.distance, frame.bound))
         while self._moments[0][0] < now - _HISTORY:
             self._moments.popleft()

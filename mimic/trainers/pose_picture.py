@@ -1,0 +1,131 @@
+"""A picture of five poses of an expert, and of the learner's nearest poses below them."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from jaxtyping import Float  # noqa: E402
+
+from mimic.envs.arms import Arm, ArmConfig  # noqa: E402
+from mimic.envs.config import EnvConfig, MetricConfig  # noqa: E402
+from mimic.pose import imitate_pose  # noqa: E402
+from mimic.rendering import ArmScene  # noqa: E402
+from mimic.similarity import CentreLine, centre_line_table, similarity  # noqa: E402
+from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR  # noqa: E402
+
+# What the Panda's joints are turned by [rad]: poses that show the whole arm, within its joint ranges.
+PANDA_POSES = np.array(
+    [
+        [0.6, 0.7, -0.5, -1.3, 0.5, 1.6, 0.4],
+        [-0.9, 0.5, 0.9, -1.8, -0.6, 1.2, 0.0],
+        [0.3, -0.6, 0.4, -1.5, 1.2, 2.2, 0.8],
+        [1.2, 0.5, 0.0, -1.3, 0.0, 1.7, 0.0],
+        [-1.4, -0.3, 0.3, -2.3, 0.2, 2.0, -0.5],
+    ],
+    np.float32,
+)
+_PIXELS = 260  # of one picture; a mesh takes its time without a GPU
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PosePairs:
+    """Poses of an expert and the nearest ones of a learner.
+
+    Attributes:
+      expert_qpos: [poses, joints] [rad].
+      learner_qpos: [poses, learner_joints] of least embodiment distance [rad].
+      distance: [poses] embodiment distance of the two, at rest.
+      similarity: the measures of `mimic.similarity`, [poses] each.
+    """
+
+    expert_qpos: Float[np.ndarray, "poses joints"]
+    learner_qpos: Float[np.ndarray, "poses learner_joints"]
+    distance: Float[np.ndarray, " poses"]
+    similarity: Mapping[str, Float[np.ndarray, " poses"]]
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """One entry for each pose."""
+        columns = {
+            "expert_qpos": self.expert_qpos,
+            "learner_qpos": self.learner_qpos,
+            "distance": self.distance,
+            **self.similarity,
+        }
+        return [
+            dict(zip(columns, row, strict=True)) for row in zip(*(x.tolist() for x in columns.values()), strict=True)
+        ]
+
+
+def readable_poses(
+    config: ArmConfig, arm: Arm, others: Float[np.ndarray, "candidates joints"]
+) -> Float[np.ndarray, "poses joints"]:
+    """Five poses of an expert [rad]: fixed ones of the Panda, else some of `others`, as far between as may be."""
+    if config.model == "panda":
+        return PANDA_POSES[:, [int(name.removeprefix("joint")) - 1 for name in arm.embodiment.joint_names]]
+    count = len(PANDA_POSES)
+    return np.asarray(others, np.float32)[np.linspace(0, len(others) - 1, count + 1).round().astype(int)[1:]]
+
+
+def nearest_poses(
+    expert: Arm, learner: Arm, metric: MetricConfig, qpos: Float[np.ndarray, "poses joints"]
+) -> PosePairs:
+    """The learner's poses of least embodiment distance to poses of the expert [rad], and how alike they look."""
+    pair = expert.embodiment, learner.embodiment
+    measure: Any = {"rotation": metric.rotation_measure, "reduction": metric.reduction}
+    correspondence, weights = metric.make_correspondence(*pair), metric.make_weights()
+    found = jax.jit(lambda qpos: imitate_pose(*pair, qpos, correspondence, weights, **measure))(qpos)
+    learner_qpos = np.asarray(found.qpos)
+    alike = similarity(centre_line_table(pair[0], qpos), centre_line_table(pair[1], learner_qpos))
+    return PosePairs(qpos, learner_qpos, np.asarray(found.distance), alike)
+
+
+def save_poses(path: Path, expert: Arm, learner: Arm, env: EnvConfig, pairs: PosePairs) -> None:
+    """Draws each pose of the expert, the learner's below it, and both centre lines over each other.
+
+    Raises:
+      ValueError: no OpenGL.
+    """
+    columns = len(pairs.expert_qpos)
+    figure, rows = plt.subplots(3, columns, figsize=(2.2 * columns, 6.9), layout="constrained")
+    lines: list[tuple[str, Any]] = []
+    arms = (env.expert, expert, pairs.expert_qpos, "expert"), (env.learner, learner, pairs.learner_qpos, "learner")
+    for row, (config, arm, poses, role) in zip(rows, arms, strict=False):
+        with ArmScene([config], limits=env.limits, width=_PIXELS, height=_PIXELS) as scene:
+            _show(row, [scene.image([pose]) for pose in poses], f"{role}: {arm.embodiment.name}")
+            lines.append((role, scene.flattened(_with_ends(centre_line_table(arm.embodiment, poses)))))
+    for column, axes in enumerate(rows[2]):
+        for (role, points), colour, width in zip(lines, (EXPERT_COLOUR, LEARNER_COLOUR), (6, 2.5), strict=True):
+            alpha = 0.45 if role == "expert" else 1.0
+            axes.plot(*points[column].T, color=colour, lw=width, alpha=alpha, label=role, solid_capstyle="round")
+        axes.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.15, 0.95), xticks=[], yticks=[])
+        measured = {name: float(values[column]) for name, values in pairs.similarity.items()}
+        rows[1][column].set_title(
+            f"centre line {measured['centre_line_distance']:.3f}\n"
+            f"hand {measured['hand_position_error']:.3f}, {measured['hand_angle_deg']:.0f}°",
+            fontsize="medium",
+        )
+    rows[2][0].set_ylabel("centre lines,\neach arm of length 1")
+    rows[2][0].legend(fontsize="small", loc="lower left")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _with_ends(line: CentreLine) -> Float[np.ndarray, "poses points 3"]:
+    """Base, points and hand [chain lengths]."""
+    hand = line.hand_position[..., None, :]
+    return np.concatenate([line.points[..., :1, :] * 0, line.points, hand], axis=-2)
+
+
+def _show(row: Sequence[Any], images: Sequence[np.ndarray], label: str) -> None:
+    for axes, image in zip(row, images, strict=True):
+        axes.imshow(image)
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_visible(False)
+    row[0].set_ylabel(label)
