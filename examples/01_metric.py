@@ -24,8 +24,8 @@ out.mkdir(parents=True, exist_ok=True)
 # ---- Two embodiments -------------------------------------------------------------------------------------------------
 #
 # An embodiment is what the metric knows of an arm: a chain of hinges and links. Here the expert is a Panda, which has
-# seven joints. The learner is a Panda whose joints 3, 6 and 7 are locked. A locked joint makes one link of the two that
-# it connects, so that four links are left. `planar_arm` and `load_mjcf` make other embodiments.
+# seven joints. The learner is a Panda whose joints 3, 6 and 7 are locked. Locking removes a joint and no link: it has
+# four joints and seven links. `planar_arm` and `load_mjcf` make other embodiments.
 
 expert = mimic.panda()
 learner = mimic.panda(locked=(3, 6, 7))
@@ -55,13 +55,13 @@ print("\nan arm and its copy at ten times the size, in the same pose: link dista
 
 # ---- Which links belong together -------------------------------------------------------------------------------------
 #
-# Seven links face four. A correspondence matrix W says how much each pair counts. The one that all environments use
-# lays both chains on [0, 1] and looks how far links overlap: link 2 of the learner lies beside the links 2, 3 and a
-# part of link 4 of the expert. It does not depend on the pose, which leaves the distance with fewer local minima than
-# the two that follow the distances: `hard_correspondence` (nearest neighbours) and `soft_correspondence` (a softmax).
+# A correspondence matrix W says how much each pair of links counts. The one that all environments use lays both chains on
+# [0, 1] and takes the length that two links share there: for two Pandas, each link with itself, by its length. It does
+# not depend on the pose, which leaves the distance with fewer local minima than the two that follow the distances:
+# `hard_correspondence` (nearest neighbours) and `soft_correspondence` (a softmax).
 
-correspondence = mimic.overlap_correspondence(expert, learner)
-print("\ncorrespondence by overlap (rows: expert, columns: learner)")
+correspondence = mimic.arc_length_correspondence(expert, learner)
+print("\ncorrespondence by arc length (rows: expert, columns: learner)")
 print(np.asarray(correspondence).round(2))
 
 # ---- From link distances to one number -------------------------------------------------------------------------------
@@ -84,8 +84,8 @@ for name, weights in PARTS.items():
     print(f"  {name:16}  {mimic.embodiment_distance(states, copied, correspondence, weights):.4f}")
 
 # Those are not on one scale: a rotation can be 3.1, a translation hardly more than 1. The weights decide what "alike"
-# means. The paper's, used for all training here, are rotation 1, angular velocity 0.01, linear velocity 0.001 and no
-# translation: links shall point the same way, and where they are follows from that for arms of equal proportions.
+# means. The paper's, used below, are rotation 1, angular velocity 0.01, linear velocity 0.001 and no translation. The
+# default of the commands has a translation weight of 1 besides, by which arms resemble each other more.
 
 paper = mimic.embodiment_distance(states, copied, correspondence, mimic.PAPER_WEIGHTS)
 print(f"under the paper's weights: {paper:.4f}")

@@ -73,7 +73,14 @@ def test_holding_still_has_a_gap_of_one(run_dir, tmp_path):
     assert [float(row["optimality_gap"]) for row in rows] == pytest.approx([1] * 6, abs=1e-5)
     assert report["torque_rms"] == {"train": 0, "held_out": 0}
     names = {path.name for path in (tmp_path / "new").iterdir()}
-    assert names == {"report.json", "demonstrations.csv", "quality.csv", "quality.png", "demonstrations.png"}
+    assert names == {
+        "report.json",
+        "demonstrations.csv",
+        "quality.csv",
+        "quality.png",
+        "demonstrations.png",
+        "similarity.png",
+    }
 
 
 def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_path):

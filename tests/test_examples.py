@@ -88,7 +88,7 @@ def test_metric(said, tmp_path):
     gap = (float(copied) - float(bound)) / (float(rest) - float(bound))
     assert number(r"1 for holding still: (\S+)%", said) / 100 == pytest.approx(gap, abs=0.006)  # of four digits
     shares = [float(share) for share in re.findall(r"^  link\S+ +(\S+)  \(", said, re.MULTILINE)]
-    assert len(shares) == 4 and sum(shares) == pytest.approx(float(copied), abs=3e-4)
+    assert len(shares) == 7 and sum(shares) == pytest.approx(float(copied), abs=3e-4)
     parts = ("translation", "rotation", "linear_velocity", "angular_velocity")
     by_part = {part: number(rf"\n  {part} +(\S+)(?=\n)", said) for part in parts}
     weighted = sum(getattr(mimic.PAPER_WEIGHTS, part) * value for part, value in by_part.items())

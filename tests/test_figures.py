@@ -75,7 +75,7 @@ def test_figures_without_a_mapper(tmp_path):
         (FiguresConfig(), "out: expected a folder"),
         (
             FiguresConfig(out="new", only=["contour"]),
-            "expected some of links, correspondence, points, similarity, weights, contours, planar, panda",
+            "expected some of links, correspondence, similarity, points, weights, contours, planar, panda",
         ),
         (FiguresConfig(out=__file__), "is a file"),
     ],

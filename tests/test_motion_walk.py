@@ -29,7 +29,7 @@ CASES = {
         None,
         ALL_WEIGHTS,
     ),
-    "few pairs": ((panda(), panda(locked=(3, 6, 7))), SPARSE, ALL_WEIGHTS),
+    "few pairs": ((panda(), panda(locked=(3, 6, 7), links="merged")), SPARSE, ALL_WEIGHTS),
     "links swapped": ((panda(locked=(1, 4), links="kept"), panda()), SWAPPED, PAPER_WEIGHTS),
     "long and short": (LONG_ARMS, None, ALL_WEIGHTS),
     "rotation alone": (LONG_ARMS, None, DistanceWeights(rotation=1.0)),

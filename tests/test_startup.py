@@ -95,7 +95,7 @@ def test_the_table_of_link_states_is_what_they_are():
 
 
 def test_a_learner_that_can_do_what_the_expert_does_needs_no_search(monkeypatch):
-    monkeypatch.setattr(evaluation, "kinematic_bound", None)  # would fail
+    monkeypatch.setattr(evaluation, "closest_motion", None)  # would fail
     config = mimic.env_config("panda7dof", demonstrations={"count": 2, "held_out": 1}, physics="fused")
     training, held_out = training_and_held_out(config)
     evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)

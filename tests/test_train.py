@@ -67,7 +67,7 @@ def test_a_run_compiles_few_programs(finished):
     """Each takes a tenth of a second and more on a GPU."""
     _, result = finished
     names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", result.stderr)
-    for program in ("_begin", "_learn", "rollouts", "bound"):
+    for program in ("_begin", "_learn", "rollouts", "closest"):
         assert names.count(program) == 1
     assert len(names) < 20  # 54 with brax's own training loop
 
@@ -77,7 +77,7 @@ def test_evaluate_repeats_the_report(finished, tmp_path):
     out = tmp_path / "again"
     result = command("evaluate", f"run={run_dir}", f"out={out}")
     assert result.returncode == 0, result.stderr[-2000:]
-    pictures = {"quality.png", "demonstrations.png"}
+    pictures = {"quality.png", "demonstrations.png", "similarity.png"}
     tables = {"demonstrations.csv", "quality.csv"}
     assert {path.name for path in out.iterdir()} == {"report.json", *tables, *pictures}
     again, report = (json.loads((folder / "report.json").read_text()) for folder in (out, run_dir))

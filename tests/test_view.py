@@ -76,8 +76,10 @@ def test_what_is_shown_is_the_metric(live, env):
         mimic.link_states(arm, np.array([angles[name] for name in arm.joint_names], np.float32))
         for arm, angles in ((expert, frame.expert), (learner, frame.learner))
     )
-    matrix = mimic.overlap_correspondence(expert, learner)
-    distance = mimic.embodiment_distance(expert_states, learner_states, matrix, mimic.DistanceWeights())
+    matrix = mimic.arc_length_correspondence(expert, learner)
+    distance = mimic.embodiment_distance(
+        expert_states, learner_states, matrix, mimic.DistanceWeights(translation=1.0, rotation=1.0)
+    )
     np.testing.assert_allclose(frame.distance, distance, atol=1e-5)  # float32 of two programs
     np.testing.assert_allclose(frame.matrix, matrix, atol=1e-6)
     np.testing.assert_allclose((frame.matrix * frame.links).mean(), distance, atol=1e-5)
@@ -112,8 +114,9 @@ def test_the_expert_plays_a_motion_and_a_slider_ends_it(live):
 
 
 def test_weights_change_without_compiling_and_the_distance_scales(live):
+    live.move(2, 1.0)  # a joint that the learner has not
     before = settle(live).distance
-    live.change(rotation=2.0)
+    live.change(translation=2.0, rotation=2.0)
     frame = live.advance(TICK)
     assert frame is not None and frame.distance == pytest.approx(2 * before, rel=1e-3)  # the minimum stays in its place
 
@@ -170,10 +173,10 @@ def test_locking_the_last_joint_is_refused_and_undone():
 
 def test_settings_that_differ_in_weights_alone_share_programs(env):
     settings = initial_settings(env)
-    assert settings.locked == ("joint3", "joint6", "joint7") and settings.correspondence == "overlap"
+    assert settings.locked == ("joint3", "joint6", "joint7") and settings.correspondence == "arc_length"
     assert dataclasses.replace(settings, rotation=0.3).program_key == settings.program_key
     assert dataclasses.replace(settings, correspondence="hard").program_key != settings.program_key
-    with pytest.raises(ValueError, match="expected one of overlap, hard, soft"):
+    with pytest.raises(ValueError, match="expected one of arc_length, overlap, hard, soft"):
         Settings((), "none", 0.0, 1.0)
 
 
