@@ -55,9 +55,9 @@ print("\nan arm and its copy at ten times the size, in the same pose: link dista
 
 # ---- Which links belong together -------------------------------------------------------------------------------------
 #
-# A correspondence matrix W says how much each pair of links counts. The one that all environments use lays both chains on
-# [0, 1] and takes the length that two links share there: for two Pandas, each link with itself, by its length. It does
-# not depend on the pose, which leaves the distance with fewer local minima than the two that follow the distances:
+# A correspondence matrix W says how much each pair of links counts. The one that all environments use lays both chains
+# on [0, 1] and takes the length that two links share there: for two Pandas, each link with itself, by its length. It
+# does not depend on the pose, which leaves the distance with fewer local minima than the two that follow the distances:
 # `hard_correspondence` (nearest neighbours) and `soft_correspondence` (a softmax).
 
 correspondence = mimic.arc_length_correspondence(expert, learner)
