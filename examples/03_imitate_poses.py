@@ -93,7 +93,7 @@ reached = float(jnp.mean(found.distance <= best + 1e-3 * float(best.mean())))
 print(f"imitate_pose is at the best known pose in {reached:.1%}, one descent in "
       f"{float(jnp.mean(descended.distance <= best + 1e-3 * float(best.mean()))):.1%}")  # fmt: skip
 
-# The best known distance is not 0: four joints cannot point seven links in any direction. That part no method can take away.
+# The best known distance is not 0: four joints cannot point seven links everywhere. No method can take that part away.
 
 print(f"what remains of the distance at the best poses: {float(best.mean()):.4f}, "
       f"from {float(best.min()):.4f} to {float(best.max()):.4f}")  # fmt: skip
