@@ -28,7 +28,7 @@ from rich.table import Table
 import mimic
 from benchmarks.pose import planar
 from benchmarks.record import write_results
-from mimic.envs.arms import Arm, ArmConfig, build_arm
+from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.envs.config import MetricConfig
 from mimic.envs.recording import record_demonstrations
 from mimic.pose import pose_limits, shared_joints

@@ -21,7 +21,7 @@ from rich.console import Console
 from benchmarks import study_results
 from benchmarks.processes import Task, run_tasks
 from benchmarks.record import write_results
-from mimic.envs.arms import ArmConfig, build_arm
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.config import MetricConfig
 from mimic.envs.recording import KINDS, record_demonstrations
 

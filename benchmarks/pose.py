@@ -25,7 +25,7 @@ from rich.table import Table
 
 import mimic
 from benchmarks.record import write_results
-from mimic.envs.arms import Arm, ArmConfig, build_arm
+from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.envs.config import MetricConfig
 
 METRIC = MetricConfig()

@@ -31,8 +31,8 @@ import mimic
 from benchmarks import similarity_summary
 from benchmarks.record import write_results
 from benchmarks.similarity_poses import arm_data, best_poses
-from mimic.embodiment import Embodiment
-from mimic.envs.arms import ArmConfig, build_arm
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import MetricConfig
 from mimic.kinematics import link_state_table
 from mimic.pose import shared_joints

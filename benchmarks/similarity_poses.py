@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mimic.arms.embodiment import Embodiment
 from mimic.descent import Derivatives, End, Scalars, newton
-from mimic.embodiment import Embodiment
 from mimic.kinematics import LinkStates
 from mimic.pose import pose_limits
 

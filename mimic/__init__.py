@@ -10,6 +10,8 @@ from mimic import compat
 compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
 compat.import_mujoco()
 
+from mimic.arms.arm import ArmConfig, build_arm  # noqa: E402
+from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
 from mimic.correspondence import (  # noqa: E402
     arc_length_correspondence,
     hard_correspondence,
@@ -25,9 +27,7 @@ from mimic.distance import (  # noqa: E402
     link_distances,
     rotation_distance,
 )
-from mimic.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
 from mimic.envs import env_config, environments, make  # noqa: E402
-from mimic.envs.arms import ArmConfig, build_arm  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
 from mimic.envs.importing import import_demonstrations  # noqa: E402
 from mimic.envs.recording import record_demonstrations  # noqa: E402
@@ -45,8 +45,8 @@ from mimic.motion import motion_distance  # noqa: E402
 from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:
+    from mimic.arms.rendering import ArmScene
     from mimic.envs.imitation import ImitationEnv
-    from mimic.rendering import ArmScene
     from mimic.trainers.exporting import export_run
     from mimic.trainers.pose_mapper import PoseMapper
 
@@ -106,7 +106,7 @@ def __getattr__(name: str) -> Any:
 
         return ImitationEnv
     if name == "ArmScene":  # pictures, which few need
-        from mimic.rendering import ArmScene
+        from mimic.arms.rendering import ArmScene
 
         return ArmScene
     if name == "PoseMapper":  # checkpoints and metrics, likewise

@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment
 
 LinkLengths = Literal["path", "chord"]
 

@@ -15,9 +15,9 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from mimic import compat
+from mimic.arms.rendering import ArmScene
 from mimic.config import check_choice
 from mimic.envs import environments, make
-from mimic.rendering import ArmScene
 
 compat.import_mjx()  # quietly; brax would import it too
 

@@ -9,8 +9,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from mimic.arms.embodiment import Embodiment
 from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
-from mimic.embodiment import Embodiment
 from mimic.kinematics import LinkStates, link_states
 from mimic.pose import pose_limits, shared_joints
 from mimic.quasi_newton import Descent, bfgs

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic import spatial
-from mimic.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment
 from mimic.spatial import Rotation, Vector
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from mimic.arms.embodiment import Embodiment
 from mimic.distance import Correspondence, RotationMeasure, Weights, embodiment_distance
-from mimic.embodiment import Embodiment
 from mimic.kinematics import link_states
 
 

@@ -13,6 +13,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mimic import kernel, motion_gradient, motion_walk
+from mimic.arms.embodiment import Embodiment
 from mimic.distance import (
     PAPER_WEIGHTS,
     PARTS,
@@ -24,7 +25,6 @@ from mimic.distance import (
     embodiment_distance,
     pair_distances,
 )
-from mimic.embodiment import Embodiment
 from mimic.kinematics import LONG, joint_values, link_states
 
 Values = Callable[..., tuple[Array, ...]]  # of motions: a distance, and gradients

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic import spatial
+from mimic.arms.embodiment import Embodiment
 from mimic.distance import PARTS
-from mimic.embodiment import Embodiment
 from mimic.kinematics import JointFrame, LinkVectors, joint_frames, link_vectors
 from mimic.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract, times
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mimic import kernel, spatial
-from mimic.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment
 from mimic.kinematics import BASE, JointFrame, LinkVectors, behind_joint, link_behind
 from mimic.motion_gradient import NO_SLOPES, Slopes, by_joint, compare_part, with_link
 from mimic.spatial import ZERO, Scalar, Vector, plus, subtract

@@ -11,9 +11,9 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from mimic.arms.embodiment import Embodiment
 from mimic.descent import Derivatives, End, Scalars, gradient_descent, newton
 from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights
-from mimic.embodiment import Embodiment
 from mimic.kinematics import LinkStates, link_states
 from mimic.objective import PoseObjective, Target, pose_objective
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from mimic.embodiment import Embodiment, segment_arm
+from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.pose import pose_limits, shared_joints
 from mimic.segment_alignment import Poses, align_segments, checked_poses
 from mimic.similarity import centre_line_table

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mimic.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment
 from mimic.kinematics import joint_frames
 from mimic.pose import pose_limits
 from mimic.subproblems import PARALLEL, bend_to_angle, dot, frame_of, rotate_onto, rotate_onto_by_two, rotated, unit

@@ -15,7 +15,7 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.embodiment import Embodiment, segment_arm
+from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.kinematics import LinkStates, link_state_table, link_states
 
 SAMPLES = 64  # of a centre line

@@ -15,19 +15,19 @@ REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
 
 # Not mimic.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
 CORE = (
-    "chain",
-    "descent",
-    "mjcf",
-    "embodiment",
-    "kinematics",
-    "distance",
-    "correspondence",
-    "similarity",
-    "imitation",
-    "objective",
-    "closed_form",
-    "pose",
-    "motion",
+    "arms.chain",
+    "arms.embodiment",
+    "arms.mujoco_chain",
+    "metric.correspondence",
+    "metric.distance",
+    "metric.kinematics",
+    "metric.motion_distance",
+    "metric.similarity",
+    "retargeting.closed_form",
+    "retargeting.kinematic_bound",
+    "retargeting.optimizers",
+    "retargeting.pose",
+    "retargeting.pose_objective",
 )
 
 

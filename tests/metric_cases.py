@@ -5,9 +5,9 @@ import functools
 import numpy as np
 from jax.typing import DTypeLike
 
+from mimic.arms.embodiment import planar_arm
 from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
 from mimic.distance import DistanceWeights, Reduction, RotationMeasure, adaptive_weights
-from mimic.embodiment import planar_arm
 from mimic.kinematics import link_states
 
 ALL_WEIGHTS = DistanceWeights(translation=2.0, rotation=1.0, linear_velocity=3.0, angular_velocity=0.5)

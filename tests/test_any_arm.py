@@ -11,8 +11,8 @@ import original_model
 import pytest
 
 import mimic
-from mimic.envs.arms import ArmConfig, build_arm
-from mimic.model_files import LARGEST_FILE, read_model, read_spec
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.model_files import LARGEST_FILE, read_model, read_spec
 
 POSES = 40
 # Arms that others wrote, in packages that need not be installed: their paths there, and where the last link ends.

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.envs.arms import ArmConfig, build_arm
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.recording import record_demonstrations
 
 PLANAR = ["env=planar4dof", "env.demonstrations.count=1", "env.demonstrations.held_out=1"]

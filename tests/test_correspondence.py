@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import random_arms
 
-from mimic.chain import Chain, Joint, Link, lock
+from mimic.arms.chain import Chain, Joint, Link, lock
+from mimic.arms.embodiment import from_chain, load_mjcf, panda, planar_arm
 from mimic.correspondence import (
     arc_length_correspondence,
     hard_correspondence,
@@ -12,7 +13,6 @@ from mimic.correspondence import (
     soft_correspondence,
 )
 from mimic.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance, link_distances
-from mimic.embodiment import from_chain, load_mjcf, panda, planar_arm
 from mimic.kinematics import link_states
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, MEASURES, REDUCTIONS, WEIGHTS, states
 
+from mimic.arms.embodiment import panda, planar_arm
 from mimic.correspondence import hard_correspondence, overlap_correspondence
 from mimic.distance import (
     PAPER_WEIGHTS,
@@ -18,7 +19,6 @@ from mimic.distance import (
     link_distances,
     rotation_distance,
 )
-from mimic.embodiment import panda, planar_arm
 from mimic.kinematics import candidate_points, link_states
 
 # --- values -----------------------------------------------------------------------------------------------------------

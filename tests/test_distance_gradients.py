@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, MEASURES, REDUCTIONS, WEIGHTS, states
 
+from mimic.arms.embodiment import panda
 from mimic.correspondence import overlap_correspondence
 from mimic.distance import PAPER_WEIGHTS, embodiment_distance
-from mimic.embodiment import panda
 from mimic.kinematics import LinkStates, link_states
 
 

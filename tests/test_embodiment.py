@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import random_arms
 
-from mimic.embodiment import load_mjcf, panda, panda_path, planar_arm
+from mimic.arms.embodiment import load_mjcf, panda, panda_path, planar_arm
 from mimic.kinematics import forward_kinematics, link_states
 from mimic.similarity import centre_line
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mimic.embodiment import planar_arm
-from mimic.envs.arms import ArmConfig
-from mimic.rendering import ArmScene
+from mimic.arms.arm import ArmConfig
+from mimic.arms.embodiment import planar_arm
+from mimic.arms.rendering import ArmScene
 from mimic.trainers import point_figures
 from mimic.trainers.arm_drawing import joint_points
 from mimic.trainers.config import FiguresConfig

@@ -9,9 +9,9 @@ import numpy as np
 import optax
 import pytest
 
+from mimic.arms.embodiment import panda, planar_arm
 from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
 from mimic.distance import PAPER_WEIGHTS, DistanceWeights, adaptive_weights, embodiment_distance
-from mimic.embodiment import panda, planar_arm
 from mimic.imitation import closest_motion, kinematic_bound
 from mimic.kinematics import link_states
 

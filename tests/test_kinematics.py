@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import random_arms
 
-from mimic.embodiment import load_mjcf, panda, panda_path, planar_arm
+from mimic.arms.embodiment import load_mjcf, panda, panda_path, planar_arm
+from mimic.arms.model_files import read_model
 from mimic.kinematics import LONG, body_twists, candidate_points, forward_kinematics, link_states
-from mimic.model_files import read_model
 
 # Against MuJoCo, in m, m/s and rad/s. Arms are up to 3 m long and move at up to 10 rad/s and 10 m/s.
 TOLERANCE = {

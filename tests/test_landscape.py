@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from mimic.arms.embodiment import planar_arm
 from mimic.correspondence import hard_correspondence, overlap_correspondence
 from mimic.distance import DistanceWeights, adaptive_weights
-from mimic.embodiment import planar_arm
 from mimic.landscape import distance_landscape, local_minima
 
 ARM = planar_arm([0.5, 0.5])

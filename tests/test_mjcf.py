@@ -5,8 +5,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic import chain
-from mimic.embodiment import load_arm, load_mjcf, panda, panda_path
+from mimic.arms import chain
+from mimic.arms.embodiment import load_arm, load_mjcf, panda, panda_path
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
 

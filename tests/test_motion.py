@@ -9,9 +9,9 @@ from lowering import gpu_program
 from metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, WEIGHTS
 
 from mimic import kernel, motion_distance
+from mimic.arms.embodiment import panda, planar_arm
 from mimic.correspondence import hard_correspondence, overlap_correspondence
 from mimic.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
-from mimic.embodiment import panda, planar_arm
 from mimic.kinematics import LONG, link_states
 
 PAIRS = {

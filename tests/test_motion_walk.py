@@ -10,9 +10,9 @@ from metric_cases import ALL_WEIGHTS
 from random_arms import random_arm
 
 from mimic import kernel, motion, motion_distance, motion_walk
+from mimic.arms.embodiment import load_mjcf, panda, planar_arm
 from mimic.correspondence import overlap_correspondence
 from mimic.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
-from mimic.embodiment import load_mjcf, panda, planar_arm
 from mimic.kinematics import LONG, link_states
 
 ARGUMENTS = (0, 1, 2, 3)

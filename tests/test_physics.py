@@ -10,8 +10,8 @@ from random_arms import SEEDS, random_arm
 
 import mimic
 from mimic import kernel
+from mimic.arms.arm import ArmConfig, build_arm, simulation_model
 from mimic.envs import dynamics, physics
-from mimic.envs.arms import ArmConfig, build_arm, simulation_model
 from mimic.envs.physics import Load, make_advance
 
 # Double precision leaves 1e-16 of each of a few thousand operations, and bodies that are light beside others amplify

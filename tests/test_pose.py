@@ -7,10 +7,10 @@ import pytest
 from scipy.optimize import minimize
 
 from mimic import objective
+from mimic.arms.embodiment import panda, planar_arm
 from mimic.closed_form import SMOOTHING
 from mimic.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
 from mimic.distance import DistanceWeights, adaptive_weights, embodiment_distance
-from mimic.embodiment import panda, planar_arm
 from mimic.envs.config import MetricConfig
 from mimic.kinematics import link_states
 from mimic.pose import imitate_pose, imitate_trajectory

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mimic.embodiment import Embodiment, panda, planar_arm
+from mimic.arms.embodiment import Embodiment, panda, planar_arm
 from mimic.pose_baselines import BASELINES, copy_joints, hand_ik, hold_home
 from mimic.segment_alignment import (
     Landmarks,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mimic.envs.arms import ArmConfig, build_arm
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.rendering import ArmScene
 from mimic.envs.config import EnvConfig
-from mimic.rendering import ArmScene
 from mimic.similarity import MEASURES
 from mimic.trainers.pose_picture import PANDA_POSES, nearest_poses, readable_poses, save_poses
 

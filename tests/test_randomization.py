@@ -11,8 +11,8 @@ import pytest
 from random_arms import SEEDS, posed, random_arm
 
 import mimic
+from mimic.arms.arm import simulation_model
 from mimic.envs import dynamics
-from mimic.envs.arms import simulation_model
 from mimic.envs.config import RandomizationConfig
 from mimic.envs.physics import Load
 from mimic.envs.wrappers import wrap_for_training

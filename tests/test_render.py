@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 
 import mimic
+from mimic.arms.arm import build_arm
+from mimic.arms.rendering import ArmScene
 from mimic.envs import env_config
-from mimic.envs.arms import build_arm
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.recording import record_demonstrations
-from mimic.rendering import ArmScene
 from mimic.trainers import session
 from mimic.trainers.clips import prepare_clip
 from mimic.trainers.config import PoseMapperConfig, RenderConfig, TrainConfig

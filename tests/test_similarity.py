@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mimic import similarity
-from mimic.embodiment import panda, panda_path, planar_arm
+from mimic.arms.embodiment import panda, panda_path, planar_arm
 from mimic.similarity import MEASURES, centre_line, centre_line_table
 
 ANGLE = 0.7  # rad

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
+from mimic.arms.embodiment import panda
 from mimic.correspondence import arc_length_correspondence
 from mimic.distance import embodiment_distance
-from mimic.embodiment import panda
 from mimic.envs.config import MetricConfig
 from mimic.kinematics import LinkStates, link_state_table, link_states
 from mimic.pose import imitate_pose

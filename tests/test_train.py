@@ -152,7 +152,7 @@ def test_the_cpu_flag_speeds_up_kinematics(capsys):
     """Times MJX's kinematics of 64 Pandas with and without it, each in a process of its own."""
     code = (
         "import time, jax, jax.numpy as jnp, mujoco\nfrom mujoco import mjx\n"
-        "from mimic.embodiment import panda_path\n"
+        "from mimic.arms.embodiment import panda_path\n"
         "model = mujoco.MjModel.from_xml_path(panda_path())\nmx = mjx.put_model(model)\ndata = mjx.make_data(model)\n"
         "f = jax.jit(jax.vmap(lambda q: mjx.kinematics(mx, data.replace(qpos=q)).xpos))\nq = jnp.zeros((64, 7))\n"
         "f(q).block_until_ready()\nstart = time.perf_counter()\n"

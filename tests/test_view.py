@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.arms.arm import ArmConfig, build_arm, rated_speed
 from mimic.envs import env_config
-from mimic.envs.arms import ArmConfig, build_arm, rated_speed
 from mimic.trainers import session as training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.viewing import drawing, viewer

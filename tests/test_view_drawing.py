@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 
 import mimic
+from mimic.arms.arm import ArmConfig
 from mimic.envs import env_config
-from mimic.envs.arms import ArmConfig
 from mimic.viewing import drawing
 from mimic.viewing.shapes import ArmShape, places
 
@@ -13,7 +13,7 @@ from mimic.viewing.shapes import ArmShape, places
 def test_shapes_stand_where_mujoco_puts_them():
     shape = ArmShape(env_config("panda4dof").learner)
     angles = dict.fromkeys(shape.joint_names, 0.0) | {"joint2": 0.7, "joint4": -1.2}
-    model = mujoco.MjModel.from_xml_path(str(mimic.embodiment.panda_path()))
+    model = mujoco.MjModel.from_xml_path(str(mimic.arms.embodiment.panda_path()))
     data = mujoco.MjData(model)
     for name, angle in angles.items():
         data.joint(name).qpos[0] = angle

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mimic.chain import LINKS
+from mimic.arms.arm import ArmConfig
+from mimic.arms.chain import LINKS
+from mimic.arms.embodiment import LIMITS, Embodiment
 from mimic.config import check_choice
 from mimic.correspondence import (
     arc_length_correspondence,
@@ -18,8 +20,6 @@ from mimic.correspondence import (
     soft_correspondence,
 )
 from mimic.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
-from mimic.embodiment import LIMITS, Embodiment
-from mimic.envs.arms import ArmConfig
 from mimic.envs.recording import KINDS
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")

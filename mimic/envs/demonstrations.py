@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mimic.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment
 
 FORMAT = "mimic-demonstrations-1"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")

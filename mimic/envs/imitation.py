@@ -12,9 +12,9 @@ from brax.envs.base import Env, State
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from mimic.arms.arm import Arm, build_arm, torque_scale
+from mimic.arms.embodiment import Embodiment
 from mimic.distance import embodiment_distance
-from mimic.embodiment import Embodiment
-from mimic.envs.arms import Arm, build_arm, torque_scale
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.envs.physics import Load, make_advance

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mimic.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment
 from mimic.envs.demonstrations import Demonstrations, check_effort
 
 SOURCES = (".csv", ".npz")

@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.arm import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale, with_rotors
+from mimic.arms.embodiment import load_arm
 from mimic.distance import embodiment_distance
-from mimic.embodiment import load_arm
-from mimic.envs.arms import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale, with_rotors
 from mimic.envs.config import EnvConfig
 from mimic.envs.recording import record_demonstrations
 from mimic.imitation import closest_motion

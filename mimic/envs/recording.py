@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.embodiment import Embodiment
-from mimic.envs.arms import Arm, rated_speed
+from mimic.arms.arm import Arm, rated_speed
+from mimic.arms.embodiment import Embodiment
 from mimic.envs.demonstrations import Demonstrations
 
 KINDS = ("pd", "reach")

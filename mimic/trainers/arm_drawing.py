@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from mimic.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment
 from mimic.kinematics import forward_kinematics
 
 EXPERT_COLOUR, LEARNER_COLOUR = "tab:blue", "tab:orange"

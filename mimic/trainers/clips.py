@@ -9,10 +9,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.arm import build_arm
+from mimic.arms.embodiment import Embodiment
 from mimic.distance import embodiment_distance, link_distances
-from mimic.embodiment import Embodiment
 from mimic.envs import env_config
-from mimic.envs.arms import build_arm
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations

@@ -13,7 +13,7 @@ import numpy as np  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 from matplotlib.collections import LineCollection  # noqa: E402
 
-from mimic.embodiment import Embodiment  # noqa: E402
+from mimic.arms.embodiment import Embodiment  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations  # noqa: E402
 from mimic.kinematics import forward_kinematics  # noqa: E402
 

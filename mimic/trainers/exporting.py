@@ -14,10 +14,10 @@ import jax.numpy as jnp
 from rich.console import Console
 
 import mimic
+from mimic.arms.arm import build_arm
+from mimic.arms.embodiment import Embodiment
 from mimic.config import check_choice, new_file
-from mimic.embodiment import Embodiment
 from mimic.envs import env_config
-from mimic.envs.arms import build_arm
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import observation_layout, torque_scale
 from mimic.trainers import ppo, runs

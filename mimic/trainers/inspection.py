@@ -17,10 +17,10 @@ from rich.console import Console  # noqa: E402
 from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from mimic.envs.arms import Arm, ArmConfig, build_arm, effective_inertia, rated_speed, torque_scale  # noqa: E402
+from mimic.arms.arm import Arm, ArmConfig, build_arm, effective_inertia, rated_speed, torque_scale  # noqa: E402
+from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs.config import EnvConfig, InspectConfig  # noqa: E402
 from mimic.envs.preflight import Nearness, assumptions, calmed, doubts, joint_ranges, nearness  # noqa: E402
-from mimic.rendering import ArmScene  # noqa: E402
 from mimic.trainers.measures import pose_similarity  # noqa: E402
 from mimic.trainers.pose_picture import PosePairs, nearest_poses, readable_poses, save_poses  # noqa: E402
 from mimic.trainers.progress import similarity_table  # noqa: E402

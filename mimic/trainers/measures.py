@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from mimic.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment
 from mimic.kinematics import LinkStates
 from mimic.pose import pose_limits
 from mimic.pose_baselines import baseline_poses

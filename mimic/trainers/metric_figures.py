@@ -11,9 +11,9 @@ import matplotlib.patches  # noqa: E402
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 
+from mimic.arms.embodiment import Embodiment, planar_arm  # noqa: E402
 from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence  # noqa: E402
 from mimic.distance import DistanceWeights, link_distances  # noqa: E402
-from mimic.embodiment import Embodiment, planar_arm  # noqa: E402
 from mimic.kinematics import link_states  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 

@@ -15,9 +15,9 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from mimic.arms.arm import build_arm
+from mimic.arms.embodiment import Embodiment
 from mimic.distance import Correspondence, embodiment_distance
-from mimic.embodiment import Embodiment
-from mimic.envs.arms import build_arm
 from mimic.envs.config import EnvConfig, MetricConfig
 from mimic.kinematics import link_states
 from mimic.pose import pose_limits

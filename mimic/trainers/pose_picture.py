@@ -13,10 +13,10 @@ import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 
-from mimic.envs.arms import Arm, ArmConfig  # noqa: E402
+from mimic.arms.arm import Arm, ArmConfig  # noqa: E402
+from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs.config import EnvConfig, MetricConfig  # noqa: E402
 from mimic.pose import imitate_pose  # noqa: E402
-from mimic.rendering import ArmScene  # noqa: E402
 from mimic.similarity import CentreLine, centre_line_table, similarity  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR  # noqa: E402
 

@@ -9,9 +9,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from mimic.arms.arm import Arm, build_arm
+from mimic.arms.embodiment import Embodiment
 from mimic.config import new_file
-from mimic.embodiment import Embodiment
-from mimic.envs.arms import Arm, build_arm
 from mimic.envs.config import EnvConfig, RecordingConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort
 from mimic.envs.importing import import_demonstrations

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 from rich.console import Console
 from rich.table import Table
 
+from mimic.arms.arm import build_arm, rated_speed
+from mimic.arms.embodiment import Embodiment
 from mimic.config import new_file
-from mimic.embodiment import Embodiment
 from mimic.envs import env_config
-from mimic.envs.arms import build_arm, rated_speed
 from mimic.envs.config import MetricConfig, RetargetConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.pose import PoseImitation, imitate_trajectory, pose_limits

@@ -9,7 +9,7 @@ import matplotlib.patches  # noqa: E402
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 
-from mimic.embodiment import planar_arm  # noqa: E402
+from mimic.arms.embodiment import planar_arm  # noqa: E402
 from mimic.similarity import MEASURES, CentreLine, centre_line_table, similarity  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 

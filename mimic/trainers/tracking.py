@@ -8,8 +8,8 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
+from mimic.arms.arm import effective_inertia
 from mimic.envs import dynamics
-from mimic.envs.arms import effective_inertia
 from mimic.envs.imitation import ArmState, ImitationEnv
 from mimic.trainers.evaluation import Controller, Evaluator, Rollouts
 from mimic.trainers.retargeting import largest_jump, optimal_motions

@@ -17,7 +17,7 @@ from PIL import Image  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
-from mimic.rendering import ArmScene  # noqa: E402
+from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.trainers import session  # noqa: E402
 from mimic.trainers.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
 from mimic.trainers.config import RenderConfig  # noqa: E402

@@ -3,9 +3,9 @@
 import dataclasses
 from pathlib import Path
 
+from mimic.arms.arm import ArmConfig
 from mimic.config import check_choice
 from mimic.envs import env_config, environments
-from mimic.envs.arms import ArmConfig
 from mimic.envs.config import EnvConfig
 
 SPLITS = ("held_out", "train")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from mimic.envs.arms import build_arm
+from mimic.arms.arm import build_arm
 from mimic.envs.config import CORRESPONDENCES, EnvConfig
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.recording import record_demonstrations

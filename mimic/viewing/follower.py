@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mimic.arms.arm import Arm, build_arm
+from mimic.arms.embodiment import Embodiment
 from mimic.config import check_choice
 from mimic.distance import Correspondence, DistanceWeights, Weights, link_distances
-from mimic.embodiment import Embodiment
-from mimic.envs.arms import Arm, build_arm
 from mimic.envs.config import CORRESPONDENCES, EnvConfig, MetricConfig
 from mimic.kinematics import link_states
 from mimic.pose import imitate_pose, pose_limits

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mimic.embodiment import Embodiment
-from mimic.envs.arms import build_arm, rated_speed
+from mimic.arms.arm import build_arm, rated_speed
+from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
 from mimic.viewing.follower import Mapper, ProgramCache, Programs, Settings, home_angles, initial_settings, step_towards
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from mimic.envs.arms import build_arm
+from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
 from mimic.similarity import centre_line_table, similarity
 from mimic.trainers import session

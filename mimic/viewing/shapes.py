@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from mimic.envs.arms import ArmConfig, arm_spec, build_arm
-from mimic.rendering import LOCKED, MARK, SPACING
+from mimic.arms.arm import ArmConfig, arm_spec, build_arm
+from mimic.arms.rendering import LOCKED, MARK, SPACING
 
 _VISIBLE_GROUPS = 3  # MuJoCo draws groups 0, 1 and 2; shapes for collisions are in those above
 _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)

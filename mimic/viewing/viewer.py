@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mimic import compat
-from mimic.envs.arms import build_arm
+from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
 from mimic.trainers import runs
 from mimic.viewing import drawing

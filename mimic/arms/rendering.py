@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mimic.envs.arms import ArmConfig, build_arm
-from mimic.portrait import portrait
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.visual_model import portrait
 
 SPACING, FLAT_SPACING = 0.9, 1.5  # chain lengths between two arms; flat ones are seen from above, and reach aside
 LOCKED = (0.85, 0.12, 0.10, 1.0)

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from mimic.route import Route, find_route, joint_kind
+from mimic.arms.kinematic_tree import Route, find_route, joint_kind
 
 _SHOWN = 6  # names in a list, then a count
 _AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)

@@ -12,9 +12,9 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from mimic.chain import Chain, Joint, Link, Links, Locked, lock, resolve_locked
-from mimic.mjcf import read_chain
-from mimic.model_files import model_name, read_model
+from mimic.arms.chain import Chain, Joint, Link, Links, Locked, lock, resolve_locked
+from mimic.arms.model_files import model_name, read_model
+from mimic.arms.mujoco_chain import read_chain
 
 Limits = Literal["none", "hardware"]
 LIMITS = ("none", "hardware")
@@ -135,7 +135,8 @@ def load_mjcf(
 
     Links are the capsule sites named link… where the model has them (`fromto` gives start and end), else the segments
     from each joint's anchor to the next, the last one ending at `tip`. The base frame is that of the body before the
-    first hinge. A hand's joints stay where they are; where the model branches: see `find_route` in mimic.route.
+    first hinge. A hand's joints stay where they are; where the model branches: see `find_route` in
+    mimic.arms.kinematic_tree.
 
     Args:
       path_or_model: an MJCF or URDF file, or a compiled model.

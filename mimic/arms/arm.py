@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.chain import Links
-from mimic.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
-from mimic.model_files import VELOCITY_LIMIT, read_spec
-from mimic.set_aside import set_aside
+from mimic.arms.chain import Links
+from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
+from mimic.arms.ignored_elements import set_aside
+from mimic.arms.model_files import VELOCITY_LIMIT, read_spec
 
 # Planar arms are ours to define: slender rods, whose joints feel about as heavy for their size as the Panda's.
 _PLANAR_MASS = 1.0  # kg/m

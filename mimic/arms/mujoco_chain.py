@@ -5,9 +5,9 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from mimic.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
-from mimic.model_files import VELOCITY_LIMIT
-from mimic.route import Route, ancestors, body_id, find_route, is_hinge, tip_body
+from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
+from mimic.arms.kinematic_tree import Route, ancestors, body_id, find_route, is_hinge, tip_body
+from mimic.arms.model_files import VELOCITY_LIMIT
 
 START_POSES = "ready", "home"  # keyframes that hold a model's own start pose, the first that it has
 

@@ -3,9 +3,9 @@
 import mujoco
 import numpy as np
 
-from mimic.envs.arms import ArmConfig, arm_spec
-from mimic.mjcf import zero_pose
-from mimic.route import Route, ancestors, find_route
+from mimic.arms.arm import ArmConfig, arm_spec
+from mimic.arms.kinematic_tree import Route, ancestors, find_route
+from mimic.arms.mujoco_chain import zero_pose
 
 _THICKNESS, _COLOUR = 0.03, (0.55, 0.62, 0.70, 1.0)  # of links that the model gives no shape; share of the chain length
 _ABOUT = ("keys", "equalities", "actuators", "sensors", "tendons", "excludes", "pairs", "lights", "cameras")
