@@ -12,7 +12,7 @@ import numpy as np
 
 from mimic.arms.embodiment import Embodiment
 from mimic.descent import Derivatives, End, Scalars, newton
-from mimic.kinematics import LinkStates
+from mimic.metric.kinematics import LinkStates
 from mimic.pose import pose_limits
 
 JOINTS = LINKS = 7  # that arms are padded to

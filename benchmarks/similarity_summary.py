@@ -8,8 +8,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from mimic.metric.similarity import MEASURES
 from mimic.pose_baselines import BASELINES
-from mimic.similarity import MEASURES
 
 Rows = list[dict[str, Any]]
 

@@ -12,13 +12,18 @@ compat.import_mujoco()
 
 from mimic.arms.arm import ArmConfig, build_arm  # noqa: E402
 from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
-from mimic.correspondence import (  # noqa: E402
+from mimic.envs import env_config, environments, make  # noqa: E402
+from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
+from mimic.envs.importing import import_demonstrations  # noqa: E402
+from mimic.envs.recording import record_demonstrations  # noqa: E402
+from mimic.imitation import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
+from mimic.metric.correspondence import (  # noqa: E402
     arc_length_correspondence,
     hard_correspondence,
     overlap_correspondence,
     soft_correspondence,
 )
-from mimic.distance import (  # noqa: E402
+from mimic.metric.distance import (  # noqa: E402
     PAPER_WEIGHTS,
     DistanceWeights,
     PairDistances,
@@ -27,12 +32,7 @@ from mimic.distance import (  # noqa: E402
     link_distances,
     rotation_distance,
 )
-from mimic.envs import env_config, environments, make  # noqa: E402
-from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
-from mimic.envs.importing import import_demonstrations  # noqa: E402
-from mimic.envs.recording import record_demonstrations  # noqa: E402
-from mimic.imitation import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
-from mimic.kinematics import (  # noqa: E402
+from mimic.metric.kinematics import (  # noqa: E402
     Frames,
     LinkStates,
     body_twists,
@@ -40,8 +40,8 @@ from mimic.kinematics import (  # noqa: E402
     forward_kinematics,
     link_states,
 )
-from mimic.landscape import distance_landscape, local_minima  # noqa: E402
-from mimic.motion import motion_distance  # noqa: E402
+from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
+from mimic.metric.motion_distance import motion_distance  # noqa: E402
 from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:

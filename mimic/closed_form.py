@@ -8,7 +8,7 @@ p towards points p_i with weights w_i. Up to a constant of the expert, the dista
 A length has a kink at 0, where Newton's method would divide by it, and a sum of lengths often has its minimum there, at
 links that match exactly. Smoothed, it is 0 with derivative 0 at a match, and nowhere off by more than s.
 
-All is done on scalar components (see `mimic.spatial`). Rotating joint k moves all distal links: with its axis a and a
+All is done on scalar components (see `mimic.metric.spatial`). Rotating joint k moves all distal links: with its axis a and a
 point c on it, a link's position by J = a x (p - c) = m + a x p, m = c x a. Sums over the distal links are accumulated
 from tip to base, as for a composite rigid body: the force g = grad h, the moments M of force and pull, and the
 stiffness of position.
@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from mimic import spatial
 from mimic.descent import Derivatives
-from mimic.spatial import Rotation, Scalar, Vector
+from mimic.metric import spatial
+from mimic.metric.spatial import Rotation, Scalar, Vector
 
 # s [chain lengths]. Newton's steps overshoot a kink that is far away in units of s, so a descent begins with the rough
 # one. Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone

@@ -1,6 +1,6 @@
 """Descents of a smooth function of joint angles, within limits; each from one start, batched by `jax.vmap`.
 
-All is done on scalar components (see `mimic.spatial`): a batch of descents is one elementwise program.
+All is done on scalar components (see `mimic.metric.spatial`): a batch of descents is one elementwise program.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.spatial import Scalar, plus, times
+from mimic.metric.spatial import Scalar, plus, times
 
 _LARGEST_STEP = 1.0  # rad, of a joint in one Newton step
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: at the start, after a success, after a failure

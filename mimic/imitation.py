@@ -10,8 +10,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
-from mimic.kinematics import LinkStates, link_states
+from mimic.metric.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
+from mimic.metric.kinematics import LinkStates, link_states
 from mimic.pose import pose_limits, shared_joints
 from mimic.quasi_newton import Descent, bfgs
 

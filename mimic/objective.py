@@ -11,12 +11,19 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int
 
-from mimic import spatial
 from mimic.arms.embodiment import Embodiment
 from mimic.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
 from mimic.descent import Derivatives, Scalars
-from mimic.distance import Correspondence, DistanceWeights, Reduction, RotationMeasure, Weights, embodiment_distance
-from mimic.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
+from mimic.metric import spatial
+from mimic.metric.distance import (
+    Correspondence,
+    DistanceWeights,
+    Reduction,
+    RotationMeasure,
+    Weights,
+    embodiment_distance,
+)
+from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
 
 Target = Any  # what of the expert's pose counts: a pytree
 

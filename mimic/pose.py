@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.descent import Derivatives, End, Scalars, gradient_descent, newton
-from mimic.distance import Correspondence, Reduction, RotationMeasure, Weights
-from mimic.kinematics import LinkStates, link_states
+from mimic.metric.distance import Correspondence, Reduction, RotationMeasure, Weights
+from mimic.metric.kinematics import LinkStates, link_states
 from mimic.objective import PoseObjective, Target, pose_objective
 
 Method = Literal["newton", "gradient_descent"]

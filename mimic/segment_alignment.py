@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.kinematics import joint_frames
+from mimic.metric.kinematics import joint_frames
 from mimic.pose import pose_limits
 from mimic.subproblems import PARALLEL, bend_to_angle, dot, frame_of, rotate_onto, rotate_onto_by_two, rotated, unit
 

@@ -13,7 +13,7 @@ from jaxtyping import install_import_hook
 
 REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
 
-# Not mimic.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
+# Not mimic.metric.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
 CORE = (
     "arms.chain",
     "arms.embodiment",
@@ -62,7 +62,7 @@ def dtype(request: pytest.FixtureRequest):
 @pytest.fixture
 def interpreted(monkeypatch: pytest.MonkeyPatch):
     """Runs GPU kernels on the CPU, step by step."""
-    from mimic import kernel
+    from mimic.metric import fused_kernel as kernel
 
     monkeypatch.setattr(kernel.pl, "pallas_call", functools.partial(kernel.pl.pallas_call, interpret=True))
 

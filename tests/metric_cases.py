@@ -6,9 +6,9 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from mimic.arms.embodiment import planar_arm
-from mimic.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
-from mimic.distance import DistanceWeights, Reduction, RotationMeasure, adaptive_weights
-from mimic.kinematics import link_states
+from mimic.metric.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
+from mimic.metric.distance import DistanceWeights, Reduction, RotationMeasure, adaptive_weights
+from mimic.metric.kinematics import link_states
 
 ALL_WEIGHTS = DistanceWeights(translation=2.0, rotation=1.0, linear_velocity=3.0, angular_velocity=0.5)
 SHAPE = (3, 2)  # links of the two arms that gradients are taken with

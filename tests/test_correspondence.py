@@ -6,14 +6,14 @@ import random_arms
 
 from mimic.arms.chain import Chain, Joint, Link, lock
 from mimic.arms.embodiment import from_chain, load_mjcf, panda, planar_arm
-from mimic.correspondence import (
+from mimic.metric.correspondence import (
     arc_length_correspondence,
     hard_correspondence,
     overlap_correspondence,
     soft_correspondence,
 )
-from mimic.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance, link_distances
-from mimic.kinematics import link_states
+from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance, link_distances
+from mimic.metric.kinematics import link_states
 
 
 def random_distances(seed=0, shape=(5, 3)):

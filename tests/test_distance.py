@@ -9,8 +9,8 @@ import pytest
 from metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, MEASURES, REDUCTIONS, WEIGHTS, states
 
 from mimic.arms.embodiment import panda, planar_arm
-from mimic.correspondence import hard_correspondence, overlap_correspondence
-from mimic.distance import (
+from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
+from mimic.metric.distance import (
     PAPER_WEIGHTS,
     DistanceWeights,
     RotationMeasure,
@@ -19,7 +19,7 @@ from mimic.distance import (
     link_distances,
     rotation_distance,
 )
-from mimic.kinematics import candidate_points, link_states
+from mimic.metric.kinematics import candidate_points, link_states
 
 # --- values -----------------------------------------------------------------------------------------------------------
 

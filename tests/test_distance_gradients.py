@@ -7,9 +7,9 @@ import pytest
 from metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, MEASURES, REDUCTIONS, WEIGHTS, states
 
 from mimic.arms.embodiment import panda
-from mimic.correspondence import overlap_correspondence
-from mimic.distance import PAPER_WEIGHTS, embodiment_distance
-from mimic.kinematics import LinkStates, link_states
+from mimic.metric.correspondence import overlap_correspondence
+from mimic.metric.distance import PAPER_WEIGHTS, embodiment_distance
+from mimic.metric.kinematics import LinkStates, link_states
 
 
 def distances_of(combinations):

@@ -6,8 +6,8 @@ import pytest
 import random_arms
 
 from mimic.arms.embodiment import load_mjcf, panda, panda_path, planar_arm
-from mimic.kinematics import forward_kinematics, link_states
-from mimic.similarity import centre_line
+from mimic.metric.kinematics import forward_kinematics, link_states
+from mimic.metric.similarity import centre_line
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
 

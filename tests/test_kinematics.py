@@ -10,7 +10,7 @@ import random_arms
 
 from mimic.arms.embodiment import load_mjcf, panda, panda_path, planar_arm
 from mimic.arms.model_files import read_model
-from mimic.kinematics import LONG, body_twists, candidate_points, forward_kinematics, link_states
+from mimic.metric.kinematics import LONG, body_twists, candidate_points, forward_kinematics, link_states
 
 # Against MuJoCo, in m, m/s and rad/s. Arms are up to 3 m long and move at up to 10 rad/s and 10 m/s.
 TOLERANCE = {

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from mimic.arms.embodiment import planar_arm
-from mimic.correspondence import hard_correspondence, overlap_correspondence
-from mimic.distance import DistanceWeights, adaptive_weights
-from mimic.landscape import distance_landscape, local_minima
+from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
+from mimic.metric.distance import DistanceWeights, adaptive_weights
+from mimic.metric.landscape import distance_landscape, local_minima
 
 ARM = planar_arm([0.5, 0.5])
 EXPERT_POSE = np.array([1.5, -1.5])

@@ -11,7 +11,7 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
-from mimic.kinematics import link_state_table
+from mimic.metric.kinematics import link_state_table
 from mimic.trainers import plots
 from mimic.trainers.evaluation import Evaluator, Rollouts
 from mimic.trainers.measures import gaps, has_gap, measure

@@ -8,11 +8,12 @@ from jax.typing import DTypeLike
 from lowering import gpu_program
 from metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, WEIGHTS
 
-from mimic import kernel, motion_distance
+from mimic import motion_distance
 from mimic.arms.embodiment import panda, planar_arm
-from mimic.correspondence import hard_correspondence, overlap_correspondence
-from mimic.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
-from mimic.kinematics import LONG, link_states
+from mimic.metric import fused_kernel as kernel
+from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
+from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
+from mimic.metric.kinematics import LONG, link_states
 
 PAIRS = {
     "panda 7->4": (panda(), panda(locked=(3, 6, 7))),

@@ -9,11 +9,14 @@ from lowering import gpu_program
 from metric_cases import ALL_WEIGHTS
 from random_arms import random_arm
 
-from mimic import kernel, motion, motion_distance, motion_walk
+from mimic import motion_distance
 from mimic.arms.embodiment import load_mjcf, panda, planar_arm
-from mimic.correspondence import overlap_correspondence
-from mimic.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
-from mimic.kinematics import LONG, link_states
+from mimic.metric import fused_kernel as kernel
+from mimic.metric import long_chain_kernel as motion_walk
+from mimic.metric import motion_distance as motion
+from mimic.metric.correspondence import overlap_correspondence
+from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
+from mimic.metric.kinematics import LONG, link_states
 
 ARGUMENTS = (0, 1, 2, 3)
 LONG_ARMS = planar_arm(np.linspace(0.1, 0.3, LONG + 3)), planar_arm(np.linspace(0.2, 0.1, 5))

@@ -8,10 +8,10 @@ from random_arms import random_arm
 
 from mimic.arms.embodiment import load_mjcf, panda, planar_arm
 from mimic.closed_form import SMOOTHING
-from mimic.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
-from mimic.distance import DistanceWeights, adaptive_weights, embodiment_distance, rotation_distance
 from mimic.envs.config import MetricConfig
-from mimic.kinematics import link_states
+from mimic.metric.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
+from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance, rotation_distance
+from mimic.metric.kinematics import link_states
 from mimic.objective import pose_objective
 
 DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.7)

@@ -9,10 +9,10 @@ from lowering import gpu_program
 from random_arms import SEEDS, random_arm
 
 import mimic
-from mimic import kernel
 from mimic.arms.arm import ArmConfig, build_arm, simulation_model
 from mimic.envs import dynamics, physics
 from mimic.envs.physics import Load, make_advance
+from mimic.metric import fused_kernel as kernel
 
 # Double precision leaves 1e-16 of each of a few thousand operations, and bodies that are light beside others amplify
 # it: up to 1e-12 on the random arms, 1e-15 on the Panda.

@@ -9,10 +9,10 @@ from scipy.optimize import minimize
 from mimic import objective
 from mimic.arms.embodiment import panda, planar_arm
 from mimic.closed_form import SMOOTHING
-from mimic.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
-from mimic.distance import DistanceWeights, adaptive_weights, embodiment_distance
 from mimic.envs.config import MetricConfig
-from mimic.kinematics import link_states
+from mimic.metric.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
+from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance
+from mimic.metric.kinematics import link_states
 from mimic.pose import imitate_pose, imitate_trajectory
 
 DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.0)

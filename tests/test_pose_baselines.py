@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mimic.arms.embodiment import Embodiment, panda, planar_arm
+from mimic.metric.similarity import centre_line_table, similarity
 from mimic.pose_baselines import BASELINES, copy_joints, hand_ik, hold_home
 from mimic.segment_alignment import (
     Landmarks,
@@ -12,7 +13,6 @@ from mimic.segment_alignment import (
     part_directions,
     part_joints,
 )
-from mimic.similarity import centre_line_table, similarity
 from mimic.subproblems import bend_to_angle, rotate_onto, rotate_onto_by_two
 
 PANDA = panda()

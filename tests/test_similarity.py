@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic import similarity
 from mimic.arms.embodiment import panda, panda_path, planar_arm
-from mimic.similarity import MEASURES, centre_line, centre_line_table
+from mimic.metric import similarity
+from mimic.metric.similarity import MEASURES, centre_line, centre_line_table
 
 ANGLE = 0.7  # rad
 ARMS = {"kept": panda(locked=(3, 6, 7)), "merged": panda(locked=(3, 6, 7), links="merged")}

@@ -10,9 +10,9 @@ import mimic
 from benchmarks import similarity as benchmark
 from benchmarks import similarity_poses as poses
 from benchmarks import similarity_summary as summary
-from mimic.kinematics import link_state_table
+from mimic.metric.kinematics import link_state_table
+from mimic.metric.similarity import MEASURES
 from mimic.pose import shared_joints
-from mimic.similarity import MEASURES
 
 
 def test_all_single_and_double_locks_and_two_more():

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from mimic.arms.embodiment import panda
-from mimic.correspondence import arc_length_correspondence
-from mimic.distance import embodiment_distance
 from mimic.envs.config import MetricConfig
-from mimic.kinematics import LinkStates, link_state_table, link_states
+from mimic.metric.correspondence import arc_length_correspondence
+from mimic.metric.distance import embodiment_distance
+from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.pose import imitate_pose
 
 # Every set of locked joints but all seven: 127.

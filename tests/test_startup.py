@@ -15,7 +15,7 @@ import mimic
 from mimic import cli, compat
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.wrappers import wrap_for_training
-from mimic.kinematics import link_state_table
+from mimic.metric.kinematics import link_state_table
 from mimic.trainers import evaluation, prepared
 from mimic.trainers.config import PRESETS, PPOConfig
 from mimic.trainers.evaluation import Evaluator

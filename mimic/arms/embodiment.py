@@ -26,7 +26,7 @@ class Embodiment:
 
     A frozen pytree: the arrays are leaves, names and structure are static. The constructors make NumPy arrays in
     float64, and functions compute in the dtype of the pose that they are given. An arm that a function closes over is
-    known while JAX traces and costs less than one that `jax.jit` is given as an argument (see `mimic.spatial`; up to 16
+    known while JAX traces and costs less than one that `jax.jit` is given as an argument (see `mimic.metric.spatial`; up to 16
     joints).
 
     Attributes:

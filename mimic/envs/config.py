@@ -13,14 +13,14 @@ from mimic.arms.arm import ArmConfig
 from mimic.arms.chain import LINKS
 from mimic.arms.embodiment import LIMITS, Embodiment
 from mimic.config import check_choice
-from mimic.correspondence import (
+from mimic.envs.recording import KINDS
+from mimic.metric.correspondence import (
     arc_length_correspondence,
     hard_correspondence,
     overlap_correspondence,
     soft_correspondence,
 )
-from mimic.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
-from mimic.envs.recording import KINDS
+from mimic.metric.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")
 PHYSICS = ("mjx", "fused")

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
-from mimic.spatial import (
+from mimic.metric.spatial import (
     IDENTITY,
     ZERO,
     Rotation,

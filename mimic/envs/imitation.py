@@ -14,12 +14,12 @@ from jaxtyping import Array, Float, Int
 
 from mimic.arms.arm import Arm, build_arm, torque_scale
 from mimic.arms.embodiment import Embodiment
-from mimic.distance import embodiment_distance
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.envs.physics import Load, make_advance
 from mimic.envs.recording import record_demonstrations
-from mimic.kinematics import LinkStates, link_state_table, link_states
+from mimic.metric.distance import embodiment_distance
+from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 
 # Of a limit, in rad or as a share of the rated speed: where nearness begins to cost, and how much further all it can.
 _MARGIN, _FAR = 0.03, 0.1

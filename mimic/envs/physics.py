@@ -9,8 +9,8 @@ import mujoco
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from mimic import kernel
 from mimic.envs import dynamics
+from mimic.metric import fused_kernel as kernel
 
 _LAYOUT = kernel.Layout(block=64, warps=2)  # by measurement
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.kinematics import forward_kinematics
+from mimic.metric.kinematics import forward_kinematics
 
 EXPERT_COLOUR, LEARNER_COLOUR = "tab:blue", "tab:orange"
 

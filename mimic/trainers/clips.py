@@ -11,12 +11,12 @@ from jaxtyping import Float
 
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
-from mimic.distance import embodiment_distance, link_distances
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
-from mimic.kinematics import link_states
+from mimic.metric.distance import embodiment_distance, link_distances
+from mimic.metric.kinematics import link_states
 from mimic.pose import imitate_pose, pose_limits
 from mimic.trainers import runs, session
 from mimic.trainers.checkpoints import load_checkpoint

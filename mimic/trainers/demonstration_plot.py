@@ -15,7 +15,7 @@ from matplotlib.collections import LineCollection  # noqa: E402
 
 from mimic.arms.embodiment import Embodiment  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations  # noqa: E402
-from mimic.kinematics import forward_kinematics  # noqa: E402
+from mimic.metric.kinematics import forward_kinematics  # noqa: E402
 
 _COLOURS = {"angle": "tab:blue", "speed": "tab:green", "torque": "tab:purple", "hand": "tab:orange"}
 _LIMIT: dict[str, Any] = {"color": "tab:red", "lw": 0.8, "ls": "--"}

@@ -17,10 +17,10 @@ from jaxtyping import Array, Float
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
 from mimic.imitation import closest_motion
-from mimic.kinematics import link_state_table
+from mimic.metric.kinematics import link_state_table
+from mimic.metric.similarity import CentreLine, centre_line_table
 from mimic.pose import pose_limits, shared_joints
 from mimic.pose_baselines import baseline_poses
-from mimic.similarity import CentreLine, centre_line_table
 from mimic.trainers.measures import WORST, Table, gaps, means_by_split, measure, measure_similarity
 from mimic.trainers.prepared import Prepared, on_host
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Int
 
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import fresh_episodes
-from mimic.kinematics import LinkStates
+from mimic.metric.kinematics import LinkStates
 from mimic.trainers import updates
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo_loss import Unrolls

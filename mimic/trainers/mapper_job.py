@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from mimic.kinematics import link_states
+from mimic.metric.kinematics import link_states
 from mimic.pose import imitate_pose
 from mimic.trainers import mapper_training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.kinematics import LinkStates
+from mimic.metric.kinematics import LinkStates
+from mimic.metric.similarity import CentreLine, centre_line_table, similarity
 from mimic.pose import pose_limits
 from mimic.pose_baselines import baseline_poses
-from mimic.similarity import CentreLine, centre_line_table, similarity
 
 if TYPE_CHECKING:  # brax and MJX, which pose mappers need not
     from mimic.envs.imitation import ImitationEnv
@@ -75,7 +75,7 @@ def measure(
 def measure_similarity(
     expert: CentreLine, learner: Embodiment, qpos: Float[np.ndarray, "demonstrations time joints"]
 ) -> Table:
-    """Columns of the measures of `mimic.similarity`, means over time.
+    """Columns of the measures of `mimic.metric.similarity`, means over time.
 
     Args:
       expert: centre lines of the demonstrations, [demonstrations, time, samples, 3].

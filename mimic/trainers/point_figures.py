@@ -11,8 +11,8 @@ import numpy as np  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 
 from mimic.arms.embodiment import Embodiment, planar_arm  # noqa: E402
-from mimic.distance import DistanceWeights, embodiment_distance  # noqa: E402
-from mimic.kinematics import candidate_points, link_states  # noqa: E402
+from mimic.metric.distance import DistanceWeights, embodiment_distance  # noqa: E402
+from mimic.metric.kinematics import candidate_points, link_states  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, joint_points  # noqa: E402
 
 _POSITIONS = DistanceWeights(translation=1.0, rotation=0.0)

@@ -16,10 +16,10 @@ import numpy as np  # noqa: E402
 
 from mimic.arms.embodiment import planar_arm  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
-from mimic.distance import DistanceWeights, adaptive_weights  # noqa: E402
 from mimic.envs import env_config  # noqa: E402
-from mimic.landscape import distance_landscape, local_minima  # noqa: E402
+from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
+from mimic.metric.distance import DistanceWeights, adaptive_weights  # noqa: E402
+from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.pose import imitate_pose  # noqa: E402
 from mimic.trainers import metric_figures, point_figures, similarity_figures  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402

@@ -17,9 +17,9 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
-from mimic.distance import Correspondence, embodiment_distance
 from mimic.envs.config import EnvConfig, MetricConfig
-from mimic.kinematics import link_states
+from mimic.metric.distance import Correspondence, embodiment_distance
+from mimic.metric.kinematics import link_states
 from mimic.pose import pose_limits
 from mimic.trainers import runs
 from mimic.trainers.checkpoints import load_checkpoint

@@ -16,8 +16,8 @@ from jaxtyping import Float  # noqa: E402
 from mimic.arms.arm import Arm, ArmConfig  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs.config import EnvConfig, MetricConfig  # noqa: E402
+from mimic.metric.similarity import CentreLine, centre_line_table, similarity  # noqa: E402
 from mimic.pose import imitate_pose  # noqa: E402
-from mimic.similarity import CentreLine, centre_line_table, similarity  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR  # noqa: E402
 
 # What the Panda's joints are turned by [rad]: poses that show the whole arm, within its joint ranges.
@@ -42,7 +42,7 @@ class PosePairs:
       expert_qpos: [poses, joints] [rad].
       learner_qpos: [poses, learner_joints] of least embodiment distance [rad].
       distance: [poses] embodiment distance of the two, at rest.
-      similarity: the measures of `mimic.similarity`, [poses] each.
+      similarity: the measures of `mimic.metric.similarity`, [poses] each.
     """
 
     expert_qpos: Float[np.ndarray, "poses joints"]

@@ -48,7 +48,7 @@ def retarget(
     Returns:
       The learner's motions, and a report: `distance`, mean of all; `largest_jump` [rad] of a joint between two times;
       `settled`, the fraction of poses at a minimum, or at one that the mapper proposes; `similarity` of the motions and
-      of `mimic.pose_baselines.BASELINES`, means of the measures of `mimic.similarity`.
+      of `mimic.pose_baselines.BASELINES`, means of the measures of `mimic.metric.similarity`.
 
     Raises:
       ValueError: demonstrations of another arm, poses outside its range, or a mapper between other arms.

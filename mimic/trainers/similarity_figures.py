@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 
 from mimic.arms.embodiment import planar_arm  # noqa: E402
-from mimic.similarity import MEASURES, CentreLine, centre_line_table, similarity  # noqa: E402
+from mimic.metric.similarity import MEASURES, CentreLine, centre_line_table, similarity  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 
 _EXPERT, _LEARNER = planar_arm([0.4, 0.35, 0.25]), planar_arm([0.55, 0.45])

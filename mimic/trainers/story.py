@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from mimic.distance import link_distances
-from mimic.kinematics import link_states
+from mimic.metric.distance import link_distances
+from mimic.metric.kinematics import link_states
 from mimic.trainers import runs
 from mimic.trainers.checkpoints import check_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig

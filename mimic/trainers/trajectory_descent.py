@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.distance import PARTS, PairDistances, Weights, pair_distances
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.physics import Load, make_advance
-from mimic.kinematics import LinkStates, link_states
-from mimic.spatial import safe_sqrt
+from mimic.metric.distance import PARTS, PairDistances, Weights, pair_distances
+from mimic.metric.kinematics import LinkStates, link_states
+from mimic.metric.spatial import safe_sqrt
 
 _STEPS = (1.0, 0.5, 0.2, 0.05, 0.01)  # of the full update; all are rolled out, and the best one is taken
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-6, 1e3  # added to the curvature by the action

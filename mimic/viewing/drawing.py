@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from mimic.similarity import MEASURES
+from mimic.metric.similarity import MEASURES
 from mimic.trainers.progress import SIMILARITY_HEADERS
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
@@ -81,7 +81,7 @@ def heat_maps(
 
 
 def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[str, float] | None = None) -> str:
-    """Distance and bound, large; a note; and the measures of `mimic.similarity`."""
+    """Distance and bound, large; a note; and the measures of `mimic.metric.similarity`."""
 
     def one(name: str, label: str, value: float, colour: str) -> str:
         return (

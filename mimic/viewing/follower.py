@@ -14,12 +14,12 @@ from jaxtyping import Array, Float
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.config import check_choice
-from mimic.distance import Correspondence, DistanceWeights, Weights, link_distances
 from mimic.envs.config import CORRESPONDENCES, EnvConfig, MetricConfig
-from mimic.kinematics import link_states
+from mimic.metric.distance import Correspondence, DistanceWeights, Weights, link_distances
+from mimic.metric.kinematics import link_states
+from mimic.metric.similarity import centre_line, similarity
+from mimic.metric.spatial import safe_sqrt
 from mimic.pose import imitate_pose, pose_limits
-from mimic.similarity import centre_line, similarity
-from mimic.spatial import safe_sqrt
 
 Mapper = Callable[[Array], Array]  # the expert's pose -> the learner's
 
@@ -69,7 +69,7 @@ class Measured(NamedTuple):
       distance: embodiment distance.
       matrix: correspondence W.
       links: weighted distance of every pair of links D'.
-      similarity: see `mimic.similarity`.
+      similarity: see `mimic.metric.similarity`.
     """
 
     distance: Float[Any, ""]

@@ -32,7 +32,7 @@ class Frame:
       bound: the least that the learner could have; NaN while it is not known.
       matrix: correspondence W.
       links: weighted distance of every pair of links D'.
-      similarity: measures of `mimic.similarity` by name.
+      similarity: measures of `mimic.metric.similarity` by name.
     """
 
     expert: Mapping[str, float]

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
-from mimic.similarity import centre_line_table, similarity
+from mimic.metric.similarity import centre_line_table, similarity
 from mimic.trainers import session
 from mimic.trainers.checkpoints import load_checkpoint
 from mimic.trainers.config import TrainConfig

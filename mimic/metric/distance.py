@@ -11,8 +11,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
-from mimic import spatial
-from mimic.kinematics import LinkStates
+from mimic.metric import spatial
+from mimic.metric.kinematics import LinkStates
 
 RotationMeasure = Literal["cosine", "angle"]
 Reduction = Literal["mean", "frobenius"]

@@ -12,9 +12,9 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic import spatial
 from mimic.arms.embodiment import Embodiment
-from mimic.spatial import Rotation, Vector
+from mimic.metric import spatial
+from mimic.metric.spatial import Rotation, Vector
 
 
 @struct.dataclass

@@ -9,8 +9,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from mimic.arms.embodiment import Embodiment
-from mimic.distance import Correspondence, RotationMeasure, Weights, embodiment_distance
-from mimic.kinematics import link_states
+from mimic.metric.distance import Correspondence, RotationMeasure, Weights, embodiment_distance
+from mimic.metric.kinematics import link_states
 
 
 class Landscape(NamedTuple):

@@ -12,9 +12,11 @@ from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from mimic import kernel, motion_gradient, motion_walk
 from mimic.arms.embodiment import Embodiment
-from mimic.distance import (
+from mimic.metric import analytic_gradient as motion_gradient
+from mimic.metric import fused_kernel as kernel
+from mimic.metric import long_chain_kernel as motion_walk
+from mimic.metric.distance import (
     PAPER_WEIGHTS,
     PARTS,
     Correspondence,
@@ -25,7 +27,7 @@ from mimic.distance import (
     embodiment_distance,
     pair_distances,
 )
-from mimic.kinematics import LONG, joint_values, link_states
+from mimic.metric.kinematics import LONG, joint_values, link_states
 
 Values = Callable[..., tuple[Array, ...]]  # of motions: a distance, and gradients
 MotionDistance = Callable[..., Float[Array, ""]]  # expert_qpos, expert_qvel, learner_qpos, learner_qvel

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from mimic import spatial
 from mimic.arms.embodiment import Embodiment
-from mimic.distance import PARTS
-from mimic.kinematics import JointFrame, LinkVectors, joint_frames, link_vectors
-from mimic.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract, times
+from mimic.metric import spatial
+from mimic.metric.distance import PARTS
+from mimic.metric.kinematics import JointFrame, LinkVectors, joint_frames, link_vectors
+from mimic.metric.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract, times
 
 _ROTATION = PARTS.index("rotation")
 _REST = LinkVectors(ZERO, ZERO, ZERO, ZERO)

@@ -1,4 +1,4 @@
-"""The usual embodiment distance of long arms and its gradient: `mimic.motion_gradient` as a loop.
+"""The usual embodiment distance of long arms and its gradient: `mimic.metric.analytic_gradient` as a loop.
 
 A program that spells out all links takes a time to compile that grows faster than their number. Here both arms are
 walked along at once, a step at a time: each arm crosses a joint or stays, then a pair of links is compared. Where the
@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mimic import kernel, spatial
 from mimic.arms.embodiment import Embodiment
-from mimic.kinematics import BASE, JointFrame, LinkVectors, behind_joint, link_behind
-from mimic.motion_gradient import NO_SLOPES, Slopes, by_joint, compare_part, with_link
-from mimic.spatial import ZERO, Scalar, Vector, plus, subtract
+from mimic.metric import fused_kernel as kernel
+from mimic.metric import spatial
+from mimic.metric.analytic_gradient import NO_SLOPES, Slopes, by_joint, compare_part, with_link
+from mimic.metric.kinematics import BASE, JointFrame, LinkVectors, behind_joint, link_behind
+from mimic.metric.spatial import ZERO, Scalar, Vector, plus, subtract
 
 _VECTORS = 4  # of an arm in a row of numbers: the last two of the link
 _PER_ARM = 3 * _VECTORS

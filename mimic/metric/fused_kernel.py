@@ -11,7 +11,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array
 
-from mimic.spatial import Scalar, stack
+from mimic.metric.spatial import Scalar, stack
 
 Program = Callable[..., Sequence[Sequence[Scalar]]]
 
@@ -52,7 +52,7 @@ def fused(
 
     Args:
       program: of one sequence of scalars for each vector; gives sequences of scalars. It must be elementwise, as what
-        `mimic.spatial` does: in the kernel a scalar is a block of samples.
+        `mimic.metric.spatial` does: in the kernel a scalar is a block of samples.
       widths: length of each sequence that the program gives.
       plain: the same on vectors, for where there is no such GPU; the program itself where None.
       layout: of the kernel.
