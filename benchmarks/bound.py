@@ -31,7 +31,7 @@ from benchmarks.record import write_results
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.envs.config import MetricConfig
 from mimic.envs.recording import record_demonstrations
-from mimic.pose import pose_limits, shared_joints
+from mimic.retargeting.pose import pose_limits, shared_joints
 
 STEPS = 50
 ABSOLUTE, RELATIVE, ROUNDING = 1e-3, 1e-3, 1e-5

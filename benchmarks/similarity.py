@@ -4,7 +4,7 @@
 
 For every pair of arms and set of expert poses, the learner takes the pose of minimum distance under each candidate
 metric (links kept or merged, correspondence, translation weight beside a rotation weight of 1), and the five measures
-of `mimic.metric.similarity` say how alike the arms look; beside them those of the baselines of `mimic.pose_baselines`.
+of `mimic.metric.similarity` say how alike the arms look; beside them those of the baselines of `mimic.retargeting.pose_baselines`.
 FOLDER holds an unpacked wheel of robosuite, for arms other than the Panda; without it they are left out.
 
 Poses are optimised as by `imitate_pose`, but all pairs share one compiled function: see `benchmarks.similarity_poses`.
@@ -36,8 +36,8 @@ from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import MetricConfig
 from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table, similarity
-from mimic.pose import shared_joints
-from mimic.pose_baselines import BASELINES
+from mimic.retargeting.pose import shared_joints
+from mimic.retargeting.pose_baselines import BASELINES
 
 TRANSLATIONS = 0.0, 0.25, 0.5, 1.0, 2.0, 4.0  # with a rotation weight of 1
 STATE_DEPENDENT = 0.0, 0.5, 2.0  # translation weights of hard and soft correspondence

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mimic.arms.embodiment import Embodiment
-from mimic.descent import Derivatives, End, Scalars, newton
 from mimic.metric.kinematics import LinkStates
-from mimic.pose import pose_limits
+from mimic.retargeting.optimizers import Derivatives, End, Scalars, newton
+from mimic.retargeting.pose import pose_limits
 
 JOINTS = LINKS = 7  # that arms are padded to
 STARTS, RANDOM_POSES = 8, 264  # twelve starts lower the mean distance by less than 0.03 %

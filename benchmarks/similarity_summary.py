@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mimic.metric.similarity import MEASURES
-from mimic.pose_baselines import BASELINES
+from mimic.retargeting.pose_baselines import BASELINES
 
 Rows = list[dict[str, Any]]
 

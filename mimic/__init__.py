@@ -16,7 +16,6 @@ from mimic.envs import env_config, environments, make  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
 from mimic.envs.importing import import_demonstrations  # noqa: E402
 from mimic.envs.recording import record_demonstrations  # noqa: E402
-from mimic.imitation import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
 from mimic.metric.correspondence import (  # noqa: E402
     arc_length_correspondence,
     hard_correspondence,
@@ -42,7 +41,8 @@ from mimic.metric.kinematics import (  # noqa: E402
 )
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.metric.motion_distance import motion_distance  # noqa: E402
-from mimic.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
+from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
+from mimic.retargeting.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:
     from mimic.arms.rendering import ArmScene

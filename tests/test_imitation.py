@@ -10,10 +10,10 @@ import optax
 import pytest
 
 from mimic.arms.embodiment import panda, planar_arm
-from mimic.imitation import closest_motion, kinematic_bound
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence
 from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, adaptive_weights, embodiment_distance
 from mimic.metric.kinematics import link_states
+from mimic.retargeting.kinematic_bound import closest_motion, kinematic_bound
 
 BELOW = 1e-4  # what a controller may gain on the bound: 0.1 % of a typical one
 FEW = slice(5, 51, 15)  # some steps of a demonstration: time is not what is tested

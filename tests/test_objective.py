@@ -7,12 +7,12 @@ import pytest
 from random_arms import random_arm
 
 from mimic.arms.embodiment import load_mjcf, panda, planar_arm
-from mimic.closed_form import SMOOTHING
 from mimic.envs.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
 from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance, rotation_distance
 from mimic.metric.kinematics import link_states
-from mimic.objective import pose_objective
+from mimic.retargeting.closed_form import SMOOTHING
+from mimic.retargeting.pose_objective import pose_objective
 
 DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.7)
 BOTH = DistanceWeights(translation=0.6, rotation=1.7)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from mimic import objective
 from mimic.arms.embodiment import panda, planar_arm
-from mimic.closed_form import SMOOTHING
 from mimic.envs.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
 from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance
 from mimic.metric.kinematics import link_states
-from mimic.pose import imitate_pose, imitate_trajectory
+from mimic.retargeting import pose_objective as objective
+from mimic.retargeting.closed_form import SMOOTHING
+from mimic.retargeting.pose import imitate_pose, imitate_trajectory
 
 DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.0)
 DEFAULT = MetricConfig()

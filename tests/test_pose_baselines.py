@@ -5,15 +5,15 @@ import pytest
 
 from mimic.arms.embodiment import Embodiment, panda, planar_arm
 from mimic.metric.similarity import centre_line_table, similarity
-from mimic.pose_baselines import BASELINES, copy_joints, hand_ik, hold_home
-from mimic.segment_alignment import (
+from mimic.retargeting.pose_baselines import BASELINES, copy_joints, hand_ik, hold_home
+from mimic.retargeting.segment_alignment import (
     Landmarks,
     align_segments,
     landmarks,
     part_directions,
     part_joints,
 )
-from mimic.subproblems import bend_to_angle, rotate_onto, rotate_onto_by_two
+from mimic.retargeting.subproblems import bend_to_angle, rotate_onto, rotate_onto_by_two
 
 PANDA = panda()
 PANDA_MARKS = Landmarks(1, 3, 5, 7)  # (0,0,.333), (.0825,0,.649), (0,0,1.033) and the tip

@@ -12,7 +12,7 @@ from benchmarks import similarity_poses as poses
 from benchmarks import similarity_summary as summary
 from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import MEASURES
-from mimic.pose import shared_joints
+from mimic.retargeting.pose import shared_joints
 
 
 def test_all_single_and_double_locks_and_two_more():

@@ -11,7 +11,7 @@ from mimic.envs.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import embodiment_distance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
-from mimic.pose import imitate_pose
+from mimic.retargeting.pose import imitate_pose
 
 # Every set of locked joints but all seven: 127.
 LOCKS = [joints for count in range(7) for joints in itertools.combinations(range(1, 8), count)]

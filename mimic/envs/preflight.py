@@ -15,9 +15,9 @@ from mimic.arms.arm import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale
 from mimic.arms.embodiment import load_arm
 from mimic.envs.config import EnvConfig
 from mimic.envs.recording import record_demonstrations
-from mimic.imitation import closest_motion
 from mimic.metric.distance import embodiment_distance
 from mimic.metric.kinematics import LinkStates, link_state_table
+from mimic.retargeting.kinematic_bound import closest_motion
 
 _DEMONSTRATIONS, _EVERY = 2, 5  # few, and of them every fifth step: a rough value in seconds
 

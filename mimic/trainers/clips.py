@@ -17,7 +17,7 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
 from mimic.metric.distance import embodiment_distance, link_distances
 from mimic.metric.kinematics import link_states
-from mimic.pose import imitate_pose, pose_limits
+from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.trainers import runs, session
 from mimic.trainers.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig, RenderConfig

@@ -16,11 +16,11 @@ from jaxtyping import Array, Float
 
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
-from mimic.imitation import closest_motion
 from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table
-from mimic.pose import pose_limits, shared_joints
-from mimic.pose_baselines import baseline_poses
+from mimic.retargeting.kinematic_bound import closest_motion
+from mimic.retargeting.pose import pose_limits, shared_joints
+from mimic.retargeting.pose_baselines import baseline_poses
 from mimic.trainers.measures import WORST, Table, gaps, means_by_split, measure, measure_similarity
 from mimic.trainers.prepared import Prepared, on_host
 
@@ -122,7 +122,7 @@ class Evaluator:
     def similarity_summary(self, rollouts: Rollouts, controller: str) -> dict[str, dict[str, dict[str, float]]]:
         """Means by split of each measure of similarity, for a controller and for the baselines beside it.
 
-        Beside it: `nearest_poses`, where the kinematic bound is, and `mimic.pose_baselines.BASELINES`.
+        Beside it: `nearest_poses`, where the kinematic bound is, and `mimic.retargeting.pose_baselines.BASELINES`.
         """
         tables = {controller: self.similarity(np.asarray(rollouts.qpos)), **self._baseline_similarity}
         return means_by_split(tables, self.parts)

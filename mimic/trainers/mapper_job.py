@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from mimic.metric.kinematics import link_states
-from mimic.pose import imitate_pose
+from mimic.retargeting.pose import imitate_pose
 from mimic.trainers import mapper_training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row

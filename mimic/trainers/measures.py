@@ -9,8 +9,8 @@ from jaxtyping import Float
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.kinematics import LinkStates
 from mimic.metric.similarity import CentreLine, centre_line_table, similarity
-from mimic.pose import pose_limits
-from mimic.pose_baselines import baseline_poses
+from mimic.retargeting.pose import pose_limits
+from mimic.retargeting.pose_baselines import baseline_poses
 
 if TYPE_CHECKING:  # brax and MJX, which pose mappers need not
     from mimic.envs.imitation import ImitationEnv

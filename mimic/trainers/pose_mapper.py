@@ -20,7 +20,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig, MetricConfig
 from mimic.metric.distance import Correspondence, embodiment_distance
 from mimic.metric.kinematics import link_states
-from mimic.pose import pose_limits
+from mimic.retargeting.pose import pose_limits
 from mimic.trainers import runs
 from mimic.trainers.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig

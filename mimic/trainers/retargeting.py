@@ -18,7 +18,7 @@ from mimic.config import new_file
 from mimic.envs import env_config
 from mimic.envs.config import MetricConfig, RetargetConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
-from mimic.pose import PoseImitation, imitate_trajectory, pose_limits
+from mimic.retargeting.pose import PoseImitation, imitate_trajectory, pose_limits
 from mimic.trainers.measures import pose_similarity
 from mimic.trainers.pose_mapper import PoseMapper
 from mimic.trainers.progress import similarity_table
@@ -48,7 +48,7 @@ def retarget(
     Returns:
       The learner's motions, and a report: `distance`, mean of all; `largest_jump` [rad] of a joint between two times;
       `settled`, the fraction of poses at a minimum, or at one that the mapper proposes; `similarity` of the motions and
-      of `mimic.pose_baselines.BASELINES`, means of the measures of `mimic.metric.similarity`.
+      of `mimic.retargeting.pose_baselines.BASELINES`, means of the measures of `mimic.metric.similarity`.
 
     Raises:
       ValueError: demonstrations of another arm, poses outside its range, or a mapper between other arms.

@@ -19,7 +19,7 @@ from mimic.metric.distance import Correspondence, DistanceWeights, Weights, link
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
 from mimic.metric.spatial import safe_sqrt
-from mimic.pose import imitate_pose, pose_limits
+from mimic.retargeting.pose import imitate_pose, pose_limits
 
 Mapper = Callable[[Array], Array]  # the expert's pose -> the learner's
 

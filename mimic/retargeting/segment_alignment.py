@@ -13,8 +13,17 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.kinematics import joint_frames
-from mimic.pose import pose_limits
-from mimic.subproblems import PARALLEL, bend_to_angle, dot, frame_of, rotate_onto, rotate_onto_by_two, rotated, unit
+from mimic.retargeting.pose import pose_limits
+from mimic.retargeting.subproblems import (
+    PARALLEL,
+    bend_to_angle,
+    dot,
+    frame_of,
+    rotate_onto,
+    rotate_onto_by_two,
+    rotated,
+    unit,
+)
 
 Poses = Float[np.ndarray, "*batch time joints"]
 

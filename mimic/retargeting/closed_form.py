@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from mimic.descent import Derivatives
 from mimic.metric import spatial
 from mimic.metric.spatial import Rotation, Scalar, Vector
+from mimic.retargeting.optimizers import Derivatives
 
 # s [chain lengths]. Newton's steps overshoot a kink that is far away in units of s, so a descent begins with the rough
 # one. Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone

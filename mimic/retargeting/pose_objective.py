@@ -12,8 +12,6 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Int
 
 from mimic.arms.embodiment import Embodiment
-from mimic.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
-from mimic.descent import Derivatives, Scalars
 from mimic.metric import spatial
 from mimic.metric.distance import (
     Correspondence,
@@ -24,6 +22,8 @@ from mimic.metric.distance import (
     embodiment_distance,
 )
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
+from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
+from mimic.retargeting.optimizers import Derivatives, Scalars
 
 Target = Any  # what of the expert's pose counts: a pytree
 
@@ -83,7 +83,7 @@ class StaticTarget(NamedTuple):
     """What of the expert counts for the static measure: one pull on each direction of the learner, and positions.
 
     Attributes:
-      unit, strength: [links, 3], [links] of the pull on the learner's directions, see `mimic.closed_form`.
+      unit, strength: [links, 3], [links] of the pull on the learner's directions, see `mimic.retargeting.closed_form`.
       points, weights: [pairs, 3], [pairs] of the pulls on its positions.
       pulls: the same on each link, as scalar components.
     """

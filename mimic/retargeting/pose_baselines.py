@@ -11,8 +11,8 @@ import numpy as np
 
 from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.metric.similarity import centre_line_table
-from mimic.pose import pose_limits, shared_joints
-from mimic.segment_alignment import Poses, align_segments, checked_poses
+from mimic.retargeting.pose import pose_limits, shared_joints
+from mimic.retargeting.segment_alignment import Poses, align_segments, checked_poses
 
 IK_EVERY = 5  # samples of a motion of which inverse kinematics solves one; a solve takes 0.1 ms
 _TRACKING_STEPS = 6  # from the solution of the sample before

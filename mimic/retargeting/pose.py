@@ -12,10 +12,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.descent import Derivatives, End, Scalars, gradient_descent, newton
 from mimic.metric.distance import Correspondence, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.objective import PoseObjective, Target, pose_objective
+from mimic.retargeting.optimizers import Derivatives, End, Scalars, gradient_descent, newton
+from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
 
 Method = Literal["newton", "gradient_descent"]
 METHODS = ("newton", "gradient_descent")
@@ -35,7 +35,7 @@ class PoseImitation(NamedTuple):
       qpos: [*batch, learner_joints] angles [rad].
       distance: [*batch] embodiment distance that is left.
       converged: [*batch] whether the gradient vanishes there, but for joints that are held at a limit. Where positions
-        match, a kink of the distance, it is the gradient of the smoothed one (see `mimic.closed_form`).
+        match, a kink of the distance, it is the gradient of the smoothed one (see `mimic.retargeting.closed_form`).
     """
 
     qpos: Float[Array, "*batch learner_joints"]

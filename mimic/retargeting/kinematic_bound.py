@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.pose import pose_limits, shared_joints
-from mimic.quasi_newton import Descent, bfgs
+from mimic.retargeting.pose import pose_limits, shared_joints
+from mimic.retargeting.quasi_newton import Descent, bfgs
 
 _POSES = 256  # random poses that are compared, without a descent, to find the initial guesses
 _LEAST_SPEED = 1e-2  # rad/s, of the unit that the velocities are optimised in
