@@ -11,8 +11,8 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from mimic.trainers import runs
-from mimic.trainers.checkpoints import checkpoint_steps
+from mimic.runs import files as runs
+from mimic.runs.checkpoints import checkpoint_steps
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mimic.trainers import runs
+from mimic.runs import files as runs
 
 _HELD = 3  # evaluations on end
 

@@ -31,7 +31,7 @@ from rich.progress import track  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 from benchmarks.record import train, write_results  # noqa: E402
-from mimic.trainers import runs  # noqa: E402
+from mimic.runs import files as runs  # noqa: E402
 from mimic.trainers.config import PRESETS  # noqa: E402
 
 KINDS = ("weak", "strong")

@@ -24,6 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mimic import compat
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, InspectConfig, RecordingConfig, RetargetConfig
+from mimic.runs.signals import STOPPED_BY_SIGNAL
 from mimic.sweeping.services import check_launcher, register_launchers
 from mimic.sweeping.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import (
@@ -35,7 +36,6 @@ from mimic.trainers.config import (
     RenderConfig,
     TrainConfig,
 )
-from mimic.trainers.signals import STOPPED_BY_SIGNAL
 from mimic.viewing.config import ViewConfig
 
 BAD_INPUT = 2

@@ -3,9 +3,9 @@
 import time
 
 from mimic import cli
+from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.group import join
-from mimic.trainers.signals import Signals
 
 _process_started = [cli.process_started()]  # for the first job; those that follow in a sweep start when they start
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mimic.envs import env_config
-from mimic.trainers import runs
+from mimic.runs import files as runs
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 
 

@@ -15,10 +15,10 @@ import pytest
 from omegaconf import OmegaConf
 from tiny import TINY
 
+from mimic.runs.files import run_schema
 from mimic.trainers import group
 from mimic.trainers.group import DistributedConfig
 from mimic.trainers.local_processes import LocalProcesses, Told, told
-from mimic.trainers.runs import run_schema
 
 FUSED = [*TINY, "env.physics=fused"]
 LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with many checkpoints

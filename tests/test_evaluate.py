@@ -11,8 +11,9 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
-from mimic.trainers import ppo, runs, session
-from mimic.trainers.checkpoints import save_checkpoint
+from mimic.runs import files as runs
+from mimic.runs.checkpoints import save_checkpoint
+from mimic.trainers import ppo, session
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.learning import initial_params
 from mimic.trainers.ppo_job import PPOJob

@@ -10,8 +10,9 @@ import pytest
 
 import mimic
 from mimic.envs.config import MetricConfig
-from mimic.trainers import ppo, runs
-from mimic.trainers.checkpoints import save_checkpoint
+from mimic.runs import files as runs
+from mimic.runs.checkpoints import save_checkpoint
+from mimic.trainers import ppo
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.learning import initial_params
 from mimic.trainers.pose_mapper import PoseMapper, make_model

@@ -14,9 +14,9 @@ from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 
 import mimic
+from mimic.compilation import compiler_options
 from mimic.trainers import learning, ppo, ppo_loss, updates
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.prepared import compiler_options
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
 _SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"

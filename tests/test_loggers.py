@@ -7,9 +7,9 @@ import types
 import pytest
 
 import mimic
+from mimic.runs.loggers import make_loggers
 from mimic.trainers import session
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.trainers.loggers import make_loggers
 
 
 class FakeWandb(types.ModuleType):

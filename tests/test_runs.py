@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from run_directories import write_run
 
 from mimic.envs.config import MetricConfig
-from mimic.trainers import runs
+from mimic.runs import files as runs
 
 
 def test_a_report_is_json_even_after_a_divergence(tmp_path):

@@ -10,7 +10,8 @@ import numpy as np
 import optax
 import pytest
 
-from mimic.trainers import learning, ppo, prepared, updates
+from mimic import compilation as prepared
+from mimic.trainers import learning, ppo, updates
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo_loss import Unrolls, policy_loss, value_loss
 

@@ -13,8 +13,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from mimic.runs.signals import STOPPED_BY_SIGNAL
 from mimic.sweeping.sweeper import FAILED, Outcome, path_override
-from mimic.trainers.signals import STOPPED_BY_SIGNAL
 
 _LOOK_S = 0.2
 

@@ -14,9 +14,9 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
+from mimic.runs.signals import Signals, noted_signals
 from mimic.sweeping.command import RunCommand
 from mimic.sweeping.sweeper import FAILED, LOGS, Outcome, path_of
-from mimic.trainers.signals import Signals, noted_signals
 
 LOCAL = "basic"  # Hydra's own: one run after the other, in the process of the sweep
 _LOOK_S = 0.2

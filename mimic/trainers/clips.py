@@ -18,8 +18,9 @@ from mimic.envs.recording import record_demonstrations
 from mimic.metric.distance import embodiment_distance, link_distances
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose, pose_limits
-from mimic.trainers import runs, session
-from mimic.trainers.checkpoints import load_checkpoint
+from mimic.runs import files as runs
+from mimic.runs.checkpoints import load_checkpoint
+from mimic.trainers import session
 from mimic.trainers.config import PoseMapperConfig, RenderConfig
 from mimic.trainers.pose_mapper import PoseMapper
 from mimic.trainers.ppo_job import PPOJob

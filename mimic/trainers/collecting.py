@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mimic.trainers import runs
+from mimic.runs import files as runs
 from mimic.trainers.config import CollectConfig
 from mimic.trainers.finished_runs import FIGURES, SPLITS, Figure, FinishedRun, LeftOut, find_runs
 from mimic.trainers.run_groups import CONFIDENCE, HOW, Group, Interval, drop_repeated, group_runs, telling_keys

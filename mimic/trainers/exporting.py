@@ -20,8 +20,9 @@ from mimic.config import check_choice, new_file
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import observation_layout, torque_scale
-from mimic.trainers import ppo, runs
-from mimic.trainers.checkpoints import check_checkpoint, load_checkpoint
+from mimic.runs import files as runs
+from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
+from mimic.trainers import ppo
 from mimic.trainers.config import EXPORT_FORMATS, ExportConfig, PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper import PoseMapper
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from rich.console import Console
 
 from mimic.envs import env_config
+from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers import session
-from mimic.trainers.checkpoints import checkpoint_steps
 from mimic.trainers.config import FiguresConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_figures import FIGURES, save_figure
 from mimic.trainers.pose_mapper import PoseMapper

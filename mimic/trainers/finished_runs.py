@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from mimic.config import to_dict
+from mimic.runs import files as runs
 from mimic.sweeping.sweeper import LOGS, SWEEP
-from mimic.trainers import runs
 from mimic.trainers.config import TrainConfig
 
 SPLITS = ("train", "held_out")

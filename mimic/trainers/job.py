@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainerConfig
-from mimic.trainers.signals import Signals
 
 Params = Any  # pytree
 Figures = dict[str, Any]  # quality figures of a report, some by split

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from mimic.compilation import Prepared, compiling
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose
+from mimic.runs.signals import Signals
 from mimic.trainers import mapper_training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
 from mimic.trainers.measures import pose_similarity
 from mimic.trainers.pose_mapper import make_model
-from mimic.trainers.prepared import Prepared, compiling
-from mimic.trainers.signals import Signals
 
 # Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.
 _TRAINING, _VALIDATION, _HELD_OUT, _CHANCE = range(4)

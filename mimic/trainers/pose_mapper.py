@@ -17,14 +17,14 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.compilation import on_host
 from mimic.envs.config import EnvConfig, MetricConfig
 from mimic.metric.distance import Correspondence, embodiment_distance
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import pose_limits
-from mimic.trainers import runs
-from mimic.trainers.checkpoints import load_checkpoint
+from mimic.runs import files as runs
+from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig
-from mimic.trainers.prepared import on_host
 
 Params = Any
 PoseDistance = Callable[[Array, Array], Array]  # expert's pose, learner's pose

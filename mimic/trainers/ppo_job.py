@@ -7,16 +7,17 @@ from pathlib import Path
 
 import jax
 
+from mimic.compilation import Prepared, compiling
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.trainers import ppo, runs
+from mimic.runs import files as runs
+from mimic.runs.signals import Signals
+from mimic.trainers import ppo
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.evaluation import SPLITS, Controller, Evaluator, Rollouts
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
 from mimic.trainers.measures import LEAST_SPAN
-from mimic.trainers.prepared import Prepared, compiling
-from mimic.trainers.signals import Signals
 
 
 class PPOJob(Job):

@@ -14,14 +14,14 @@ from rich.console import Console
 from mimic import compat
 from mimic.config import to_dict
 from mimic.envs.demonstrations import load_demonstrations
-from mimic.trainers import runs
-from mimic.trainers.checkpoints import check_checkpoint, load_checkpoint
+from mimic.runs import files as runs
+from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
+from mimic.runs.loggers import check_loggers, make_loggers
+from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.group import Group
 from mimic.trainers.job import Job, Params
-from mimic.trainers.loggers import check_loggers, make_loggers
 from mimic.trainers.progress import TrainingProgress, report_table, similarity_table
-from mimic.trainers.signals import Interrupted, Signals, noted_signals
 
 
 def prepare_training(

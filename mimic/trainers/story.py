@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from mimic.metric.distance import link_distances
 from mimic.metric.kinematics import link_states
-from mimic.trainers import runs
-from mimic.trainers.checkpoints import check_checkpoint
+from mimic.runs import files as runs
+from mimic.runs.checkpoints import check_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.evaluation import Evaluator, Rollouts
 

@@ -10,8 +10,8 @@ from rich.console import Console
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
 from mimic.metric.similarity import centre_line_table, similarity
+from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers import session
-from mimic.trainers.checkpoints import load_checkpoint
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.measures import gaps
 from mimic.trainers.ppo_job import PPOJob

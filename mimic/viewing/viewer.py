@@ -16,7 +16,7 @@ import numpy as np
 from mimic import compat
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
-from mimic.trainers import runs
+from mimic.runs import files as runs
 from mimic.viewing import drawing
 from mimic.viewing.config import ViewConfig
 from mimic.viewing.live import Frame, LiveSession

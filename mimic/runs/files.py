@@ -17,9 +17,9 @@ import jax
 from omegaconf import DictConfig, OmegaConf
 
 from mimic import compat
+from mimic.compilation import WAITED
 from mimic.config import explain, schema, to_dict
 from mimic.trainers.config import TRAINERS, TrainConfig
-from mimic.trainers.prepared import WAITED
 
 CONFIG, REPORT, METRICS, DEMONSTRATIONS = "config.yaml", "report.json", "metrics.csv", "demonstrations.npz"
 _PACKAGES = ("mimic-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
