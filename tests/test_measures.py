@@ -11,12 +11,12 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
+from mimic.evaluation import plots
+from mimic.evaluation.evaluator import Evaluator, Rollouts
+from mimic.evaluation.rollout_metrics import gaps, has_gap, measure
+from mimic.evaluation.tracking_controllers import run_controller
 from mimic.metric.kinematics import link_state_table
-from mimic.trainers import plots
-from mimic.trainers.evaluation import Evaluator, Rollouts
-from mimic.trainers.measures import gaps, has_gap, measure
 from mimic.trainers.ppo_job import PPOJob
-from mimic.trainers.tracking import run_controller
 
 COUNT, HELD_OUT, HORIZON = 5, 4, 30
 SPLITS = {"train": slice(0, COUNT), "held_out": slice(COUNT, None)}

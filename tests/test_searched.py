@@ -9,11 +9,11 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
+from mimic.evaluation.evaluator import SPLITS, Evaluator
+from mimic.evaluation.searched_torques import _CHUNK, _descend, _task
+from mimic.evaluation.trajectory_descent import TrajectoryDescent, _bounded_law
 from mimic.trainers import session
 from mimic.trainers.config import EvaluateConfig, SearchConfig
-from mimic.trainers.evaluation import SPLITS, Evaluator
-from mimic.trainers.searched_torques import _CHUNK, _descend, _task
-from mimic.trainers.trajectory_descent import TrajectoryDescent, _bounded_law
 from tests.test_evaluate import untrained_run
 
 HORIZON = 20

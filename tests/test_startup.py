@@ -17,10 +17,10 @@ from mimic import compilation as prepared
 from mimic.compilation import Prepared, compiler_options
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.wrappers import wrap_for_training
+from mimic.evaluation import evaluator as evaluation
+from mimic.evaluation.evaluator import Evaluator
 from mimic.metric.kinematics import link_state_table
-from mimic.trainers import evaluation
 from mimic.trainers.config import PRESETS, PPOConfig
-from mimic.trainers.evaluation import Evaluator
 
 HEAVY = ("brax", "mujoco.mjx", "orbax", "matplotlib", "tensorboardX", "mink", "optax", "scipy", "trimesh")
 REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_initialized()\nprint(*sys.modules)"

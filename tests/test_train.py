@@ -174,7 +174,7 @@ def test_the_cpu_flag_speeds_up_kinematics(capsys):
 def test_no_rollout_goes_below_the_bound():
     """Random controllers on the planar arm; 1e-4 is what the search may leave."""
     from mimic.envs.imitation import training_and_held_out
-    from mimic.trainers.evaluation import Evaluator
+    from mimic.evaluation.evaluator import Evaluator
 
     config = mimic.env_config("planar4dof", demonstrations={"count": 3, "held_out": 2})
     training, held_out = training_and_held_out(config)

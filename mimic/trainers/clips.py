@@ -15,6 +15,7 @@ from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
+from mimic.evaluation.rollout_frames import Story, demonstration_index, interpolate, policy_run
 from mimic.metric.distance import embodiment_distance, link_distances
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose, pose_limits
@@ -24,7 +25,6 @@ from mimic.trainers import session
 from mimic.trainers.config import PoseMapperConfig, RenderConfig
 from mimic.trainers.pose_mapper import PoseMapper
 from mimic.trainers.ppo_job import PPOJob
-from mimic.trainers.story import Story, demonstration_index, interpolate, policy_run
 
 FRAMES_PER_SECOND = 30
 _HOLD, _OPTIMUM = {"linestyle": ":", "color": "grey"}, {"linestyle": "--", "color": "black", "lw": 1}

@@ -21,7 +21,7 @@ from mimic.arms.arm import Arm, ArmConfig, build_arm, effective_inertia, rated_s
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs.config import EnvConfig, InspectConfig  # noqa: E402
 from mimic.envs.preflight import Nearness, assumptions, calmed, doubts, joint_ranges, nearness  # noqa: E402
-from mimic.trainers.measures import pose_similarity  # noqa: E402
+from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
 from mimic.trainers.pose_picture import PosePairs, nearest_poses, readable_poses, save_poses  # noqa: E402
 from mimic.trainers.progress import similarity_table  # noqa: E402
 

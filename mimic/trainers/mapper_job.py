@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Array
 
 from mimic.compilation import Prepared, compiling
+from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.signals import Signals
 from mimic.trainers import mapper_training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
-from mimic.trainers.measures import pose_similarity
 from mimic.trainers.pose_mapper import make_model
 
 # Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.
@@ -246,7 +246,7 @@ class MapperJob(Job):
     def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
         """In a run directory, how it learned."""
         del outcome, controller
-        from mimic.trainers import plots  # matplotlib, a second; not before there is something to plot
+        from mimic.evaluation import plots  # matplotlib, a second; not before there is something to plot
 
         plots.plot_training(folder, "quality", "above the optimum [%]", of="poses", title=self._name)
 

@@ -11,10 +11,10 @@ from brax.training.acme import running_statistics
 from brax.training.agents.ppo import networks as ppo_networks
 
 from mimic.envs.imitation import ImitationEnv
+from mimic.evaluation.evaluator import Controller
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.evaluation import Controller
 from mimic.trainers.learning import Params, initial_params, make_programs
 
 OnEvaluation = Callable[[int, Params, dict[str, float]], bool]  # whether that is good enough to stop

@@ -11,13 +11,13 @@ from mimic.compilation import Prepared, compiling
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
+from mimic.evaluation.evaluator import SPLITS, Controller, Evaluator, Rollouts
+from mimic.evaluation.rollout_metrics import LEAST_SPAN
 from mimic.runs import files as runs
 from mimic.runs.signals import Signals
 from mimic.trainers import ppo
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.evaluation import SPLITS, Controller, Evaluator, Rollouts
 from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
-from mimic.trainers.measures import LEAST_SPAN
 
 
 class PPOJob(Job):
@@ -152,7 +152,7 @@ class PPOJob(Job):
 
     def save_outcome(self, folder: Path, outcome: Rollouts, controller: str = "policy") -> None:
         """A table of all demonstrations, the distance over an episode, and in a run directory how it learned."""
-        from mimic.trainers import plots  # matplotlib, a second; not before there is something to plot
+        from mimic.evaluation import plots  # matplotlib, a second; not before there is something to plot
 
         self.evaluator.save_table(outcome, folder / "demonstrations.csv")
         self.evaluator.save_curves(outcome, folder / "quality.csv")

@@ -150,12 +150,12 @@ def _outcome(job: Job, params: Params, config: EvaluateConfig, console: Console)
 
     assert isinstance(job, PPOJob)
     if config.controller == "searched":
-        from mimic.trainers.searched_torques import search_torques
+        from mimic.evaluation.searched_torques import search_torques
 
         policy = job.controller(params)
         outcome, starts = search_torques(job.evaluator, policy, config.search, console)
         return outcome, {"trainer": "searched", "search": dataclasses.asdict(config.search), "starts": starts}
-    from mimic.trainers.tracking import run_controller
+    from mimic.evaluation.tracking_controllers import run_controller
 
     outcome, frequency = run_controller(job.evaluator, config.controller)
     return outcome, {"trainer": config.controller, "frequency_rad_s": frequency}

@@ -9,13 +9,13 @@ from rich.console import Console
 
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
+from mimic.evaluation.rollout_frames import Story, demonstration_index
+from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers import session
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.measures import gaps
 from mimic.trainers.ppo_job import PPOJob
-from mimic.trainers.story import Story, demonstration_index
 from mimic.viewing import drawing
 from mimic.viewing.live import Frame
 

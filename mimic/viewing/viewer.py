@@ -70,7 +70,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     use_compilation_cache(config.compilation_cache)
     if config.run:
         compat.import_mjx()
-        from mimic.trainers.story import policy_run
+        from mimic.evaluation.rollout_frames import policy_run
         from mimic.viewing.playback import Playback
 
         run_dir, trained = policy_run(config.run, config.checkpoint)

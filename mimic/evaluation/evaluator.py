@@ -17,12 +17,12 @@ from jaxtyping import Array, Float
 from mimic.compilation import Prepared, on_host
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
+from mimic.evaluation.rollout_metrics import WORST, Table, gaps, means_by_split, measure, measure_similarity
 from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table
 from mimic.retargeting.kinematic_bound import closest_motion
 from mimic.retargeting.pose import pose_limits, shared_joints
 from mimic.retargeting.pose_baselines import baseline_poses
-from mimic.trainers.measures import WORST, Table, gaps, means_by_split, measure, measure_similarity
 
 Controller = Callable[[State], Array]  # state of the environment -> action
 Motions = Float[np.ndarray, "demonstrations time joints"]

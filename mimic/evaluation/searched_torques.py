@@ -11,12 +11,12 @@ from rich.console import Console
 
 from mimic.envs.imitation import ArmState, ImitationEnv
 from mimic.envs.physics import Load
+from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
+from mimic.evaluation.rollout_metrics import gaps
+from mimic.evaluation.tracking_controllers import run_controller
+from mimic.evaluation.trajectory_descent import Task, TrajectoryDescent
 from mimic.trainers.config import SearchConfig
-from mimic.trainers.evaluation import Controller, Evaluator, Rollouts
-from mimic.trainers.measures import gaps
 from mimic.trainers.progress import SearchProgress
-from mimic.trainers.tracking import run_controller
-from mimic.trainers.trajectory_descent import Task, TrajectoryDescent
 
 _NOISE = 0.3  # standard deviation of what is added to a policy's actions for further starts
 _NOISE_STEPS = 5  # that a noise is held for, so that the arm leaves its way

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.metric.distance import link_distances
 from mimic.metric.kinematics import link_states
 from mimic.runs import files as runs
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.evaluation import Evaluator, Rollouts
 
 
 def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:

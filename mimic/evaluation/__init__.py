@@ -1,0 +1,1 @@
+"""Evaluation of controllers on demonstrations: rollouts, metrics, other controllers, plots."""
