@@ -36,9 +36,9 @@ from benchmarks.record import write_results  # noqa: E402
 from mimic import compat  # noqa: E402
 from mimic.envs.imitation import ImitationEnv  # noqa: E402
 from mimic.envs.wrappers import wrap_for_training  # noqa: E402
-from mimic.trainers import ppo  # noqa: E402
 from mimic.trainers.config import PPOConfig  # noqa: E402
-from mimic.trainers.learning import make_programs  # noqa: E402
+from mimic.trainers.ppo.programs import make_programs  # noqa: E402
+from mimic.trainers.ppo.training import training as ppo  # noqa: E402
 
 ON_PROCESSOR = "stable-baselines3, C MuJoCo"
 _STRETCHES = 6  # the first compiles

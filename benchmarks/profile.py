@@ -23,9 +23,9 @@ from rich.table import Table
 
 import mimic
 from benchmarks.record import write_results
-from mimic.trainers import ppo
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.learning import make_programs
+from mimic.trainers.ppo.programs import make_programs
+from mimic.trainers.ppo.training import training as ppo
 
 # What a kernel is, by its name; the first that fits.
 KINDS = (

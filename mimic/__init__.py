@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from mimic.arms.rendering import ArmScene
     from mimic.envs.imitation import ImitationEnv
     from mimic.trainers.exporting import export_run
-    from mimic.trainers.pose_mapper import PoseMapper
+    from mimic.trainers.pose_mapper.model import PoseMapper
 
 __version__ = "0.1.0"
 
@@ -110,7 +110,7 @@ def __getattr__(name: str) -> Any:
 
         return ArmScene
     if name == "PoseMapper":  # checkpoints and metrics, likewise
-        from mimic.trainers.pose_mapper import PoseMapper
+        from mimic.trainers.pose_mapper.model import PoseMapper
 
         return PoseMapper
     if name == "export_run":  # all of these

@@ -5,7 +5,7 @@ import time
 from mimic import cli
 from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.group import join
+from mimic.trainers.distributed.process_group import join
 
 _process_started = [cli.process_started()]  # for the first job; those that follow in a sweep start when they start
 

@@ -16,9 +16,9 @@ from omegaconf import OmegaConf
 from tiny import TINY
 
 from mimic.runs.files import run_schema
-from mimic.trainers import group
-from mimic.trainers.group import DistributedConfig
-from mimic.trainers.local_processes import LocalProcesses, Told, told
+from mimic.trainers.distributed import process_group as group
+from mimic.trainers.distributed.local_processes import LocalProcesses, Told, told
+from mimic.trainers.distributed.process_group import DistributedConfig
 
 FUSED = [*TINY, "env.physics=fused"]
 LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with many checkpoints
@@ -160,7 +160,7 @@ def test_what_both_processes_refuse_is_one_line(tmp_path):
 
 def test_other_processes_are_told_who_they_are(monkeypatch):
     """Each is the same command; what it says last is kept, and it is killed if it does not end."""
-    program = "import sys; from mimic.trainers.local_processes import told; this = told();"
+    program = "import sys; from mimic.trainers.distributed.local_processes import told; this = told();"
     program += " print('x' * 3000, this, file=sys.stderr)"
     monkeypatch.setattr(sys, "orig_argv", ["python", "-c", program])
     others = LocalProcesses(3)

@@ -16,7 +16,7 @@ from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.evaluation.rollout_metrics import gaps, has_gap, measure
 from mimic.evaluation.tracking_controllers import run_controller
 from mimic.metric.kinematics import link_state_table
-from mimic.trainers.ppo_job import PPOJob
+from mimic.trainers.ppo.trainer import PPOJob
 
 COUNT, HELD_OUT, HORIZON = 5, 4, 30
 SPLITS = {"train": slice(0, COUNT), "held_out": slice(COUNT, None)}

@@ -11,10 +11,11 @@ import pytest
 import mimic
 from mimic.envs import env_config
 from mimic.envs.config import RetargetConfig
-from mimic.trainers import mapper_training, retargeting, session
+from mimic.trainers import retargeting, session
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
-from mimic.trainers.mapper_job import MapperJob
-from mimic.trainers.pose_mapper import make_model
+from mimic.trainers.pose_mapper.model import make_model
+from mimic.trainers.pose_mapper.model import training as mapper_training
+from mimic.trainers.pose_mapper.trainer import MapperJob
 
 SMALL = {"samples": 8192, "batch_size": 256, "epochs": 40, "evaluations": 2, "hidden_layers": [64, 64]}
 SHORT: dict[str, Any] = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1}

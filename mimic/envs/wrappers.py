@@ -55,7 +55,7 @@ class FreshEpisodeWrapper(Wrapper):
 
 
 def fresh_episodes(env: ImitationEnv) -> Wrapper:
-    """Many arms at once, without end; all that `mimic.trainers.learning` needs."""
+    """Many arms at once, without end; all that `mimic.trainers.ppo.programs` needs."""
     return FreshEpisodeWrapper(VmapWrapper(env), env)
 
 

@@ -1,0 +1,1 @@
+"""Trainers: PPO and the pose mapper."""

@@ -23,8 +23,8 @@ from mimic.runs import files as runs
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers import session
 from mimic.trainers.config import PoseMapperConfig, RenderConfig
-from mimic.trainers.pose_mapper import PoseMapper
-from mimic.trainers.ppo_job import PPOJob
+from mimic.trainers.pose_mapper.model import PoseMapper
+from mimic.trainers.ppo.trainer import PPOJob
 
 FRAMES_PER_SECOND = 30
 _HOLD, _OPTIMUM = {"linestyle": ":", "color": "grey"}, {"linestyle": "--", "color": "black", "lw": 1}

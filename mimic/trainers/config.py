@@ -8,7 +8,7 @@ from omegaconf import MISSING
 
 from mimic.config import check_choice
 from mimic.envs.config import PHYSICS, EnvConfig
-from mimic.trainers.group import DistributedConfig
+from mimic.trainers.distributed.process_group import DistributedConfig
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "searched")
 EXPORT_FORMATS = ("onnx", "jax")
@@ -90,7 +90,7 @@ class PPOConfig(TrainerConfig):
       gae_lambda: of the advantage estimate.
       entropy_cost: reward for a wide action distribution.
       clipping_epsilon: of the policy ratio.
-      max_grad_norm: gradients are clipped to it: see `updated` in mimic/trainers/updates.py.
+      max_grad_norm: gradients are clipped to it: see `updated` in mimic/trainers/ppo/updates.py.
       reward_scaling: of the reward inside PPO.
       hidden_layers: widths of policy and value network.
       crossovers: demonstrations to train on beyond the given ones, mixed from them joint by joint: see `crossovers` in

@@ -11,7 +11,7 @@ from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers import session
 from mimic.trainers.config import FiguresConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_figures import FIGURES, save_figure
-from mimic.trainers.pose_mapper import PoseMapper
+from mimic.trainers.pose_mapper.model import PoseMapper
 
 
 def prepare_figures(config: FiguresConfig) -> Callable[[], int]:

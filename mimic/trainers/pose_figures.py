@@ -23,7 +23,7 @@ from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E40
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
 from mimic.trainers import metric_figures, point_figures, similarity_figures  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
-from mimic.trainers.pose_mapper import PoseMapper  # noqa: E402
+from mimic.trainers.pose_mapper.model import PoseMapper  # noqa: E402
 from mimic.trainers.pose_picture import PANDA_POSES  # noqa: E402
 
 LoadMapper = Callable[[str], PoseMapper]  # by the name of the environment

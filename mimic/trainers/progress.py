@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from mimic.trainers.job import Job
+from mimic.trainers.trainer import Job
 
 SIMILARITY_HEADERS = {  # positions in chain lengths
     "centre_line_distance": "centre\nline",

@@ -20,7 +20,7 @@ from mimic.envs.config import MetricConfig, RetargetConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.retargeting.pose import PoseImitation, imitate_trajectory, pose_limits
-from mimic.trainers.pose_mapper import PoseMapper
+from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.progress import similarity_table
 
 

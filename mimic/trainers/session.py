@@ -19,9 +19,9 @@ from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.loggers import check_loggers, make_loggers
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
-from mimic.trainers.group import Group
-from mimic.trainers.job import Job, Params
+from mimic.trainers.distributed.process_group import Group
 from mimic.trainers.progress import TrainingProgress, report_table, similarity_table
+from mimic.trainers.trainer import Job, Params
 
 
 def prepare_training(
@@ -125,7 +125,7 @@ def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig
     )
     trained = dataclasses.replace(trained, env=env)
     compat.import_mjx()
-    from mimic.trainers.ppo_job import PPOJob
+    from mimic.trainers.ppo.trainer import PPOJob
 
     unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
     return trained, PPOJob(trained, run_dir, unseen)
@@ -146,7 +146,7 @@ def _outcome(job: Job, params: Params, config: EvaluateConfig, console: Console)
     """What a controller did, and what the report says of the controller."""
     if config.controller == "policy":
         return job.evaluate(params), {}
-    from mimic.trainers.ppo_job import PPOJob
+    from mimic.trainers.ppo.trainer import PPOJob
 
     assert isinstance(job, PPOJob)
     if config.controller == "searched":
@@ -168,11 +168,11 @@ def make_job(config: TrainConfig, run_dir: Path | None) -> Job:
       ValueError: a config that cannot be trained.
     """
     if isinstance(config.trainer, PoseMapperConfig):
-        from mimic.trainers.mapper_job import MapperJob
+        from mimic.trainers.pose_mapper.trainer import MapperJob
 
         return MapperJob(config, run_dir)
     compat.import_mjx()
-    from mimic.trainers.ppo_job import PPOJob  # brax and MJX, which take seconds to import
+    from mimic.trainers.ppo.trainer import PPOJob  # brax and MJX, which take seconds to import
 
     return PPOJob(config, run_dir)
 

@@ -15,7 +15,7 @@ from mimic.metric.similarity import centre_line_table, similarity
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers import session
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.ppo_job import PPOJob
+from mimic.trainers.ppo.trainer import PPOJob
 from mimic.viewing import drawing
 from mimic.viewing.live import Frame
 

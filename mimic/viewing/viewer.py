@@ -78,7 +78,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         return lambda: _serve(config, trained.env, lambda page: _play(page, playback, config.split), playback.run)
     mapper, env = None, config.resolve_env()
     if config.mapper:
-        from mimic.trainers.pose_mapper import PoseMapper
+        from mimic.trainers.pose_mapper.model import PoseMapper
 
         mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
         env = runs.load_config(Path(config.mapper).expanduser()).env

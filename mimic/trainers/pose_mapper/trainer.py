@@ -15,10 +15,10 @@ from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.signals import Signals
-from mimic.trainers import mapper_training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
-from mimic.trainers.pose_mapper import make_model
+from mimic.trainers.pose_mapper.model import make_model
+from mimic.trainers.pose_mapper.model import training as mapper_training
+from mimic.trainers.trainer import Figures, Job, OnEvaluation, Params, Row
 
 # Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.
 _TRAINING, _VALIDATION, _HELD_OUT, _CHANCE = range(4)

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from mimic.compilation import compiling
 from mimic.runs.checkpoints import delete_checkpoint, save_checkpoint
 from mimic.runs.signals import Signals
-from mimic.trainers.job import OnEvaluation
-from mimic.trainers.pose_mapper import MapperModel, Params
+from mimic.trainers.pose_mapper.model import MapperModel, Params
+from mimic.trainers.trainer import OnEvaluation
 
 _WARM_UP = 0.02  # share of the updates over which the learning rate rises
 _SHARED = 0.1  # share of the loss that all heads bear alike, so that none is left behind; the nearest bears the rest

@@ -15,7 +15,7 @@ from mimic.evaluation.evaluator import Controller
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.learning import Params, initial_params, make_programs
+from mimic.trainers.ppo.programs import Params, initial_params, make_programs
 
 OnEvaluation = Callable[[int, Params, dict[str, float]], bool]  # whether that is good enough to stop
 

@@ -12,8 +12,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo_loss import METRICS as OF_POLICY
-from mimic.trainers.ppo_loss import Unrolls, policy_loss, value_loss
+from mimic.trainers.ppo.losses import METRICS as OF_POLICY
+from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
 
 METRICS = ("value_loss", *OF_POLICY)
 

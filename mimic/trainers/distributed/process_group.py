@@ -17,7 +17,7 @@ import jax
 
 from mimic import compat
 from mimic.runs.signals import STOPPED_BY_SIGNAL, Signals
-from mimic.trainers.local_processes import LocalProcesses, gpus, told
+from mimic.trainers.distributed.local_processes import LocalProcesses, gpus, told
 
 AUTO, LOCAL = "auto", "local"
 _ENDED, _SIGNAL = "mimic/ended", "mimic/signal"  # keys of the coordination service

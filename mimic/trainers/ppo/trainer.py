@@ -15,9 +15,9 @@ from mimic.evaluation.evaluator import SPLITS, Controller, Evaluator, Rollouts
 from mimic.evaluation.rollout_metrics import LEAST_SPAN
 from mimic.runs import files as runs
 from mimic.runs.signals import Signals
-from mimic.trainers import ppo
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.job import Figures, Job, OnEvaluation, Params, Row
+from mimic.trainers.ppo.training import training as ppo
+from mimic.trainers.trainer import Figures, Job, OnEvaluation, Params, Row
 
 
 class PPOJob(Job):
