@@ -19,8 +19,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from benchmarks.timing import time_call
+from mimic.commands import view as viewer
 from mimic.envs import env_config
-from mimic.viewing import viewer
 from mimic.viewing.live import LiveSession
 from mimic.viewing.page import Page
 from mimic.viewing.shapes import ArmShape

@@ -46,8 +46,8 @@ from mimic.retargeting.pose import PoseImitation, imitate_pose, imitate_trajecto
 
 if TYPE_CHECKING:
     from mimic.arms.rendering import ArmScene
+    from mimic.commands.export import export_run
     from mimic.envs.imitation import ImitationEnv
-    from mimic.trainers.exporting import export_run
     from mimic.trainers.pose_mapper.model import PoseMapper
 
 __version__ = "0.1.0"
@@ -115,7 +115,7 @@ def __getattr__(name: str) -> Any:
         return PoseMapper
     if name == "export_run":  # all of these
         compat.import_mjx()
-        from mimic.trainers.exporting import export_run
+        from mimic.commands.export import export_run
 
         return export_run
     raise AttributeError(f"module 'mimic' has no attribute {name!r}")

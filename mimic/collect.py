@@ -6,7 +6,7 @@ from mimic.trainers.config import CollectConfig
 
 def prepare(config: CollectConfig) -> cli.Work:
     """The collection that the config describes."""
-    from mimic.trainers import collecting  # not needed for --help
+    from mimic.commands import collect as collecting  # not needed for --help
 
     return collecting.prepare_collection(config)
 

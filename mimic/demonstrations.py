@@ -6,7 +6,7 @@ from mimic.envs.config import RecordingConfig
 
 def prepare(config: RecordingConfig) -> cli.Work:
     """The recording that the config describes."""
-    from mimic.trainers import recording_session  # not needed for --help
+    from mimic.commands import demonstrations as recording_session  # not needed for --help
 
     return recording_session.prepare_recording(config)
 

@@ -7,7 +7,7 @@ from mimic.trainers.config import EvaluateConfig
 def prepare(config: EvaluateConfig) -> cli.Work:
     """The evaluation that the config describes."""
     cli.start_backend()
-    from mimic.trainers import session  # not needed for --help
+    from mimic.commands import train as session  # not needed for --help
 
     return session.prepare_evaluation(config, cli.process_started())
 

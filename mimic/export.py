@@ -7,7 +7,7 @@ from mimic.trainers.config import ExportConfig
 def prepare(config: ExportConfig) -> cli.Work:
     """The export that the config describes."""
     compat.import_mjx()
-    from mimic.trainers import exporting  # not needed for --help
+    from mimic.commands import export as exporting  # not needed for --help
 
     return exporting.prepare_export(config)
 

@@ -6,7 +6,7 @@ from mimic.trainers.config import FiguresConfig
 
 def prepare(config: FiguresConfig) -> cli.Work:
     """The figures that the config describes."""
-    from mimic.trainers import figure_session  # not needed for --help
+    from mimic.commands import figures as figure_session  # not needed for --help
 
     return figure_session.prepare_figures(config)
 

@@ -6,7 +6,7 @@ from mimic.envs.config import InspectConfig
 
 def prepare(config: InspectConfig) -> cli.Work:
     """The inspection that the config describes."""
-    from mimic.trainers import inspection  # not needed for --help
+    from mimic.commands import inspect as inspection  # not needed for --help
 
     return inspection.prepare_inspection(config)
 

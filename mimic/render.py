@@ -7,7 +7,7 @@ from mimic.trainers.config import RenderConfig
 def prepare(config: RenderConfig) -> cli.Work:
     """The video that the config describes."""
     compat.import_mjx()
-    from mimic.trainers import video  # not needed for --help
+    from mimic.commands import render as video  # not needed for --help
 
     return video.prepare_video(config)
 

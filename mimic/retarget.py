@@ -6,7 +6,7 @@ from mimic.envs.config import RetargetConfig
 
 def prepare(config: RetargetConfig) -> cli.Work:
     """The retargeting that the config describes."""
-    from mimic.trainers import retargeting  # not needed for --help
+    from mimic.commands import retarget as retargeting  # not needed for --help
 
     return retargeting.prepare_retargeting(config)
 

@@ -17,7 +17,7 @@ def prepare(config: TrainConfig) -> cli.Work:
         raise ValueError("distributed: expected one run, got a sweep; start each of its runs by itself")
     group = join(config.distributed)
     cli.start_backend()
-    from mimic.trainers import session  # not needed for --help
+    from mimic.commands import train as session  # not needed for --help
 
     started = _process_started.pop() if _process_started else began
     signals = group.signals if group else Signals()

@@ -6,7 +6,7 @@ from mimic.viewing.config import ViewConfig
 
 def prepare(config: ViewConfig) -> cli.Work:
     """The viewer that the config describes."""
-    from mimic.viewing import viewer  # not needed for --help
+    from mimic.commands import view as viewer  # not needed for --help
 
     return viewer.prepare_view(config)
 

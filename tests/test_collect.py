@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from run_directories import write_run
 
+from mimic.commands.collect import prepare_collection
 from mimic.sweeping.sweeper import SWEEP
-from mimic.trainers.collecting import prepare_collection
 from mimic.trainers.config import CollectConfig
 from mimic.trainers.run_groups import mean_interval
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.commands.demonstrations import prepare_recording
+from mimic.commands.retarget import retarget
 from mimic.envs.config import RecordingConfig
 from mimic.envs.demonstrations import concatenate, crossovers
 from mimic.envs.recording import KINDS
-from mimic.trainers.recording_session import prepare_recording
-from mimic.trainers.retargeting import retarget
 
 DT, SUBSTEPS = 0.1, 10
 TRAIN = ["env=panda4dof", "env.demonstrations.count=1", "env.demonstrations.held_out=1"]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.commands import train as session
 from mimic.envs.imitation import training_and_held_out
 from mimic.runs import files as runs
 from mimic.runs.checkpoints import save_checkpoint
-from mimic.trainers import session
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.trainer import PPOJob

@@ -6,10 +6,10 @@ import pytest
 from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import planar_arm
 from mimic.arms.rendering import ArmScene
+from mimic.commands.figures import prepare_figures
 from mimic.trainers import point_figures
 from mimic.trainers.arm_drawing import joint_points
 from mimic.trainers.config import FiguresConfig
-from mimic.trainers.figure_session import prepare_figures
 
 
 def red_share(image):

@@ -7,8 +7,8 @@ import types
 import pytest
 
 import mimic
+from mimic.commands import train as session
 from mimic.runs.loggers import make_loggers
-from mimic.trainers import session
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 

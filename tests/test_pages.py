@@ -6,7 +6,7 @@ import pytest
 from pages import PAGES, REPOSITORY, Block, check, commands, module, read_blocks, run_page
 
 import mimic
-from mimic.trainers import session
+from mimic.commands import train as session
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 README = (REPOSITORY / "README.md").read_text()

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.commands import retarget as retargeting
+from mimic.commands import train as session
 from mimic.envs import env_config
 from mimic.envs.config import RetargetConfig
-from mimic.trainers import retargeting, session
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.pose_mapper.model import training as mapper_training

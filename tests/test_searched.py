@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.commands import train as session
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.evaluation.evaluator import SPLITS, Evaluator
 from mimic.evaluation.searched_torques import _CHUNK, _descend, _task
 from mimic.evaluation.trajectory_descent import TrajectoryDescent, _bounded_law
-from mimic.trainers import session
 from mimic.trainers.config import EvaluateConfig, SearchConfig
 from tests.test_evaluate import untrained_run
 

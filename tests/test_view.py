@@ -13,10 +13,11 @@ import pytest
 
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm, rated_speed
+from mimic.commands import train as training
+from mimic.commands import view as viewer
 from mimic.envs import env_config
-from mimic.trainers import session as training
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.viewing import drawing, viewer
+from mimic.viewing import drawing
 from mimic.viewing.config import ViewConfig
 from mimic.viewing.follower import Settings, initial_settings, learner_arm, step_towards
 from mimic.viewing.live import LiveSession

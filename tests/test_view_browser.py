@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mimic.commands import train as session
 from mimic.envs import env_config
-from mimic.trainers import session
 from mimic.trainers.config import PPOConfig, TrainConfig
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

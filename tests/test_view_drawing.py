@@ -66,7 +66,7 @@ def test_drawings_hold_their_numbers():
 
 
 def test_the_chart_is_level_while_the_arms_rest(monkeypatch):
-    from mimic.viewing import viewer
+    from mimic.commands import view as viewer
     from mimic.viewing.live import Frame
 
     now = iter([0.0, 1.0, 1.03, 9.0, 9.03])

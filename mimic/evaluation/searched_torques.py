@@ -9,6 +9,7 @@ from brax.envs.base import State
 from jaxtyping import Array, Float
 from rich.console import Console
 
+from mimic.commands.progress import SearchProgress
 from mimic.envs.imitation import ArmState, ImitationEnv
 from mimic.envs.physics import Load
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
@@ -16,7 +17,6 @@ from mimic.evaluation.rollout_metrics import gaps
 from mimic.evaluation.tracking_controllers import run_controller
 from mimic.evaluation.trajectory_descent import Task, TrajectoryDescent
 from mimic.trainers.config import SearchConfig
-from mimic.trainers.progress import SearchProgress
 
 _NOISE = 0.3  # standard deviation of what is added to a policy's actions for further starts
 _NOISE_STEPS = 5  # that a noise is held for, so that the arm leaves its way

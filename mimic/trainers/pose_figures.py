@@ -16,6 +16,7 @@ import numpy as np  # noqa: E402
 
 from mimic.arms.embodiment import planar_arm  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
+from mimic.commands.pose_picture import PANDA_POSES  # noqa: E402
 from mimic.envs import env_config  # noqa: E402
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
 from mimic.metric.distance import DistanceWeights, adaptive_weights  # noqa: E402
@@ -24,7 +25,6 @@ from mimic.retargeting.pose import imitate_pose  # noqa: E402
 from mimic.trainers import metric_figures, point_figures, similarity_figures  # noqa: E402
 from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 from mimic.trainers.pose_mapper.model import PoseMapper  # noqa: E402
-from mimic.trainers.pose_picture import PANDA_POSES  # noqa: E402
 
 LoadMapper = Callable[[str], PoseMapper]  # by the name of the environment
 

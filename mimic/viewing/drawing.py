@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from mimic.commands.progress import SIMILARITY_HEADERS
 from mimic.metric.similarity import MEASURES
-from mimic.trainers.progress import SIMILARITY_HEADERS
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
 _BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)

@@ -8,12 +8,12 @@ import numpy as np
 from rich.console import Console
 
 from mimic.arms.arm import build_arm
+from mimic.commands import train as session
 from mimic.envs.config import EnvConfig
 from mimic.evaluation.rollout_frames import Story, demonstration_index
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers import session
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.ppo.trainer import PPOJob
 from mimic.viewing import drawing

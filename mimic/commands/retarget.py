@@ -14,6 +14,7 @@ from rich.table import Table
 
 from mimic.arms.arm import build_arm, rated_speed
 from mimic.arms.embodiment import Embodiment
+from mimic.commands.progress import similarity_table
 from mimic.config import new_file
 from mimic.envs import env_config
 from mimic.envs.config import MetricConfig, RetargetConfig
@@ -21,7 +22,6 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.retargeting.pose import PoseImitation, imitate_trajectory, pose_limits
 from mimic.trainers.pose_mapper.model import PoseMapper
-from mimic.trainers.progress import similarity_table
 
 
 def retarget(

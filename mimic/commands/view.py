@@ -65,7 +65,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
             "pip install 'mimic-mjx[view]'"
         )
     check_port(config.host, config.port)
-    from mimic.trainers.session import use_compilation_cache
+    from mimic.commands.train import use_compilation_cache
 
     use_compilation_cache(config.compilation_cache)
     if config.run:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.commands import train as session
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
@@ -21,7 +22,6 @@ from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs import files as runs
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers import session
 from mimic.trainers.config import PoseMapperConfig, RenderConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo.trainer import PPOJob

@@ -11,12 +11,12 @@ from rich.table import Table
 
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_share
 from mimic.config import new_file
 from mimic.envs.config import EnvConfig, RecordingConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort
 from mimic.envs.importing import import_demonstrations
 from mimic.envs.recording import record_demonstrations
-from mimic.trainers.demonstration_plot import peak, plot_demonstrations, with_share
 
 _PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 

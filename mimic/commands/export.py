@@ -224,7 +224,7 @@ def _write(portable: Portable, out: Path, format: str) -> None:
 
 
 def _onnx_bytes(portable: Portable) -> bytes:
-    from mimic.onnx_graph import to_onnx  # of an extra
+    from mimic.commands.onnx_graph import to_onnx  # of an extra
 
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in portable.metadata.items()}
     model = to_onnx(

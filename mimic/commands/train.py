@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from mimic import compat
+from mimic.commands.progress import TrainingProgress, report_table, similarity_table
 from mimic.config import to_dict
 from mimic.envs.demonstrations import load_demonstrations
 from mimic.runs import files as runs
@@ -20,7 +21,6 @@ from mimic.runs.loggers import check_loggers, make_loggers
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.distributed.process_group import Group
-from mimic.trainers.progress import TrainingProgress, report_table, similarity_table
 from mimic.trainers.trainer import Job, Params
 
 

@@ -18,8 +18,8 @@ from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.trainers import session  # noqa: E402
-from mimic.trainers.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
+from mimic.commands import train as session  # noqa: E402
+from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
 from mimic.trainers.config import RenderConfig  # noqa: E402
 
 _SIZE, _DPI = (1280, 640), 100  # pixels

@@ -1,0 +1,1 @@
+"""What each command does: mimic/NAME.py starts mimic/commands/NAME.py."""
