@@ -25,8 +25,8 @@ from mimic import compat
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig, InspectConfig, RecordingConfig, RetargetConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL
-from mimic.sweeping.services import check_launcher, register_launchers
-from mimic.sweeping.sweeper import FAILED, Outcome, register_sweeper
+from mimic.sweeps.launchers import check_launcher, register_launchers
+from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import (
     TRAINERS,
     CollectConfig,

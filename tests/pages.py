@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from mimic import cli
-from mimic.sweeping.sweeper import Sweeper
+from mimic.sweeps.sweeper import Sweeper
 
 REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("**/*.md"))]

@@ -16,9 +16,9 @@ from run_directories import write_run
 from tiny import TINY
 
 from mimic import cli
-from mimic.sweeping.command import RunCommand
-from mimic.sweeping.services import gpus_of
-from mimic.sweeping.sweeper import Outcome, path_of, path_override
+from mimic.sweeps.launchers import gpus_of
+from mimic.sweeps.run_command import RunCommand
+from mimic.sweeps.sweeper import Outcome, path_of, path_override
 
 # What Slurm would do, by the same commands: an array of jobs, each of which starts its step.
 SBATCH = """#!/bin/bash

@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from mimic.runs import files as runs
+from mimic.sweeps.finished_runs import FIGURES, SPLITS, Figure, FinishedRun, LeftOut, find_runs
+from mimic.sweeps.seed_groups import CONFIDENCE, HOW, Group, Interval, drop_repeated, group_runs, telling_keys
 from mimic.trainers.config import CollectConfig
-from mimic.trainers.finished_runs import FIGURES, SPLITS, Figure, FinishedRun, LeftOut, find_runs
-from mimic.trainers.run_groups import CONFIDENCE, HOW, Group, Interval, drop_repeated, group_runs, telling_keys
 
 NAME = "collected"
 SOME_LEFT_OUT = 1
@@ -53,7 +53,7 @@ def prepare_collection(config: CollectConfig) -> Callable[[], int]:
 
 
 def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path, figure: Figure) -> int:
-    from mimic.trainers.collected_plot import plot_collected  # matplotlib, a second
+    from mimic.sweeps.plot import plot_collected  # matplotlib, a second
 
     groups = group_runs(finished)
     out.mkdir(parents=True, exist_ok=True)

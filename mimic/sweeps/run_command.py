@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mimic.runs.signals import STOPPED_BY_SIGNAL
-from mimic.sweeping.sweeper import FAILED, Outcome, path_override
+from mimic.sweeps.sweeper import FAILED, Outcome, path_override
 
 _LOOK_S = 0.2
 

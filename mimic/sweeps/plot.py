@@ -13,8 +13,8 @@ import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 from matplotlib.lines import Line2D  # noqa: E402
 
-from mimic.trainers.finished_runs import SPLITS, Figure  # noqa: E402
-from mimic.trainers.run_groups import Group, mean_interval  # noqa: E402
+from mimic.sweeps.finished_runs import SPLITS, Figure  # noqa: E402
+from mimic.sweeps.seed_groups import Group, mean_interval  # noqa: E402
 
 _LABELS = {"train": "training data", "held_out": "held-out data"}
 _MARKERS = {"train": "s", "held_out": "o"}

@@ -15,8 +15,8 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 from mimic.runs.signals import Signals, noted_signals
-from mimic.sweeping.command import RunCommand
-from mimic.sweeping.sweeper import FAILED, LOGS, Outcome, path_of
+from mimic.sweeps.run_command import RunCommand
+from mimic.sweeps.sweeper import FAILED, LOGS, Outcome, path_of
 
 LOCAL = "basic"  # Hydra's own: one run after the other, in the process of the sweep
 _LOOK_S = 0.2

@@ -21,7 +21,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.sweeping.plugins import register, target
+from mimic.sweeps.hydra_plugins import register, target
 
 SWEEP, LOGS = "sweep.json", "logs"
 FAILED = 1

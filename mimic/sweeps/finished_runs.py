@@ -10,7 +10,7 @@ from typing import Any
 
 from mimic.config import to_dict
 from mimic.runs import files as runs
-from mimic.sweeping.sweeper import LOGS, SWEEP
+from mimic.sweeps.sweeper import LOGS, SWEEP
 from mimic.trainers.config import TrainConfig
 
 SPLITS = ("train", "held_out")

@@ -17,10 +17,10 @@ from typing import Any
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from mimic.sweeping.command import RunCommand
-from mimic.sweeping.launcher import LOCAL, CommandLauncher
-from mimic.sweeping.plugins import register, target
-from mimic.sweeping.sweeper import Outcome
+from mimic.sweeps.hydra_plugins import register, target
+from mimic.sweeps.launcher import LOCAL, CommandLauncher
+from mimic.sweeps.run_command import RunCommand
+from mimic.sweeps.sweeper import Outcome
 
 _GPUS = "CUDA_VISIBLE_DEVICES"
 _NO_TIMEOUT_MIN = 365 * 24 * 60  # submitit wants one
