@@ -21,9 +21,9 @@ from websockets.sync.client import connect
 from benchmarks.timing import time_call
 from mimic.commands import view as viewer
 from mimic.envs import env_config
-from mimic.viewing.live import LiveSession
-from mimic.viewing.page import Page
-from mimic.viewing.shapes import ArmShape
+from mimic.viewer.live_session import LiveSession
+from mimic.viewer.meshes import ArmShape
+from mimic.viewer.page import Page
 
 NEEDED = 20  # updates a second
 SECONDS = 5.0

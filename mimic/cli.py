@@ -36,7 +36,7 @@ from mimic.trainers.config import (
     RenderConfig,
     TrainConfig,
 )
-from mimic.viewing.config import ViewConfig
+from mimic.viewer.config import ViewConfig
 
 BAD_INPUT = 2
 ARM_KEYS = {  # of each command: keys that take an arm by name or file alone

@@ -17,11 +17,11 @@ from mimic.commands import train as training
 from mimic.commands import view as viewer
 from mimic.envs import env_config
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.viewing import drawing
-from mimic.viewing.config import ViewConfig
-from mimic.viewing.follower import Settings, initial_settings, learner_arm, step_towards
-from mimic.viewing.live import LiveSession
-from mimic.viewing.shapes import ArmShape
+from mimic.viewer import html as drawing
+from mimic.viewer.config import ViewConfig
+from mimic.viewer.follower import Settings, initial_settings, learner_arm, step_towards
+from mimic.viewer.live_session import LiveSession
+from mimic.viewer.meshes import ArmShape
 
 TICK = 1 / 30
 ENOUGH = 20  # updates a second that feel live

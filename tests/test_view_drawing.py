@@ -6,8 +6,8 @@ import numpy as np
 import mimic
 from mimic.arms.arm import ArmConfig
 from mimic.envs import env_config
-from mimic.viewing import drawing
-from mimic.viewing.shapes import ArmShape, places
+from mimic.viewer import html as drawing
+from mimic.viewer.meshes import ArmShape, places
 
 
 def test_shapes_stand_where_mujoco_puts_them():
@@ -67,7 +67,7 @@ def test_drawings_hold_their_numbers():
 
 def test_the_chart_is_level_while_the_arms_rest(monkeypatch):
     from mimic.commands import view as viewer
-    from mimic.viewing.live import Frame
+    from mimic.viewer.live_session import Frame
 
     now = iter([0.0, 1.0, 1.03, 9.0, 9.03])
     monkeypatch.setattr(viewer.time, "perf_counter", lambda: next(now))

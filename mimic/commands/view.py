@@ -17,12 +17,12 @@ from mimic import compat
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
 from mimic.runs import files as runs
-from mimic.viewing import drawing
-from mimic.viewing.config import ViewConfig
-from mimic.viewing.live import Frame, LiveSession
+from mimic.viewer import html as drawing
+from mimic.viewer.config import ViewConfig
+from mimic.viewer.live_session import Frame, LiveSession
 
 if TYPE_CHECKING:
-    from mimic.viewing.page import Page
+    from mimic.viewer.page import Page
 
 RATE = 30.0  # updates a second, as many as a video has
 _LONGEST_STEP = 0.1  # s: after a pause of the process, arms go on instead of jumping
@@ -71,7 +71,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     if config.run:
         compat.import_mjx()
         from mimic.evaluation.rollout_frames import policy_run
-        from mimic.viewing.playback import Playback
+        from mimic.viewer.playback import Playback
 
         run_dir, trained = policy_run(config.run, config.checkpoint)
         playback = Playback(trained, run_dir, config.checkpoint)
@@ -118,8 +118,8 @@ def _serve(
     """Shows a page until Ctrl-C or SIGTERM."""
     import viser
 
-    from mimic.viewing.page import Page
-    from mimic.viewing.shapes import ArmShape
+    from mimic.viewer.meshes import ArmShape
+    from mimic.viewer.page import Page
 
     for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C too, which is ignored in what a script starts with `&`
         signal.signal(number, signal.default_int_handler)
@@ -153,7 +153,7 @@ def _title(config: ViewConfig, env: EnvConfig) -> str:
 
 
 def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
-    from mimic.viewing.controls import LiveControls
+    from mimic.viewer.controls import LiveControls
 
     controls = LiveControls(page.server, live, env, can_lock)
     history, frame, was_compiling = History(), None, True
@@ -176,7 +176,7 @@ def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> 
 
 
 def _play(page: "Page", playback: Any, split: str) -> None:
-    from mimic.viewing.player import Player
+    from mimic.viewer.player import Player
 
     player = Player(page.server, playback, split)
     for dt in _ticks():

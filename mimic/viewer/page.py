@@ -7,9 +7,9 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from mimic.viewing import drawing
-from mimic.viewing.live import Frame
-from mimic.viewing.shapes import ArmShape, Part, places
+from mimic.viewer import html as drawing
+from mimic.viewer.live_session import Frame
+from mimic.viewer.meshes import ArmShape, Part, places
 
 _ROLES = ("expert", "learner")
 _GRID = 0.1, 0.5  # m, of a cell and of a section

@@ -16,8 +16,8 @@ from mimic.metric.similarity import centre_line_table, similarity
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.ppo.trainer import PPOJob
-from mimic.viewing import drawing
-from mimic.viewing.live import Frame
+from mimic.viewer import html as drawing
+from mimic.viewer.live_session import Frame
 
 FRAMES_PER_SECOND = 30
 _SAMPLES = 32  # of the centre lines that a frame is measured by: half the usual number, to be quick

@@ -4,8 +4,8 @@ from typing import Any
 
 import viser
 
-from mimic.viewing.config import SPLITS
-from mimic.viewing.playback import FRAMES_PER_SECOND, Playback
+from mimic.viewer.config import SPLITS
+from mimic.viewer.playback import FRAMES_PER_SECOND, Playback
 
 
 class Player:

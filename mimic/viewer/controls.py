@@ -10,8 +10,8 @@ from mimic.arms.arm import build_arm
 from mimic.envs.config import CORRESPONDENCES, EnvConfig
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.recording import record_demonstrations
-from mimic.viewing.follower import home_angles
-from mimic.viewing.live import LiveSession
+from mimic.viewer.follower import home_angles
+from mimic.viewer.live_session import LiveSession
 
 _DEMONSTRATIONS = 8  # to choose from; recorded when the first is asked for
 _HEAVIEST, _WEIGHT_STEP = 2.0, 0.05

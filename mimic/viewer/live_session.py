@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mimic.arms.arm import build_arm, rated_speed
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
-from mimic.viewing.follower import Mapper, ProgramCache, Programs, Settings, home_angles, initial_settings, step_towards
+from mimic.viewer.follower import Mapper, ProgramCache, Programs, Settings, home_angles, initial_settings, step_towards
 
 _GLIDE = 1.0  # s, that the expert takes to a pose that a button gives
 _STILL = 0.25  # s without a new pose of the expert, after which the learner may leave a local minimum
