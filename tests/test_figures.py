@@ -7,8 +7,8 @@ from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import planar_arm
 from mimic.arms.rendering import ArmScene
 from mimic.commands.figures import prepare_figures
-from mimic.trainers import point_figures
-from mimic.trainers.arm_drawing import joint_points
+from mimic.paper_figures import candidate_points as point_figures
+from mimic.paper_figures.planar_arms import joint_points
 from mimic.trainers.config import FiguresConfig
 
 

@@ -17,8 +17,8 @@ from mimic.arms.arm import Arm, ArmConfig  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs.config import EnvConfig, MetricConfig  # noqa: E402
 from mimic.metric.similarity import CentreLine, centre_line_table, similarity  # noqa: E402
+from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR  # noqa: E402
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
-from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR  # noqa: E402
 
 # What the Panda's joints are turned by [rad]: poses that show the whole arm, within its joint ranges.
 PANDA_POSES = np.array(

@@ -21,9 +21,11 @@ from mimic.envs import env_config  # noqa: E402
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
 from mimic.metric.distance import DistanceWeights, adaptive_weights  # noqa: E402
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
+from mimic.paper_figures import candidate_points as point_figures
+from mimic.paper_figures import metric as metric_figures  # noqa: E402
+from mimic.paper_figures import similarity as similarity_figures
+from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
-from mimic.trainers import metric_figures, point_figures, similarity_figures  # noqa: E402
-from mimic.trainers.arm_drawing import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 from mimic.trainers.pose_mapper.model import PoseMapper  # noqa: E402
 
 LoadMapper = Callable[[str], PoseMapper]  # by the name of the environment
