@@ -37,8 +37,8 @@ from mimic import compat  # noqa: E402
 from mimic.envs.imitation import ImitationEnv  # noqa: E402
 from mimic.envs.wrappers import wrap_for_training  # noqa: E402
 from mimic.trainers.config import PPOConfig  # noqa: E402
+from mimic.trainers.ppo import training as ppo  # noqa: E402
 from mimic.trainers.ppo.programs import make_programs  # noqa: E402
-from mimic.trainers.ppo.training import training as ppo  # noqa: E402
 
 ON_PROCESSOR = "stable-baselines3, C MuJoCo"
 _STRETCHES = 6  # the first compiles

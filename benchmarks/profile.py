@@ -24,8 +24,8 @@ from rich.table import Table
 import mimic
 from benchmarks.record import write_results
 from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo import training as ppo
 from mimic.trainers.ppo.programs import make_programs
-from mimic.trainers.ppo.training import training as ppo
 
 # What a kernel is, by its name; the first that fits.
 KINDS = (

@@ -15,9 +15,9 @@ from mimic.envs.imitation import training_and_held_out
 from mimic.runs import files as runs
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.ppo import training as ppo
 from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.trainer import PPOJob
-from mimic.trainers.ppo.training import training as ppo
 
 COUNT, HELD_OUT, HORIZON = 4, 2, 20
 

@@ -14,8 +14,8 @@ from mimic.runs import files as runs
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper, make_model
+from mimic.trainers.ppo import training as ppo
 from mimic.trainers.ppo.programs import initial_params
-from mimic.trainers.ppo.training import training as ppo
 
 pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")

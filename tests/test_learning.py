@@ -16,10 +16,10 @@ from brax.training.types import Transition
 import mimic
 from mimic.compilation import compiler_options
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo.training import losses as ppo_loss
-from mimic.trainers.ppo.training import programs as learning
-from mimic.trainers.ppo.training import training as ppo
-from mimic.trainers.ppo.training import updates
+from mimic.trainers.ppo import losses as ppo_loss
+from mimic.trainers.ppo import programs as learning
+from mimic.trainers.ppo import training as ppo
+from mimic.trainers.ppo import updates
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
 _SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"

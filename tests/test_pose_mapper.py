@@ -14,8 +14,8 @@ from mimic.commands import train as session
 from mimic.envs import env_config
 from mimic.envs.config import RetargetConfig
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
+from mimic.trainers.pose_mapper import training as mapper_training
 from mimic.trainers.pose_mapper.model import make_model
-from mimic.trainers.pose_mapper.model import training as mapper_training
 from mimic.trainers.pose_mapper.trainer import MapperJob
 
 SMALL = {"samples": 8192, "batch_size": 256, "epochs": 40, "evaluations": 2, "hidden_layers": [64, 64]}

@@ -12,10 +12,10 @@ import pytest
 
 from mimic import compilation as prepared
 from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo import programs as learning
+from mimic.trainers.ppo import training as ppo
+from mimic.trainers.ppo import updates
 from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
-from mimic.trainers.ppo.training import programs as learning
-from mimic.trainers.ppo.training import training as ppo
-from mimic.trainers.ppo.training import updates
 
 DEVICES, UNROLLS, TIME, UPDATES, MINIBATCH = 2, 6, 3, 5, 4
 LIMIT = 1.5  # of gradients: the policy's norm is below it, that of both above

@@ -24,7 +24,7 @@ from mimic.runs import files as runs
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import EXPORT_FORMATS, ExportConfig, PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
-from mimic.trainers.ppo.training import training as ppo
+from mimic.trainers.ppo import training as ppo
 
 _NEEDS = {"onnx": "onnx", "jax": "flatbuffers"}  # the package that each format is written with
 _JAX_PLATFORMS = ("cpu", "cuda")

@@ -16,8 +16,8 @@ from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from mimic.trainers.pose_mapper import training as mapper_training
 from mimic.trainers.pose_mapper.model import make_model
-from mimic.trainers.pose_mapper.model import training as mapper_training
 from mimic.trainers.trainer import Figures, Job, OnEvaluation, Params, Row
 
 # Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.

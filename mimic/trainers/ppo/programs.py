@@ -25,8 +25,8 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import fresh_episodes
 from mimic.metric.kinematics import LinkStates
 from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo import updates
 from mimic.trainers.ppo.losses import Unrolls
-from mimic.trainers.ppo.training import updates
 
 Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, value parameters
 Metrics = dict[str, Array]

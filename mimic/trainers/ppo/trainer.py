@@ -16,7 +16,7 @@ from mimic.evaluation.rollout_metrics import LEAST_SPAN
 from mimic.runs import files as runs
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.ppo.training import training as ppo
+from mimic.trainers.ppo import training as ppo
 from mimic.trainers.trainer import Figures, Job, OnEvaluation, Params, Row
 
 
