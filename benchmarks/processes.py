@@ -11,8 +11,8 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from mimic.runs import files as runs
 from mimic.runs.checkpoints import checkpoint_steps
+from mimic.runs.files import REPORT
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Task:
 
     @property
     def done(self) -> bool:
-        return (self.folder / runs.REPORT).is_file()
+        return (self.folder / REPORT).is_file()
 
     def command(self) -> list[str]:
         """What does it, or goes on where it was interrupted."""
@@ -63,7 +63,7 @@ def run_tasks(tasks: Sequence[Task], *, jobs: int, devices: int) -> list[Task]:
         shown = bar.add_task("runs", total=len(tasks), completed=len(tasks) - len(waiting), now="")
         try:
             while waiting or running:
-                ready = [task for task in waiting if task.of is None or (task.of / runs.REPORT).is_file()]
+                ready = [task for task in waiting if task.of is None or (task.of / REPORT).is_file()]
                 for task in sorted(ready, key=lambda task: task.of is None):  # evaluations first: they are short
                     if len(running) < jobs * max(devices, 1):
                         waiting.remove(task)

@@ -12,7 +12,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mimic.runs import files as runs
+from mimic.runs.files import METRICS
+from mimic.runs.provenance import hardware, versions
 
 _HELD = 3  # evaluations on end
 
@@ -23,8 +24,8 @@ def write_results(out: Path, benchmark: str, commit: str | None, **content: Any)
         "benchmark": benchmark,
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes"),
         "commit": commit or commit_id(),
-        "hardware": runs.hardware(),
-        "versions": {**runs.versions(), "mink": importlib.metadata.version("mink")},
+        "hardware": hardware(),
+        "versions": {**versions(), "mink": importlib.metadata.version("mink")},
         **content,
     }
     partial = out.with_name(out.name + ".partial")
@@ -37,7 +38,7 @@ def time_to_goal(run_dir: Path, quality: str, goal: float) -> float | None:
 
     For all that are left, if the training ends before; None where it never is.
     """
-    with (run_dir / runs.METRICS).open(newline="") as file:
+    with (run_dir / METRICS).open(newline="") as file:
         rows = [(float(row[f"quality/{quality}"]), float(row["wall_time_s"])) for row in csv.DictReader(file)]
     reached = (wall for i, (_, wall) in enumerate(rows) if all(value <= goal for value, _ in rows[i : i + _HELD]))
     return next(reached, None)

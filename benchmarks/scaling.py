@@ -31,7 +31,7 @@ from rich.progress import track  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 from benchmarks.record import train, write_results  # noqa: E402
-from mimic.runs import files as runs  # noqa: E402
+from mimic.runs.files import METRICS  # noqa: E402
 from mimic.trainers.config import PRESETS  # noqa: E402
 
 KINDS = ("weak", "strong")
@@ -82,7 +82,7 @@ def measure(
         run_dir = Path(folder) / "run"
         here = ["distributed.coordinator=local", f"distributed.processes={processes}"] if processes > 1 else []
         result = train(run_dir, [*given, *here], environment=environment(devices, processes, backend))
-        rates = speed(run_dir / runs.METRICS)
+        rates = speed(run_dir / METRICS)
     report = result["report"]
     return {
         "scaling": kind,

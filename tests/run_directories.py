@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from mimic.envs import env_config
-from mimic.runs import files as runs
+from mimic.runs.files import METRICS, REPORT
+from mimic.runs.provenance import versions
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.run_config import save_config
 
 
 def write_run(
@@ -26,16 +28,16 @@ def write_run(
     figure, unit = {"ppo": ("optimality_gap", "env_steps"), "pose_mapper": ("quality", "training_poses")}[trainer]
     config = TrainConfig(env=env_config(env), trainer=settings_of[trainer](), seed=seed, run_dir=str(run_dir))
     run_dir.mkdir(parents=True)
-    runs.save_config(run_dir, config)
+    save_config(run_dir, config)
     rows = [{"step": 1000 * (i + 1), **_by_split(f"quality/{figure}.", gap)} for i, gap in enumerate(gaps)]
-    with (run_dir / runs.METRICS).open("w", newline="") as file:
+    with (run_dir / METRICS).open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows({key: "nan" if x is None else x for key, x in row.items()} for row in rows)
     if report:
-        versions = {**runs.versions(), **({"mimic-mjx": version} if version else {})}
-        content = {"seed": seed, figure: _by_split("", gaps[-1]), unit: 1000 * len(gaps), "versions": versions}
-        (run_dir / runs.REPORT).write_text(json.dumps(content))
+        package_versions = {**versions(), **({"mimic-mjx": version} if version else {})}
+        content = {"seed": seed, figure: _by_split("", gaps[-1]), unit: 1000 * len(gaps), "versions": package_versions}
+        (run_dir / REPORT).write_text(json.dumps(content))
     return run_dir
 
 

@@ -15,10 +15,10 @@ import pytest
 from omegaconf import OmegaConf
 from tiny import TINY
 
-from mimic.runs.files import run_schema
 from mimic.trainers.distributed import process_group as group
 from mimic.trainers.distributed.local_processes import LocalProcesses, Told, told
 from mimic.trainers.distributed.process_group import DistributedConfig
+from mimic.trainers.run_config import run_schema
 
 FUSED = [*TINY, "env.physics=fused"]
 LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with many checkpoints

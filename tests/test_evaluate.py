@@ -12,12 +12,12 @@ import pytest
 import mimic
 from mimic.commands import train as session
 from mimic.envs.imitation import training_and_held_out
-from mimic.runs import files as runs
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.ppo import training as ppo
 from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.trainer import PPOJob
+from mimic.trainers.run_config import save_config
 
 COUNT, HELD_OUT, HORIZON = 4, 2, 20
 
@@ -39,7 +39,7 @@ def untrained_run(folder, **settings):
     config = TrainConfig(environment(**settings), trainer, compilation_cache="")
     job = PPOJob(config, None)
     folder.mkdir()
-    runs.save_config(folder, dataclasses.replace(config, trainer=job.settings))
+    save_config(folder, dataclasses.replace(config, trainer=job.settings))
     job.save_inputs(folder)
     env = job.evaluator.env
     networks = ppo.make_networks(job.settings, env.observation_size, env.action_size)
@@ -168,7 +168,7 @@ def test_demonstrations_beyond_the_torque_limits(refused, tmp_path):
     panda = dataclasses.replace(environment(), expert=mimic.ArmConfig())
     folder = tmp_path / "run"
     (folder / "checkpoints" / "0").mkdir(parents=True)
-    runs.save_config(folder, TrainConfig(panda, PPOConfig(hidden_layers=[8], preset="cpu").resolve("cpu")))
+    save_config(folder, TrainConfig(panda, PPOConfig(hidden_layers=[8], preset="cpu").resolve("cpu")))
     given = mimic.record_demonstrations(mimic.build_arm(panda.expert), COUNT + HELD_OUT, horizon=HORIZON)
     given.save(folder / "demonstrations.npz")
     assert given.torque is not None
@@ -198,6 +198,6 @@ def test_a_damaged_checkpoint(refused, run_dir, tmp_path):
 
 def test_a_mapper_has_no_controllers(refused, tmp_path):
     (tmp_path / "run" / "checkpoints" / "0").mkdir(parents=True)
-    runs.save_config(tmp_path / "run", TrainConfig(environment(), PoseMapperConfig()))
+    save_config(tmp_path / "run", TrainConfig(environment(), PoseMapperConfig()))
     error = refused("evaluate", f"run={tmp_path / 'run'}", "controller=pd", "compilation_cache=")
     assert "expected a run of trainer=ppo, got one of pose_mapper" in error

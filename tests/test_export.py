@@ -10,12 +10,12 @@ import pytest
 
 import mimic
 from mimic.envs.config import MetricConfig
-from mimic.runs import files as runs
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper, make_model
 from mimic.trainers.ppo import training as ppo
 from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.run_config import save_config
 
 pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -35,7 +35,7 @@ def policy_run(run_dir, name="panda4dof"):
     )
     params = (statistics, *networks)
     run_dir.mkdir()
-    runs.save_config(run_dir, TrainConfig(env.config, config))
+    save_config(run_dir, TrainConfig(env.config, config))
     save_checkpoint(run_dir, 7, params)
     return env, ppo.make_controller(config, env.observation_size, env.action_size)(params)
 
@@ -46,7 +46,7 @@ def mapper_run(run_dir, name="panda4dof", preset="paper", metric=None):
     config = PoseMapperConfig(preset=preset, hidden_layers=[16, 16]).resolve()
     params = make_model(env, config).init(jax.random.key(3))
     run_dir.mkdir()
-    runs.save_config(run_dir, TrainConfig(env, config))
+    save_config(run_dir, TrainConfig(env, config))
     save_checkpoint(run_dir, 5, params)
     return PoseMapper.load(run_dir)
 
@@ -154,7 +154,7 @@ def test_what_cannot_be_exported_is_refused(refused, tmp_path):
 def test_a_mapper_of_other_arms_than_its_config_says_is_refused(refused, tmp_path):
     mapper_run(tmp_path / "run")
     config = PoseMapperConfig(preset="paper", hidden_layers=[16, 16]).resolve()
-    runs.save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda3dof"), config))
+    save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda3dof"), config))
     assert "it is of other arms or another network" in refused("export", f"run={tmp_path / 'run'}", "out=new.onnx")
 
 

@@ -8,12 +8,14 @@ from omegaconf import OmegaConf
 from run_directories import write_run
 
 from mimic.envs.config import MetricConfig
-from mimic.runs import files as runs
+from mimic.runs.files import CONFIG, REPORT, write_report
+from mimic.runs.metrics_log import MetricsLog
+from mimic.trainers.run_config import load_config
 
 
 def test_a_report_is_json_even_after_a_divergence(tmp_path):
-    runs.write_report(tmp_path, {"gap": {"train": float("nan"), "held_out": 0.5}, "worst": [float("inf"), 1]})
-    text = (tmp_path / runs.REPORT).read_text()
+    write_report(tmp_path, {"gap": {"train": float("nan"), "held_out": 0.5}, "worst": [float("inf"), 1]})
+    text = (tmp_path / REPORT).read_text()
     assert "NaN" not in text  # which is not JSON, though Python reads it
     assert json.loads(text) == {"gap": {"train": None, "held_out": 0.5}, "worst": [None, 1]}
 
@@ -21,7 +23,7 @@ def test_a_report_is_json_even_after_a_divergence(tmp_path):
 def test_metrics_of_another_version_keep_their_columns(tmp_path):
     """A run that another version began goes on with columns of its own."""
     (tmp_path / "metrics.csv").write_text("step,old,wall_time_s\n1,0.5,2.0\n")
-    log = runs.MetricsLog(tmp_path)
+    log = MetricsLog(tmp_path)
     for step in (2, 3):
         log.write(step, {"new": 10.0 * step, "wall_time_s": 4.0})
     log.close()
@@ -42,14 +44,14 @@ def test_metrics_of_another_version_keep_their_columns(tmp_path):
 )
 def test_a_run_from_before_links_were_kept_has_the_metric_of_its_time(tmp_path, saved, expected):
     run_dir = write_run(tmp_path / "run", [0.1], env="panda4dof")
-    content = OmegaConf.to_container(OmegaConf.load(run_dir / runs.CONFIG))
+    content = OmegaConf.to_container(OmegaConf.load(run_dir / CONFIG))
     assert isinstance(content, dict)
     content["env"]["metric"] = saved or {}
-    OmegaConf.save(OmegaConf.create(content), run_dir / runs.CONFIG)
-    metric = runs.load_config(run_dir).env.metric
+    OmegaConf.save(OmegaConf.create(content), run_dir / CONFIG)
+    metric = load_config(run_dir).env.metric
     assert (metric.links, metric.correspondence, metric.translation) == expected
 
 
 def test_a_run_of_today_keeps_its_metric(tmp_path):
-    metric = runs.load_config(write_run(tmp_path / "run", [0.1], env="panda4dof")).env.metric
+    metric = load_config(write_run(tmp_path / "run", [0.1], env="panda4dof")).env.metric
     assert metric == MetricConfig() and metric.links == "kept"

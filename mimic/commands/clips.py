@@ -16,15 +16,15 @@ from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
-from mimic.evaluation.rollout_frames import Story, demonstration_index, interpolate, policy_run
+from mimic.evaluation.rollout_frames import Story, demonstration_index, interpolate
 from mimic.metric.distance import embodiment_distance, link_distances
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose, pose_limits
-from mimic.runs import files as runs
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig, RenderConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo.trainer import PPOJob
+from mimic.trainers.run_config import load_config, policy_run
 
 FRAMES_PER_SECOND = 30
 _HOLD, _OPTIMUM = {"linestyle": ":", "color": "grey"}, {"linestyle": "--", "color": "black", "lw": 1}
@@ -80,7 +80,7 @@ def prepare_clip(config: RenderConfig) -> Recipe:
     """
     if config.retargeted or (config.demonstrations and not config.run):
         return _of_retargeted(config)
-    if config.run and isinstance(runs.load_config(Path(config.run).expanduser()).trainer, PoseMapperConfig):
+    if config.run and isinstance(load_config(Path(config.run).expanduser()).trainer, PoseMapperConfig):
         return _of_mapper(config)
     return _of_policy(config)
 
@@ -113,7 +113,7 @@ def _of_mapper(config: RenderConfig) -> Recipe:
     """An expert on its way through a demonstration, and the pose that a mapper makes of it at each frame."""
     _check_unused(config, "a run of trainer=pose_mapper", "split", "learner", "limits")
     run_dir = Path(config.run).expanduser()
-    env = runs.load_config(run_dir).env
+    env = load_config(run_dir).env
     mapper = PoseMapper.load(run_dir, config.checkpoint)
     if config.demonstrations:
         _check_unused(config, "demonstrations=FILE", "seed")

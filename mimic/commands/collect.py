@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mimic.runs import files as runs
+from mimic.runs.files import REPORT, write_atomically
 from mimic.sweeps.finished_runs import FIGURES, SPLITS, Figure, FinishedRun, LeftOut, find_runs
 from mimic.sweeps.seed_groups import CONFIDENCE, HOW, Group, Interval, drop_repeated, group_runs, telling_keys
 from mimic.trainers.config import CollectConfig
@@ -41,7 +41,7 @@ def prepare_collection(config: CollectConfig) -> Callable[[], int]:
     if not finished:
         wanted = f" of trainer={config.only}" if config.only else ""
         why = f"; {len(left_out)} without: {left_out[0].name}: {left_out[0].reason}" if left_out else ""
-        raise ValueError(f"{str(folder)!r}: expected runs{wanted} with a {runs.REPORT}, found none{why}")
+        raise ValueError(f"{str(folder)!r}: expected runs{wanted} with a {REPORT}, found none{why}")
     trainers = sorted({run.trainer for run in finished})
     if len(trainers) > 1:
         raise ValueError(
@@ -57,9 +57,9 @@ def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: 
 
     groups = group_runs(finished)
     out.mkdir(parents=True, exist_ok=True)
-    runs.write_atomically(out / f"{NAME}.csv", _csv(groups))
+    write_atomically(out / f"{NAME}.csv", _csv(groups))
     content = json.dumps(_summary(groups, left_out, figure), indent=2, default=str)
-    runs.write_atomically(out / f"{NAME}.json", content + "\n")
+    write_atomically(out / f"{NAME}.json", content + "\n")
     plot_collected(groups, figure, out / f"{NAME}.png")
     console = Console()
     console.print(_table(groups, figure))

@@ -20,11 +20,12 @@ from mimic.config import check_choice, new_file
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import observation_layout, torque_scale
-from mimic.runs import files as runs
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
+from mimic.runs.files import write_atomically
 from mimic.trainers.config import EXPORT_FORMATS, ExportConfig, PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo import training as ppo
+from mimic.trainers.run_config import load_config
 
 _NEEDS = {"onnx": "onnx", "jax": "flatbuffers"}  # the package that each format is written with
 _JAX_PLATFORMS = ("cpu", "cuda")
@@ -129,7 +130,7 @@ def _portable(config: ExportConfig) -> Portable:
     if not config.run:
         raise ValueError("run: expected the run directory to export, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
-    trained = runs.load_config(run_dir)
+    trained = load_config(run_dir)
     steps = check_checkpoint(run_dir, config.checkpoint)
     expert, learner = _arms(trained.env)
     if config.learner:
@@ -219,7 +220,7 @@ def _write(portable: Portable, out: Path, format: str) -> None:
     partial = out.with_name(out.name + ".partial")
     partial.write_bytes(written)
     if format == "jax":
-        runs.write_atomically(_beside(out), json.dumps(portable.metadata, indent=2) + "\n")
+        write_atomically(_beside(out), json.dumps(portable.metadata, indent=2) + "\n")
     os.replace(partial, out)
 
 

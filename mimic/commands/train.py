@@ -15,12 +15,16 @@ from mimic import compat
 from mimic.commands.progress import TrainingProgress, report_table, similarity_table
 from mimic.config import to_dict
 from mimic.envs.demonstrations import load_demonstrations
-from mimic.runs import files as runs
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
+from mimic.runs.files import write_report
 from mimic.runs.loggers import check_loggers, make_loggers
+from mimic.runs.metrics_log import MetricsLog
+from mimic.runs.provenance import hardware, versions
 from mimic.runs.signals import Interrupted, Signals, noted_signals
+from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
 from mimic.trainers.distributed.process_group import Group
+from mimic.trainers.run_config import load_config, new_run_dir, run_schema, save_config
 from mimic.trainers.trainer import Job, Params
 
 
@@ -47,7 +51,7 @@ def prepare_training(
     Raises:
       ValueError: input that cannot be trained.
     """
-    stopwatch = runs.Stopwatch(started)
+    stopwatch = Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
     resumed = Path(config.resume).expanduser() if config.resume else None
     if resumed:
@@ -56,7 +60,7 @@ def prepare_training(
         raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
     leads = group is None or group.first
     check_loggers(config.loggers)
-    run_dir = resumed or (runs.new_run_dir(config) if leads else Path())
+    run_dir = resumed or (new_run_dir(config) if leads else Path())
     with stopwatch.stage("build"):
         job = make_job(config, resumed)
         restore = load_checkpoint(resumed, job.params_template()) if resumed else None
@@ -73,12 +77,12 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
     Raises:
       ValueError: no run directory, no such checkpoint, an `out` that exists, or what only a policy can be asked for.
     """
-    stopwatch = runs.Stopwatch(started)
+    stopwatch = Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
     if not config.run:
         raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
-    trained = runs.load_config(run_dir)  # saved resolved: the machine does not matter
+    trained = load_config(run_dir)  # saved resolved: the machine does not matter
     check_checkpoint(run_dir, config.checkpoint)
     out = Path(config.out).expanduser() if config.out else None
     if out and (out.exists() or not out.parent.is_dir()):
@@ -99,7 +103,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         if out:
             out.mkdir()
             job.save_outcome(out, outcome, config.controller)
-            runs.write_report(out, report)
+            write_report(out, report)
             console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
 
     return run
@@ -188,7 +192,7 @@ def use_compilation_cache(folder: str) -> None:
 
 
 def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
-    config = runs.load_config(run_dir)
+    config = load_config(run_dir)
     steps = check_checkpoint(run_dir)
     of_the_process = ("resume=", "compilation_cache=", "distributed.", "logger=")
     changes = [override for override in overrides if not override.startswith(of_the_process)]
@@ -199,7 +203,7 @@ def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str])
             f"resume: only settings of the trainer can change, as in trainer.{config.trainer.length_key}=N; "
             f"got {refused[0]!r}"
         )
-    merged = OmegaConf.merge(runs.run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
+    merged = OmegaConf.merge(run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
     config: TrainConfig = OmegaConf.to_object(merged)  # type: ignore[assignment]
     total = config.trainer.total_steps
     if steps >= total:
@@ -225,15 +229,15 @@ def _train(
     job: Job,
     run_dir: Path,
     restore: tuple[int, Params] | None,
-    stopwatch: runs.Stopwatch,
+    stopwatch: Stopwatch,
     group: Group | None,
     signals: Signals,
 ) -> int:
     console = Console()
-    device = runs.hardware()["device"]
+    device = hardware()["device"]
     with noted_signals(signals):  # also while the report is made: all is done then, and a signal changes nothing
         run_dir.mkdir(parents=True, exist_ok=restore is not None)
-        runs.save_config(run_dir, config)
+        save_config(run_dir, config)
         job.save_inputs(run_dir)
         console.print(
             f"{job.headline} on {device} (preset {job.settings.preset})\nrun directory: {run_dir}",
@@ -254,7 +258,7 @@ def _train(
             figures = {**job.figures(outcome), **job.details(outcome)}
         done_before = restore[0] if restore else 0
         report = _report(config, job, figures, stopwatch, steps, steps - done_before)
-        runs.write_report(run_dir, report)
+        write_report(run_dir, report)
         job.save_outcome(run_dir, outcome)
     _show(console, report, job)
     console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
@@ -267,13 +271,13 @@ def _train_and_log(
     run_dir: Path,
     signals: Signals,
     restore: tuple[int, Params] | None,
-    stopwatch: runs.Stopwatch,
+    stopwatch: Stopwatch,
     console: Console,
 ) -> tuple[int, Params]:
     """Trains; evaluates, logs and shows the result after each stretch. Steps and parameters of the result."""
     done_before = restore[0] if restore else 0
     with contextlib.ExitStack() as stack:
-        loggers = [runs.MetricsLog(run_dir), *make_loggers(config.loggers, run_dir, config)]
+        loggers = [MetricsLog(run_dir), *make_loggers(config.loggers, run_dir, config)]
         for logger in loggers:
             stack.callback(logger.close)  # also where training is interrupted
         progress = stack.enter_context(TrainingProgress(console, job.total_steps, done_before))
@@ -312,7 +316,7 @@ def _show(console: Console, report: Mapping[str, Any], job: Job) -> None:
 
 
 def _report(
-    config: TrainConfig, job: Job, figures: Mapping[str, Any], stopwatch: runs.Stopwatch, steps: int, trained: int
+    config: TrainConfig, job: Job, figures: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
 ) -> dict[str, Any]:
     wall_time = stopwatch.report()
     return {
@@ -323,6 +327,6 @@ def _report(
         "wall_time_s": wall_time,
         job.unit: steps,
         "steps_per_second": trained / wall_time["train"] if wall_time["train"] else 0.0,
-        "hardware": runs.hardware(),
-        "versions": runs.versions(),
+        "hardware": hardware(),
+        "versions": versions(),
     }

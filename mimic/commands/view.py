@@ -16,7 +16,7 @@ import numpy as np
 from mimic import compat
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
-from mimic.runs import files as runs
+from mimic.trainers.run_config import load_config
 from mimic.viewer import html as drawing
 from mimic.viewer.config import ViewConfig
 from mimic.viewer.live_session import Frame, LiveSession
@@ -70,7 +70,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     use_compilation_cache(config.compilation_cache)
     if config.run:
         compat.import_mjx()
-        from mimic.evaluation.rollout_frames import policy_run
+        from mimic.trainers.run_config import policy_run
         from mimic.viewer.playback import Playback
 
         run_dir, trained = policy_run(config.run, config.checkpoint)
@@ -81,7 +81,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         from mimic.trainers.pose_mapper.model import PoseMapper
 
         mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
-        env = runs.load_config(Path(config.mapper).expanduser()).env
+        env = load_config(Path(config.mapper).expanduser()).env
     live = LiveSession(env, mapper)
     return lambda: _serve(config, env, lambda page: _follow(page, live, env, mapper is None), None, live.finish)
 

@@ -1,6 +1,5 @@
 """A policy's rollout as it is shown: resampled in time, with its distance, bound and what each link adds."""
 
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,25 +10,6 @@ from jaxtyping import Float
 from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.metric.distance import link_distances
 from mimic.metric.kinematics import link_states
-from mimic.runs import files as runs
-from mimic.runs.checkpoints import check_checkpoint
-from mimic.trainers.config import PPOConfig, TrainConfig
-
-
-def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
-    """The directory and the config of a run whose policy shall be shown.
-
-    Raises:
-      ValueError: no run directory of PPO, or no such checkpoint.
-    """
-    if not run:
-        raise ValueError("run: expected the run directory to show, as in run=runs/NAME")
-    run_dir = Path(run).expanduser()
-    trained = runs.load_config(run_dir)
-    check_checkpoint(run_dir, checkpoint)
-    if not isinstance(trained.trainer, PPOConfig):
-        raise ValueError(f"run: expected a run of trainer=ppo, got one of {trained.trainer.name}")
-    return run_dir, trained
 
 
 def demonstration_index(evaluator: Evaluator, split: str, demonstration: int) -> int:

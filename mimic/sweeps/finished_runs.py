@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from mimic.config import to_dict
-from mimic.runs import files as runs
+from mimic.runs.files import CONFIG, METRICS, REPORT
+from mimic.runs.provenance import versions
 from mimic.sweeps.sweeper import LOGS, SWEEP
 from mimic.trainers.config import TrainConfig
+from mimic.trainers.run_config import load_config
 
 SPLITS = ("train", "held_out")
 _OF_THE_PROCESS = (
@@ -84,7 +86,7 @@ def find_runs(folder: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
     for path in _folders(folder):
         if (path / SWEEP).is_file():
             planned |= _planned(path)
-        if (path / runs.CONFIG).is_file():
+        if (path / CONFIG).is_file():
             found[path] = _read(path, _name(path, folder))
     for path, (label, reason) in planned.items():
         known = found.get(path)
@@ -99,7 +101,7 @@ def find_runs(folder: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
 def _folders(folder: Path) -> Iterator[Path]:
     """All of them, but what lies in run directories: services keep a config.yaml of their own there."""
     for name, below, files in os.walk(folder):
-        below[:] = [] if runs.CONFIG in files else sorted(entry for entry in below if not entry.startswith("."))
+        below[:] = [] if CONFIG in files else sorted(entry for entry in below if not entry.startswith("."))
         yield Path(name)
 
 
@@ -132,19 +134,19 @@ def _reason(folder: Path, entry: Mapping[str, Any]) -> str:
 
 def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     try:
-        report = json.loads((path / runs.REPORT).read_text())
+        report = json.loads((path / REPORT).read_text())
     except FileNotFoundError:
         report = None
     except (ValueError, OSError) as error:
-        return LeftOut(name, f"{runs.REPORT} cannot be read: {error}")
+        return LeftOut(name, f"{REPORT} cannot be read: {error}")
     version = str((report or {}).get("versions", {}).get("mimic-mjx", "unknown"))
     try:
-        config = runs.load_config(path)
+        config = load_config(path)
     except ValueError as error:
-        this = runs.versions()["mimic-mjx"]
+        this = versions()["mimic-mjx"]
         written = f"of mimic {version}, and this is {this}: " if report and version != this else ""
         return LeftOut(name, f"{written}{error}")
-    history = _history(path / runs.METRICS)
+    history = _history(path / METRICS)
     if report is None:
         return LeftOut(name, _progress(path, config, history))
     figure = FIGURES[config.trainer.name]
@@ -152,7 +154,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     missing = [key for split in SPLITS if (key := f"{figure.key}.{split}") not in numbers]
     if missing:
         reason = f"diverged, without a meaningful gap, or of another version ({version})"
-        return LeftOut(name, f"{reason}: {runs.REPORT} has no number {missing[0]}")
+        return LeftOut(name, f"{reason}: {REPORT} has no number {missing[0]}")
     settings = _flat(to_dict(config))
     return FinishedRun(
         name=name,
@@ -162,14 +164,14 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
         numbers=numbers,
         version=version,
         curves={split: history.get(f"quality/{figure.key}.{split}", {}) for split in SPLITS},
-        finished=(path / runs.REPORT).stat().st_mtime,
+        finished=(path / REPORT).stat().st_mtime,
     )
 
 
 def _progress(path: Path, config: TrainConfig, history: Mapping[str, Mapping[int, float]]) -> str:
     step = max((step for column in history.values() for step in column), default=0)
     total = config.trainer.total_steps
-    return f"no {runs.REPORT}: stopped or still running, at {step:,} of {total:,} steps; resume={path} goes on with it"
+    return f"no {REPORT}: stopped or still running, at {step:,} of {total:,} steps; resume={path} goes on with it"
 
 
 def _history(path: Path) -> dict[str, dict[int, float]]:

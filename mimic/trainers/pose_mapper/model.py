@@ -22,9 +22,9 @@ from mimic.envs.config import EnvConfig, MetricConfig
 from mimic.metric.distance import Correspondence, embodiment_distance
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import pose_limits
-from mimic.runs import files as runs
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.run_config import load_config
 
 Params = Any
 PoseDistance = Callable[[Array, Array], Array]  # expert's pose, learner's pose
@@ -164,7 +164,7 @@ class PoseMapper:
         Raises:
           ValueError: no run directory, one of another trainer, or no such checkpoint.
         """
-        config = runs.load_config(Path(run_dir))
+        config = load_config(Path(run_dir))
         if not isinstance(config.trainer, PoseMapperConfig):
             raise ValueError(
                 f"{os.fspath(run_dir)!r}: expected a run of trainer=pose_mapper, got one of {config.trainer.name}"

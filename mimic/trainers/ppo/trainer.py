@@ -13,7 +13,7 @@ from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate,
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.evaluation.evaluator import SPLITS, Controller, Evaluator, Rollouts
 from mimic.evaluation.rollout_metrics import LEAST_SPAN
-from mimic.runs import files as runs
+from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.ppo import training as ppo
@@ -58,7 +58,7 @@ class PPOJob(Job):
 
     def save_inputs(self, run_dir: Path) -> None:
         """The demonstrations."""
-        self._demonstrations.save(run_dir / runs.DEMONSTRATIONS)
+        self._demonstrations.save(run_dir / DEMONSTRATIONS)
 
     def params_template(self) -> Params:
         """Observation statistics, policy and value network."""
@@ -172,7 +172,7 @@ def _text(form: str, value: float) -> str:
 def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
     """The environment on its training demonstrations, and the held-out ones; those of a run where there is one."""
     if run_dir is not None:
-        path = str(run_dir / runs.DEMONSTRATIONS)
+        path = str(run_dir / DEMONSTRATIONS)
         stored = dataclasses.replace(config.demonstrations, path=path)
         config = dataclasses.replace(config, demonstrations=stored)
     training, held_out = training_and_held_out(config)
