@@ -29,8 +29,8 @@ import mimic
 from benchmarks.pose import planar
 from benchmarks.record import write_results
 from mimic.arms.arm import Arm, ArmConfig, build_arm
-from mimic.envs.config import MetricConfig
 from mimic.envs.recording import record_demonstrations
+from mimic.metric.config import MetricConfig
 from mimic.retargeting.pose import pose_limits, shared_joints
 
 STEPS = 50

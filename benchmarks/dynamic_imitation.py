@@ -22,8 +22,8 @@ from benchmarks import study_results
 from benchmarks.processes import Task, run_tasks
 from benchmarks.record import write_results
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.envs.config import MetricConfig
 from mimic.envs.recording import KINDS, record_demonstrations
+from mimic.metric.config import MetricConfig
 
 ARMS = ("panda7dof", "panda4dof", "panda3dof")
 _PAPER = ("metric=paper", "env.preview=0", "trainer.discounting=0.4", "trainer.crossovers=0")

@@ -32,7 +32,7 @@ from benchmarks import kernel_peers
 from benchmarks.kernel_figure import plot
 from benchmarks.record import write_results
 from benchmarks.timing import Timing, compiled, time_call
-from mimic.envs.config import MetricConfig
+from mimic.metric.config import MetricConfig
 
 BATCHES = (1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
 LINKS = (3, 4, 7, 16, 32, 64)

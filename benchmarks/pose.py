@@ -26,7 +26,7 @@ from rich.table import Table
 import mimic
 from benchmarks.record import write_results
 from mimic.arms.arm import Arm, ArmConfig, build_arm
-from mimic.envs.config import MetricConfig
+from mimic.metric.config import MetricConfig
 
 METRIC = MetricConfig()
 REPEATS = 5

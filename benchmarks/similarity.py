@@ -4,7 +4,8 @@
 
 For every pair of arms and set of expert poses, the learner takes the pose of minimum distance under each candidate
 metric (links kept or merged, correspondence, translation weight beside a rotation weight of 1), and the five measures
-of `mimic.metric.similarity` say how alike the arms look; beside them those of the baselines of `mimic.retargeting.pose_baselines`.
+of `mimic.metric.similarity` say how alike the arms look; beside them those of the baselines of
+`mimic.retargeting.pose_baselines`.
 FOLDER holds an unpacked wheel of robosuite, for arms other than the Panda; without it they are left out.
 
 Poses are optimised as by `imitate_pose`, but all pairs share one compiled function: see `benchmarks.similarity_poses`.
@@ -33,7 +34,7 @@ from benchmarks.record import write_results
 from benchmarks.similarity_poses import arm_data, best_poses
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
-from mimic.envs.config import MetricConfig
+from mimic.metric.config import MetricConfig
 from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table, similarity
 from mimic.retargeting.pose import shared_joints

@@ -19,8 +19,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from benchmarks.timing import time_call
-from mimic.commands import view as viewer
 from mimic.envs import env_config
+from mimic.viewer.history import RATE, History
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.meshes import ArmShape
 from mimic.viewer.page import Page
@@ -45,11 +45,11 @@ def main() -> None:
     shapes = [ArmShape(arm, env.limits) for arm in (env.expert, env.learner)]
     page = Page(server, shapes, ("expert", "learner"), "benchmark", is_flat=False)
     angles = itertools.cycle(np.sin(np.linspace(0, 2 * np.pi, 200)))
-    history = viewer.History()
+    history = History()
 
     def update() -> None:
         live.move(1, next(angles))
-        frame = live.advance(1 / viewer.RATE)
+        frame = live.advance(1 / RATE)
         if frame is not None:
             history.add(frame)
             page.show(frame, history.chart(), "")
@@ -58,7 +58,7 @@ def main() -> None:
         timing = time_call(call, wait=lambda _: None)
         console.print(f"{name}: {1e3 * timing.median:.2f} ms, {1 / timing.median:.0f} a second ({NEEDED} needed)")
     shown, received = served(port, update)
-    console.print(f"served for {SECONDS:g} s at {viewer.RATE:g} a second: {shown:.1f} shown, {received:.1f} received")
+    console.print(f"served for {SECONDS:g} s at {RATE:g} a second: {shown:.1f} shown, {received:.1f} received")
     server.stop()
 
 
@@ -82,7 +82,7 @@ def served(port: int, update: Callable[[], None]) -> tuple[float, float]:
         while time.perf_counter() < began + SECONDS:
             update()
             count += 1
-            time.sleep(max(0.0, began + count / viewer.RATE - time.perf_counter()))
+            time.sleep(max(0.0, began + count / RATE - time.perf_counter()))
         seconds = time.perf_counter() - began
         time.sleep(0.5)
         return count / seconds, len(arrived) / seconds
@@ -90,7 +90,7 @@ def served(port: int, update: Callable[[], None]) -> tuple[float, float]:
 
 def live_alone(live: LiveSession, angles: itertools.cycle) -> None:
     live.move(1, next(angles))
-    live.advance(1 / viewer.RATE)
+    live.advance(1 / RATE)
 
 
 if __name__ == "__main__":

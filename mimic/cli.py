@@ -22,21 +22,23 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import compat
-from mimic.config import explain, schema
-from mimic.envs.config import EnvConfig, InspectConfig, RecordingConfig, RetargetConfig
-from mimic.runs.signals import STOPPED_BY_SIGNAL
-from mimic.sweeps.launchers import check_launcher, register_launchers
-from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
-from mimic.trainers.config import (
-    TRAINERS,
+from mimic.commands.config import (
     CollectConfig,
     EvaluateConfig,
     ExportConfig,
     FiguresConfig,
+    InspectConfig,
+    RecordingConfig,
     RenderConfig,
-    TrainConfig,
+    RetargetConfig,
+    ViewConfig,
 )
-from mimic.viewer.config import ViewConfig
+from mimic.config import explain, schema
+from mimic.envs.config import EnvConfig
+from mimic.runs.signals import STOPPED_BY_SIGNAL
+from mimic.sweeps.launchers import check_launcher, register_launchers
+from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
+from mimic.trainers.config import TRAINERS, TrainConfig
 
 BAD_INPUT = 2
 ARM_KEYS = {  # of each command: keys that take an arm by name or file alone

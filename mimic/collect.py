@@ -1,7 +1,7 @@
 """`python -m mimic.collect DIR`: the runs below a folder as one table and figure, with confidence intervals."""
 
 from mimic import cli
-from mimic.trainers.config import CollectConfig
+from mimic.commands.config import CollectConfig
 
 
 def prepare(config: CollectConfig) -> cli.Work:

@@ -1,7 +1,7 @@
 """`python -m mimic.demonstrations kind=pd count=124 out=FILE.npz`: demonstrations of an expert, with their torques."""
 
 from mimic import cli
-from mimic.envs.config import RecordingConfig
+from mimic.commands.config import RecordingConfig
 
 
 def prepare(config: RecordingConfig) -> cli.Work:

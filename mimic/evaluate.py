@@ -1,15 +1,15 @@
 """`python -m mimic.evaluate run=DIR`: repeats the report of a run from a checkpoint alone."""
 
 from mimic import cli
-from mimic.trainers.config import EvaluateConfig
+from mimic.commands.config import EvaluateConfig
 
 
 def prepare(config: EvaluateConfig) -> cli.Work:
     """The evaluation that the config describes."""
     cli.start_backend()
-    from mimic.commands import train as session  # not needed for --help
+    from mimic.commands.evaluate import prepare_evaluation  # not needed for --help
 
-    return session.prepare_evaluation(config, cli.process_started())
+    return prepare_evaluation(config, cli.process_started())
 
 
 if __name__ == "__main__":

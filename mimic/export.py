@@ -1,7 +1,7 @@
 """`python -m mimic.export run=DIR out=FILE`: a trained policy or pose mapper as ONNX, or as StableHLO for JAX."""
 
 from mimic import cli, compat
-from mimic.trainers.config import ExportConfig
+from mimic.commands.config import ExportConfig
 
 
 def prepare(config: ExportConfig) -> cli.Work:

@@ -1,7 +1,7 @@
 """`python -m mimic.figures out=DIR`: figures of the metric and of static pose imitation, from our own runs."""
 
 from mimic import cli
-from mimic.trainers.config import FiguresConfig
+from mimic.commands.config import FiguresConfig
 
 
 def prepare(config: FiguresConfig) -> cli.Work:

@@ -1,7 +1,7 @@
 """`python -m mimic.inspect ARM.xml`: what an arm's file holds, whether it can be trained, and how near it can come."""
 
 from mimic import cli
-from mimic.envs.config import InspectConfig
+from mimic.commands.config import InspectConfig
 
 
 def prepare(config: InspectConfig) -> cli.Work:

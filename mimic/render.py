@@ -1,7 +1,7 @@
 """`python -m mimic.render run=DIR`: a video of expert and learner: a policy, a pose mapper, or retargeted motions."""
 
 from mimic import cli, compat
-from mimic.trainers.config import RenderConfig
+from mimic.commands.config import RenderConfig
 
 
 def prepare(config: RenderConfig) -> cli.Work:

@@ -1,7 +1,7 @@
 """`python -m mimic.retarget demonstrations=FILE learner=ENV out=FILE`: an expert's motions as a learner's."""
 
 from mimic import cli
-from mimic.envs.config import RetargetConfig
+from mimic.commands.config import RetargetConfig
 
 
 def prepare(config: RetargetConfig) -> cli.Work:

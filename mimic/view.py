@@ -1,7 +1,7 @@
 """`python -m mimic.view`: expert and learner live in the browser."""
 
 from mimic import cli
-from mimic.viewer.config import ViewConfig
+from mimic.commands.config import ViewConfig
 
 
 def prepare(config: ViewConfig) -> cli.Work:

@@ -9,9 +9,9 @@ import pytest
 from run_directories import write_run
 
 from mimic.commands.collect import prepare_collection
+from mimic.commands.config import CollectConfig
 from mimic.sweeps.seed_groups import mean_interval
 from mimic.sweeps.sweeper import SWEEP
-from mimic.trainers.config import CollectConfig
 
 
 def collect(folder, **more):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations import prepare_recording
 from mimic.commands.retarget import retarget
-from mimic.envs.config import RecordingConfig
 from mimic.envs.demonstrations import concatenate, crossovers
 from mimic.envs.recording import KINDS
 

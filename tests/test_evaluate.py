@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands import train as session
+from mimic.commands.config import EvaluateConfig
+from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs.imitation import training_and_held_out
 from mimic.runs.checkpoints import save_checkpoint
-from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.make import make_job
 from mimic.trainers.ppo import training as ppo
 from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.trainer import PPOJob
@@ -62,7 +64,7 @@ def unseen():
 
 def evaluate(run_dir, out, **settings):
     config = EvaluateConfig(str(run_dir), out=str(out), compilation_cache="", **settings)
-    session.prepare_evaluation(config, 0.0)()
+    prepare_evaluation(config, 0.0)()
     with (out / "demonstrations.csv").open(newline="") as file:
         return json.loads((out / "report.json").read_text()), list(csv.DictReader(file))
 
@@ -102,7 +104,7 @@ def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_pat
 
 def test_crossovers_are_trained_on_and_not_evaluated():
     trainer = PPOConfig(hidden_layers=[8], preset="cpu", crossovers=3)
-    job = session.make_job(TrainConfig(environment(), trainer), None)
+    job = make_job(TrainConfig(environment(), trainer), None)
     assert isinstance(job, PPOJob)
     assert job._env.demonstrations.count == COUNT + 3
     assert job.evaluator.training_env.demonstrations.count == COUNT

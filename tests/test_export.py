@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.envs.config import MetricConfig
+from mimic.metric.config import MetricConfig
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper, make_model

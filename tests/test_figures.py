@@ -6,10 +6,10 @@ import pytest
 from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import planar_arm
 from mimic.arms.rendering import ArmScene
+from mimic.commands.config import FiguresConfig
 from mimic.commands.figures import prepare_figures
 from mimic.paper_figures import candidate_points as point_figures
 from mimic.paper_figures.planar_arms import joint_points
-from mimic.trainers.config import FiguresConfig
 
 
 def red_share(image):

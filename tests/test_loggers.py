@@ -7,6 +7,7 @@ import types
 import pytest
 
 import mimic
+from mimic.config import to_dict
 from mimic.commands import train as session
 from mimic.runs.loggers import make_loggers
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
@@ -83,7 +84,7 @@ def test_a_run_logs_what_its_own_files_hold(tmp_path, services):
 def test_a_resumed_run_goes_on_in_the_same_mlflow_run(tmp_path, services):
     _, mlflow = services
     for _ in range(2):
-        for logger in make_loggers(["mlflow", "mlflow"], tmp_path, short_run(tmp_path, "mlflow")):
+        for logger in make_loggers(["mlflow", "mlflow"], tmp_path, to_dict(short_run(tmp_path, "mlflow"))):
             logger.write(1, {"gap": 0.5, "diverged": float("nan")})
             logger.close()
     assert [settings["run_id"] for settings in mlflow.named("start_run")] == [None, "run-7"]

@@ -7,7 +7,7 @@ import pytest
 from random_arms import random_arm
 
 from mimic.arms.embodiment import load_mjcf, panda, planar_arm
-from mimic.envs.config import MetricConfig
+from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
 from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance, rotation_distance
 from mimic.metric.kinematics import link_states

@@ -13,8 +13,9 @@ from PIL import Image
 
 import mimic
 from mimic import cli, inspect
+from mimic.commands.config import InspectConfig
 from mimic.commands.inspect import train_command
-from mimic.envs.config import EnvConfig, InspectConfig
+from mimic.envs.config import EnvConfig
 
 FEW = ["env.demonstrations.count=4", "env.demonstrations.held_out=2"]
 

@@ -11,9 +11,10 @@ import pytest
 import mimic
 from mimic.commands import retarget as retargeting
 from mimic.commands import train as session
+from mimic.commands.config import EvaluateConfig, RetargetConfig
+from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config
-from mimic.envs.config import RetargetConfig
-from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training as mapper_training
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.pose_mapper.trainer import MapperJob
@@ -64,7 +65,7 @@ def test_it_learns(trained):
 def test_evaluate_repeats_the_report(trained, tmp_path):
     run_dir, report = trained
     out = tmp_path / "again"
-    session.prepare_evaluation(EvaluateConfig(str(run_dir), out=str(out), compilation_cache=""), 0.0)()
+    prepare_evaluation(EvaluateConfig(str(run_dir), out=str(out), compilation_cache=""), 0.0)()
     again = json.loads((out / "report.json").read_text())
     for key in ("quality", "mean_distance", "optimal_distance"):
         assert again[key] == pytest.approx(report[key], rel=1e-5)

@@ -15,11 +15,12 @@ from mimic.arms.arm import build_arm
 from mimic.arms.rendering import ArmScene
 from mimic.commands import train as session
 from mimic.commands.clips import prepare_clip
+from mimic.commands.config import RenderConfig
 from mimic.commands.render import draw_frames, prepare_video
 from mimic.envs import env_config
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.recording import record_demonstrations
-from mimic.trainers.config import PoseMapperConfig, RenderConfig, TrainConfig
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 STEPS = 4  # of a motion: 0.4 s, 13 frames
 EVERY = 3  # frames from one sample to the next, 0.1 s at 30 frames a second

@@ -7,7 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 from run_directories import write_run
 
-from mimic.envs.config import MetricConfig
+from mimic.metric.config import MetricConfig
 from mimic.runs.files import CONFIG, REPORT, write_report
 from mimic.runs.metrics_log import MetricsLog
 from mimic.trainers.run_config import load_config

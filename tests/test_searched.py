@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands import train as session
+from mimic.commands.config import EvaluateConfig
+from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.evaluation.evaluator import SPLITS, Evaluator
+from mimic.evaluation.config import SearchConfig
+from mimic.evaluation.evaluator import Evaluator
+from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.searched_torques import _CHUNK, _descend, _task
 from mimic.evaluation.trajectory_descent import TrajectoryDescent, _bounded_law
-from mimic.trainers.config import EvaluateConfig, SearchConfig
 from tests.test_evaluate import untrained_run
 
 HORIZON = 20
@@ -166,7 +168,7 @@ def test_the_report_of_a_search(tmp_path):
     config = EvaluateConfig(
         str(run), out=str(tmp_path / "out"), controller="searched", search=SearchConfig(5, 5), compilation_cache=""
     )
-    session.prepare_evaluation(config, 0.0)()
+    prepare_evaluation(config, 0.0)()
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["trainer"] == "searched" and report["search"] == {"iterations": 5, "starts": 5}
     names = ["policy", "computed_torque", "pd", "hold", "noisy_policy_1"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mimic.arms.embodiment import panda
-from mimic.envs.config import MetricConfig
+from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import embodiment_distance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states

@@ -11,7 +11,7 @@ from benchmarks import dynamic_imitation as study
 from benchmarks import study_results
 from benchmarks.processes import Task, run_tasks
 from mimic import cli
-from mimic.envs.config import MetricConfig
+from mimic.metric.config import MetricConfig
 
 GROUPS = {case.group for case in study.cases(study.PRESETS["paper"])}
 

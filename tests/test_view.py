@@ -15,10 +15,10 @@ import mimic
 from mimic.arms.arm import ArmConfig, build_arm, rated_speed
 from mimic.commands import train as training
 from mimic.commands import view as viewer
+from mimic.commands.config import ViewConfig
 from mimic.envs import env_config
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.viewer import html as drawing
-from mimic.viewer.config import ViewConfig
 from mimic.viewer.follower import Settings, initial_settings, learner_arm, step_towards
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.meshes import ArmShape

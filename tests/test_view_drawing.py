@@ -67,13 +67,14 @@ def test_drawings_hold_their_numbers():
 
 def test_the_chart_is_level_while_the_arms_rest(monkeypatch):
     from mimic.commands import view as viewer
+    from mimic.viewer.history import History
     from mimic.viewer.live_session import Frame
 
     now = iter([0.0, 1.0, 1.03, 9.0, 9.03])
     monkeypatch.setattr(viewer.time, "perf_counter", lambda: next(now))
     drawn = {}
     monkeypatch.setattr(drawing, "chart", lambda time, curves: drawn.update(time=time, distance=curves[0][1]) or "")
-    history = viewer.History()
+    history = History()
     for distance in (0.0, 0.0, 0.4, 0.2):
         history.add(Frame({}, {}, (), (), (), distance, 0.0, np.eye(1), np.eye(1), {}))
     history.chart()

@@ -26,8 +26,8 @@ class Embodiment:
 
     A frozen pytree: the arrays are leaves, names and structure are static. The constructors make NumPy arrays in
     float64, and functions compute in the dtype of the pose that they are given. An arm that a function closes over is
-    known while JAX traces and costs less than one that `jax.jit` is given as an argument (see `mimic.metric.spatial`; up to 16
-    joints).
+    known while JAX traces and costs less than one that `jax.jit` is given as an argument (see
+    `mimic.metric.spatial`; up to 16 joints).
 
     Attributes:
       joint_axis: [num_joints, 3] unit axes in the zero pose.

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
-from mimic.commands import train as session
+from mimic.commands.config import RenderConfig
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
@@ -21,7 +21,8 @@ from mimic.metric.distance import embodiment_distance, link_distances
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import PoseMapperConfig, RenderConfig
+from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.make import make_job
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo.trainer import PPOJob
 from mimic.trainers.run_config import load_config, policy_run
@@ -89,7 +90,7 @@ def _of_policy(config: RenderConfig) -> Recipe:
     """A policy's rollout, with the lower bound and an arm at rest."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
     _check_unused(config, "a run of trainer=ppo", "demonstrations", "learner", "limits", "seed")
-    job = session.make_job(trained, run_dir)
+    job = make_job(trained, run_dir)
     assert isinstance(job, PPOJob)
     index = demonstration_index(job.evaluator, config.split, config.demonstration)
     _, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)

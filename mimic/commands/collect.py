@@ -13,10 +13,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from mimic.commands.config import CollectConfig
+from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import REPORT, write_atomically
-from mimic.sweeps.finished_runs import FIGURES, SPLITS, Figure, FinishedRun, LeftOut, find_runs
+from mimic.sweeps.finished_runs import FIGURES, Figure, FinishedRun, LeftOut, find_runs
 from mimic.sweeps.seed_groups import CONFIDENCE, HOW, Group, Interval, drop_repeated, group_runs, telling_keys
-from mimic.trainers.config import CollectConfig
 
 NAME = "collected"
 SOME_LEFT_OUT = 1

@@ -11,9 +11,10 @@ from rich.table import Table
 
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_share
 from mimic.config import new_file
-from mimic.envs.config import EnvConfig, RecordingConfig
+from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort
 from mimic.envs.importing import import_demonstrations
 from mimic.envs.recording import record_demonstrations

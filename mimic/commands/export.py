@@ -13,16 +13,17 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
-import mimic
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.commands.config import EXPORT_FORMATS, ExportConfig
 from mimic.config import check_choice, new_file
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import observation_layout, torque_scale
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_atomically
-from mimic.trainers.config import EXPORT_FORMATS, ExportConfig, PPOConfig, TrainConfig
+from mimic.runs.provenance import versions
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo import training as ppo
 from mimic.trainers.run_config import load_config
@@ -136,7 +137,7 @@ def _portable(config: ExportConfig) -> Portable:
     if config.learner:
         _check_meant_for(config.learner, expert, learner)
     common = {
-        "mimic_version": mimic.__version__,
+        "mimic_version": versions()["mimic-mjx"],
         "env": trained.env.name,
         "trainer": trained.trainer.name,
         "checkpoint": steps,

@@ -7,10 +7,11 @@ from pathlib import Path
 from rich.console import Console
 
 from mimic.commands import train as session
+from mimic.commands.config import FiguresConfig
 from mimic.envs import env_config
 from mimic.paper_figures.poses import FIGURES, save_figure
 from mimic.runs.checkpoints import checkpoint_steps
-from mimic.trainers.config import FiguresConfig, PoseMapperConfig, TrainConfig
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
 
 

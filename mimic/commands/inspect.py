@@ -20,10 +20,11 @@ from rich.table import Table  # noqa: E402
 from mimic.arms.arm import Arm, ArmConfig, build_arm, effective_inertia, rated_speed, torque_scale  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.commands.arm_checks import Nearness, assumptions, calmed, doubts, joint_ranges, nearness  # noqa: E402
-from mimic.commands.pose_picture import PosePairs, nearest_poses, readable_poses, save_poses  # noqa: E402
+from mimic.commands.config import InspectConfig  # noqa: E402
 from mimic.commands.progress import similarity_table  # noqa: E402
-from mimic.envs.config import EnvConfig, InspectConfig  # noqa: E402
+from mimic.envs.config import EnvConfig
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
+from mimic.paper_figures.pose_picture import PosePairs, nearest_poses, readable_poses, save_poses  # noqa: E402
 
 _PICTURE, _POSES, _FINDINGS = "arms.png", "poses.png", "inspection.json"
 _SCENE = 800, 640  # pixels

@@ -9,23 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES, SPLIT_NAMES
 from mimic.trainers.trainer import Job
-
-SIMILARITY_HEADERS = {  # positions in chain lengths
-    "centre_line_distance": "centre\nline",
-    "tangent_angle_deg": "tangent\nangle",
-    "frechet_distance": "Frechet\ndistance",
-    "hand_position_error": "hand\nposition",
-    "hand_angle_deg": "hand\nangle",
-}
-SPLIT_NAMES = {"train": "training", "held_out": "held out"}
-SIMILARITY_NAMES = {  # of what moves the learner, where the name is not said by its key
-    "nearest_poses": "nearest poses (metric)",
-    "copy_joints": "copying shared joints",
-    "hand_ik": "IK of the scaled hand",
-    "align_segments": "aligning segments",
-    "hold_home": "holding start pose",
-}
 
 
 class TrainingProgress:

@@ -18,9 +18,9 @@ from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.commands import train as session  # noqa: E402
 from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
-from mimic.trainers.config import RenderConfig  # noqa: E402
+from mimic.commands.config import RenderConfig  # noqa: E402
+from mimic.compilation import use_compilation_cache  # noqa: E402
 
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760  # pixels of the width that show the arms
@@ -33,7 +33,7 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
     Raises:
       ValueError: what `prepare_clip` rejects, an `out` that exists, none for retargeted motions, or no OpenGL.
     """
-    session.use_compilation_cache(config.compilation_cache)
+    use_compilation_cache(config.compilation_cache)
     env, own_out, make_clip = prepare_clip(config)
     out = _new_video(config, own_out)
     scene = ArmScene([env.expert, env.learner], limits=env.limits, width=_SCENE, height=_SIZE[1])

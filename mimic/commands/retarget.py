@@ -14,13 +14,15 @@ from rich.table import Table
 
 from mimic.arms.arm import build_arm, rated_speed
 from mimic.arms.embodiment import Embodiment
+from mimic.commands.config import RetargetConfig
 from mimic.commands.progress import similarity_table
 from mimic.config import new_file
 from mimic.envs import env_config
-from mimic.envs.config import MetricConfig, RetargetConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity
-from mimic.retargeting.pose import PoseImitation, imitate_trajectory, pose_limits
+from mimic.metric.config import MetricConfig
+from mimic.retargeting.motions import largest_jump, optimal_motions
+from mimic.retargeting.pose import pose_limits
 from mimic.trainers.pose_mapper.model import PoseMapper
 
 
@@ -130,34 +132,6 @@ def follow_mapper(
     poses, settled = jax.jit(jax.vmap(one))(candidates, distances)
     distance = jax.jit(jax.vmap(jax.vmap(model.distance)))(qpos, poses)
     return np.asarray(poses), np.asarray(distance), np.asarray(settled)
-
-
-def largest_jump(arm: Embodiment, dt: float) -> Float[np.ndarray, " joints"]:
-    """How far each joint goes in a time [s] at its rated speed [rad]."""
-    return rated_speed(arm) * dt
-
-
-def optimal_motions(
-    expert: Embodiment, learner: Embodiment, qpos: Array, metric: MetricConfig, largest_jump: np.ndarray, seed: int
-) -> PoseImitation:
-    """The `imitate_trajectory` of each of an expert's motions [motions, time, joints] under a metric."""
-    correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
-
-    def one(qpos: jax.Array) -> PoseImitation:
-        return imitate_trajectory(
-            expert,
-            learner,
-            qpos,
-            correspondence,
-            weights,
-            largest_jump=largest_jump,
-            key=jax.random.key(seed),
-            rotation=metric.rotation_measure,  # type: ignore[arg-type]
-            reduction=metric.reduction,  # type: ignore[arg-type]
-        )
-
-    # One demonstration after the other: the minima that are tracked fill the processor, and memory stays small.
-    return jax.jit(lambda all_qpos: jax.lax.map(one, all_qpos))(qpos)
 
 
 def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:

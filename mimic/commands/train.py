@@ -7,23 +7,23 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 from omegaconf import OmegaConf
 from rich.console import Console
 
-from mimic import compat
-from mimic.commands.progress import TrainingProgress, report_table, similarity_table
+from mimic.commands.progress import TrainingProgress
+from mimic.commands.report import make_report, show_report
+from mimic.compilation import use_compilation_cache
 from mimic.config import to_dict
-from mimic.envs.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.loggers import check_loggers, make_loggers
 from mimic.runs.metrics_log import MetricsLog
-from mimic.runs.provenance import hardware, versions
+from mimic.runs.provenance import hardware
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.runs.stopwatch import Stopwatch
-from mimic.trainers.config import EvaluateConfig, PoseMapperConfig, TrainConfig
+from mimic.trainers.config import TrainConfig
 from mimic.trainers.distributed.process_group import Group
+from mimic.trainers.make import make_job
 from mimic.trainers.run_config import load_config, new_run_dir, run_schema, save_config
 from mimic.trainers.trainer import Job, Params
 
@@ -69,126 +69,6 @@ def prepare_training(
         return lambda: _follow(job, restore, group)
     noted = group.signals if group else signals or Signals()
     return lambda: _train(config, job, run_dir, restore, stopwatch, group, noted)
-
-
-def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
-    """An evaluation of a run from a checkpoint alone, ready to start.
-
-    Raises:
-      ValueError: no run directory, no such checkpoint, an `out` that exists, or what only a policy can be asked for.
-    """
-    stopwatch = Stopwatch(started)
-    use_compilation_cache(config.compilation_cache)
-    if not config.run:
-        raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
-    run_dir = Path(config.run).expanduser()
-    trained = load_config(run_dir)  # saved resolved: the machine does not matter
-    check_checkpoint(run_dir, config.checkpoint)
-    out = Path(config.out).expanduser() if config.out else None
-    if out and (out.exists() or not out.parent.is_dir()):
-        reason = "exists; name a new folder" if out.exists() else f"there is no folder {str(out.parent)!r}"
-        raise ValueError(f"out: {str(out)!r}: {reason}")
-    with stopwatch.stage("build"):
-        trained, job = _job_to_evaluate(trained, run_dir, config)
-        steps, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
-
-    def run() -> None:
-        console = Console()
-        with stopwatch.stage("evaluate"):
-            outcome, controller = _outcome(job, params, config, console)
-            figures = {**job.figures(outcome), **job.details(outcome, config.controller)}
-        report = _report(trained, job, figures, stopwatch, steps, 0)
-        report |= {**controller, "evaluated": _conditions(trained, config)}
-        _show(console, report, job)
-        if out:
-            out.mkdir()
-            job.save_outcome(out, outcome, config.controller)
-            write_report(out, report)
-            console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
-
-    return run
-
-
-def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Job]:
-    """A run as it was, or with other demonstrations, physics or loads."""
-    factors = {"mass": config.mass, "damping": config.damping}
-    changes: dict[str, Any] = {key: [value, value] for key, value in factors.items() if value is not None}
-    if config.torque_noise is not None:
-        changes["torque_noise"] = config.torque_noise
-    if trained.trainer.name != "ppo":
-        if changes or config.physics or config.demonstrations or config.controller != "policy":
-            raise ValueError(
-                "controller, demonstrations, physics, mass, damping and torque_noise: expected a run of trainer=ppo, "
-                f"got one of {trained.trainer.name}"
-            )
-        return trained, make_job(trained, run_dir)
-    env = dataclasses.replace(
-        trained.env,
-        physics=config.physics or trained.env.physics,
-        randomization=dataclasses.replace(trained.env.randomization, **changes),
-    )
-    trained = dataclasses.replace(trained, env=env)
-    compat.import_mjx()
-    from mimic.trainers.ppo.trainer import PPOJob
-
-    unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
-    return trained, PPOJob(trained, run_dir, unseen)
-
-
-def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
-    """What an evaluation was made under."""
-    env = trained.env
-    return {
-        "run": config.run,
-        "demonstrations": config.demonstrations,
-        "physics": env.physics,
-        **dataclasses.asdict(env.randomization),
-    }
-
-
-def _outcome(job: Job, params: Params, config: EvaluateConfig, console: Console) -> tuple[Any, dict[str, Any]]:
-    """What a controller did, and what the report says of the controller."""
-    if config.controller == "policy":
-        return job.evaluate(params), {}
-    from mimic.trainers.ppo.trainer import PPOJob
-
-    assert isinstance(job, PPOJob)
-    if config.controller == "searched":
-        from mimic.evaluation.searched_torques import search_torques
-
-        policy = job.controller(params)
-        outcome, starts = search_torques(job.evaluator, policy, config.search, console)
-        return outcome, {"trainer": "searched", "search": dataclasses.asdict(config.search), "starts": starts}
-    from mimic.evaluation.tracking_controllers import run_controller
-
-    outcome, frequency = run_controller(job.evaluator, config.controller)
-    return outcome, {"trainer": config.controller, "frequency_rad_s": frequency}
-
-
-def make_job(config: TrainConfig, run_dir: Path | None) -> Job:
-    """What the trainer of a config does; with the inputs of a run directory where there is one.
-
-    Raises:
-      ValueError: a config that cannot be trained.
-    """
-    if isinstance(config.trainer, PoseMapperConfig):
-        from mimic.trainers.pose_mapper.trainer import MapperJob
-
-        return MapperJob(config, run_dir)
-    compat.import_mjx()
-    from mimic.trainers.ppo.trainer import PPOJob  # brax and MJX, which take seconds to import
-
-    return PPOJob(config, run_dir)
-
-
-def use_compilation_cache(folder: str) -> None:
-    """Lets JAX keep compiled programs in a folder, so that the same run starts faster the next time.
-
-    The small ones too: on a GPU each takes a tenth of a second, and there are dozens.
-    """
-    if folder:
-        jax.config.update("jax_compilation_cache_dir", str(Path(folder).expanduser()))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
@@ -257,10 +137,10 @@ def _train(
             outcome = job.evaluate(params)
             figures = {**job.figures(outcome), **job.details(outcome)}
         done_before = restore[0] if restore else 0
-        report = _report(config, job, figures, stopwatch, steps, steps - done_before)
+        report = make_report(config, job, figures, stopwatch, steps, steps - done_before)
         write_report(run_dir, report)
         job.save_outcome(run_dir, outcome)
-    _show(console, report, job)
+    show_report(console, report, job)
     console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
     return 0
 
@@ -277,7 +157,7 @@ def _train_and_log(
     """Trains; evaluates, logs and shows the result after each stretch. Steps and parameters of the result."""
     done_before = restore[0] if restore else 0
     with contextlib.ExitStack() as stack:
-        loggers = [MetricsLog(run_dir), *make_loggers(config.loggers, run_dir, config)]
+        loggers = [MetricsLog(run_dir), *make_loggers(config.loggers, run_dir, to_dict(config))]
         for logger in loggers:
             stack.callback(logger.close)  # also where training is interrupted
         progress = stack.enter_context(TrainingProgress(console, job.total_steps, done_before))
@@ -307,26 +187,3 @@ def _flat(figures: Mapping[str, Any]) -> dict[str, float]:
         else:
             flat[key] = value
     return flat
-
-
-def _show(console: Console, report: Mapping[str, Any], job: Job) -> None:
-    console.print(report_table(report, job))
-    if "similarity" in report:
-        console.print(similarity_table(report["similarity"]))
-
-
-def _report(
-    config: TrainConfig, job: Job, figures: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
-) -> dict[str, Any]:
-    wall_time = stopwatch.report()
-    return {
-        "env": config.env.name,
-        "trainer": config.trainer.name,
-        "seed": config.seed,
-        **figures,
-        "wall_time_s": wall_time,
-        job.unit: steps,
-        "steps_per_second": trained / wall_time["train"] if wall_time["train"] else 0.0,
-        "hardware": hardware(),
-        "versions": versions(),
-    }

@@ -6,51 +6,23 @@ import io
 import signal
 import socket
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from mimic import compat
 from mimic.arms.arm import build_arm
+from mimic.commands.config import ViewConfig
 from mimic.envs.config import EnvConfig
 from mimic.trainers.run_config import load_config
-from mimic.viewer import html as drawing
-from mimic.viewer.config import ViewConfig
+from mimic.viewer.history import RATE, History
 from mimic.viewer.live_session import Frame, LiveSession
 
 if TYPE_CHECKING:
     from mimic.viewer.page import Page
 
-RATE = 30.0  # updates a second, as many as a video has
 _LONGEST_STEP = 0.1  # s: after a pause of the process, arms go on instead of jumping
-_HISTORY = 15.0  # s of the chart
-_PAUSE = 0.5  # s without an update: the arms were at rest, and the chart shall be level there
 _NEAR = 1e-3  # of the distance: what counts as the bound itself
-
-
-class History:
-    """Distance and bound of the last seconds, for the chart."""
-
-    def __init__(self) -> None:
-        self._began = time.perf_counter()
-        self._moments: deque[tuple[float, float, float]] = deque()
-
-    def add(self, frame: Frame) -> None:
-        """Appends what is shown now."""
-        now = time.perf_counter() - self._began
-        if self._moments and now - self._moments[-1][0] > _PAUSE:  # nothing changed until just before
-            self._moments.append((now - 1 / RATE, *self._moments[-1][1:]))
-        self._moments.append((now, frame.distance, frame.bound))
-        while self._moments[0][0] < now - _HISTORY:
-            self._moments.popleft()
-
-    def chart(self) -> str:
-        """Both as curves."""
-        times, distance, bound = np.array(self._moments).T
-        return drawing.chart(times, [("distance", distance, drawing.LEARNER), ("bound", bound, drawing.BOUND)])
 
 
 def prepare_view(config: ViewConfig) -> Callable[[], int]:
@@ -65,7 +37,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
             "pip install 'mimic-mjx[view]'"
         )
     check_port(config.host, config.port)
-    from mimic.commands.train import use_compilation_cache
+    from mimic.compilation import use_compilation_cache
 
     use_compilation_cache(config.compilation_cache)
     if config.run:

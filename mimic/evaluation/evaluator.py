@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from mimic.compilation import Prepared, on_host
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
+from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.rollout_metrics import WORST, Table, gaps, means_by_split, measure, measure_similarity
 from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table
@@ -26,7 +27,6 @@ from mimic.retargeting.pose_baselines import baseline_poses
 
 Controller = Callable[[State], Array]  # state of the environment -> action
 Motions = Float[np.ndarray, "demonstrations time joints"]
-SPLITS = ("train", "held_out")
 
 
 @struct.dataclass

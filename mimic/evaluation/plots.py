@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 
-from mimic.commands.progress import SIMILARITY_HEADERS, SIMILARITY_NAMES  # noqa: E402
+from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES  # noqa: E402
 from mimic.evaluation.rollout_metrics import WORST  # noqa: E402
 from mimic.runs.files import METRICS  # noqa: E402
 

@@ -7,16 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
-from rich.console import Console
 
-from mimic.commands.progress import SearchProgress
 from mimic.envs.imitation import ArmState, ImitationEnv
 from mimic.envs.physics import Load
+from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.evaluation.tracking_controllers import run_controller
 from mimic.evaluation.trajectory_descent import Task, TrajectoryDescent
-from mimic.trainers.config import SearchConfig
 
 _NOISE = 0.3  # standard deviation of what is added to a policy's actions for further starts
 _NOISE_STEPS = 5  # that a noise is held for, so that the arm leaves its way
@@ -27,7 +25,7 @@ NOISY_POLICY = "noisy_policy"
 
 
 def search_torques(
-    evaluator: Evaluator, policy: Controller, config: SearchConfig, console: Console
+    evaluator: Evaluator, policy: Controller, config: SearchConfig, on_update: Callable[[int, str], None]
 ) -> tuple[Rollouts, dict[str, dict[str, dict[str, float]]]]:
     """The best torques that are found for each demonstration, by descent from several starts.
 
@@ -42,7 +40,7 @@ def search_torques(
       evaluator: of the environment and its demonstrations.
       policy: the first start.
       config: see `SearchConfig`.
-      console: for the progress.
+      on_update: called with the number of updates done, from 0 on, and the objective as text.
 
     Returns:
       Rollouts of the best torques; and by the name of a start, the optimality gap of itself ("start") and of what is
@@ -52,8 +50,7 @@ def search_torques(
     starts = _starts(evaluator, policy, config)
     scale = np.asarray(env.torque_scale)
     actions = np.concatenate([np.asarray(start.torque) / scale for start in starts.values()])
-    with SearchProgress(console, config.iterations) as progress:
-        searched = _descend(evaluator, actions, config.iterations, progress.update)
+    searched = _descend(evaluator, actions, config.iterations, on_update)
     searched = searched.reshape(len(starts), env.demonstrations.count, *searched.shape[1:])
     replay = jax.jit(lambda action: evaluator.rollout(_replay(action)))
     found = dict(zip(starts, map(replay, searched), strict=True))

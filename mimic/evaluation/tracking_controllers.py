@@ -9,10 +9,10 @@ from brax.envs.base import State
 from jaxtyping import Array, Float
 
 from mimic.arms.arm import effective_inertia
-from mimic.commands.retarget import largest_jump, optimal_motions
 from mimic.envs import dynamics
 from mimic.envs.imitation import ArmState, ImitationEnv
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
+from mimic.retargeting.motions import largest_jump, optimal_motions
 
 _FREQUENCIES = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)  # rad/s that are tried; a torque is held for 0.1 s
 

@@ -16,7 +16,6 @@ import numpy as np  # noqa: E402
 
 from mimic.arms.embodiment import planar_arm  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.commands.pose_picture import PANDA_POSES  # noqa: E402
 from mimic.envs import env_config  # noqa: E402
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
 from mimic.metric.distance import DistanceWeights, adaptive_weights  # noqa: E402
@@ -25,6 +24,7 @@ from mimic.paper_figures import candidate_points as point_figures
 from mimic.paper_figures import metric as metric_figures  # noqa: E402
 from mimic.paper_figures import similarity as similarity_figures
 from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
+from mimic.paper_figures.pose_picture import PANDA_POSES  # noqa: E402
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
 from mimic.trainers.pose_mapper.model import PoseMapper  # noqa: E402
 

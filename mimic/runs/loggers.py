@@ -7,9 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from mimic.config import to_dict
-from mimic.trainers.config import TrainConfig
-
 
 class Logger(Protocol):
     """A service that metrics are sent to."""
@@ -26,13 +23,13 @@ class Logger(Protocol):
 class _WandbLogger:
     """Weights & Biases; its project, mode and account are what its own environment variables say."""
 
-    def __init__(self, run_dir: Path, config: TrainConfig):
+    def __init__(self, run_dir: Path, config: Mapping[str, Any]):
         self._run = _package("wandb").init(
             name=run_dir.name,
             id=run_dir.name,  # a resumed run goes on there too
             resume="allow",
             dir=str(run_dir),
-            config=to_dict(config),
+            config=dict(config),
             **_unless_set("WANDB_PROJECT", project="mimic"),
         )
 
@@ -46,7 +43,7 @@ class _WandbLogger:
 class _MlflowLogger:
     """MLflow; where to, is what its own environment variables say."""
 
-    def __init__(self, run_dir: Path, config: TrainConfig):
+    def __init__(self, run_dir: Path, config: Mapping[str, Any]):
         self._mlflow = _package("mlflow")
         if wanted := _unless_set("MLFLOW_EXPERIMENT_NAME", experiment_name="mimic"):
             self._mlflow.set_experiment(**wanted)
@@ -54,7 +51,7 @@ class _MlflowLogger:
         self._mlflow.start_run(run_id=known.read_text() if known.exists() else None, run_name=run_dir.name)
         if not known.exists():
             known.write_text(self._mlflow.active_run().info.run_id)
-            self._mlflow.log_dict(to_dict(config), "config.json")
+            self._mlflow.log_dict(dict(config), "config.json")
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         finite = {name: float(value) for name, value in metrics.items() if math.isfinite(value)}
@@ -77,7 +74,7 @@ def check_loggers(names: Sequence[str]) -> None:
         raise ValueError("logger=mlflow: expected MLFLOW_TRACKING_URI in the environment, as in http://localhost:5000")
 
 
-def make_loggers(names: Sequence[str], run_dir: Path, config: TrainConfig) -> list[Logger]:
+def make_loggers(names: Sequence[str], run_dir: Path, config: Mapping[str, Any]) -> list[Logger]:
     """A run at each of the services; "local" is none of them."""
     return [_SERVICES[name](run_dir, config) for name in dict.fromkeys(names) if name in _SERVICES]
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from mimic.config import to_dict
+from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import CONFIG, METRICS, REPORT
 from mimic.runs.provenance import versions
 from mimic.sweeps.sweeper import LOGS, SWEEP
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config
 
-SPLITS = ("train", "held_out")
 _OF_THE_PROCESS = (
     "run_dir",
     "resume",

@@ -13,7 +13,8 @@ import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 from matplotlib.lines import Line2D  # noqa: E402
 
-from mimic.sweeps.finished_runs import SPLITS, Figure  # noqa: E402
+from mimic.evaluation.labels import SPLITS
+from mimic.sweeps.finished_runs import Figure  # noqa: E402
 from mimic.sweeps.seed_groups import Group, mean_interval  # noqa: E402
 
 _LABELS = {"train": "training data", "held_out": "held-out data"}

@@ -7,9 +7,10 @@ import numpy as np
 import viser
 
 from mimic.arms.arm import build_arm
-from mimic.envs.config import CORRESPONDENCES, EnvConfig
+from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.recording import record_demonstrations
+from mimic.metric.config import CORRESPONDENCES
 from mimic.viewer.follower import home_angles
 from mimic.viewer.live_session import LiveSession
 

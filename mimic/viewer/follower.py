@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.config import check_choice
-from mimic.envs.config import CORRESPONDENCES, EnvConfig, MetricConfig
+from mimic.envs.config import EnvConfig
+from mimic.metric.config import CORRESPONDENCES, MetricConfig
 from mimic.metric.distance import Correspondence, DistanceWeights, Weights, link_distances
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from mimic.commands.progress import SIMILARITY_HEADERS
+from mimic.evaluation.labels import SIMILARITY_HEADERS
 from mimic.metric.similarity import MEASURES
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"

@@ -8,13 +8,13 @@ import numpy as np
 from rich.console import Console
 
 from mimic.arms.arm import build_arm
-from mimic.commands import train as session
 from mimic.envs.config import EnvConfig
 from mimic.evaluation.rollout_frames import Story, demonstration_index
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import TrainConfig
+from mimic.trainers.make import make_job
 from mimic.trainers.ppo.trainer import PPOJob
 from mimic.viewer import html as drawing
 from mimic.viewer.live_session import Frame
@@ -36,7 +36,7 @@ class Playback:
     """
 
     def __init__(self, trained: TrainConfig, run_dir: Path, checkpoint: int | None):
-        job = session.make_job(trained, run_dir)
+        job = make_job(trained, run_dir)
         assert isinstance(job, PPOJob)
         self.env: EnvConfig = trained.env
         self._job, self._evaluator = job, job.evaluator

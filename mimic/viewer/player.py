@@ -4,7 +4,7 @@ from typing import Any
 
 import viser
 
-from mimic.viewer.config import SPLITS
+from mimic.evaluation.labels import SPLITS
 from mimic.viewer.playback import FRAMES_PER_SECOND, Playback
 
 

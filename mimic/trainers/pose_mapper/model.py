@@ -18,7 +18,8 @@ from jaxtyping import Array, Float
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.compilation import on_host
-from mimic.envs.config import EnvConfig, MetricConfig
+from mimic.envs.config import EnvConfig
+from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Correspondence, embodiment_distance
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import pose_limits

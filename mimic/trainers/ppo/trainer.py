@@ -11,7 +11,8 @@ from mimic.compilation import Prepared, compiling
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.evaluation.evaluator import SPLITS, Controller, Evaluator, Rollouts
+from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
+from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.rollout_metrics import LEAST_SPAN
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals

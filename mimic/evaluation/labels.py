@@ -1,0 +1,18 @@
+"""Splits of the demonstrations and names of measures, as keys and as people read them."""
+
+SPLITS = ("train", "held_out")
+SIMILARITY_HEADERS = {  # positions in chain lengths
+    "centre_line_distance": "centre\nline",
+    "tangent_angle_deg": "tangent\nangle",
+    "frechet_distance": "Frechet\ndistance",
+    "hand_position_error": "hand\nposition",
+    "hand_angle_deg": "hand\nangle",
+}
+SPLIT_NAMES = {"train": "training", "held_out": "held out"}
+SIMILARITY_NAMES = {  # of what moves the learner, where the name is not said by its key
+    "nearest_poses": "nearest poses (metric)",
+    "copy_joints": "copying shared joints",
+    "hand_ik": "IK of the scaled hand",
+    "align_segments": "aligning segments",
+    "hold_home": "holding start pose",
+}

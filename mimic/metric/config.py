@@ -1,0 +1,85 @@
+"""The config of a metric, and what it is made into."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.arms.chain import LINKS
+from mimic.arms.embodiment import Embodiment
+from mimic.config import check_choice
+from mimic.metric.correspondence import (
+    arc_length_correspondence,
+    hard_correspondence,
+    overlap_correspondence,
+    soft_correspondence,
+)
+from mimic.metric.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
+
+CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")
+
+
+@dataclasses.dataclass(frozen=True)
+class MetricConfig:
+    """The distance that is the reward. The defaults were chosen by `benchmarks.similarity`: see docs/similarity.md.
+
+    Attributes:
+      translation, rotation, linear_velocity, angular_velocity: weights; per chain length, rad, and their rates.
+      adaptive: the paper's distance-dependent weights for translation and rotation instead.
+      rotation_measure: "cosine" or "angle".
+      links: "kept" (a locked joint removes no link) or "merged" (it makes one chord of two links; paper).
+      correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance); "chord_overlap" is the overlap
+        of runs before links were kept.
+      xi: sharpness of the soft correspondence, below 0.
+      reduction: "mean" or "frobenius".
+    """
+
+    translation: float = 1.0
+    rotation: float = 1.0
+    linear_velocity: float = 0.001
+    angular_velocity: float = 0.01
+    adaptive: bool = False
+    rotation_measure: str = "cosine"
+    correspondence: str = "arc_length"
+    xi: float = -10.0
+    reduction: str = "mean"
+    links: str = "kept"
+
+    def __post_init__(self) -> None:
+        check_choice("links", self.links, LINKS)
+        check_choice("correspondence", self.correspondence, CORRESPONDENCES)
+        check_choice("rotation_measure", self.rotation_measure, ("cosine", "angle"))
+        check_choice("reduction", self.reduction, ("mean", "frobenius"))
+        if not -math.inf < self.xi < 0:
+            raise ValueError(f"xi: expected a finite number below 0 (soft minimum), got {self.xi}")
+        for name in ("translation", "rotation", "linear_velocity", "angular_velocity"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite weight of at least 0, got {getattr(self, name)}")
+
+    def make_weights(self) -> Weights:
+        """The weights as the metric takes them."""
+        velocities = {"linear_velocity": self.linear_velocity, "angular_velocity": self.angular_velocity}
+        if self.adaptive:
+            return lambda distances: dataclasses.replace(adaptive_weights(distances), **velocities)
+        return DistanceWeights(self.translation, self.rotation, **velocities)
+
+    def make_correspondence(self, expert: Embodiment, learner: Embodiment) -> Correspondence:
+        """W, or the function that makes it of the link distances."""
+        made: dict[str, Callable[[], Correspondence]] = {
+            "arc_length": lambda: arc_length_correspondence(expert, learner),
+            "overlap": lambda: overlap_correspondence(expert, learner),
+            "chord_overlap": lambda: overlap_correspondence(expert, learner, lengths="chord"),
+            "hard": lambda: hard_correspondence,
+            "soft": lambda: partial(soft_correspondence, xi=self.xi),
+        }
+        return made[self.correspondence]()
+
+    def shares(self, expert: Embodiment, learner: Embodiment) -> Float[np.ndarray, "expert learner"]:
+        """How much each expert link counts for a learner link: columns sum to 1; alike where W depends on the state."""
+        correspondence = self.make_correspondence(expert, learner)
+        shape = expert.num_links, learner.num_links
+        matrix = np.ones(shape) if callable(correspondence) else np.asarray(correspondence)
+        return matrix / matrix.sum(axis=0)
