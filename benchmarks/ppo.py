@@ -37,7 +37,7 @@ from mimic import compat  # noqa: E402
 from mimic.envs.imitation import ImitationEnv  # noqa: E402
 from mimic.envs.wrappers import wrap_for_training  # noqa: E402
 from mimic.trainers.config import PPOConfig  # noqa: E402
-from mimic.trainers.ppo import training as ppo  # noqa: E402
+from mimic.trainers.ppo import training  # noqa: E402
 from mimic.trainers.ppo.programs import make_programs  # noqa: E402
 
 ON_PROCESSOR = "stable-baselines3, C MuJoCo"
@@ -59,7 +59,7 @@ def rates(steps: int, seconds: Sequence[float]) -> dict[str, float]:
 
 def learn(env: ImitationEnv, config: PPOConfig, batches: int) -> dict[str, float]:
     """PPO as `mimic.train` runs it, in stretches of so many batches."""
-    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    networks = training.make_networks(config, env.observation_size, env.action_size)
     schedule = optax.constant_schedule(config.learning_rate)  # type: ignore[arg-type]
     seconds: list[float] = []
     began = time.perf_counter()

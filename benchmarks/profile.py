@@ -24,7 +24,7 @@ from rich.table import Table
 import mimic
 from benchmarks.record import write_results
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo import training as ppo
+from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import make_programs
 
 # What a kernel is, by its name; the first that fits.
@@ -90,7 +90,7 @@ def profile(name: str, batches: int) -> dict[str, Any]:
     """One call of the training program."""
     env = mimic.make(name, physics="fused")
     config = PPOConfig().resolve(jax.default_backend(), jax.device_count())
-    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    networks = training.make_networks(config, env.observation_size, env.action_size)
     schedule = optax.constant_schedule(config.learning_rate)  # type: ignore[arg-type]
     begin, program = make_programs(env, config, networks, batches, schedule, None)
     learning, _ = jax.block_until_ready(program()(begin()(0)))

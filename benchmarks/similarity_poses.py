@@ -12,7 +12,7 @@ import numpy as np
 
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.kinematics import LinkStates
-from mimic.retargeting.optimizers import Derivatives, End, Scalars, newton
+from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, newton
 from mimic.retargeting.pose import pose_limits
 
 JOINTS = LINKS = 7  # that arms are padded to
@@ -102,7 +102,7 @@ def _solve(
         def objective(qpos: Scalars) -> Derivatives:
             return _derivatives(arm, position, direction, matrix, translation, jnp.stack(qpos))
 
-        def descend(start: Any, steps: int) -> End:
+        def descend(start: Any, steps: int) -> Solution:
             return newton(objective, start, (arm.lower, arm.upper), steps)
 
         def value(qpos: Any) -> Any:

@@ -6,9 +6,9 @@ from mimic.commands.config import CollectConfig
 
 def prepare(config: CollectConfig) -> cli.Work:
     """The collection that the config describes."""
-    from mimic.commands import collect as collecting  # not needed for --help
+    from mimic.commands import collect  # not needed for --help
 
-    return collecting.prepare_collection(config)
+    return collect.prepare_collection(config)
 
 
 if __name__ == "__main__":

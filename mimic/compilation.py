@@ -28,7 +28,7 @@ _MESSAGES = {
 T = TypeVar("T")
 
 
-class Prepared(Generic[T]):
+class Background(Generic[T]):
     """What is made once: in a thread of its own from `start` on, else when it is first asked for.
 
     Args:
@@ -58,14 +58,14 @@ class Prepared(Generic[T]):
         return self._future.result()
 
 
-def compiling(function: Callable[..., T], *shapes: Any) -> Prepared[Callable[..., T]]:
+def compiling(function: Callable[..., T], *shapes: Any) -> Background[Callable[..., T]]:
     """`jax.jit` of a function for arguments of these shapes: traced now, compiled in the background.
 
     Args:
       function: of arrays.
       *shapes: arrays, or `jax.ShapeDtypeStruct`s in their place.
     """
-    program = Prepared(jax.jit(function, compiler_options=compiler_options()).lower(*shapes).compile)
+    program = Background(jax.jit(function, compiler_options=compiler_options()).lower(*shapes).compile)
     program.start()
     return program
 

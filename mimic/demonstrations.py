@@ -6,9 +6,9 @@ from mimic.commands.config import RecordingConfig
 
 def prepare(config: RecordingConfig) -> cli.Work:
     """The recording that the config describes."""
-    from mimic.commands import demonstrations as recording_session  # not needed for --help
+    from mimic.commands import demonstrations  # not needed for --help
 
-    return recording_session.prepare_recording(config)
+    return demonstrations.prepare_recording(config)
 
 
 if __name__ == "__main__":

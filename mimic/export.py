@@ -7,9 +7,9 @@ from mimic.commands.config import ExportConfig
 def prepare(config: ExportConfig) -> cli.Work:
     """The export that the config describes."""
     compat.import_mjx()
-    from mimic.commands import export as exporting  # not needed for --help
+    from mimic.commands import export  # not needed for --help
 
-    return exporting.prepare_export(config)
+    return export.prepare_export(config)
 
 
 if __name__ == "__main__":

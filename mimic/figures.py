@@ -6,9 +6,9 @@ from mimic.commands.config import FiguresConfig
 
 def prepare(config: FiguresConfig) -> cli.Work:
     """The figures that the config describes."""
-    from mimic.commands import figures as figure_session  # not needed for --help
+    from mimic.commands import figures  # not needed for --help
 
-    return figure_session.prepare_figures(config)
+    return figures.prepare_figures(config)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,9 @@ from mimic.commands.config import InspectConfig
 
 def prepare(config: InspectConfig) -> cli.Work:
     """The inspection that the config describes."""
-    from mimic.commands import inspect as inspection  # not needed for --help
+    from mimic.commands import inspect  # not needed for --help
 
-    return inspection.prepare_inspection(config)
+    return inspect.prepare_inspection(config)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,9 @@ from mimic.commands.config import RenderConfig
 def prepare(config: RenderConfig) -> cli.Work:
     """The video that the config describes."""
     compat.import_mjx()
-    from mimic.commands import render as video  # not needed for --help
+    from mimic.commands import render  # not needed for --help
 
-    return video.prepare_video(config)
+    return render.prepare_video(config)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,9 @@ from mimic.commands.config import RetargetConfig
 
 def prepare(config: RetargetConfig) -> cli.Work:
     """The retargeting that the config describes."""
-    from mimic.commands import retarget as retargeting  # not needed for --help
+    from mimic.commands import retarget  # not needed for --help
 
-    return retargeting.prepare_retargeting(config)
+    return retarget.prepare_retargeting(config)
 
 
 if __name__ == "__main__":

@@ -17,11 +17,11 @@ def prepare(config: TrainConfig) -> cli.Work:
         raise ValueError("distributed: expected one run, got a sweep; start each of its runs by itself")
     group = join(config.distributed)
     cli.start_backend()
-    from mimic.commands import train as session  # not needed for --help
+    from mimic.commands import train  # not needed for --help
 
     started = _process_started.pop() if _process_started else began
     signals = group.signals if group else Signals()
-    work = session.prepare_training(config, started, cli.overrides(), group, signals)
+    work = train.prepare_training(config, started, cli.overrides(), group, signals)
     # One that came while the report was made changed nothing for this run, but a sweep ends by it.
     return (lambda: work() or signals.exit_code) if cli.is_sweep() else work
 

@@ -6,9 +6,9 @@ from mimic.commands.config import ViewConfig
 
 def prepare(config: ViewConfig) -> cli.Work:
     """The viewer that the config describes."""
-    from mimic.commands import view as viewer  # not needed for --help
+    from mimic.commands import view  # not needed for --help
 
-    return viewer.prepare_view(config)
+    return view.prepare_view(config)
 
 
 if __name__ == "__main__":

@@ -62,9 +62,9 @@ def dtype(request: pytest.FixtureRequest):
 @pytest.fixture
 def interpreted(monkeypatch: pytest.MonkeyPatch):
     """Runs GPU kernels on the CPU, step by step."""
-    from mimic.metric import fused_kernel as kernel
+    from mimic.metric import fused_kernel
 
-    monkeypatch.setattr(kernel.pl, "pallas_call", functools.partial(kernel.pl.pallas_call, interpret=True))
+    monkeypatch.setattr(fused_kernel.pl, "pallas_call", functools.partial(fused_kernel.pl.pallas_call, interpret=True))
 
 
 @pytest.fixture

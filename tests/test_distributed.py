@@ -15,7 +15,7 @@ import pytest
 from omegaconf import OmegaConf
 from tiny import TINY
 
-from mimic.trainers.distributed import process_group as group
+from mimic.trainers.distributed import process_group
 from mimic.trainers.distributed.local_processes import LocalProcesses, Told, told
 from mimic.trainers.distributed.process_group import DistributedConfig
 from mimic.trainers.run_config import run_schema
@@ -203,13 +203,13 @@ def test_a_process_without_its_first_ends(monkeypatch):
     ],
 )
 def test_there_is_a_gpu_for_each_process_of_a_host(monkeypatch, asked, gpus, platforms, expected):
-    monkeypatch.setattr(group, "gpus", lambda: gpus)
+    monkeypatch.setattr(process_group, "gpus", lambda: gpus)
     monkeypatch.setenv("JAX_PLATFORMS", platforms)
     if isinstance(expected, int):
-        assert group.processes_here(asked) == expected
+        assert process_group.processes_here(asked) == expected
     else:
         with pytest.raises(ValueError, match=f"distributed.processes: {expected}"):
-            group.processes_here(asked)
+            process_group.processes_here(asked)
 
 
 @pytest.mark.slow

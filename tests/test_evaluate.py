@@ -15,10 +15,10 @@ from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs.imitation import training_and_held_out
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
-from mimic.trainers.make import make_job
-from mimic.trainers.ppo import training as ppo
+from mimic.trainers.make import make_trainer
+from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import initial_params
-from mimic.trainers.ppo.trainer import PPOJob
+from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import save_config
 
 COUNT, HELD_OUT, HORIZON = 4, 2, 20
@@ -39,12 +39,12 @@ def untrained_run(folder, **settings):
     """What a training run leaves, but with the parameters that it starts from: no training is compiled."""
     trainer = PPOConfig(hidden_layers=[8], preset="cpu")
     config = TrainConfig(environment(**settings), trainer, compilation_cache="")
-    job = PPOJob(config, None)
+    job = PPOTrainer(config, None)
     folder.mkdir()
     save_config(folder, dataclasses.replace(config, trainer=job.settings))
     job.save_inputs(folder)
     env = job.evaluator.env
-    networks = ppo.make_networks(job.settings, env.observation_size, env.action_size)
+    networks = training.make_networks(job.settings, env.observation_size, env.action_size)
     save_checkpoint(folder, 0, initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
     return folder
 
@@ -104,8 +104,8 @@ def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_pat
 
 def test_crossovers_are_trained_on_and_not_evaluated():
     trainer = PPOConfig(hidden_layers=[8], preset="cpu", crossovers=3)
-    job = make_job(TrainConfig(environment(), trainer), None)
-    assert isinstance(job, PPOJob)
+    job = make_trainer(TrainConfig(environment(), trainer), None)
+    assert isinstance(job, PPOTrainer)
     assert job._env.demonstrations.count == COUNT + 3
     assert job.evaluator.training_env.demonstrations.count == COUNT
     np.testing.assert_array_equal(job._env.demonstrations.qpos[:COUNT], job.evaluator.env.demonstrations.qpos[:COUNT])

@@ -13,7 +13,7 @@ from mimic.metric.config import MetricConfig
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper, make_model
-from mimic.trainers.ppo import training as ppo
+from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.run_config import save_config
 
@@ -26,7 +26,7 @@ def policy_run(run_dir, name="panda4dof"):
     """A run whose policy has random weights, and statistics that are not those of the start."""
     env = mimic.make(name, demonstrations={"count": 1, "held_out": 1}, physics="fused")
     config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
-    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    networks = training.make_networks(config, env.observation_size, env.action_size)
     statistics, *networks = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
     rng = np.random.default_rng(0)
     statistics = statistics.replace(
@@ -37,7 +37,7 @@ def policy_run(run_dir, name="panda4dof"):
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env.config, config))
     save_checkpoint(run_dir, 7, params)
-    return env, ppo.make_controller(config, env.observation_size, env.action_size)(params)
+    return env, training.make_controller(config, env.observation_size, env.action_size)(params)
 
 
 def mapper_run(run_dir, name="panda4dof", preset="paper", metric=None):

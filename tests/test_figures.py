@@ -8,7 +8,7 @@ from mimic.arms.embodiment import planar_arm
 from mimic.arms.rendering import ArmScene
 from mimic.commands.config import FiguresConfig
 from mimic.commands.figures import prepare_figures
-from mimic.paper_figures import candidate_points as point_figures
+from mimic.paper_figures import candidate_points
 from mimic.paper_figures.planar_arms import joint_points
 
 
@@ -41,8 +41,10 @@ def test_planar_arms_are_seen_from_above():
 
 
 def test_points_and_frames_disagree_on_what_is_perfect():
-    expert, mirrored, parallel = point_figures.poses().values()
-    itself, same_hand, same_directions = (point_figures.distances(expert, arm) for arm in (expert, mirrored, parallel))
+    expert, mirrored, parallel = candidate_points.poses().values()
+    itself, same_hand, same_directions = (
+        candidate_points.distances(expert, arm) for arm in (expert, mirrored, parallel)
+    )
     rounding = 1e-6  # of float32, for lengths and angles of about 1
     assert max(itself.values()) < rounding
     assert same_hand["points"] < rounding and same_hand["frames"] > 1.5  # rad; a right angle is pi / 2

@@ -17,9 +17,7 @@ import mimic
 from mimic.compilation import compiler_options
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import losses as ppo_loss
-from mimic.trainers.ppo import programs as learning
-from mimic.trainers.ppo import training as ppo
-from mimic.trainers.ppo import updates
+from mimic.trainers.ppo import programs, training, updates
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
 _SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
@@ -33,7 +31,7 @@ def one_batch():
         num_envs=ARMS, unroll_length=1, batch_size=UNROLLS * ARMS // 2, num_minibatches=2, num_updates_per_batch=PASSES,
         hidden_layers=[8],
     ).resolve("cpu")  # fmt: skip
-    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    networks = training.make_networks(config, env.observation_size, env.action_size)
     along = np.random.default_rng(0).normal(size=env.observation_size).astype(np.float32)
 
     def of_value(params, statistics, unrolls, *_):
@@ -47,7 +45,7 @@ def one_batch():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(updates, "value_loss", of_value)
         patch.setattr(updates, "policy_loss", of_policy)
-        begin, learn = learning.make_programs(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+        begin, learn = programs.make_programs(env, config, networks, 1, optax.constant_schedule(1e-3), None)
         start = begin()(7)
         before = jax.device_get(start)
         after, metrics = jax.device_get(learn()(start))
@@ -81,13 +79,13 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     """The entropy is that of a sample, whose numbers are drawn in the same order for one step alone."""
     sizes, unrolls = (5, 3), 6
     config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), entropy_cost=entropy_cost)
-    networks = ppo.make_networks(config, *sizes)
+    networks = training.make_networks(config, *sizes)
     rng = np.random.default_rng(time)
 
     def normal(*shape):
         return jnp.asarray(rng.normal(size=shape))
 
-    statistics, *params = learning.initial_params(networks, sizes[0], jax.random.PRNGKey(1))
+    statistics, *params = programs.initial_params(networks, sizes[0], jax.random.PRNGKey(1))
     statistics = statistics.replace(mean=normal(5), std=jnp.exp(normal(5)))
     params = jax.tree.map(lambda x: x + 0.1 * normal(*x.shape), losses.PPONetworkParams(*params))
     observation, raw_action = normal(unrolls, time + 1, 5), normal(unrolls, time + 1, 3)
@@ -163,11 +161,11 @@ def test_devices_see_different_arms_and_learn_the_same(physics):
 
 
 def test_both_programs_are_compiled_with_the_options_of_a_run(monkeypatch):
-    monkeypatch.setattr(learning, "compiler_options", lambda: {"no_option_of_xla": True})
+    monkeypatch.setattr(programs, "compiler_options", lambda: {"no_option_of_xla": True})
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
-    networks = ppo.make_networks(config, env.observation_size, env.action_size)
-    for program in learning.make_programs(env, config, networks, 1, optax.constant_schedule(1e-3), None):
+    networks = training.make_networks(config, env.observation_size, env.action_size)
+    for program in programs.make_programs(env, config, networks, 1, optax.constant_schedule(1e-3), None):
         with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
             program()
 
@@ -178,11 +176,11 @@ def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):
     """To the bit, where XLA picks the same matrix products and adds in the same order."""
     env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
     config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")
-    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    networks = training.make_networks(config, env.observation_size, env.action_size)
     given, learned = compiler_options(), []
     for scheduling in ("SERIALIZE", given[_SCHEDULING]):
         options = {**given, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
-        monkeypatch.setattr(learning, "compiler_options", lambda options=options: options)
-        begin, learn = learning.make_programs(env, config, networks, 5, optax.constant_schedule(1e-3), None)
+        monkeypatch.setattr(programs, "compiler_options", lambda options=options: options)
+        begin, learn = programs.make_programs(env, config, networks, 5, optax.constant_schedule(1e-3), None)
         learned.append(jax.device_get(learn()(begin()(7))))
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))

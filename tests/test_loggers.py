@@ -7,8 +7,8 @@ import types
 import pytest
 
 import mimic
+from mimic.commands import train
 from mimic.config import to_dict
-from mimic.commands import train as session
 from mimic.runs.loggers import make_loggers
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
@@ -69,7 +69,7 @@ def short_run(run_dir, logger):
 def test_a_run_logs_what_its_own_files_hold(tmp_path, services):
     wandb, mlflow = services
     config = short_run(tmp_path / "run", ["local", "wandb", "mlflow"])
-    assert session.prepare_training(config, 0.0)() == 0
+    assert train.prepare_training(config, 0.0)() == 0
     with (tmp_path / "run" / "metrics.csv").open() as file:
         rows = {int(row.pop("step")): {key: float(value) for key, value in row.items()} for row in csv.DictReader(file)}
     assert len(rows) == 2 and list((tmp_path / "run" / "tensorboard").iterdir())

@@ -16,7 +16,7 @@ from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.evaluation.rollout_metrics import gaps, has_gap, measure
 from mimic.evaluation.tracking_controllers import run_controller
 from mimic.metric.kinematics import link_state_table
-from mimic.trainers.ppo.trainer import PPOJob
+from mimic.trainers.ppo.trainer import PPOTrainer
 
 COUNT, HELD_OUT, HORIZON = 5, 4, 30
 SPLITS = {"train": slice(0, COUNT), "held_out": slice(COUNT, None)}
@@ -188,7 +188,7 @@ def test_a_report_says_why_there_is_no_gap(evaluator):
     figures = {**close.summary(ran), "worst_demonstrations": close.worst(ran)}
     assert all(np.isnan(gap) for gap in figures["optimality_gap"].values())
     assert figures["worst_demonstrations"] == {"train": {}, "held_out": {}}
-    rows = PPOJob.rows(object.__new__(PPOJob), figures)
+    rows = PPOTrainer.rows(object.__new__(PPOTrainer), figures)
     assert rows[0] == ("optimality gap", "none", "none") and "saves less than" in rows[1][0]
     assert rows[2][0] == "mean distance" and float(rows[2][1]) > 0
 

@@ -10,7 +10,7 @@ from metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, WEIGHTS
 
 from mimic import motion_distance
 from mimic.arms.embodiment import panda, planar_arm
-from mimic.metric import fused_kernel as kernel
+from mimic.metric import fused_kernel
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
 from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
 from mimic.metric.kinematics import LONG, link_states
@@ -197,15 +197,15 @@ def test_what_weighs_nothing_is_left_out():
 # --- the GPU kernel ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [1, kernel.DEFAULT.block, kernel.DEFAULT.block + 1])
+@pytest.mark.parametrize("count", [1, fused_kernel.DEFAULT.block, fused_kernel.DEFAULT.block + 1])
 @pytest.mark.usefixtures("interpreted")
 def test_the_kernel_computes_what_the_plain_program_does(count):
     def program(x, y):
         return [[x[0] * y[1] + 2.0], [jnp.sin(x[1]), 0.5, y[0] - x[0]]]
 
     rows = [jnp.asarray(x, jnp.float32) for x in np.random.default_rng(0).normal(size=(2, count, 2))]
-    found = jax.jit(lambda *rows: kernel.gpu_kernel(program, (1, 3))(*rows))(*rows)
-    expected = jax.vmap(kernel.fused(program, (1, 3)))(*rows)
+    found = jax.jit(lambda *rows: fused_kernel.gpu_kernel(program, (1, 3))(*rows))(*rows)
+    expected = jax.vmap(fused_kernel.fused(program, (1, 3)))(*rows)
     for values, reference, width in zip(found, expected, (1, 3), strict=True):
         assert values.shape == (count, width)
         np.testing.assert_allclose(values, reference, rtol=1e-6)  # float32, fused and not

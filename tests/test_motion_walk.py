@@ -11,8 +11,7 @@ from random_arms import random_arm
 
 from mimic import motion_distance
 from mimic.arms.embodiment import load_mjcf, panda, planar_arm
-from mimic.metric import fused_kernel as kernel
-from mimic.metric import long_chain_kernel as motion_walk
+from mimic.metric import fused_kernel, long_chain_kernel
 from mimic.metric import motion_distance as motion
 from mimic.metric.correspondence import overlap_correspondence
 from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
@@ -41,7 +40,7 @@ CASES = {
 
 def plan(arms, correspondence, weights):
     factors = motion._factors(np.asarray(correspondence, float), weights)
-    return motion_walk.plan([motion._of_length_one(arm) for arm in arms], factors)
+    return long_chain_kernel.plan([motion._of_length_one(arm) for arm in arms], factors)
 
 
 def walk_of(*case):
@@ -72,11 +71,11 @@ def values_and_gradients(arms, correspondence, weights, batch):
 def test_the_kernel_computes_what_the_composition_does(case):
     arms, correspondence, weights = CASES[case]
     correspondence = overlap_correspondence(*arms) if correspondence is None else correspondence
-    batch = motions(arms, kernel.DEFAULT.block + 1)  # the last block sticks out
+    batch = motions(arms, fused_kernel.DEFAULT.block + 1)  # the last block sticks out
     expected = values_and_gradients(arms, correspondence, weights, batch)
     walk = walk_of(arms, correspondence, weights)
     for wanted in ((), (2,), ARGUMENTS):
-        found = jax.jit(motion_walk.gpu_kernel(walk, wanted))(*batch)
+        found = jax.jit(long_chain_kernel.gpu_kernel(walk, wanted))(*batch)
         for values, reference in zip(found, [expected[0], *(expected[1 + k] for k in wanted)], strict=True):
             np.testing.assert_allclose(values, reference, atol=1e-13)  # rounding
 
@@ -86,7 +85,7 @@ def test_arms_of_any_shape_are_walked():
     arms = load_mjcf(random_arm(4, 9)), load_mjcf(random_arm(7, 6))
     metric = overlap_correspondence(*arms), ALL_WEIGHTS
     batch = motions(arms, 3)
-    found = jax.jit(motion_walk.gpu_kernel(walk_of(arms, *metric), ARGUMENTS))(*batch)
+    found = jax.jit(long_chain_kernel.gpu_kernel(walk_of(arms, *metric), ARGUMENTS))(*batch)
     for values, reference in zip(found, values_and_gradients(arms, *metric, batch), strict=True):
         np.testing.assert_allclose(values, reference, atol=1e-12)  # rounding, of velocities up to 20 chain lengths/s
 
@@ -106,7 +105,7 @@ def test_zero_with_gradients_of_zero_at_a_match():
     walk = walk_of((arm, arm), 2 * np.eye(7), ALL_WEIGHTS)
     qpos, qvel, *_ = motions((arm, arm), 2, np.float32)
     for motion_of_both in ((qpos, qvel), (qpos, 0 * qvel), (0 * qpos, 0 * qvel)):
-        for values in motion_walk.gpu_kernel(walk, ARGUMENTS)(*motion_of_both, *motion_of_both):
+        for values in long_chain_kernel.gpu_kernel(walk, ARGUMENTS)(*motion_of_both, *motion_of_both):
             assert np.all(np.abs(values) < 1e-6)  # rounding, where the two arms are rounded otherwise
 
 

@@ -6,7 +6,7 @@ import pytest
 from pages import PAGES, REPOSITORY, Block, check, commands, module, read_blocks, run_page
 
 import mimic
-from mimic.commands import train as session
+from mimic.commands import train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 README = (REPOSITORY / "README.md").read_text()
@@ -34,7 +34,7 @@ def test_the_examples_on_poses_run(monkeypatch, tmp_path):
     settings = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}
     trainer = PoseMapperConfig(**settings, evaluations=1, validation_poses=32)
     config = TrainConfig(mimic.env_config("panda4dof"), trainer, run_dir="runs/panda4dof", compilation_cache="")
-    assert session.prepare_training(config, 0.0)() == 0
+    assert train.prepare_training(config, 0.0)() == 0
     scope: dict = {}
     exec("\n".join(python(REPOSITORY / "docs" / "static_pose_imitation.md")), scope)  # noqa: S102 - our own text
     assert scope["found"].qpos.shape == (100, 4) and scope["learner_poses"].shape == (10, 4)

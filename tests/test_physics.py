@@ -12,7 +12,7 @@ import mimic
 from mimic.arms.arm import ArmConfig, build_arm, simulation_model
 from mimic.envs import dynamics, physics
 from mimic.envs.physics import Load, make_advance
-from mimic.metric import fused_kernel as kernel
+from mimic.metric import fused_kernel
 
 # Double precision leaves 1e-16 of each of a few thousand operations, and bodies that are light beside others amplify
 # it: up to 1e-12 on the random arms, 1e-15 on the Panda.
@@ -190,7 +190,7 @@ def test_the_kernel_computes_what_the_plain_program_does(planar):
     count = physics._LAYOUT.block + 1
     model, states, loads = planar
     step = physics._scalar_step(dynamics.segments(model), 0.01, 2)
-    on_gpu = kernel.gpu_kernel(step, (3, 3), physics._LAYOUT)
+    on_gpu = fused_kernel.gpu_kernel(step, (3, 3), physics._LAYOUT)
     rows = [jnp.resize(x, (count, *x.shape[1:])) for x in (*states, *loads)]
     found = jax.jit(lambda *rows: on_gpu(*rows[:3], jnp.stack(rows[3:], axis=1)))(*rows)
     expected = jax.jit(jax.vmap(make_advance(model, 0.01, 2, "fused")))(*rows[:3], Load(*rows[3:]))

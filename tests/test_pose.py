@@ -11,7 +11,7 @@ from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
 from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance
 from mimic.metric.kinematics import link_states
-from mimic.retargeting import pose_objective as objective
+from mimic.retargeting import pose_objective
 from mimic.retargeting.closed_form import SMOOTHING
 from mimic.retargeting.pose import imitate_pose, imitate_trajectory
 
@@ -95,7 +95,7 @@ def test_the_closed_form_ends_no_higher_than_automatic_derivatives(name, weights
     )
     closed = imitate_pose(*arguments)
     monkeypatch.setattr(
-        objective, "_static", lambda learner, _, __, distance: objective._differentiated(learner, distance)
+        pose_objective, "_static", lambda learner, _, __, distance: pose_objective._differentiated(learner, distance)
     )
     automatic = imitate_pose(*arguments)
     assert np.mean(closed.distance) <= np.mean(automatic.distance) + 1e-5  # float32, and a smoothing here and there

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands import retarget as retargeting
+from mimic.commands import retarget
 from mimic.commands import train as session
 from mimic.commands.config import EvaluateConfig, RetargetConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.trainers.pose_mapper import training as mapper_training
+from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model
-from mimic.trainers.pose_mapper.trainer import MapperJob
+from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 
 SMALL = {"samples": 8192, "batch_size": 256, "epochs": 40, "evaluations": 2, "hidden_layers": [64, 64]}
 SHORT: dict[str, Any] = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1}
@@ -100,14 +100,12 @@ def test_retargeted_motions_do_not_jump(trained, tmp_path):
     out = tmp_path / "learner.npz"
     env.demonstrations.save(tmp_path / "expert.npz")
     config = RetargetConfig(str(tmp_path / "expert.npz"), "planar4dof", str(trained[0]), out=str(out))
-    retargeting.prepare_retargeting(config)()
+    retarget.prepare_retargeting(config)()
     motions = mimic.load_demonstrations(out)
     motions.check_fits(env.learner, 0.1, 50)
     assert np.all(np.abs(np.diff(motions.qpos, axis=1)) <= env.learner.velocity_limit * 0.1 + 1e-5)
     metric, arms = env.config.metric, (env.expert, env.learner)
-    mapped, optimised = (
-        retargeting.retarget(env.demonstrations, *arms, metric, mapper=way)[1] for way in (mapper, None)
-    )
+    mapped, optimised = (retarget.retarget(env.demonstrations, *arms, metric, mapper=way)[1] for way in (mapper, None))
     assert optimised["distance"] < mapped["distance"] < optimised["distance"] + 0.05
 
 
@@ -139,7 +137,7 @@ def test_the_paper_overfits_and_early_stopping_goes_back_to_the_best(tmp_path):
 
 
 def test_what_is_judged_is_not_what_is_learned(tmp_path):
-    jobs = [MapperJob(run_config(tmp_path, seed=seed)) for seed in (0, 1)]
+    jobs = [PoseMapperTrainer(run_config(tmp_path, seed=seed)) for seed in (0, 1)]
     for job in jobs:
         seen = np.asarray(job._poses["train"])
         for split in ("validation", "held_out"):
@@ -165,7 +163,7 @@ def test_weights_decay_and_biases_do_not():
     settings = {**SMALL, "learning_rate": 1e-2, "final_learning_rate": 1.0, "weight_decay": 0.5}
     model = make_model(env_config("planar4dof"), PoseMapperConfig(**settings).resolve())
     params = jax.tree.map(jnp.ones_like, model.init(jax.random.key(0)))
-    optimiser = mapper_training._optimiser(model, 0)
+    optimiser = training._optimiser(model, 0)
     change, _ = optimiser.update(jax.tree.map(jnp.zeros_like, params), optimiser.init(params), params)
     for path, value in jax.tree_util.tree_leaves_with_path(change):
         expected = -1e-2 * 0.5 if "kernel" in jax.tree_util.keystr(path) else 0.0
@@ -195,7 +193,7 @@ def test_a_regularised_run_differs_in_training_and_repeats_its_report(tmp_path):
         for name, settings in (("plain", {}), ("regularised", {"dropout": 0.3, "weight_decay": 0.1}))
     )
     assert plain["quality"] != regularised["quality"]
-    job = MapperJob(run_config(tmp_path, dropout=0.3, **SHORT))
+    job = PoseMapperTrainer(run_config(tmp_path, dropout=0.3, **SHORT))
     mapper = mimic.PoseMapper.load(tmp_path / "regularised")
     assert job.figures(job.evaluate(mapper.params))["quality"] == pytest.approx(regularised["quality"], rel=1e-5)
 

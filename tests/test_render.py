@@ -13,7 +13,7 @@ from PIL import Image
 import mimic
 from mimic.arms.arm import build_arm
 from mimic.arms.rendering import ArmScene
-from mimic.commands import train as session
+from mimic.commands import train
 from mimic.commands.clips import prepare_clip
 from mimic.commands.config import RenderConfig
 from mimic.commands.render import draw_frames, prepare_video
@@ -34,7 +34,7 @@ def mapper_run(tmp_path_factory):
     trainer = PoseMapperConfig(**TINY, validation_poses=16, held_out_poses=16)
     env = env_config("planar4dof", horizon=STEPS)
     config = TrainConfig(env, trainer, run_dir=str(run_dir), compilation_cache="")
-    assert session.prepare_training(config, 0.0)() == 0
+    assert train.prepare_training(config, 0.0)() == 0
     return run_dir
 
 

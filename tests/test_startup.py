@@ -12,9 +12,8 @@ import pytest
 from hydra.core.config_store import ConfigStore
 
 import mimic
-from mimic import cli, compat
-from mimic import compilation as prepared
-from mimic.compilation import Prepared, compiler_options
+from mimic import cli, compat, compilation
+from mimic.compilation import Background, compiler_options
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.wrappers import wrap_for_training
 from mimic.evaluation import evaluator as evaluation
@@ -120,13 +119,13 @@ def test_observations_of_fresh_episodes_fit_their_states():
 
 def test_what_is_prepared_is_made_once():
     made = []
-    lazy, started = Prepared(lambda: made.append("lazy")), Prepared(lambda: made.append("started"))
+    lazy, started = Background(lambda: made.append("lazy")), Background(lambda: made.append("started"))
     started.start()
     started.start()
     for program in (started, started, lazy, lazy):
         program()
     assert made == ["started", "lazy"]
-    failing = Prepared(lambda: 1 / 0)
+    failing = Background(lambda: 1 / 0)
     failing.start()
     with pytest.raises(ZeroDivisionError):
         failing()
@@ -136,16 +135,16 @@ def test_what_is_prepared_is_made_once():
 def test_options_for_gpus_are_known_to_jaxlib(monkeypatch, a_process_for_each, count):
     """Which takes them on CPUs too, and refuses a wrong name or value."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(prepared, "a_process_for_each_gpu", lambda: a_process_for_each)
+    monkeypatch.setattr(compilation, "a_process_for_each_gpu", lambda: a_process_for_each)
     options = compiler_options()
     assert len(options) == count
     assert jax.jit(lambda x: x + 1, compiler_options=options)(1.0) == 2.0
 
 
 def test_what_is_compiled_beside_a_training_is_compiled_with_them(monkeypatch):
-    monkeypatch.setattr(prepared, "compiler_options", lambda: {"no_option_of_xla": True})
+    monkeypatch.setattr(compilation, "compiler_options", lambda: {"no_option_of_xla": True})
     with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
-        prepared.compiling(lambda x: x + 1, jnp.zeros(3))()
+        compilation.compiling(lambda x: x + 1, jnp.zeros(3))()
 
 
 def test_xla_flags_of_the_user_stay(monkeypatch):

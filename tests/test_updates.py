@@ -10,11 +10,9 @@ import numpy as np
 import optax
 import pytest
 
-from mimic import compilation as prepared
+from mimic import compilation
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo import programs as learning
-from mimic.trainers.ppo import training as ppo
-from mimic.trainers.ppo import updates
+from mimic.trainers.ppo import programs, training, updates
 from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
 
 DEVICES, UNROLLS, TIME, UPDATES, MINIBATCH = 2, 6, 3, 5, 4
@@ -32,15 +30,15 @@ class Case:
     keys: jax.Array
 
     def __post_init__(self):
-        self.networks = ppo.make_networks(self.config, *SIZES)
-        self.statistics, *self.params = learning.initial_params(self.networks, OBSERVED, jax.random.PRNGKey(1))
+        self.networks = training.make_networks(self.config, *SIZES)
+        self.statistics, *self.params = programs.initial_params(self.networks, OBSERVED, jax.random.PRNGKey(1))
         self.optimizer = optax.adam(0.01)
 
     def on_device(self, staggered, unroll, unrolls, order, key):
         """By mimic: policy and value, metrics."""
         policy, value = (updates.begin(params, self.optimizer) for params in self.params)
         of_run = self.networks, self.config, self.optimizer
-        how = updates.Updating(*of_run, axis="devices", staggered=staggered, unroll=unroll)
+        how = updates.UpdateConfig(*of_run, axis="devices", staggered=staggered, unroll=unroll)
         return updates.updated((policy, value), self.statistics, unrolls, order, key, how)
 
     def expected(self):
@@ -142,6 +140,6 @@ def test_messages_go_beside_computation_where_each_gpu_has_a_process(
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     monkeypatch.setattr(jax, "process_count", lambda: processes)
     monkeypatch.setattr(jax, "device_count", lambda: devices)
-    assert prepared.a_process_for_each_gpu() == expected
-    given = prepared.compiler_options().get("xla_gpu_enable_command_buffer", "")
+    assert compilation.a_process_for_each_gpu() == expected
+    given = compilation.compiler_options().get("xla_gpu_enable_command_buffer", "")
     assert ("COLLECTIVES" in given) == expected

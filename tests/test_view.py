@@ -13,12 +13,11 @@ import pytest
 
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm, rated_speed
-from mimic.commands import train as training
-from mimic.commands import view as viewer
+from mimic.commands import train, view
 from mimic.commands.config import ViewConfig
 from mimic.envs import env_config
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.viewer import html as drawing
+from mimic.viewer import html
 from mimic.viewer.follower import Settings, initial_settings, learner_arm, step_towards
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.meshes import ArmShape
@@ -152,7 +151,7 @@ def test_a_trained_mapper_moves_the_learner(tmp_path):
     trainer = PoseMapperConfig(**tiny, evaluations=1, validation_poses=32)
     env = env_config("planar4dof")
     config = TrainConfig(env, trainer, run_dir=str(tmp_path / "run"), compilation_cache="")
-    assert training.prepare_training(config, 0.0)() == 0
+    assert train.prepare_training(config, 0.0)() == 0
     mapper = mimic.PoseMapper.load(tmp_path / "run")
     session = LiveSession(env, mapper)
     session.compile()
@@ -200,7 +199,7 @@ def test_an_update_is_quick(live):
         assert frame is not None
         for angles in (frame.expert, frame.learner):
             shape.bodies(angles)
-        drawing.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
+        html.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
         seconds.append(time.perf_counter() - began)
     print(f"update of the view: {1e3 * np.median(seconds):.1f} ms in the median")
     assert np.median(seconds) < 1 / ENOUGH
@@ -221,12 +220,12 @@ def test_an_update_is_quick(live):
     ],
 )
 def test_bad_input(refused, arguments, message, monkeypatch):
-    monkeypatch.setattr(viewer, "is_installed", lambda: True)
+    monkeypatch.setattr(view, "is_installed", lambda: True)
     assert message in refused("view", *arguments, *([] if "port=0" in arguments else [f"port={free_port()}"]))
 
 
 def test_a_port_that_is_taken_is_refused(refused, monkeypatch):
-    monkeypatch.setattr(viewer, "is_installed", lambda: True)
+    monkeypatch.setattr(view, "is_installed", lambda: True)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mimic.commands import train as session
+from mimic.commands import train
 from mimic.envs import env_config
 from mimic.trainers.config import PPOConfig, TrainConfig
 
@@ -149,7 +149,7 @@ def test_a_policy_plays_and_can_be_scrubbed(page, serve, tmp_path):
     env = env_config("planar4dof", demonstrations={"count": 1, "held_out": 2}, physics="fused")
     settings = PPOConfig(**tiny, num_timesteps=2000, evaluations=1)
     config = TrainConfig(env, settings, run_dir=str(tmp_path / "run"), compilation_cache="")
-    assert session.prepare_training(config, 0.0)() == 0
+    assert train.prepare_training(config, 0.0)() == 0
     page.goto(serve(f"run={tmp_path / 'run'}"))
     page.wait_for_function("(document.querySelector('#mimic-note')?.innerText ?? '').includes('gap')", timeout=LATEST)
     playing = {page.inner_text("#mimic-distance") for _ in range(20) if not time.sleep(0.1)}

@@ -6,7 +6,7 @@ import numpy as np
 import mimic
 from mimic.arms.arm import ArmConfig
 from mimic.envs import env_config
-from mimic.viewer import html as drawing
+from mimic.viewer import html
 from mimic.viewer.meshes import ArmShape, places
 
 
@@ -51,29 +51,29 @@ def test_every_kind_of_geom_has_triangles_of_its_size(tmp_path):
 
 
 def test_drawings_hold_their_numbers():
-    table = drawing.heat_maps(np.eye(2), np.array([[0.25, 3.0], [0, 1]]), ["link1", "<b>"], ["link1+link2", "tip"])
+    table = html.heat_maps(np.eye(2), np.array([[0.25, 3.0], [0, 1]]), ["link1", "<b>"], ["link1+link2", "tip"])
     assert all(text in table for text in (">1.00<", ">0.25<", ">3.00<", ">1+2<", "&lt;b&gt;")) and "<b>" not in table
-    assert ">0.1235<" in drawing.numbers(0.12345, 0.1) and "…" in drawing.numbers(0.1, float("nan"))
-    assert ">12.9<" in drawing.heat_maps(np.array([[12.94]]), np.eye(1), ["link1"], ["link1"])  # five do not fit
+    assert ">0.1235<" in html.numbers(0.12345, 0.1) and "…" in html.numbers(0.1, float("nan"))
+    assert ">12.9<" in html.heat_maps(np.array([[12.94]]), np.eye(1), ["link1"], ["link1"])  # five do not fit
     mixed = {"hand_angle_deg": 4.0, "centre_line_distance": 0.01, "tangent_angle_deg": 2.0}  # as jit sorts them
-    shown = drawing.numbers(0.1, 0.1, similarity=mixed)
+    shown = html.numbers(0.1, 0.1, similarity=mixed)
     assert shown.index("centre line") < shown.index("tangent angle") < shown.index("hand angle")
     time_s, unknown = np.linspace(0, 1, 5), np.array([np.nan, np.nan, 0.1, 0.1, 0.1])
-    svg = drawing.chart(time_s, [("distance", time_s, "red"), ("bound", unknown, "black")], now=0.5)
+    svg = html.chart(time_s, [("distance", time_s, "red"), ("bound", unknown, "black")], now=0.5)
     assert svg.count("<polyline") == 2 and "nan" not in svg
-    level = drawing.chart(time_s, [("distance", np.zeros(5), "red")])
+    level = html.chart(time_s, [("distance", np.zeros(5), "red")])
     assert ">0.000<" in level and ">0.005<" in level and ">0.010<" in level  # three different ones
 
 
 def test_the_chart_is_level_while_the_arms_rest(monkeypatch):
-    from mimic.commands import view as viewer
+    from mimic.commands import view
     from mimic.viewer.history import History
     from mimic.viewer.live_session import Frame
 
     now = iter([0.0, 1.0, 1.03, 9.0, 9.03])
-    monkeypatch.setattr(viewer.time, "perf_counter", lambda: next(now))
+    monkeypatch.setattr(view.time, "perf_counter", lambda: next(now))
     drawn = {}
-    monkeypatch.setattr(drawing, "chart", lambda time, curves: drawn.update(time=time, distance=curves[0][1]) or "")
+    monkeypatch.setattr(html, "chart", lambda time, curves: drawn.update(time=time, distance=curves[0][1]) or "")
     history = History()
     for distance in (0.0, 0.0, 0.4, 0.2):
         history.add(Frame({}, {}, (), (), (), distance, 0.0, np.eye(1), np.eye(1), {}))

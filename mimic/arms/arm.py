@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from mimic.arms.chain import Links
 from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
-from mimic.arms.ignored_elements import set_aside
+from mimic.arms.ignored_elements import ignored_elements
 from mimic.arms.model_files import VELOCITY_LIMIT, read_spec
 
 # Planar arms are ours to define: slender rods, whose joints feel about as heavy for their size as the Panda's.
@@ -44,7 +44,7 @@ class ArmConfig:
       locked: joint names or numbers, or a mapping from these to angles [rad].
       link_lengths: of a planar arm [m].
       base: body that the chain starts behind (of a file).
-      tip: body or site that the chain ends at (of a file); else see `find_route`.
+      tip: body or site that the chain ends at (of a file); else see `find_chain`.
       armature: least rotor inertia of each joint, as its motor feels it [kg m^2]; many models state none.
       damping: least damping of each joint [N m s/rad].
     """
@@ -122,7 +122,9 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
             links=cast(Links, links),
             limits=cast(Limits, limits),
         )
-        return with_rotors(Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config)
+        return with_minimum_armature(
+            Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config
+        )
     is_panda = config.model == "panda"
     embodiment, source, angles = load_arm(
         panda_path() if is_panda else config.model,
@@ -133,11 +135,13 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         links=cast(Links, links),
         limits=cast(Limits, limits),
     )
-    notes = () if is_panda else set_aside(source, config.base, config.tip)
-    return with_rotors(Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, notes), config)
+    notes = () if is_panda else ignored_elements(source, config.base, config.tip)
+    return with_minimum_armature(
+        Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, notes), config
+    )
 
 
-def with_rotors(arm: Arm, config: ArmConfig) -> Arm:
+def with_minimum_armature(arm: Arm, config: ArmConfig) -> Arm:
     """The arm whose joints have at least the rotor inertia and the damping of a config."""
     model = copy.copy(arm.model)
     model.dof_armature[:] = np.maximum(model.dof_armature, config.armature)

@@ -135,7 +135,7 @@ def load_mjcf(
 
     Links are the capsule sites named link… where the model has them (`fromto` gives start and end), else the segments
     from each joint's anchor to the next, the last one ending at `tip`. The base frame is that of the body before the
-    first hinge. A hand's joints stay where they are; where the model branches: see `find_route` in
+    first hinge. A hand's joints stay where they are; where the model branches: see `find_chain` in
     mimic.arms.kinematic_tree.
 
     Args:

@@ -13,7 +13,7 @@ _KINDS = {int(kind): kind.name.removeprefix("mjJNT_").lower() for kind in mujoco
 
 
 @dataclasses.dataclass(frozen=True)
-class Route:
+class ChainIds:
     """The arm within a model, by ids.
 
     Attributes:
@@ -31,7 +31,7 @@ class Route:
     elsewhere: tuple[int, ...]
 
 
-def find_route(model: mujoco.MjModel, base: str | None = None, tip: str | None = None) -> Route:
+def find_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None = None) -> ChainIds:
     """The serial chain of hinges of a model.
 
     Args:
@@ -66,7 +66,7 @@ def find_route(model: mujoco.MjModel, base: str | None = None, tip: str | None =
     before = [joint for joint in others if model.jnt_bodyid[joint] in upstream]
     beyond = [j for j in others if j not in before and bodies[-1] in ancestors(model, int(model.jnt_bodyid[j]))]
     elsewhere = [joint for joint in others if joint not in before and joint not in beyond]
-    return Route(tuple(bodies), tuple(hinges), tuple(before), tuple(beyond), tuple(elsewhere))
+    return ChainIds(tuple(bodies), tuple(hinges), tuple(before), tuple(beyond), tuple(elsewhere))
 
 
 def joint_kind(model: mujoco.MjModel, joint: int) -> str:

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
-from mimic.arms.kinematic_tree import Route, ancestors, body_id, find_route, is_hinge, tip_body
+from mimic.arms.kinematic_tree import ChainIds, ancestors, body_id, find_chain, is_hinge, tip_body
 from mimic.arms.model_files import VELOCITY_LIMIT
 
 START_POSES = "ready", "home"  # keyframes that hold a model's own start pose, the first that it has
@@ -23,8 +23,8 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None =
     Raises:
       ValueError: no hinge, a joint of another kind, a branch, a loop, or a name that the model lacks.
     """
-    route = find_route(model, base, tip)
-    path = route.bodies
+    chain_ids = find_chain(model, base, tip)
+    path = chain_ids.bodies
     data = mujoco.MjData(model)
     data.qpos[:] = zero_pose(model)
     mujoco.mj_kinematics(model, data)
@@ -39,7 +39,7 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None =
     joints: list[Joint] = []
     links: list[Link] = []
     for body in path:
-        for joint_id in (joint for joint in route.joints if model.jnt_bodyid[joint] == body):
+        for joint_id in (joint for joint in chain_ids.joints if model.jnt_bodyid[joint] == body):
             joint = model.joint(joint_id)
             limited = bool(model.jnt_limited[joint_id])
             low, high = map(float, model.jnt_range[joint_id]) if limited else (-np.pi, np.pi)
@@ -61,7 +61,7 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None =
     if twice:
         raise ValueError(f"two joints of the chain are called {', '.join(twice)}; name the unnamed ones in the MJCF")
     if not links:
-        links = _anchor_links(joints, in_base(_tip_point(model, data, route, tip)))
+        links = _anchor_links(joints, in_base(_tip_point(model, data, chain_ids, tip)))
     return Chain(tuple(joints), drop_zero_length(links))
 
 
@@ -84,7 +84,7 @@ def _anchor_links(joints: list[Joint], tip: np.ndarray) -> list[Link]:
     return [Link(f"link{i + 1}", joint.anchor, end, i) for i, (joint, end) in enumerate(zip(joints, ends, strict=True))]
 
 
-def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, route: Route, tip: str | None) -> np.ndarray:
+def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, chain_ids: ChainIds, tip: str | None) -> np.ndarray:
     """Where the last link ends.
 
     The named tip, else the farthest of the sites and bodies that the last body carries, else of its geoms' ends,
@@ -93,11 +93,11 @@ def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, route: Route, tip: st
     if tip is not None:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
         return data.site_xpos[site] if site >= 0 else data.xpos[tip_body(model, tip)]
-    last = route.bodies[-1]
+    last = chain_ids.bodies[-1]
     carried = [body for body in range(1, model.nbody) if last in ancestors(model, body)]
     points = [data.site_xpos[site] for site in range(model.nsite) if model.site_bodyid[site] in carried]
     points += [data.xpos[body] for body in carried if body != last]
-    anchor = data.xanchor[route.joints[-1]]
+    anchor = data.xanchor[chain_ids.joints[-1]]
 
     def distance(point: np.ndarray) -> float:
         return float(np.linalg.norm(point - anchor))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.visual_model import portrait
+from mimic.arms.visual_model import visual_spec
 
 SPACING, FLAT_SPACING = 0.9, 1.5  # chain lengths between two arms; flat ones are seen from above, and reach aside
 LOCKED = (0.85, 0.12, 0.10, 1.0)
@@ -45,7 +45,7 @@ class ArmScene:
         highest = 0.0
         for index, (config, arm) in enumerate(zip(arms, built, strict=True)):
             prefix = f"arm{index}-"
-            source, base = portrait(config)
+            source, base = visual_spec(config)
             highest = max(highest, float(base[2]))
             _share_options(source, spec)
             for name in arm.locked:

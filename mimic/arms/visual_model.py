@@ -4,38 +4,38 @@ import mujoco
 import numpy as np
 
 from mimic.arms.arm import ArmConfig, arm_spec
-from mimic.arms.kinematic_tree import Route, ancestors, find_route
+from mimic.arms.kinematic_tree import ChainIds, ancestors, find_chain
 from mimic.arms.mujoco_chain import zero_pose
 
 _THICKNESS, _COLOUR = 0.03, (0.55, 0.62, 0.70, 1.0)  # of links that the model gives no shape; share of the chain length
 _ABOUT = ("keys", "equalities", "actuators", "sensors", "tendons", "excludes", "pairs", "lights", "cameras")
 
 
-def portrait(config: ArmConfig) -> tuple[mujoco.MjSpec, np.ndarray]:
+def visual_spec(config: ArmConfig) -> tuple[mujoco.MjSpec, np.ndarray]:
     """The model of an arm without the scene around it, and where its base is [m].
 
     Raises:
-      ValueError: what `arm_spec` and `find_route` refuse.
+      ValueError: what `arm_spec` and `find_chain` refuse.
     """
     spec = arm_spec(config)
     model = spec.compile()
-    route = find_route(model, config.base, config.tip)
+    chain_ids = find_chain(model, config.base, config.tip)
     data = mujoco.MjData(model)
     data.qpos[:] = zero_pose(model)
     mujoco.mj_kinematics(model, data)
     if config.is_file:
-        _remove_scene(spec, model, route)
+        _remove_scene(spec, model, chain_ids)
     if not any(bool(body.geoms) for body in spec.bodies[1:]):
-        _draw_links(model, data, spec, route)
-    return spec, data.xpos[model.body_parentid[route.bodies[0]]].copy()
+        _draw_links(model, data, spec, chain_ids)
+    return spec, data.xpos[model.body_parentid[chain_ids.bodies[0]]].copy()
 
 
-def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, route: Route) -> None:
+def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, chain_ids: ChainIds) -> None:
     """Leaves the root body that the arm is in."""
     for kind in _ABOUT:
         for item in list(getattr(spec, kind)):
             spec.delete(item)
-    root = model.body(ancestors(model, route.bodies[0])[-2]).name
+    root = model.body(ancestors(model, chain_ids.bodies[0])[-2]).name
     for item in [*spec.worldbody.geoms, *spec.worldbody.sites]:
         spec.delete(item)
     for body in [body for body in spec.worldbody.bodies if body.name != root]:
@@ -47,15 +47,15 @@ def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, route: Route) -> N
                 geom.material, geom.rgba = "", [0, 0, 0, 0]
 
 
-def _draw_links(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec, route: Route) -> None:
+def _draw_links(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec, chain_ids: ChainIds) -> None:
     """Capsules from each joint to the next, for models without any shape."""
-    points = [data.xanchor[joint] for joint in route.joints]
-    carried = [body for body in range(model.nbody) if route.bodies[-1] in ancestors(model, body)]
+    points = [data.xanchor[joint] for joint in chain_ids.joints]
+    carried = [body for body in range(model.nbody) if chain_ids.bodies[-1] in ancestors(model, body)]
     points.append(
         max((data.xpos[body] for body in carried), key=lambda point: float(np.linalg.norm(point - points[-1])))
     )
     lengths = [float(np.linalg.norm(end - start)) for start, end in zip(points[:-1], points[1:], strict=True)]
-    for joint, start, end, length in zip(route.joints, points[:-1], points[1:], lengths, strict=True):
+    for joint, start, end, length in zip(chain_ids.joints, points[:-1], points[1:], lengths, strict=True):
         body = int(model.jnt_bodyid[joint])
         R_body_world = data.xmat[body].reshape(3, 3).T
         if length > _THICKNESS * sum(lengths) / 10:

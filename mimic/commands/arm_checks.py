@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale, with_rotors
+from mimic.arms.arm import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale, with_minimum_armature
 from mimic.arms.embodiment import load_arm
 from mimic.envs.config import EnvConfig
 from mimic.envs.recording import record_demonstrations
@@ -29,7 +29,7 @@ _CALM_SHARE = 0.8  # of the speed bound that random torques may reach
 
 
 @dataclasses.dataclass(frozen=True)
-class Nearness:
+class ReachableDistance:
     """How near a learner can come to some demonstrations of its expert, mean over their steps.
 
     Attributes:
@@ -45,7 +45,7 @@ class Nearness:
     nearest_qpos: Float[np.ndarray, "poses 1 learner_joints"]
 
 
-def nearness(expert: Arm, learner: Arm, config: EnvConfig) -> Nearness:
+def reachable_distance(expert: Arm, learner: Arm, config: EnvConfig) -> ReachableDistance:
     """Kinematic bound and holding still, on a few random demonstrations.
 
     Raises:
@@ -69,7 +69,7 @@ def nearness(expert: Arm, learner: Arm, config: EnvConfig) -> Nearness:
     found = jax.jit(lambda qpos, qvel: closest_motion(*pair, qpos, qvel, correspondence, weights, **measure))(
         qpos, qvel
     )
-    return Nearness(
+    return ReachableDistance(
         float(jnp.mean(found.distance)), float(jnp.mean(hold)), qpos[:, None], np.asarray(found.qpos)[:, None]
     )
 
@@ -130,7 +130,7 @@ def assumptions(config: ArmConfig, arm: Arm) -> Iterator[str]:
             )
 
 
-def doubts(config: ArmConfig, arm: Arm) -> Iterator[str]:
+def warnings(config: ArmConfig, arm: Arm) -> Iterator[str]:
     """What may keep a learner from imitating well."""
     embodiment, names = arm.embodiment, np.array(arm.embodiment.joint_names)
     unseen = names[max(embodiment.link_joint) + 1 :]
@@ -157,7 +157,7 @@ def calmed(config: ArmConfig, arm: Arm, env: EnvConfig) -> tuple[ArmConfig, str]
         if speed < limit:
             break
         tried = dataclasses.replace(config, armature=armature, damping=_DAMPING_SHARE * armature)
-        speed = random_torque_speed(with_rotors(arm, tried), env)
+        speed = random_torque_speed(with_minimum_armature(arm, tried), env)
     if alone < limit:
         return config, ""
     return tried, (

@@ -16,15 +16,15 @@ from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
-from mimic.evaluation.rollout_frames import Story, demonstration_index, interpolate
+from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
 from mimic.metric.distance import embodiment_distance, link_distances
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig
-from mimic.trainers.make import make_job
+from mimic.trainers.make import make_trainer
 from mimic.trainers.pose_mapper.model import PoseMapper
-from mimic.trainers.ppo.trainer import PPOJob
+from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import load_config, policy_run
 
 FRAMES_PER_SECOND = 30
@@ -90,14 +90,14 @@ def _of_policy(config: RenderConfig) -> Recipe:
     """A policy's rollout, with the lower bound and an arm at rest."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
     _check_unused(config, "a run of trainer=ppo", "demonstrations", "learner", "limits", "seed")
-    job = make_job(trained, run_dir)
-    assert isinstance(job, PPOJob)
+    job = make_trainer(trained, run_dir)
+    assert isinstance(job, PPOTrainer)
     index = demonstration_index(job.evaluator, config.split, config.demonstration)
     _, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
     title = f"{trained.env.name}, {config.split.replace('_', '-')} demonstration {config.demonstration}"
 
     def make() -> Clip:
-        story = Story(job.evaluator, job.evaluate(params), index, FRAMES_PER_SECOND)
+        story = RolloutFrames(job.evaluator, job.evaluate(params), index, FRAMES_PER_SECOND)
         curves = (
             Curve("holding the start pose", story.hold, _HOLD),
             Curve("policy", story.distance, {"color": "tab:blue"}),

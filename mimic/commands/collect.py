@@ -17,7 +17,7 @@ from mimic.commands.config import CollectConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import REPORT, write_atomically
 from mimic.sweeps.finished_runs import FIGURES, Figure, FinishedRun, LeftOut, find_runs
-from mimic.sweeps.seed_groups import CONFIDENCE, HOW, Group, Interval, drop_repeated, group_runs, telling_keys
+from mimic.sweeps.seed_groups import CONFIDENCE, HOW, Interval, SeedGroup, drop_repeated, group_runs, telling_keys
 
 NAME = "collected"
 SOME_LEFT_OUT = 1
@@ -74,7 +74,7 @@ def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: 
     return SOME_LEFT_OUT if left_out else 0
 
 
-def _csv(groups: Sequence[Group]) -> str:
+def _csv(groups: Sequence[SeedGroup]) -> str:
     """One row a run: what differs between the groups, then the numbers of its report."""
     numbers = list(dict.fromkeys(key for group in groups for run in group.runs for key in run.numbers))
     text = io.StringIO()
@@ -87,7 +87,7 @@ def _csv(groups: Sequence[Group]) -> str:
     return text.getvalue()
 
 
-def _summary(groups: Sequence[Group], left_out: Sequence[LeftOut], figure: Figure) -> dict[str, Any]:
+def _summary(groups: Sequence[SeedGroup], left_out: Sequence[LeftOut], figure: Figure) -> dict[str, Any]:
     return {
         "how": HOW,
         "confidence": CONFIDENCE,
@@ -106,11 +106,11 @@ def _summary(groups: Sequence[Group], left_out: Sequence[LeftOut], figure: Figur
     }
 
 
-def _shared_numbers(group: Group) -> list[str]:
+def _shared_numbers(group: SeedGroup) -> list[str]:
     return [key for key in group.runs[0].numbers if all(key in run.numbers for run in group.runs)]
 
 
-def _table(groups: Sequence[Group], figure: Figure) -> Table:
+def _table(groups: Sequence[SeedGroup], figure: Figure) -> Table:
     keys = telling_keys(groups)
     table = Table(title=figure.label, title_justify="left")
     for key in keys:

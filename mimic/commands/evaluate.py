@@ -17,9 +17,9 @@ from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.make import make_job
+from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import load_config
-from mimic.trainers.trainer import Job, Params
+from mimic.trainers.trainer import Params, Trainer
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
@@ -60,7 +60,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
     return run
 
 
-def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Job]:
+def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
     """A run as it was, or with other demonstrations, physics or loads."""
     factors = {"mass": config.mass, "damping": config.damping}
     changes: dict[str, Any] = {key: [value, value] for key, value in factors.items() if value is not None}
@@ -72,7 +72,7 @@ def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig
                 "controller, demonstrations, physics, mass, damping and torque_noise: expected a run of trainer=ppo, "
                 f"got one of {trained.trainer.name}"
             )
-        return trained, make_job(trained, run_dir)
+        return trained, make_trainer(trained, run_dir)
     env = dataclasses.replace(
         trained.env,
         physics=config.physics or trained.env.physics,
@@ -80,10 +80,10 @@ def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig
     )
     trained = dataclasses.replace(trained, env=env)
     compat.import_mjx()
-    from mimic.trainers.ppo.trainer import PPOJob
+    from mimic.trainers.ppo.trainer import PPOTrainer
 
     unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
-    return trained, PPOJob(trained, run_dir, unseen)
+    return trained, PPOTrainer(trained, run_dir, unseen)
 
 
 def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
@@ -97,13 +97,13 @@ def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
     }
 
 
-def _outcome(job: Job, params: Params, config: EvaluateConfig, console: Console) -> tuple[Any, dict[str, Any]]:
+def _outcome(job: Trainer, params: Params, config: EvaluateConfig, console: Console) -> tuple[Any, dict[str, Any]]:
     """What a controller did, and what the report says of the controller."""
     if config.controller == "policy":
         return job.evaluate(params), {}
-    from mimic.trainers.ppo.trainer import PPOJob
+    from mimic.trainers.ppo.trainer import PPOTrainer
 
-    assert isinstance(job, PPOJob)
+    assert isinstance(job, PPOTrainer)
     if config.controller == "searched":
         from mimic.evaluation.searched_torques import search_torques
 

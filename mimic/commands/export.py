@@ -25,7 +25,7 @@ from mimic.runs.files import write_atomically
 from mimic.runs.provenance import versions
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
-from mimic.trainers.ppo import training as ppo
+from mimic.trainers.ppo import training
 from mimic.trainers.run_config import load_config
 
 _NEEDS = {"onnx": "onnx", "jax": "flatbuffers"}  # the package that each format is written with
@@ -174,8 +174,8 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str
     layout = observation_layout(expert, learner, trained.env.preview)
     size = layout[-1]["stop"]
     config: PPOConfig = trained.trainer  # type: ignore[assignment] - saved resolved: the machine does not matter
-    params = load_checkpoint(run_dir, ppo.params_template(config, size, learner.num_joints), steps)[1]
-    controller = ppo.make_controller(config, size, learner.num_joints)(jax.device_get(params))
+    params = load_checkpoint(run_dir, training.params_template(config, size, learner.num_joints), steps)[1]
+    controller = training.make_controller(config, size, learner.num_joints)(jax.device_get(params))
     scale = jnp.asarray(torque_scale(arms[1], trained.env.action_scale, trained.env.control_dt))
 
     def function(observation: jax.Array) -> dict[str, jax.Array]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mimic.commands import train as session
+from mimic.commands import train
 from mimic.commands.config import FiguresConfig
 from mimic.envs import env_config
 from mimic.paper_figures.poses import FIGURES, save_figure
@@ -58,7 +58,7 @@ def _mapper(env: str, runs: Path, config: FiguresConfig) -> PoseMapper:
             run_dir=str(run_dir),
             compilation_cache=config.compilation_cache,
         )
-        exit_code = session.prepare_training(training, time.perf_counter())()
+        exit_code = train.prepare_training(training, time.perf_counter())()
         if exit_code:
             raise SystemExit(exit_code)
     return PoseMapper.load(run_dir)

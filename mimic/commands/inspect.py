@@ -19,7 +19,7 @@ from rich.table import Table  # noqa: E402
 
 from mimic.arms.arm import Arm, ArmConfig, build_arm, effective_inertia, rated_speed, torque_scale  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.commands.arm_checks import Nearness, assumptions, calmed, doubts, joint_ranges, nearness  # noqa: E402
+from mimic.commands.arm_checks import ReachableDistance, assumptions, calmed, joint_ranges, reachable_distance, warnings  # noqa: E402
 from mimic.commands.config import InspectConfig  # noqa: E402
 from mimic.commands.progress import similarity_table  # noqa: E402
 from mimic.envs.config import EnvConfig
@@ -41,11 +41,11 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     expert, learner = (build_arm(arm, env.limits, env.metric.links) for arm in (env.expert, env.learner))
     joints, links = _joints(learner, config.learner, env), _links(expert, learner, env)
     notes = list(learner.notes)
-    assumed, warned = list(assumptions(config.learner, learner)), list(doubts(config.learner, learner))
+    assumed, warned = list(assumptions(config.learner, learner)), list(warnings(config.learner, learner))
     calm, why = calmed(config.learner, learner, env)
     warned += [why] if why else []
     command = train_command(dataclasses.replace(config, learner=calm))
-    near = nearness(expert, learner, env) if config.bound else None
+    near = reachable_distance(expert, learner, env) if config.bound else None
     alike = near and pose_similarity(
         expert.embodiment, learner.embodiment, near.expert_qpos, {"nearest_poses": near.nearest_qpos}
     )
@@ -65,7 +65,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
             for line in lines:
                 console.print(f"{title}: {escape(line)}", highlight=False, soft_wrap=True)
         if near is not None and alike is not None:
-            console.print(_nearness_line(near.bound, near.hold, expert), highlight=False, soft_wrap=True)
+            console.print(_distance_line(near.bound, near.hold, expert), highlight=False, soft_wrap=True)
             console.print(similarity_table(alike))
         if out and scene:
             out.mkdir()
@@ -96,7 +96,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     return run
 
 
-def _pose_pairs(expert: Arm, learner: Arm, env: EnvConfig, near: Nearness) -> PosePairs:
+def _pose_pairs(expert: Arm, learner: Arm, env: EnvConfig, near: ReachableDistance) -> PosePairs:
     poses = readable_poses(env.expert, expert, near.expert_qpos[:, 0])
     return nearest_poses(expert, learner, env.metric, poses)
 
@@ -205,7 +205,7 @@ def _headline(expert: Arm, learner: Arm) -> str:
     )
 
 
-def _nearness_line(bound: float, hold: float, expert: Arm) -> str:
+def _distance_line(bound: float, hold: float, expert: Arm) -> str:
     return (
         f"on random demonstrations of {expert.embodiment.name}, distance of the best poses: {bound:.3f}, of holding "
         f"the start pose: {hold:.3f}; {1 - bound / hold:.0%} of it can be imitated"

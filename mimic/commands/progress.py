@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES, SPLIT_NAMES
-from mimic.trainers.trainer import Job
+from mimic.trainers.trainer import Trainer
 
 
 class TrainingProgress:
@@ -103,7 +103,7 @@ def _similarity_cell(key: str, value: float) -> str:
     return f"{value:.1f} deg" if key.endswith("_deg") else f"{value:.3f}"
 
 
-def report_table(report: Mapping[str, Any], job: Job) -> Table:
+def report_table(report: Mapping[str, Any], job: Trainer) -> Table:
     """The figures of a report, training next to held-out data."""
     table = Table(title=f"{report['env']}  {report['trainer']}  seed {report['seed']}", title_justify="left")
     table.add_column("")

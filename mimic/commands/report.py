@@ -9,10 +9,10 @@ from mimic.commands.progress import report_table, similarity_table
 from mimic.runs.provenance import hardware, versions
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.trainer import Job
+from mimic.trainers.trainer import Trainer
 
 
-def show_report(console: Console, report: Mapping[str, Any], job: Job) -> None:
+def show_report(console: Console, report: Mapping[str, Any], job: Trainer) -> None:
     """Prints a report as tables."""
     console.print(report_table(report, job))
     if "similarity" in report:
@@ -20,7 +20,7 @@ def show_report(console: Console, report: Mapping[str, Any], job: Job) -> None:
 
 
 def make_report(
-    config: TrainConfig, job: Job, figures: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
+    config: TrainConfig, job: Trainer, figures: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
 ) -> dict[str, Any]:
     """What report.json holds.
 

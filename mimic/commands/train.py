@@ -22,17 +22,17 @@ from mimic.runs.provenance import hardware
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.distributed.process_group import Group
-from mimic.trainers.make import make_job
+from mimic.trainers.distributed.process_group import ProcessGroup
+from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import load_config, new_run_dir, run_schema, save_config
-from mimic.trainers.trainer import Job, Params
+from mimic.trainers.trainer import Params, Trainer
 
 
 def prepare_training(
     config: TrainConfig,
     started: float,
     overrides: Sequence[str] = (),
-    group: Group | None = None,
+    group: ProcessGroup | None = None,
     signals: Signals | None = None,
 ) -> Callable[[], int]:
     """A new run, or one to go on with, ready to start; nothing is written yet.
@@ -62,7 +62,7 @@ def prepare_training(
     check_loggers(config.loggers)
     run_dir = resumed or (new_run_dir(config) if leads else Path())
     with stopwatch.stage("build"):
-        job = make_job(config, resumed)
+        job = make_trainer(config, resumed)
         restore = load_checkpoint(resumed, job.params_template()) if resumed else None
     config = dataclasses.replace(config, trainer=job.settings)
     if group and not group.first:
@@ -96,7 +96,7 @@ def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str])
     )
 
 
-def _follow(job: Job, restore: tuple[int, Params] | None, group: Group) -> int:
+def _follow(job: Trainer, restore: tuple[int, Params] | None, group: ProcessGroup) -> int:
     """What a process does that is not the first: it trains in step, until that one ends it."""
     with noted_signals(group.signals):
         job.follow(restore)
@@ -106,11 +106,11 @@ def _follow(job: Job, restore: tuple[int, Params] | None, group: Group) -> int:
 
 def _train(
     config: TrainConfig,
-    job: Job,
+    job: Trainer,
     run_dir: Path,
     restore: tuple[int, Params] | None,
     stopwatch: Stopwatch,
-    group: Group | None,
+    group: ProcessGroup | None,
     signals: Signals,
 ) -> int:
     console = Console()
@@ -147,7 +147,7 @@ def _train(
 
 def _train_and_log(
     config: TrainConfig,
-    job: Job,
+    job: Trainer,
     run_dir: Path,
     signals: Signals,
     restore: tuple[int, Params] | None,

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 
 from mimic.envs import dynamics
-from mimic.metric import fused_kernel as kernel
+from mimic.metric import fused_kernel
 
-_LAYOUT = kernel.Layout(block=64, warps=2)  # by measurement
+_LAYOUT = fused_kernel.LaunchConfig(block=64, warps=2)  # by measurement
 
 
 class Load(NamedTuple):
@@ -83,7 +83,7 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
 
     # On CPUs a loop over a few arrays is twice as fast as one over as many as there are joints.
     widths = len(arm), len(arm)
-    step = kernel.fused(_scalar_step(arm, timestep, substeps), widths, plain=plain, layout=_LAYOUT)
+    step = fused_kernel.fused(_scalar_step(arm, timestep, substeps), widths, plain=plain, layout=_LAYOUT)
 
     def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
         qpos, qvel = step(qpos, qvel, torque, jnp.stack([jnp.asarray(x, qpos.dtype) for x in load]))
@@ -92,7 +92,7 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
     return advance
 
 
-def _scalar_step(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: int) -> kernel.Program:
+def _scalar_step(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: int) -> fused_kernel.Program:
     """The same on scalars."""
 
     def step(qpos: Any, qvel: Any, torque: Any, load: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:

@@ -14,7 +14,7 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.compilation import Prepared, on_host
+from mimic.compilation import Background, on_host
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.labels import SPLITS
@@ -62,7 +62,7 @@ class Evaluator:
         self.training_env = env
         self._num_train = env.demonstrations.count
         self.env = env.with_demonstrations(concatenate(env.demonstrations, held_out))
-        self._references = Prepared(lambda: _references(self.env))
+        self._references = Background(lambda: _references(self.env))
 
     def prepare(self) -> None:
         """Begins to compute `lower_bound`, `hold_distance` and the baselines in the background."""

@@ -27,7 +27,7 @@ def demonstration_index(evaluator: Evaluator, split: str, demonstration: int) ->
     return which[demonstration]
 
 
-class Story:
+class RolloutFrames:
     """One rollout, resampled for pictures.
 
     Attributes:

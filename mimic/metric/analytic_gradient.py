@@ -25,7 +25,7 @@ _ROTATION = PARTS.index("rotation")
 _REST = LinkVectors(ZERO, ZERO, ZERO, ZERO)
 
 
-class Slopes(NamedTuple):
+class Adjoints(NamedTuple):
     """Sums over the links behind a joint: of the distance's slopes with respect to their states, and of moments."""
 
     force: Vector  # by positions
@@ -35,7 +35,7 @@ class Slopes(NamedTuple):
     swing: Vector  # positions x slopes by linear velocities
 
 
-NO_SLOPES = Slopes(ZERO, ZERO, ZERO, ZERO, ZERO)
+NO_ADJOINTS = Adjoints(ZERO, ZERO, ZERO, ZERO, ZERO)
 
 
 def distance_and_gradient(
@@ -116,7 +116,7 @@ def _by_joints(
     arm: Embodiment, frames: Sequence[JointFrame], links: Sequence[LinkVectors], slopes: Sequence[LinkVectors]
 ) -> tuple[list[Scalar], list[Scalar]]:
     """The gradient by qpos and by qvel."""
-    behind = NO_SLOPES
+    behind = NO_ADJOINTS
     by_qpos, by_qvel = [], []
     for joint in reversed(range(arm.num_joints)):
         for link in (link for link, own in enumerate(arm.link_joint) if own == joint):
@@ -129,12 +129,12 @@ def _by_joints(
     return by_qpos[::-1], by_qvel[::-1]
 
 
-def with_link(behind: Slopes, link: LinkVectors, slope: LinkVectors) -> Slopes:
+def with_link(behind: Adjoints, link: LinkVectors, slope: LinkVectors) -> Adjoints:
     """The sums with one more link."""
     moment = behind.moment
     for state, by_state in zip(link, slope, strict=True):
         moment = add(moment, cross(state, by_state))
-    return Slopes(
+    return Adjoints(
         force=add(behind.force, slope.position),
         push=add(behind.push, slope.linear_velocity),
         spin=add(behind.spin, slope.angular_velocity),
@@ -143,7 +143,7 @@ def with_link(behind: Slopes, link: LinkVectors, slope: LinkVectors) -> Slopes:
     )
 
 
-def by_joint(frame: JointFrame, axis: Vector, behind: Slopes) -> tuple[Scalar, Scalar]:
+def by_joint(frame: JointFrame, axis: Vector, behind: Adjoints) -> tuple[Scalar, Scalar]:
     """The slopes by a joint's angle and by its velocity.
 
     With the joint's axis a, its anchor c that moves at u, and the angular velocity w of the body behind it, for a link

@@ -17,7 +17,7 @@ Program = Callable[..., Sequence[Sequence[Scalar]]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Layout:
+class LaunchConfig:
     """How a GPU kernel shares out its work: where nothing is said, what was the fastest on an H200 by measurement.
 
     Where samples are the first axis, a thread reads numbers that lie side by side, so that a group of threads reads
@@ -35,7 +35,7 @@ class Layout:
     sample_axis: int = 0
 
 
-DEFAULT = Layout()
+DEFAULT = LaunchConfig()
 
 
 def fused(
@@ -43,7 +43,7 @@ def fused(
     widths: Sequence[int],
     *,
     plain: Callable[..., tuple[Array, ...]] | None = None,
-    layout: Layout = DEFAULT,
+    layout: LaunchConfig = DEFAULT,
 ) -> Callable[..., tuple[Array, ...]]:
     """A function of vectors whose `jax.vmap` is one kernel on NVIDIA GPUs.
 
@@ -106,7 +106,9 @@ def batched_by(
     return function
 
 
-def gpu_kernel(program: Program, widths: Sequence[int], layout: Layout = DEFAULT) -> Callable[..., tuple[Array, ...]]:
+def gpu_kernel(
+    program: Program, widths: Sequence[int], layout: LaunchConfig = DEFAULT
+) -> Callable[..., tuple[Array, ...]]:
     """The program over arrays [samples, width], as one Pallas kernel.
 
     Args:
@@ -162,7 +164,7 @@ class Columns:
 
 
 def by_columns(
-    body: Callable[..., None], widths: Sequence[int], *tables: np.ndarray, layout: Layout = DEFAULT
+    body: Callable[..., None], widths: Sequence[int], *tables: np.ndarray, layout: LaunchConfig = DEFAULT
 ) -> Callable[..., tuple[Array, ...]]:
     """A function of arrays [samples, width] as one Pallas kernel: a thread computes a sample.
 

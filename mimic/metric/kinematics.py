@@ -127,7 +127,7 @@ def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: b
 
     def behind(parent: JointFrame, joint: Any) -> tuple[JointFrame, JointFrame]:
         offset, axis, angle, speed = joint
-        frame = behind_joint(parent, spatial.vector(offset), spatial.vector(axis), angle, speed)
+        frame = child_frame(parent, spatial.vector(offset), spatial.vector(axis), angle, speed)
         return frame, frame
 
     anchors = jnp.concatenate([jnp.zeros((1, 3), qpos.dtype), arm.joint_anchor])  # the base's first
@@ -135,7 +135,7 @@ def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: b
     moves = np.asarray(arm.link_joint) + 1
     frames = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest])[moves], base, frames)
     levers, directions = arm.link_position - anchors[moves], arm.link_rotation[:, :, 0]
-    links = link_behind(frames, spatial.vector(levers.T), spatial.vector(directions.T))
+    links = link_state(frames, spatial.vector(levers.T), spatial.vector(directions.T))
     unit = 1 / arm.chain_length if normalized else 1.0
     return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, links)))
 
@@ -246,12 +246,12 @@ def joint_frames(
     for joint in range(arm.num_joints):
         axis, anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
         speed = 0.0 if qvel is None else qvel[joint]
-        frames.append(behind_joint(frames[-1], spatial.subtract(anchor, previous_anchor), axis, qpos[joint], speed))
+        frames.append(child_frame(frames[-1], spatial.subtract(anchor, previous_anchor), axis, qpos[joint], speed))
         previous_anchor = anchor
     return frames
 
 
-def behind_joint(
+def child_frame(
     parent: JointFrame, offset: Vector, axis: Vector, angle: spatial.Scalar, speed: spatial.Scalar
 ) -> JointFrame:
     """The body behind a joint; offset is the joint's anchor from the parent's, in the zero pose as the axis."""
@@ -269,12 +269,12 @@ def link_vectors(arm: Embodiment, frames: Sequence[JointFrame]) -> list[LinkVect
     """The links' states, of the frames that `joint_frames` gives."""
     directions = [spatial.vector(rotation[:, 0]) for rotation in arm.link_rotation]
     return [
-        link_behind(frames[joint + 1], _zero_lever(arm, link, joint), directions[link])
+        link_state(frames[joint + 1], _zero_lever(arm, link, joint), directions[link])
         for link, joint in enumerate(arm.link_joint)
     ]
 
 
-def link_behind(frame: JointFrame, lever: Vector, direction: Vector) -> LinkVectors:
+def link_state(frame: JointFrame, lever: Vector, direction: Vector) -> LinkVectors:
     """Of one link, with its lever from the anchor and its direction in the zero pose."""
     lever = spatial.rotate(frame.rotation, lever)
     return LinkVectors(

@@ -17,10 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mimic.arms.embodiment import Embodiment
-from mimic.metric import fused_kernel as kernel
-from mimic.metric import spatial
-from mimic.metric.analytic_gradient import NO_SLOPES, Slopes, by_joint, compare_part, with_link
-from mimic.metric.kinematics import BASE, JointFrame, LinkVectors, behind_joint, link_behind
+from mimic.metric import fused_kernel, spatial
+from mimic.metric.analytic_gradient import NO_ADJOINTS, Adjoints, by_joint, compare_part, with_link
+from mimic.metric.kinematics import BASE, JointFrame, LinkVectors, child_frame, link_state
 from mimic.metric.spatial import ZERO, Scalar, Vector, plus, subtract
 
 _VECTORS = 4  # of an arm in a row of numbers: the last two of the link
@@ -50,11 +49,11 @@ class State(NamedTuple):
 
     value: Scalar  # of the pairs that were compared
     frames: tuple[JointFrame, ...]  # of both arms
-    behind: tuple[Slopes | None, ...]  # of both; None where no gradient is wanted
+    behind: tuple[Adjoints | None, ...]  # of both; None where no gradient is wanted
 
 
 @dataclasses.dataclass(frozen=True)
-class Walk:
+class Schedule:
     """From the bases to the last pair of links.
 
     Attributes:
@@ -79,7 +78,7 @@ class Walk:
         )
 
 
-def plan(arms: Sequence[Embodiment], factors: Float[np.ndarray, "parts expert learner"]) -> Walk | None:
+def plan(arms: Sequence[Embodiment], factors: Float[np.ndarray, "parts expert learner"]) -> Schedule | None:
     """The walk that meets all pairs of links whose factors are not 0; what lies beyond the last of them is left out.
 
     None where the pairs do not lie in order, or where none of the links of an arm has a joint before it.
@@ -109,7 +108,7 @@ def plan(arms: Sequence[Embodiment], factors: Float[np.ndarray, "parts expert le
             joints.append(crossed)
             numbers.append(np.concatenate([*vectors, np.zeros(len(parts)) if left else factors[parts, *pair]]))
         reached = end
-    return Walk(np.array(joints, np.int32), np.array(numbers), tuple(parts.tolist()))
+    return Schedule(np.array(joints, np.int32), np.array(numbers), tuple(parts.tolist()))
 
 
 def _vectors(arm: Embodiment, joint: int, link: int | None) -> np.ndarray:
@@ -123,7 +122,7 @@ def _vectors(arm: Embodiment, joint: int, link: int | None) -> np.ndarray:
     return vectors.ravel()
 
 
-def gpu_kernel(walk: Walk, wanted: Sequence[int]) -> Callable[..., tuple[Array, ...]]:
+def gpu_kernel(walk: Schedule, wanted: Sequence[int]) -> Callable[..., tuple[Array, ...]]:
     """A Pallas kernel of qpos [rad] and qvel [rad/s], each [samples, joints], of the expert, then of the learner.
 
     It gives the distance, [samples, 1], and its gradient by those of its arguments that are wanted.
@@ -134,9 +133,11 @@ def gpu_kernel(walk: Walk, wanted: Sequence[int]) -> Callable[..., tuple[Array, 
     """
     steps, reached = len(walk.joints), walk.joints.max(axis=0) + 1
     has_gradient = [any(index // 2 == side for index in wanted) for side in (0, 1)]
-    start = State(0.0, (BASE, BASE), tuple(NO_SLOPES if has else None for has in has_gradient))
+    start = State(0.0, (BASE, BASE), tuple(NO_ADJOINTS if has else None for has in has_gradient))
 
-    def body(given: Sequence[kernel.Columns], made: Sequence[kernel.Columns], joints: Any, numbers: Any) -> None:
+    def body(
+        given: Sequence[fused_kernel.Columns], made: Sequence[fused_kernel.Columns], joints: Any, numbers: Any
+    ) -> None:
         def step(index: Array) -> Step:
             crossed, row = (
                 [table[index, jnp.asarray(k)] for k in range(table.shape[1])] for table in (joints, numbers)
@@ -164,8 +165,10 @@ def gpu_kernel(walk: Walk, wanted: Sequence[int]) -> Callable[..., tuple[Array, 
         made[0].write(jnp.asarray(0), state.value)
 
     widths = [1, *(int(reached[index // 2]) for index in wanted)]
-    layout = kernel.Layout(sample_axis=1 if wanted else 0)  # the fastest for 32 and 64 links, by measurement
-    walked = kernel.by_columns(body, widths, walk.joints, walk.numbers, layout=layout)
+    layout = fused_kernel.LaunchConfig(
+        sample_axis=1 if wanted else 0
+    )  # the fastest for 32 and 64 links, by measurement
+    walked = fused_kernel.by_columns(body, widths, walk.joints, walk.numbers, layout=layout)
 
     def with_joints_beyond(*motion: Array) -> tuple[Array, ...]:
         value, *gradients = walked(*motion)
@@ -179,7 +182,7 @@ def _onward(state: State, step: Step) -> State:
     """Each arm across its joint."""
 
     def cross(frame: JointFrame, crossing: Crossing) -> JointFrame:
-        return behind_joint(frame, *crossing)
+        return child_frame(frame, *crossing)
 
     def stay(frame: JointFrame, _: Crossing) -> JointFrame:
         return frame
@@ -215,10 +218,10 @@ def _back(parts: Sequence[int], state: State, step: Step) -> tuple[State, tuple[
 
 
 def _links(state: State, step: Step) -> list[LinkVectors]:
-    return [link_behind(frame, *link) for frame, link in zip(state.frames, step.links, strict=True)]
+    return [link_state(frame, *link) for frame, link in zip(state.frames, step.links, strict=True)]
 
 
-def _cross_back(frame: JointFrame, crossing: Crossing, behind: Slopes | None) -> tuple[JointFrame, Any]:
+def _cross_back(frame: JointFrame, crossing: Crossing, behind: Adjoints | None) -> tuple[JointFrame, Any]:
     """The body before the joint; the slopes by its angle and speed, where they are wanted."""
     offset, axis, angle, speed = crossing
     axis_now = spatial.rotate(frame.rotation, axis)
@@ -234,6 +237,6 @@ def _cross_back(frame: JointFrame, crossing: Crossing, behind: Slopes | None) ->
     return before, None if behind is None else by_joint(frame, axis_now, behind)
 
 
-def _stay(frame: JointFrame, _: Crossing, behind: Slopes | None) -> tuple[JointFrame, Any]:
+def _stay(frame: JointFrame, _: Crossing, behind: Adjoints | None) -> tuple[JointFrame, Any]:
     nothing = jnp.zeros_like(frame.anchor[0])
     return frame, None if behind is None else (nothing, nothing)

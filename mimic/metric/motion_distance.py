@@ -13,9 +13,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.metric import analytic_gradient as motion_gradient
-from mimic.metric import fused_kernel as kernel
-from mimic.metric import long_chain_kernel as motion_walk
+from mimic.metric import analytic_gradient, fused_kernel, long_chain_kernel
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
     PARTS,
@@ -125,15 +123,15 @@ def _short(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
     joints = [arm.num_joints for arm in arms for _ in range(2)]
 
     def values(wanted: tuple[int, ...]) -> Values:
-        program = functools.partial(motion_gradient.distance_and_gradient, *arms, factors, wanted)
-        return kernel.fused(program, [1, *(joints[k] for k in wanted)])
+        program = functools.partial(analytic_gradient.distance_and_gradient, *arms, factors, wanted)
+        return fused_kernel.fused(program, [1, *(joints[k] for k in wanted)])
 
     return _with_gradient(values)
 
 
 def _long(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
     """Loops, with a gradient of their own on GPUs, if the links that correspond lie in order."""
-    by_pairs, walk = _by_pairs(arms, factors), motion_walk.plan(arms, factors)
+    by_pairs, walk = _by_pairs(arms, factors), long_chain_kernel.plan(arms, factors)
     if walk is None:
         return by_pairs
 
@@ -142,7 +140,7 @@ def _long(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
             value, gradients = jax.value_and_grad(by_pairs, wanted)(*motion) if wanted else (by_pairs(*motion), ())
             return value[None], *gradients
 
-        return kernel.batched_by(motion_walk.gpu_kernel(walk, wanted), differentiated)
+        return fused_kernel.batched_by(long_chain_kernel.gpu_kernel(walk, wanted), differentiated)
 
     return _with_gradient(values)
 

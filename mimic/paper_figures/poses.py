@@ -20,9 +20,8 @@ from mimic.envs import env_config  # noqa: E402
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
 from mimic.metric.distance import DistanceWeights, adaptive_weights  # noqa: E402
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
-from mimic.paper_figures import candidate_points as point_figures
+from mimic.paper_figures import candidate_points, similarity
 from mimic.paper_figures import metric as metric_figures  # noqa: E402
-from mimic.paper_figures import similarity as similarity_figures
 from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
 from mimic.paper_figures.pose_picture import PANDA_POSES  # noqa: E402
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
@@ -121,8 +120,8 @@ def draw_panda(load_mapper: LoadMapper) -> Any:
 FIGURES: dict[str, Callable[[LoadMapper], Any]] = {
     "links": lambda _: metric_figures.draw_links(),
     "correspondence": lambda _: metric_figures.draw_correspondence(),
-    "similarity": lambda _: similarity_figures.draw_similarity(),
-    "points": lambda _: point_figures.draw_points(),
+    "similarity": lambda _: similarity.draw_similarity(),
+    "points": lambda _: candidate_points.draw_points(),
     "weights": draw_weights,
     "contours": draw_contours,
     "planar": draw_planar,

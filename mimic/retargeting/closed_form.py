@@ -9,9 +9,9 @@ A length has a kink at 0, where Newton's method would divide by it, and a sum of
 links that match exactly. Smoothed, it is 0 with derivative 0 at a match, and nowhere off by more than s.
 
 All is done on scalar components (see `mimic.metric.spatial`). Rotating joint k moves all distal links: with its axis a
-and a point c on it, a link's position by J = a x (p - c) = m + a x p, m = c x a. Sums over the distal links are accumulated
-from tip to base, as for a composite rigid body: the force g = grad h, the moments M of force and pull, and the
-stiffness of position.
+and a point c on it, a link's position by J = a x (p - c) = m + a x p, m = c x a. Sums over the distal links are
+accumulated from tip to base, as for a composite rigid body: the force g = grad h, the moments M of force and pull, and
+the stiffness of position.
 """
 
 from collections.abc import Sequence

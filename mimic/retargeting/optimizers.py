@@ -37,24 +37,24 @@ class Derivatives(NamedTuple):
     hessian: Sequence[Scalars]
 
 
-class End(NamedTuple):
+class Solution(NamedTuple):
     """Where a descent came to.
 
     Attributes:
       qpos: [joints] [rad].
       value: of the objective there.
-      slope: largest derivative by a joint that no limit holds.
+      gradient_norm: largest derivative by a joint that no limit holds.
     """
 
     qpos: Float[Array, " joints"]
     value: Float[Array, ""]
-    slope: Float[Array, ""]
+    gradient_norm: Float[Array, ""]
 
 
 Objective = Callable[[Scalars], Derivatives]
 
 
-def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> End:
+def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> Solution:
     """Damped Newton descent: the exact second derivative, with its concave directions turned round."""
     joints = start.shape[0]
     bounds = _bounds(limits, joints)
@@ -80,7 +80,7 @@ def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits,
     return _end(qpos, here, bounds)
 
 
-def gradient_descent(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> End:
+def gradient_descent(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> Solution:
     """Plain descent (paper): each step is the slope times a constant."""
     bounds = _bounds(limits, start.shape[0])
 
@@ -157,7 +157,7 @@ def _largest(values: Scalars) -> Scalar:
     return largest
 
 
-def _end(qpos: Scalars, here: Derivatives, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> End:
+def _end(qpos: Scalars, here: Derivatives, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> Solution:
     free = _free(qpos, here.gradient, bounds)
     slope = _largest([times(f, g) for f, g in zip(free, here.gradient, strict=True)])
-    return End(jnp.stack(qpos), here.value, slope)
+    return Solution(jnp.stack(qpos), here.value, slope)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.distance import Correspondence, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.retargeting.optimizers import Derivatives, End, Scalars, gradient_descent, newton
+from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, gradient_descent, newton
 from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
 
 Method = Literal["newton", "gradient_descent"]
@@ -117,9 +117,9 @@ def imitate_pose(
             if kept is not None:
                 chosen = jax.lax.top_k(-ends.value, min(kept, len(first)))[1]
                 ends = jax.vmap(lambda start: descend(of_qpos, start, limits, count - rough))(ends.qpos[chosen])
-            end: End = jax.tree.map(lambda x: x[jnp.argmin(ends.value)], ends)
+            end: Solution = jax.tree.map(lambda x: x[jnp.argmin(ends.value)], ends)
             left = objective.distance(states, link_states(learner, end.qpos))
-            return PoseImitation(_wrapped(end.qpos, limits), left, end.slope <= _FLAT * scale)
+            return PoseImitation(_wrapped(end.qpos, limits), left, end.gradient_norm <= _FLAT * scale)
 
         in_axes = (0, None if warm is None else 0)
         return jax.vmap(one, in_axes)(poses, warm)
@@ -189,15 +189,15 @@ def imitate_trajectory(
         def at(derivatives: Callable[..., Derivatives], time: Array) -> Callable[[Scalars], Derivatives]:
             return functools.partial(derivatives, jax.tree.map(lambda x: x[time], targets))
 
-        def near(derivatives: Callable[..., Derivatives], previous: Array, start: Array, time: Array) -> End:
+        def near(derivatives: Callable[..., Derivatives], previous: Array, start: Array, time: Array) -> Solution:
             reach = jnp.maximum(lower, previous - jump), jnp.minimum(upper, previous + jump)
             return newton(at(derivatives, time), start, reach, _TRACKING_ITERATIONS)
 
-        def track(anchor: Array, start: Array) -> End:
+        def track(anchor: Array, start: Array) -> Solution:
             rough = objective.rough_derivatives
             begin = newton(at(rough, anchor), start, limits, _ITERATIONS["newton"]).qpos
 
-            def follow(pose: Array, time: Array) -> tuple[Array, End]:
+            def follow(pose: Array, time: Array) -> tuple[Array, Solution]:
                 end = near(rough, pose, pose, time)
                 return end.qpos, end
 
@@ -206,17 +206,17 @@ def imitate_trajectory(
             ends = jax.lax.scan(follow, begin, jnp.concatenate([jnp.maximum(times, anchor), times[::-1]]))[1]
             return jax.tree.map(lambda x: x[:last:-1], ends)
 
-        def refined(rough: End) -> End:
+        def refined(rough: Solution) -> Solution:
             """The same track, by the derivatives that count."""
 
-            def follow(pose: Array, at_time: tuple[Array, Array]) -> tuple[Array, End]:
+            def follow(pose: Array, at_time: tuple[Array, Array]) -> tuple[Array, Solution]:
                 start, time = at_time
                 end = near(objective.derivatives, pose, start, time)
                 return end.qpos, end
 
             return jax.lax.scan(follow, rough.qpos[0], (rough.qpos, jnp.arange(last + 1)))[1]
 
-        def from_anchor(anchor: Array) -> End:
+        def from_anchor(anchor: Array) -> Solution:
             target = jax.tree.map(lambda x: x[anchor], targets)
             first = _starts(objective, expert, learner, target, poses[anchor], tried if starts else None)
             return jax.vmap(lambda start: track(anchor, start))(first)
@@ -224,12 +224,12 @@ def imitate_trajectory(
         tracks = jax.vmap(from_anchor)(jnp.asarray(anchors))
         tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
         best = jnp.argmin(tracks.value.mean(axis=1))
-        found: End = jax.tree.map(lambda x: x[best], tracks)
+        found: Solution = jax.tree.map(lambda x: x[best], tracks)
         if objective.rough_derivatives is not objective.derivatives:
             found = refined(found)
         left = jax.vmap(lambda state, q: objective.distance(state, link_states(learner, q)))(states, found.qpos)
         shift = _wrapped(found.qpos[0], limits) - found.qpos[0]
-        return PoseImitation(found.qpos + shift, left, found.slope <= _FLAT * scale)
+        return PoseImitation(found.qpos + shift, left, found.gradient_norm <= _FLAT * scale)
 
     return jax.jit(solve)(poses)
 

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D  # noqa: E402
 
 from mimic.evaluation.labels import SPLITS
 from mimic.sweeps.finished_runs import Figure  # noqa: E402
-from mimic.sweeps.seed_groups import Group, mean_interval  # noqa: E402
+from mimic.sweeps.seed_groups import SeedGroup, mean_interval  # noqa: E402
 
 _LABELS = {"train": "training data", "held_out": "held-out data"}
 _MARKERS = {"train": "s", "held_out": "o"}
@@ -24,7 +24,7 @@ _SMALL = 1e-6  # [%], for a logarithmic axis
 _TABLEAU = 10  # colours that tell groups apart; beyond, a colour map
 
 
-def plot_collected(groups: Sequence[Group], figure: Figure, out: Path) -> None:
+def plot_collected(groups: Sequence[SeedGroup], figure: Figure, out: Path) -> None:
     """Learning curves on held-out data, and the final figure of each group, with confidence intervals; in percent."""
     height = max(4.0, 1.6 + 0.42 * len(groups))
     drawing, (curves, final) = plt.subplots(1, 2, figsize=(11, height), layout="constrained")
@@ -52,7 +52,7 @@ def plot_collected(groups: Sequence[Group], figure: Figure, out: Path) -> None:
     plt.close(drawing)
 
 
-def _tick(group: Group) -> str:
+def _tick(group: SeedGroup) -> str:
     return f"{textwrap.fill(group.label, _TICK_WIDTH)}\n{len(group.runs)} seed{'s' * (len(group.runs) > 1)}"
 
 
@@ -64,7 +64,7 @@ def _colour(number: int, count: int) -> Any:
     return plt.get_cmap("tab10")(number) if count <= _TABLEAU else plt.get_cmap("turbo")(number / (count - 1))
 
 
-def _draw_curves(axes: Any, group: Group, colour: Any) -> None:
+def _draw_curves(axes: Any, group: SeedGroup, colour: Any) -> None:
     """Each seed as a faint line; mean and band where all seeds have been, as some may end earlier."""
     by_seed = [run.curves["held_out"] for run in group.runs]
     for curve in by_seed:
@@ -77,7 +77,7 @@ def _draw_curves(axes: Any, group: Group, colour: Any) -> None:
         axes.fill_between(steps, np.maximum(low, _SMALL), high, color=colour, alpha=0.15, lw=0)
 
 
-def _draw_final(axes: Any, group: Group, figure: Figure, row: int, colour: Any) -> None:
+def _draw_final(axes: Any, group: SeedGroup, figure: Figure, row: int, colour: Any) -> None:
     for split, shift in zip(SPLITS, (-0.15, 0.15), strict=True):
         key = f"{figure.key}.{split}"
         interval = group.interval(key)

@@ -44,7 +44,7 @@ def mean_interval(values: Sequence[float]) -> Interval:
 
 
 @dataclasses.dataclass(frozen=True)
-class Group:
+class SeedGroup:
     """Runs with the same settings.
 
     Attributes:
@@ -75,7 +75,7 @@ def drop_repeated(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], list[
     return [run for run in runs if id(run) in kept], repeated
 
 
-def group_runs(runs: Sequence[FinishedRun]) -> list[Group]:
+def group_runs(runs: Sequence[FinishedRun]) -> list[SeedGroup]:
     """The groups, in the order of their first runs."""
     by_settings: dict[str, list[FinishedRun]] = defaultdict(list)
     for run in runs:
@@ -86,12 +86,12 @@ def group_runs(runs: Sequence[FinishedRun]) -> list[Group]:
     differing = [key for key in keys if len({_text(one.get(key)) for one in settings}) > 1]
     needed = _needed(differing, settings)
     return [
-        Group(_label(group[0], needed), {key: group[0].settings.get(key) for key in differing}, group)
+        SeedGroup(_label(group[0], needed), {key: group[0].settings.get(key) for key in differing}, group)
         for group in members
     ]
 
 
-def telling_keys(groups: Sequence[Group]) -> list[str]:
+def telling_keys(groups: Sequence[SeedGroup]) -> list[str]:
     """Of the keys that differ, those that suffice to tell the groups apart: env.name says which joints are locked."""
     return _needed(list(groups[0].settings), [group.settings for group in groups])
 

@@ -14,7 +14,7 @@ OnEvaluation = Callable[[int, Params, Mapping[str, float]], bool]  # steps, metr
 Row = tuple[str, str, str]  # of the final table: label, on training data, on held-out data
 
 
-class Job(abc.ABC):
+class Trainer(abc.ABC):
     """A run as its trainer sees it.
 
     Attributes:

@@ -7,7 +7,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from mimic.viewer import html as drawing
+from mimic.viewer import html
 from mimic.viewer.live_session import Frame
 from mimic.viewer.meshes import ArmShape, Part, places
 
@@ -39,7 +39,7 @@ class Page:
             for role, shape, place, name in zip(_ROLES, shapes, places(shapes), names, strict=True)
         ]
         server.gui.add_markdown(f"**{title}**")
-        self._numbers = server.gui.add_html(drawing.numbers(float("nan"), float("nan"), "compiling …"))
+        self._numbers = server.gui.add_html(html.numbers(float("nan"), float("nan"), "compiling …"))
         self._chart = server.gui.add_html("")
         self._maps = server.gui.add_html("")
 
@@ -48,8 +48,8 @@ class Page:
         with self.server.atomic():
             self._arms[0].put(frame.expert, ())
             self._arms[1].put(frame.learner, frame.locked)
-            self._numbers.content = drawing.numbers(frame.distance, frame.bound, note, frame.similarity)
-            self._maps.content = drawing.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
+            self._numbers.content = html.numbers(frame.distance, frame.bound, note, frame.similarity)
+            self._maps.content = html.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
             self._chart.content = chart
 
 

@@ -9,14 +9,14 @@ from rich.console import Console
 
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
-from mimic.evaluation.rollout_frames import Story, demonstration_index
+from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.make import make_job
-from mimic.trainers.ppo.trainer import PPOJob
-from mimic.viewer import html as drawing
+from mimic.trainers.make import make_trainer
+from mimic.trainers.ppo.trainer import PPOTrainer
+from mimic.viewer import html
 from mimic.viewer.live_session import Frame
 
 FRAMES_PER_SECOND = 30
@@ -36,8 +36,8 @@ class Playback:
     """
 
     def __init__(self, trained: TrainConfig, run_dir: Path, checkpoint: int | None):
-        job = make_job(trained, run_dir)
-        assert isinstance(job, PPOJob)
+        job = make_trainer(trained, run_dir)
+        assert isinstance(job, PPOTrainer)
         self.env: EnvConfig = trained.env
         self._job, self._evaluator = job, job.evaluator
         self._params = load_checkpoint(run_dir, job.params_template(), checkpoint)[1]
@@ -55,9 +55,9 @@ class Playback:
         """How many demonstrations of a split there are."""
         return len(range(self._evaluator.env.demonstrations.count)[self._evaluator.parts[split]])
 
-    def _story(self, split: str, demonstration: int) -> Story:
+    def _story(self, split: str, demonstration: int) -> RolloutFrames:
         index = demonstration_index(self._evaluator, split, demonstration)
-        return Story(self._evaluator, self._rollouts, index, FRAMES_PER_SECOND)
+        return RolloutFrames(self._evaluator, self._rollouts, index, FRAMES_PER_SECOND)
 
     def frame(self, split: str, demonstration: int, time: float) -> Frame:
         """A moment of an episode, a time [s] after its start."""
@@ -88,11 +88,11 @@ class Playback:
         story = self.story(split, demonstration)
         times = story.dt * np.arange(1, len(story.distance) + 1)
         curves = [
-            ("policy", story.distance, drawing.LEARNER),
-            ("bound", story.bound, drawing.BOUND),
-            ("holding start pose", story.hold, drawing.HOLD),
+            ("policy", story.distance, html.LEARNER),
+            ("bound", story.bound, html.BOUND),
+            ("holding start pose", story.hold, html.HOLD),
         ]
-        return drawing.chart(times, curves, now=max(time, story.dt))
+        return html.chart(times, curves, now=max(time, story.dt))
 
     def note(self, split: str, demonstration: int) -> str:
         """How good the policy is on a demonstration as a whole."""

@@ -63,7 +63,7 @@ class DistributedConfig:
             raise ValueError(f"distributed.process: expected 0 to {self.processes - 1}, got {self.process}")  # type: ignore[operator]
 
 
-class Group:
+class ProcessGroup:
     """The processes that train together, as one of them sees them; made by `join`.
 
     Attributes:
@@ -145,7 +145,7 @@ class Group:
             return ""
 
 
-def join(config: DistributedConfig) -> Group | None:
+def join(config: DistributedConfig) -> ProcessGroup | None:
     """Waits for the other processes; must run before JAX starts its backend. None where this process is alone.
 
     Raises:
@@ -174,7 +174,7 @@ def join(config: DistributedConfig) -> Group | None:
     except (RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"distributed.coordinator={config.coordinator}: no processes found: {reason}") from error
-    return Group(compat.process_number(), others)
+    return ProcessGroup(compat.process_number(), others)
 
 
 def processes_here(asked: int | None) -> int:

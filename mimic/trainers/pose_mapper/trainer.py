@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from mimic.compilation import Prepared, compiling
+from mimic.compilation import Background, compiling
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.trainers.pose_mapper import training as mapper_training
+from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model
-from mimic.trainers.trainer import Figures, Job, OnEvaluation, Params, Row
+from mimic.trainers.trainer import Figures, OnEvaluation, Params, Row, Trainer
 
 # Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.
 _TRAINING, _VALIDATION, _HELD_OUT, _CHANCE = range(4)
@@ -53,7 +53,7 @@ class _Reference(NamedTuple):
     expert_direction: Any
 
 
-class MapperJob(Job):
+class PoseMapperTrainer(Trainer):
     """Trains a mapper; tells how near to the optimum it gets on training poses and on unseen ones.
 
     Args:
@@ -83,7 +83,7 @@ class MapperJob(Job):
         return jax.jit(self._draw)(self._seed)
 
     def _draw(self, seed: int) -> dict[str, Array]:
-        settings, draw = self.settings, functools.partial(mapper_training.random_poses, self._model)
+        settings, draw = self.settings, functools.partial(training.random_poses, self._model)
         return {
             "train": draw(jax.random.fold_in(_key(_TRAINING), seed), int(settings.samples or 0)),
             "validation": draw(_key(_VALIDATION), settings.validation_poses),
@@ -98,7 +98,7 @@ class MapperJob(Job):
 
     @property
     def _every_shape(self) -> jax.ShapeDtypeStruct:
-        return mapper_training.poses_shape(self._model, sum(self._counts.values()))
+        return training.poses_shape(self._model, sum(self._counts.values()))
 
     @functools.cached_property
     def _every(self) -> np.ndarray:
@@ -114,14 +114,14 @@ class MapperJob(Job):
         return _Judged(qpos, jax.vmap(self._model.distance)(expert_qpos, qpos), direction)
 
     @functools.cached_property
-    def _evaluation(self) -> Prepared[Callable[[Params, np.ndarray], _Judged]]:
+    def _evaluation(self) -> Background[Callable[[Params, np.ndarray], _Judged]]:
         def judged(params: Params, every: Array) -> _Judged:
             return self._judge(every, jax.vmap(functools.partial(self._model, params))(every))
 
         return compiling(judged, self.params_template(), self._every_shape)
 
     @functools.cached_property
-    def _optimisation(self) -> Prepared[Callable[[np.ndarray], _Reference]]:
+    def _optimisation(self) -> Background[Callable[[np.ndarray], _Reference]]:
         model, metric = self._model, self._model.metric
 
         def reference(every: Array) -> _Reference:
@@ -158,7 +158,7 @@ class MapperJob(Job):
     ) -> tuple[int, Params]:
         """Through the metric, see `mapper_training`."""
         _ = self._optimisation, self._evaluation  # compiled beside the training's programs; the longest is the first
-        return mapper_training.train(
+        return training.train(
             self._model,
             lambda: (self._poses["train"], self._poses["validation"]),
             run_dir,

@@ -68,7 +68,7 @@ def value_loss(
     values = networks.value_network.apply(statistics, params, unrolls.observation)
     reward, goes_on = unrolls.reward[:, :-1], unrolls.goes_on[:, :-1]
     targets, advantages = jax.lax.stop_gradient(
-        estimates(config.reward_scaling * reward, config.discounting * goes_on, values, config.gae_lambda)  # type: ignore[operator]
+        compute_gae(config.reward_scaling * reward, config.discounting * goes_on, values, config.gae_lambda)  # type: ignore[operator]
     )
     loss = _VALUE_SHARE * jnp.square(targets - values[:, :-1]).mean()
     return loss, (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -112,7 +112,7 @@ def policy_loss(
     return loss, jax.lax.optimization_barrier(terms).mean(axis=(1, 2))
 
 
-def estimates(
+def compute_gae(
     reward: Float[Array, "unrolls time"],
     discount: Float[Array, "unrolls time"],
     values: Float[Array, "unrolls time+1"],

@@ -20,7 +20,7 @@ from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from mimic.compilation import Prepared, a_process_for_each_gpu, compiler_options
+from mimic.compilation import Background, a_process_for_each_gpu, compiler_options
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import fresh_episodes
 from mimic.metric.kinematics import LinkStates
@@ -35,7 +35,7 @@ _AXIS = "devices"
 
 
 @struct.dataclass
-class Learning:
+class TrainingState:
     """What goes from one call of the program that learns to the next.
 
     Attributes:
@@ -47,8 +47,8 @@ class Learning:
       key: for exploration and shuffling.
     """
 
-    policy: updates.Learner
-    value: updates.Learner
+    policy: updates.TrainState
+    value: updates.TrainState
     statistics: running_statistics.RunningStatisticsState
     episodes: State
     expert_states: LinkStates
@@ -67,7 +67,9 @@ def make_programs(
     batches: int,
     learning_rate: optax.Schedule,
     restored: Params | None,
-) -> tuple[Prepared[Callable[[int], Learning]], Prepared[Callable[[Learning], tuple[Learning, Metrics]]]]:
+) -> tuple[
+    Background[Callable[[int], TrainingState]], Background[Callable[[TrainingState], tuple[TrainingState, Metrics]]]
+]:
     """The programs of a training, being compiled in the background.
 
     Args:
@@ -84,7 +86,7 @@ def make_programs(
     mesh = Mesh(np.array(jax.devices()), (_AXIS,))
     optimizer = optax.adam(learning_rate)
     same, shared = PartitionSpec(), PartitionSpec(_AXIS)
-    learning = Learning(same, same, same, shared, same, same)  # type: ignore[arg-type]
+    learning = TrainingState(same, same, same, shared, same, same)  # type: ignore[arg-type]
 
     def program(function: Any, inputs: Any, outputs: Any, **how: Any) -> Any:
         spread = jax.shard_map(function, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
@@ -99,14 +101,14 @@ def make_programs(
     expert_states = jax.device_get(env.expert_states)
     start = jax.eval_shape(begin, 0, restored, expert_states)
     lowered = learn.lower(start)
-    learns = Prepared(lowered.compile)
+    learns = Background(lowered.compile)
     learns.start()
 
-    def compile_begin() -> Callable[[int], Learning]:
+    def compile_begin() -> Callable[[int], TrainingState]:
         compiled = begin.lower(0, restored, expert_states).compile()
         return lambda seed: compiled(seed, restored, expert_states)
 
-    begins = Prepared(compile_begin)
+    begins = Background(compile_begin)
     begins.start()
     return begins, learns
 
@@ -127,13 +129,13 @@ def _begin(
     seed: Int[Array, ""],
     restored: Params | None,
     expert_states: LinkStates,
-) -> Learning:
+) -> TrainingState:
     key_networks, key_episodes, key = jax.random.split(jax.random.PRNGKey(seed), 3)
     statistics, policy, value = restored or initial_params(networks, env.observation_size, key_networks)
     keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), config.num_envs // devices)  # type: ignore[operator]
     episodes = fresh_episodes(env.with_expert_states(expert_states)).reset(keys)
     learners = updates.begin(policy, optimizer), updates.begin(value, optimizer)
-    return Learning(*learners, statistics, episodes, expert_states, key)  # type: ignore[arg-type]
+    return TrainingState(*learners, statistics, episodes, expert_states, key)  # type: ignore[arg-type]
 
 
 def _learn(
@@ -143,19 +145,19 @@ def _learn(
     optimizer: optax.GradientTransformation,
     devices: int,
     batches: int,
-    learning: Learning,
-) -> tuple[Learning, Metrics]:
+    learning: TrainingState,
+) -> tuple[TrainingState, Metrics]:
     episodes_env = fresh_episodes(env.with_expert_states(learning.expert_states))
     make_policy = ppo_networks.make_inference_fn(networks)
     rounds = config.batch_size * config.num_minibatches // config.num_envs  # type: ignore[operator]
     minibatch = config.batch_size // devices  # type: ignore[operator]
     # A GPU pauses between CUDA graphs, and none goes beyond a pass of a loop. On one GPU compiling takes what it saves.
     updates_in_a_pass = 2 if devices > 1 else 1
-    how = updates.Updating(
+    how = updates.UpdateConfig(
         networks, config, optimizer, axis=_AXIS, staggered=a_process_for_each_gpu(), unroll=updates_in_a_pass
     )
 
-    def unroll(learning: Learning, key: Array) -> tuple[Learning, Unrolls]:
+    def unroll(learning: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
         """Steps of all arms, [time + 1, arms, ...]."""
         policy = make_policy(learning.params)
 
@@ -170,7 +172,7 @@ def _learn(
         steps = jax.tree.map(lambda *x: jnp.concatenate(x), steps, last)
         return learning.replace(episodes=episodes), steps  # type: ignore[attr-defined]
 
-    def batch(learning: Learning, _: None) -> tuple[Learning, Array]:
+    def batch(learning: TrainingState, _: None) -> tuple[TrainingState, Array]:
         """Collects unrolls, and learns from them."""
         key, key_unroll, key_order, key_loss = jax.random.split(learning.key, 4)
         key_unroll, key_order, key_loss = (

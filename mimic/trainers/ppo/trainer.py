@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from mimic.compilation import Prepared, compiling
+from mimic.compilation import Background, compiling
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
@@ -18,10 +18,10 @@ from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.ppo import training as ppo
-from mimic.trainers.trainer import Figures, Job, OnEvaluation, Params, Row
+from mimic.trainers.trainer import Figures, OnEvaluation, Params, Row, Trainer
 
 
-class PPOJob(Job):
+class PPOTrainer(Trainer):
     """Trains a policy on training demonstrations; tells how good it is on these and on held-out ones.
 
     Args:
@@ -55,7 +55,7 @@ class PPOJob(Job):
             f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once, "
             f"{config.env.physics} physics"
         )
-        self._program = Prepared(self._compile)
+        self._program = Background(self._compile)
 
     def save_inputs(self, run_dir: Path) -> None:
         """The demonstrations."""

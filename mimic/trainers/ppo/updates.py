@@ -18,7 +18,7 @@ from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
 METRICS = ("value_loss", *OF_POLICY)
 
 
-class Learner(NamedTuple):
+class TrainState(NamedTuple):
     """Policy or value.
 
     Attributes:
@@ -30,15 +30,15 @@ class Learner(NamedTuple):
     optimizer: optax.OptState
 
 
-Learners = tuple[Learner, Learner]  # policy, value
+TrainStates = tuple[TrainState, TrainState]  # policy, value
 
 
-def begin(params: Any, optimizer: optax.GradientTransformation) -> Learner:
+def begin(params: Any, optimizer: optax.GradientTransformation) -> TrainState:
     """A network that has not learned yet."""
-    return Learner(params, optimizer.init(ravel_pytree(params)[0]))
+    return TrainState(params, optimizer.init(ravel_pytree(params)[0]))
 
 
-class Updating(NamedTuple):
+class UpdateConfig(NamedTuple):
     """How policy and value are updated, the same for all of a run.
 
     Attributes:
@@ -61,13 +61,13 @@ class Updating(NamedTuple):
 
 
 def updated(
-    learners: Learners,
+    learners: TrainStates,
     statistics: RunningStatisticsState,
     unrolls: Unrolls,
     order: Int[Array, "updates minibatch"],
     key: Array,
-    how: Updating,
-) -> tuple[Learners, Float[Array, " metrics"]]:
+    how: UpdateConfig,
+) -> tuple[TrainStates, Float[Array, " metrics"]]:
     """Policy and value after an update by each minibatch, and the means of `METRICS` on this device.
 
     The policy's gradient is clipped by the norm of both, as by brax; the value's by its own norm, which is most of that
@@ -91,14 +91,14 @@ def updated(
 
 
 def _at_once(
-    learners: Learners,
+    learners: TrainStates,
     statistics: RunningStatisticsState,
     minibatch: Callable[[Array], Unrolls],
     order: Array,
     keys: Array,
-    how: Updating,
-) -> tuple[Learners, Array]:
-    def update(learners: Learners, inputs: tuple[Array, Array]) -> tuple[Learners, Array]:
+    how: UpdateConfig,
+) -> tuple[TrainStates, Array]:
+    def update(learners: TrainStates, inputs: tuple[Array, Array]) -> tuple[TrainStates, Array]:
         policy, value = learners
         chosen, key = inputs
         seen = minibatch(chosen)
@@ -114,15 +114,15 @@ def _at_once(
 
 
 def _staggered(
-    learners: Learners,
+    learners: TrainStates,
     statistics: RunningStatisticsState,
     minibatch: Callable[[Array], Unrolls],
     order: Array,
     keys: Array,
-    how: Updating,
-) -> tuple[Learners, Array]:
+    how: UpdateConfig,
+) -> tuple[TrainStates, Array]:
     # NCCL must not be given two messages at once: each has the norm in it that comes of the one before.
-    def update(carry: tuple[Learner, Learner, Array], inputs: tuple[Array, Array, Array]) -> Any:
+    def update(carry: tuple[TrainState, TrainState, Array], inputs: tuple[Array, Array, Array]) -> Any:
         policy, value, message = carry
         chosen, key, first = inputs
         seen = minibatch(chosen)
@@ -137,7 +137,7 @@ def _staggered(
         message = jnp.append(gradient, value_norm)
         return (policy, _step(value, mean, value_norm, how), message), jnp.append(error, metrics)
 
-    def policy_step(policy: Learner, message: Array) -> tuple[Learner, Array]:
+    def policy_step(policy: TrainState, message: Array) -> tuple[TrainState, Array]:
         mean = jax.lax.pmean(message, how.axis)
         norm = _norm(mean[:-1])
         return _step(policy, mean[:-1], jnp.hypot(norm, mean[-1]), how), norm
@@ -154,7 +154,7 @@ def _staggered(
 
 
 def _value_gradient(
-    value: Learner, statistics: RunningStatisticsState, seen: Unrolls, how: Updating
+    value: TrainState, statistics: RunningStatisticsState, seen: Unrolls, how: UpdateConfig
 ) -> tuple[Array, Array, Array]:
     differentiated = jax.value_and_grad(value_loss, has_aux=True)
     (error, advantages), gradients = differentiated(value.params, statistics, seen, how.networks, how.config)
@@ -162,18 +162,23 @@ def _value_gradient(
 
 
 def _policy_gradient(
-    policy: Learner, statistics: RunningStatisticsState, seen: Unrolls, advantages: Array, key: Array, how: Updating
+    policy: TrainState,
+    statistics: RunningStatisticsState,
+    seen: Unrolls,
+    advantages: Array,
+    key: Array,
+    how: UpdateConfig,
 ) -> tuple[Array, Array]:
     differentiated = jax.grad(policy_loss, has_aux=True)
     gradients, metrics = differentiated(policy.params, statistics, seen, advantages, key, how.networks, how.config)
     return ravel_pytree(gradients)[0], metrics
 
 
-def _step(learner: Learner, gradient: Array, norm: Array, how: Updating) -> Learner:
+def _step(learner: TrainState, gradient: Array, norm: Array, how: UpdateConfig) -> TrainState:
     clipped = gradient * jnp.minimum(1, how.config.max_grad_norm / norm)
     change, state = how.optimizer.update(clipped, learner.optimizer)
     unravel = ravel_pytree(learner.params)[1]
-    return Learner(optax.apply_updates(learner.params, unravel(change)), state)
+    return TrainState(optax.apply_updates(learner.params, unravel(change)), state)
 
 
 def _norm(vector: Array) -> Array:
