@@ -43,7 +43,8 @@ def test_what_is_heavy_is_imported_when_it_is_needed(code):
 
 
 def test_pose_mappers_need_no_simulator():
-    code = "import sys\nfrom mimic.trainers import mapper_job, plots, retargeting, session\nprint(*sys.modules)"
+    code = "import sys\nfrom mimic.commands import retarget, train\nfrom mimic.evaluation import plots"
+    code += "\nfrom mimic.trainers.pose_mapper import trainer\nprint(*sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     imported = set(result.stdout.splitlines()[-1].split())
     assert "mimic.trainers.pose_mapper.model" in imported and not imported.intersection({"brax", "mujoco.mjx"})
@@ -51,7 +52,8 @@ def test_pose_mappers_need_no_simulator():
 
 def test_training_needs_no_meshes_and_no_contacts():
     """Of MJX and brax; what is put off is there when it is asked for."""
-    code = "import sys\nfrom mimic import compat\ncompat.import_mjx()\nfrom mimic.trainers import ppo_job, session"
+    code = "import sys\nfrom mimic import compat\ncompat.import_mjx()\nfrom mimic.commands import train"
+    code += "\nfrom mimic.trainers.ppo import trainer"
     code += "\nprint(*sys.modules)"
     code += "\nimport jaxopt\nfrom mujoco.mjx._src import mesh\nassert mesh.trimesh.Trimesh and jaxopt.projection"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -130,13 +130,13 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
 
 ON_TWO_DEVICES = """
 import sys, jax, numpy as np, optax, mimic
-from mimic.trainers import learning, ppo
+from mimic.trainers.ppo import programs, training
 from mimic.trainers.config import PPOConfig
 env = mimic.make("planar4dof", physics=sys.argv[1], demonstrations={"count": 3, "held_out": 1})
 config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
                    hidden_layers=[8]).resolve("cpu", 2)
-networks = ppo.make_networks(config, env.observation_size, env.action_size)
-begin, learn = learning.make_programs(env, config, networks, 2, optax.constant_schedule(1e-3), None)
+networks = training.make_networks(config, env.observation_size, env.action_size)
+begin, learn = programs.make_programs(env, config, networks, 2, optax.constant_schedule(1e-3), None)
 start = begin()(7)
 before = jax.device_get(start.params)
 after, metrics = learn()(start)
