@@ -109,19 +109,37 @@ def test_only_a_locked_joint_merges_links():
     assert load_mjcf(arm, locked="b", links="kept").link_names == ("link1", "link2", "link3")
 
 
-def test_limits_from_the_model():
-    limited = """<actuator>
-      <motor joint="a" gear="2" ctrllimited="true" ctrlrange="-3 4"/>
-      <position joint="b" kp="100" forcelimited="true" forcerange="-7 7"/>
-    </actuator>
-    <custom><numeric name="velocity_limit" data="1.5 2.5"/></custom>"""
-    arm = load_mjcf(toy(TIP, limited))
-    assert arm.torque_limit.tolist() == [8, 7]
-    assert arm.velocity_limit.tolist() == [1.5, 2.5]
-    narrow = '<mujoco><compiler angle="radian"/><worldbody><body><joint range="0.5 1" limited="true"/>{}</body>'
-    arm = load_mjcf(
-        mujoco.MjModel.from_xml_string(narrow.format('<geom size="1" pos="1 0 0"/>') + "</worldbody></mujoco>")
+@pytest.mark.parametrize(
+    ("actuators", "expected"),
+    [
+        ('<motor joint="a" gear="2" ctrllimited="true" ctrlrange="-3 4"/>', 8),
+        ('<motor joint="a" gear="-3" forcelimited="true" forcerange="-5 4"/>', 15),
+        ('<position joint="a" gear="3" kp="100" forcelimited="true" forcerange="-7 7"/>', 21),
+        ('<position joint="a" gear="3" kp="100" ctrllimited="true" ctrlrange="-2 2"/>', np.inf),  # a range of angles
+        ('<general joint="a" gear="2" gainprm="-10" ctrllimited="true" ctrlrange="-1 1"/>', 20),
+        ('<motor joint="a" gear="2" ctrllimited="true" ctrlrange="-9 9" forcelimited="true" forcerange="-5 5"/>', 10),
+        ('<motor joint="a" ctrllimited="true" ctrlrange="-9 9"/><motor joint="b" gear="5"/>', 9),
+    ],
+)
+def test_a_torque_limit_is_that_of_the_actuator_times_its_gear(actuators, expected):
+    limits = load_mjcf(toy(TIP, f"<actuator>{actuators}</actuator>")).torque_limit
+    assert limits.tolist() == [expected, np.inf]
+
+
+def test_a_torque_limit_of_the_joint_itself_has_no_gear():
+    arm = hinge("a", inner=TIP).replace(
+        'axis="0 0 1"', 'axis="0 0 1" actuatorfrclimited="true" actuatorfrcrange="-6 6"'
     )
+    for motor_limit, expected in ((4, 6), (2, 4)):  # of a motor with a gear of 2
+        motor = f'<motor joint="a" gear="2" ctrllimited="true" ctrlrange="-{motor_limit} {motor_limit}"/>'
+        assert load_mjcf(model(arm, f"<actuator>{motor}</actuator>")).torque_limit.tolist() == [expected]
+
+
+def test_velocity_limits_and_the_start_pose_come_from_the_model():
+    limits = '<custom><numeric name="velocity_limit" data="1.5 2.5"/></custom>'
+    assert load_mjcf(toy(TIP, limits)).velocity_limit.tolist() == [1.5, 2.5]
+    narrow = '<body><joint range="0.5 1" limited="true"/><geom size="1" pos="1 0 0"/></body>'
+    arm = load_mjcf(model(narrow))
     assert (arm.joint_range.tolist(), arm.home.tolist()) == ([[0.5, 1]], [0.5])
 
 
@@ -164,6 +182,11 @@ MODELS = {
     ),
     "connect behind the last joint": (
         lambda: toy(STATIC, '<equality><connect body1="hand" body2="A" anchor="0 0 0"/></equality>'),
+        {},
+        "expected a serial chain; .* number 1$",
+    ),
+    "connect to the world": (
+        lambda: toy(TIP, '<equality><connect body1="B" anchor="0 0 0"/></equality>'),
         {},
         "expected a serial chain; .* number 1$",
     ),

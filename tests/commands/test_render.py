@@ -154,3 +154,15 @@ def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
     for changes, message in bad:
         with pytest.raises(ValueError, match=message):
             prepare_clip(RenderConfig(run=str(mapper_run), **changes))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "run: expected the run directory"),
+        (["run=missing"], "not a run directory"),
+        (["run=missing", "split=test"], "expected one of held_out, train, got 'test'"),
+    ],
+)
+def test_bad_input_of_the_command(refused, arguments, message):
+    assert message in refused("render", *arguments)

@@ -1,7 +1,6 @@
 """The commands, from the outside: what they write, refuse and survive."""
 
 import json
-import logging
 import os
 import re
 import shutil
@@ -11,13 +10,9 @@ import sys
 import time
 
 import imageio_ffmpeg
-import jax
-import numpy as np
 import pytest
 from PIL import Image
 
-import mimic
-from mimic import compat
 from tests.helpers.tiny import TINY
 
 BY_SPLIT = {
@@ -139,53 +134,3 @@ def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
     assert process.returncode == 128 + number, error[-2000:]
     assert f"resume={run_dir}" in out.replace("\n", "") and "stopping at the next checkpoint" in error
     assert list((run_dir / "checkpoints").iterdir())
-
-
-@pytest.mark.parametrize(("version", "needed"), [("0.10.2", True), ("0.11.0", False), ("0.12.0.1", False)])
-def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
-    assert compat.needs_cpu_flag(version) is needed
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not compat.needs_cpu_flag(), reason="this jax does not need the flag and aborts on it")
-def test_the_cpu_flag_speeds_up_kinematics(capsys):
-    """Times MJX's kinematics of 64 Pandas with and without it, each in a process of its own."""
-    code = (
-        "import time, jax, jax.numpy as jnp, mujoco\nfrom mujoco import mjx\n"
-        "from mimic.arms.embodiment import panda_path\n"
-        "model = mujoco.MjModel.from_xml_path(panda_path())\nmx = mjx.put_model(model)\ndata = mjx.make_data(model)\n"
-        "f = jax.jit(jax.vmap(lambda q: mjx.kinematics(mx, data.replace(qpos=q)).xpos))\nq = jnp.zeros((64, 7))\n"
-        "f(q).block_until_ready()\nstart = time.perf_counter()\n"
-        "for _ in range(3): f(q).block_until_ready()\nprint((time.perf_counter() - start) / 3)\n"
-    )
-    seconds = []
-    for flag in ("false", "true"):
-        environment = {**os.environ, "XLA_FLAGS": f"--xla_cpu_use_fusion_emitters={flag}", "JAX_PLATFORMS": "cpu"}
-        out = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
-        ).stdout
-        seconds.append(float(out.splitlines()[-1]))
-    logging.getLogger(__name__).info("speed-up by the flag: %.0f", seconds[1] / seconds[0])
-    with capsys.disabled():
-        print(f"\nspeed-up of MJX kinematics by the CPU flag: {seconds[1] / seconds[0]:.0f} times")
-    assert seconds[1] > 5 * seconds[0]  # several hundred times where it was measured first; 5 tells it from noise
-
-
-def test_no_rollout_goes_below_the_bound():
-    """Random controllers on the planar arm; 1e-4 is what the search may leave."""
-    from mimic.envs.imitation import training_and_held_out
-    from mimic.evaluation.evaluator import Evaluator
-
-    config = mimic.env_config("planar4dof", demonstrations={"count": 3, "held_out": 2})
-    training, held_out = training_and_held_out(config)
-    evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
-    rollout = jax.jit(lambda gain: evaluator.rollout(lambda state: gain @ state.obs))
-    size = evaluator.env.action_size, evaluator.env.observation_size
-    for seed in range(5):
-        gain = np.random.default_rng(seed).normal(size=size) * 0.02 * seed
-        assert np.all(np.asarray(rollout(gain).distance) > evaluator.lower_bound - 1e-4)
-
-
-def test_api_resolves():
-    for name in mimic.__all__:
-        assert getattr(mimic, name) is not None

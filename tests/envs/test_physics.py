@@ -9,6 +9,7 @@ import pytest
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm, simulation_model
 from mimic.envs import dynamics, physics
+from mimic.envs.config import PHYSICS
 from mimic.envs.physics import Load, make_advance
 from mimic.metric import fused_kernel
 from tests.helpers.lowering import gpu_program
@@ -109,21 +110,41 @@ def test_random_arms_have_what_is_hard():
     assert all(source.jnt_pos.any() for source in sources)
 
 
-@pytest.mark.parametrize("seed", [4, 7, 17])  # 5, 8 and 9 hinges; in 17 one body has a free hinge and then a held one
-def test_locked_random_arms_move_as_the_held_arm(x64, seed):
+def locked_panda(locked):
+    arm = build_arm(ArmConfig(locked=locked))
+    return build_arm(ArmConfig()).model, arm.model, dict(arm.locked)
+
+
+def locked_random_arm(seed):
+    """Every other joint is locked, the first one included."""
     source, _ = free_arm(seed)
-    free, held = range(1, source.njnt, 2), range(0, source.njnt, 2)
-    angles = {source.joint(i).name: 0.3 * (i + 1) for i in held}
-    model = simulation_model(source, tuple(source.joint(i).name for i in free), angles)
+    angles = {source.joint(i).name: 0.3 * (i + 1) for i in range(0, source.njnt, 2)}
+    names = tuple(source.joint(i).name for i in range(1, source.njnt, 2))
+    return source, simulation_model(source, names, angles), angles
+
+
+@pytest.mark.parametrize(
+    ("make", "argument"),
+    [
+        (locked_panda, (3, 6, 7)),
+        (locked_panda, {"joint3": 0.4, "joint1": -0.3}),
+        # 5, 8 and 9 joints; in 17 one body has a free joint and then a locked one
+        *((locked_random_arm, seed) for seed in (4, 7, 17)),
+    ],
+)
+def test_locked_arms_accelerate_as_the_whole_arm_with_joints_held(x64, make, argument):
+    source, model, angles = make(argument)
+    locked = [source.joint(name).id for name in angles]
+    free = [joint for joint in range(source.njnt) if joint not in locked]
     qpos, qvel, torque = random_states(model)
     data, expected = mujoco.MjData(source), []
-    data.qpos[held] = list(angles.values())
-    for data.qpos[free], data.qvel[free], tau in zip(qpos, qvel, torque, strict=True):
+    data.qpos[locked] = list(angles.values())
+    for data.qpos[free], data.qvel[free], applied in zip(qpos, qvel, torque, strict=True):
         mujoco.mj_forward(source, data)
         columns = np.zeros((len(free), source.nv))
         for column, joint in zip(columns, free, strict=True):
             mujoco.mj_mulM(source, data, column, np.eye(source.nv)[joint])
-        forces = tau + (data.qfrc_passive - data.qfrc_bias)[free]
+        forces = applied + (data.qfrc_passive - data.qfrc_bias)[free]
         expected.append(np.linalg.solve(columns[:, free], forces))
     assert_near(ours(dynamics.acceleration, model, qpos, qvel, torque), np.array(expected))
 
@@ -263,3 +284,33 @@ def test_fused_and_mjx_stay_together_over_an_episode():
     fused = angles("fused")
     assert np.ptp(fused, axis=0).max() > 1  # the arms do move
     np.testing.assert_allclose(fused, angles("mjx"), rtol=0, atol=1e-4)
+
+
+DT = 0.1
+
+
+@pytest.fixture(scope="module")
+def panda_scale():
+    """Largest torques."""
+    return np.asarray(mimic.make("panda7dof", demonstrations={"count": 1, "held_out": 1}).torque_scale)
+
+
+@pytest.mark.parametrize("load", [Load(), Load(mass=1.2, damping=3.0)])
+@pytest.mark.parametrize("physics", PHYSICS)
+def test_the_panda_moves_as_in_mujoco(panda_scale, physics, load):
+    """1 s of random torques at the default step: 1e-4 rad, what ten control steps leave of float32."""
+    model = build_arm(ArmConfig()).model
+    substeps = mimic.env_config("panda7dof").substeps
+    model.opt.timestep = DT / substeps
+    torques = np.random.default_rng(0).uniform(-1, 1, (10, 7)) * panda_scale
+    advance = jax.jit(make_advance(model, DT / substeps, substeps, physics))
+    model.body_mass *= load.mass
+    model.body_inertia *= load.mass
+    model.dof_damping *= load.damping
+    data = mujoco.MjData(model)
+    qpos, qvel = jnp.zeros(7), jnp.zeros(7)
+    for torque in torques:
+        data.qfrc_applied[:] = torque
+        mujoco.mj_step(model, data, substeps)
+        qpos, qvel = advance(qpos, qvel, jnp.asarray(torque, jnp.float32), load)
+        np.testing.assert_allclose(qpos, data.qpos, atol=1e-4)

@@ -10,12 +10,9 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.arms.arm import simulation_model
-from mimic.envs import dynamics
 from mimic.envs.config import RandomizationConfig
 from mimic.envs.physics import Load
 from mimic.envs.wrappers import wrap_for_training
-from tests.helpers.random_arms import SEEDS, posed, random_arm
 
 RANGES = {"mass": [0.5, 2.0], "damping": [1.0, 3.0]}
 ACTION = jnp.array([0.6, -0.4])
@@ -150,23 +147,3 @@ def test_noise_shares_no_key_with_the_next_episode():
         state = env.step(state, jnp.zeros(2))
         noise = state.pipeline_state.qvel / 0.1
         assert not any(np.allclose(noise, jax.random.normal(key, (2,)), atol=1e-3) for key in keys)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.usefixtures("x64")
-def test_inverse_and_forward_dynamics_are_those_of_mujoco(seed):
-    """Random serial arms in double precision; 1e-9 is what matrices of some condition leave of it."""
-    source = random_arm(seed)
-    model = simulation_model(source, tuple(source.joint(i).name for i in range(source.njnt)))
-    rng = np.random.default_rng(seed)
-    model.dof_armature[:], model.dof_damping[:] = rng.uniform(0.01, 0.1, (2, model.nv))
-    arm = dynamics.segments(model)
-    qpos, qvel, qacc = rng.normal(size=(3, model.nv))
-    data = posed(model, qpos, qvel)
-    data.qacc[:] = qacc
-    mujoco.mj_inverse(model, data)
-    expected = np.array(data.qfrc_inverse)
-    torque = jnp.stack(dynamics.inverse(arm, list(qpos), list(qvel), list(qacc)))
-    np.testing.assert_allclose(torque, expected, rtol=1e-9, atol=1e-9)
-    found = jnp.stack(dynamics.acceleration(arm, list(qpos), list(qvel), list(expected)))
-    np.testing.assert_allclose(found, qacc, rtol=1e-9, atol=1e-9)

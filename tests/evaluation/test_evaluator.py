@@ -11,6 +11,7 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
+from mimic.evaluation import evaluator as evaluation
 from mimic.evaluation import plots
 from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.evaluation.rollout_metrics import gaps, has_gap, measure
@@ -242,3 +243,27 @@ def test_controllers_that_ask_for_too_much_get_the_largest_torque(evaluator):
     greedy = jax.jit(lambda: evaluator.rollout(lambda state: jnp.array([5.0, -5.0])))()
     scale = np.asarray(evaluator.env.torque_scale)
     np.testing.assert_array_equal(greedy.torque, np.broadcast_to(scale * [1, -1], greedy.torque.shape))
+
+
+def test_a_learner_that_can_do_what_the_expert_does_needs_no_search(monkeypatch):
+    monkeypatch.setattr(evaluation, "closest_motion", None)  # would fail
+    config = mimic.env_config("panda7dof", demonstrations={"count": 2, "held_out": 1}, physics="fused")
+    training, held_out = training_and_held_out(config)
+    evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
+    assert evaluator.lower_bound.shape == evaluator.hold_distance.shape == (3, 50)
+    assert not evaluator.lower_bound.any() and evaluator.hold_distance[:, -1].min() > 0.01
+
+
+def test_no_rollout_goes_below_the_bound():
+    """Random controllers on the planar arm; 1e-4 is what the search may leave."""
+    from mimic.envs.imitation import training_and_held_out
+    from mimic.evaluation.evaluator import Evaluator
+
+    config = mimic.env_config("planar4dof", demonstrations={"count": 3, "held_out": 2})
+    training, held_out = training_and_held_out(config)
+    evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
+    rollout = jax.jit(lambda gain: evaluator.rollout(lambda state: gain @ state.obs))
+    size = evaluator.env.action_size, evaluator.env.observation_size
+    for seed in range(5):
+        gain = np.random.default_rng(seed).normal(size=size) * 0.02 * seed
+        assert np.all(np.asarray(rollout(gain).distance) > evaluator.lower_bound - 1e-4)

@@ -7,7 +7,6 @@ import pytest
 from PIL import Image
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.rendering import ArmScene
 from mimic.envs.config import EnvConfig
 from mimic.metric.similarity import MEASURES
 from mimic.paper_figures.pose_picture import PANDA_POSES, nearest_poses, readable_poses, save_poses
@@ -43,11 +42,3 @@ def test_a_learner_that_can_do_the_pose_does_it(env, tmp_path):
     save_poses(tmp_path / "poses.png", expert, learner, env, pairs)
     image = np.asarray(Image.open(tmp_path / "poses.png").convert("RGB"), float)
     assert image.std() > 10 and image.shape[0] == 759  # 6.9 in at 110 dots an inch
-
-
-def test_points_as_the_camera_sees_them():
-    with ArmScene([ArmConfig()], width=32, height=32) as scene:
-        up, aside, ahead = scene.flattened(np.array([[0.0, 0, 1], [0, 1, 0], [1, 0, 0]]))
-    assert up[1] > 0.9 and abs(up[0]) < 1e-12  # seen from slightly above, upright
-    assert aside[0] > 0.9  # the camera looks against the x-axis, so that y is to its right
-    assert abs(ahead[0]) < 0.3 and ahead[1] < 0  # x comes towards it, and down as it looks from above

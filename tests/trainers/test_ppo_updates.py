@@ -10,7 +10,6 @@ import numpy as np
 import optax
 import pytest
 
-from mimic import compilation
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import programs, training, updates
 from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
@@ -128,18 +127,3 @@ def _made_of(variables, program):
         if made.intersection(v for v in equation.invars if not hasattr(v, "val")):
             made.update(equation.outvars)
     return made
-
-
-@pytest.mark.parametrize(
-    ("backend", "processes", "devices", "expected"),
-    [("gpu", 4, 4, True), ("gpu", 1, 4, False), ("gpu", 1, 1, False), ("gpu", 2, 8, False), ("cpu", 2, 2, False)],
-)
-def test_messages_go_beside_computation_where_each_gpu_has_a_process(
-    monkeypatch, backend, processes, devices, expected
-):
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    monkeypatch.setattr(jax, "process_count", lambda: processes)
-    monkeypatch.setattr(jax, "device_count", lambda: devices)
-    assert compilation.a_process_for_each_gpu() == expected
-    given = compilation.compiler_options().get("xla_gpu_enable_command_buffer", "")
-    assert ("COLLECTIVES" in given) == expected
