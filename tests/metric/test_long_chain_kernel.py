@@ -70,7 +70,7 @@ def values_and_gradients(arms, correspondence, weights, batch):
         return embodiment_distance(*states, correspondence, weights)
 
     value, gradients = jax.jit(jax.vmap(jax.value_and_grad(distance, ARGUMENTS)))(*batch)
-    return value[:, None], *gradients
+    return value, *gradients
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -78,16 +78,16 @@ def test_the_kernel_computes_what_the_composition_does(x64, long_kernel, case):
     arms, correspondence, weights = CASES[case]
     correspondence = overlap_correspondence(*arms) if correspondence is None else correspondence
     batch = motions(arms, fused_kernel.DEFAULT.block + 1)  # the last block is partial
-    expected = values_and_gradients(arms, correspondence, weights, batch)
+    value, *gradients = values_and_gradients(arms, correspondence, weights, batch)
     distance = motion_distance(*arms, correspondence, weights)
-    np.testing.assert_allclose(jax.jit(jax.vmap(distance))(*batch)[:, None], expected[0], atol=1e-13)  # rounding
+    found: list = [jax.jit(jax.vmap(distance))(*batch)]
+    expected = [value]
     for by in ((2,), ARGUMENTS):
-        value, gradients = jax.jit(jax.vmap(jax.value_and_grad(distance, by)))(*batch)
-        for values, reference in zip(
-            (value[:, None], *gradients), [expected[i] for i in (0, *(1 + k for k in by))], strict=True
-        ):
-            np.testing.assert_allclose(values, reference, atol=1e-13)  # rounding
+        found += jax.tree.leaves(jax.jit(jax.vmap(jax.value_and_grad(distance, by)))(*batch))
+        expected += [value, *(gradients[k] for k in by)]
     assert len(long_kernel) == 3
+    for values, reference in zip(found, expected, strict=True):
+        np.testing.assert_allclose(values, reference, atol=1e-13)  # rounding
 
 
 def test_the_kernel_takes_arms_of_any_shape(x64, long_kernel):
@@ -96,7 +96,7 @@ def test_the_kernel_takes_arms_of_any_shape(x64, long_kernel):
     batch = motions(arms, 3)
     value, gradients = jax.jit(jax.vmap(jax.value_and_grad(motion_distance(*arms, *metric), ARGUMENTS)))(*batch)
     assert long_kernel
-    for values, reference in zip((value[:, None], *gradients), values_and_gradients(arms, *metric, batch), strict=True):
+    for values, reference in zip((value, *gradients), values_and_gradients(arms, *metric, batch), strict=True):
         np.testing.assert_allclose(values, reference, atol=1e-12)  # rounding, of velocities up to 20 chain lengths/s
 
 
@@ -132,7 +132,7 @@ def test_there_is_no_kernel_where_nothing_moves(x64, pairs):
     batch = motions(arms, 2)
     value, gradients = jax.vmap(jax.value_and_grad(motion_distance(*arms, correspondence), ARGUMENTS))(*batch)
     expected = values_and_gradients(arms, correspondence, PAPER_WEIGHTS, batch)
-    for values, reference in zip((value[:, None], *gradients), expected, strict=True):
+    for values, reference in zip((value, *gradients), expected, strict=True):
         np.testing.assert_allclose(values, reference, atol=1e-13)  # rounding
 
 
@@ -145,6 +145,6 @@ def test_there_is_no_kernel_for_links_that_correspond_out_of_order(x64):
     distance = jax.value_and_grad(motion_distance(*arms, crossed), ARGUMENTS)
     value, gradients = jax.jit(jax.vmap(distance))(*batch)
     for values, reference in zip(
-        (value[:, None], *gradients), values_and_gradients(arms, crossed, PAPER_WEIGHTS, batch), strict=True
+        (value, *gradients), values_and_gradients(arms, crossed, PAPER_WEIGHTS, batch), strict=True
     ):
         np.testing.assert_allclose(values, reference, atol=1e-13)  # rounding
