@@ -17,7 +17,6 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
-from mimic.metric.distance import embodiment_distance, link_distances
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
@@ -179,22 +178,18 @@ def _static_clip(
 ) -> Clip:
     """Two arms moved pose by pose: velocities do not count; with the optimal pose's distance at each frame."""
     expert, learner = _arms(env)
-    metric = env.metric
-    correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
-    measure: Any = {"rotation": metric.rotation_measure}
-    reduced: Any = {**measure, "reduction": metric.reduction}
+    metric = env.metric.build(expert, learner)
 
     def judged(qpos: jax.Array, learner_qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         states = link_states(expert, qpos), link_states(learner, learner_qpos)
-        distances = link_distances(*states, weights, **measure)
-        matrix = correspondence(distances) if callable(correspondence) else correspondence
-        by_link = (matrix * distances).sum(axis=0) / distances.size
-        return embodiment_distance(*states, correspondence, weights, **reduced), by_link
+        distances = metric.link_distances(*states)
+        by_link = (metric.matrix(distances) * distances).sum(axis=0) / distances.size
+        return metric.reduced(distances), by_link
 
     judge = jax.jit(jax.vmap(judged))
     distance, by_link = map(np.asarray, judge(qpos, learner_qpos))
     hold = np.asarray(judge(qpos, np.broadcast_to(np.asarray(learner.home), learner_qpos.shape))[0])
-    optimum = imitate_pose(expert, learner, qpos.astype(np.float32), correspondence, weights, kept=None, **reduced)
+    optimum = imitate_pose(expert, learner, qpos.astype(np.float32), kept=None, **metric.arguments)
     curves = (
         Curve("holding the start pose", hold, _HOLD),
         Curve(by, distance, {"color": "tab:blue"}),

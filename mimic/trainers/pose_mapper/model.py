@@ -20,7 +20,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.compilation import on_host
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
-from mimic.metric.distance import Correspondence, embodiment_distance
+from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import pose_limits
 from mimic.runs.checkpoints import load_checkpoint
@@ -73,29 +73,21 @@ class MapperModel:
         return _Network(hidden_layers, outputs, activation, self.config.dropout)
 
     @functools.cached_property
-    def correspondence(self) -> Correspondence:
-        """W, or the function that makes it of the link distances."""
+    def built_metric(self) -> Metric:
+        """The metric between the two arms."""
         # It must not belong to the first program that asks for it, nor wait for the first work on a GPU.
         with jax.ensure_compile_time_eval(), on_host():
-            correspondence = self.metric.make_correspondence(self.expert, self.learner)
-            return correspondence if callable(correspondence) else np.asarray(correspondence)
+            metric = self.metric.build(self.expert, self.learner)
+            matrix = metric.correspondence
+            return metric if callable(matrix) else dataclasses.replace(metric, correspondence=np.asarray(matrix))
 
     @functools.cached_property
     def distance(self) -> PoseDistance:
         """Embodiment distance between a pose of the expert and one of the learner."""
-        correspondence, weights = self.correspondence, self.metric.make_weights()
-
-        def distance(qpos: Array, learner_qpos: Array) -> Array:
-            return embodiment_distance(
-                link_states(self.expert, qpos),
-                link_states(self.learner, learner_qpos),
-                correspondence,
-                weights,
-                rotation=self.metric.rotation_measure,  # type: ignore[arg-type]
-                reduction=self.metric.reduction,  # type: ignore[arg-type]
-            )
-
-        return distance
+        metric = self.built_metric
+        return lambda qpos, learner_qpos: metric(
+            link_states(self.expert, qpos), link_states(self.learner, learner_qpos)
+        )
 
     def init(self, key: Array) -> Params:
         """Random parameters."""

@@ -122,19 +122,11 @@ class PoseMapperTrainer(Trainer):
 
     @functools.cached_property
     def _optimisation(self) -> Background[Callable[[np.ndarray], _Reference]]:
-        model, metric = self._model, self._model.metric
+        model = self._model
 
         def reference(every: Array) -> _Reference:
-            found = imitate_pose(
-                model.expert,
-                model.learner,
-                every,
-                model.correspondence,
-                metric.make_weights(),
-                kept=None,  # compiled in half of the time
-                rotation=metric.rotation_measure,  # type: ignore[arg-type]
-                reduction=metric.reduction,  # type: ignore[arg-type]
-            )
+            kept = None  # compiled in half of the time
+            found = imitate_pose(model.expert, model.learner, every, kept=kept, **model.built_metric.arguments)
             lower, upper = jnp.asarray(model.learner.joint_range, jnp.float32).T
             chance = jax.random.uniform(_key(_CHANCE), (len(every), len(lower)), minval=lower, maxval=upper)
             direction = jax.vmap(lambda q: link_states(model.expert, q).direction)(every)
