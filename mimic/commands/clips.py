@@ -153,7 +153,7 @@ def _of_retargeted(config: RenderConfig) -> Recipe:
         if not getattr(config, key):
             raise ValueError(f"{key}: expected what mimic.retarget was given or wrote, as in {key}={example}")
     env = env_config(config.learner, limits=config.limits)
-    expert, learner = _arms(env)
+    expert, learner = env.build_arms().embodiments
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
     motions = load_demonstrations(Path(config.retargeted).expanduser())
     _check_arm("demonstrations", demonstrations, expert)
@@ -177,7 +177,7 @@ def _static_clip(
     env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray, learner_qpos: np.ndarray, *, by: str
 ) -> Clip:
     """Two arms moved pose by pose: velocities do not count; with the optimal pose's distance at each frame."""
-    expert, learner = _arms(env)
+    expert, learner = env.build_arms().embodiments
     metric = env.metric.build(expert, learner)
 
     def judged(qpos: jax.Array, learner_qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -197,12 +197,6 @@ def _static_clip(
     )
     labels = "expert", f"learner, {by}"
     return Clip(title, labels, time, (qpos, learner_qpos), time, curves, by_link, learner.link_names)
-
-
-def _arms(env: EnvConfig) -> tuple[Embodiment, Embodiment]:
-    """The embodiments of an environment's expert and learner."""
-    expert, learner = (build_arm(arm, env.limits, env.metric.links).embodiment for arm in (env.expert, env.learner))
-    return expert, learner
 
 
 def _resampled(motions: Demonstrations, number: int) -> tuple[np.ndarray, np.ndarray]:

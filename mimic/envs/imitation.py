@@ -74,19 +74,17 @@ class ImitationEnv(Env):
 
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
         self.config = config
-        expert, learner = (
-            build_arm(arm, config.limits, config.metric.links) for arm in (config.expert, config.learner)
-        )
-        self.expert, self.learner = expert.embodiment, learner.embodiment
+        arms = config.build_arms()
+        self.expert, self.learner = arms.embodiments
         self.metric = config.metric.build(self.expert, self.learner)
-        self.torque_scale = jnp.asarray(torque_scale(learner, config.action_scale, config.control_dt))
-        self.arm = learner
+        self.arm = arms.learner
+        self.torque_scale = jnp.asarray(torque_scale(self.arm, config.action_scale, config.control_dt))
         home = np.asarray(self.learner.home)
         self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
         timestep = config.control_dt / config.substeps
-        self._advance = make_advance(learner.model, timestep, config.substeps, config.physics)
+        self._advance = make_advance(self.arm.model, timestep, config.substeps, config.physics)
         if demonstrations is None:
-            demonstrations = training_and_held_out(config, expert)[0]
+            demonstrations = training_and_held_out(config, arms.expert)[0]
         self._set_demonstrations(demonstrations)
 
     def with_demonstrations(self, demonstrations: Demonstrations) -> "ImitationEnv":

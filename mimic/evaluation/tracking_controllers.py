@@ -8,7 +8,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import effective_inertia
+from mimic.arms.simulation_model import effective_inertia
 from mimic.envs import dynamics
 from mimic.envs.imitation import ArmState, ImitationEnv
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts

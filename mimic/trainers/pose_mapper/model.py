@@ -15,7 +15,6 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.compilation import on_host
 from mimic.envs.config import EnvConfig
@@ -206,8 +205,7 @@ def make_model(env: EnvConfig, config: PoseMapperConfig) -> MapperModel:
     Raises:
       ValueError: arms that cannot be built.
     """
-    expert, learner = (build_arm(arm, env.limits, env.metric.links).embodiment for arm in (env.expert, env.learner))
-    return MapperModel(expert, learner, env.metric, config)
+    return MapperModel(*env.build_arms().embodiments, env.metric, config)
 
 
 def check_poses(arm: Embodiment, qpos: ArrayLike) -> Array:
