@@ -20,10 +20,8 @@ from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, 
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import PoseMapperConfig
-from mimic.trainers.make import make_trainer
+from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.pose_mapper.model import PoseMapper
-from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import load_config, policy_run
 
 FRAMES_PER_SECOND = 30
@@ -80,7 +78,7 @@ def prepare_clip(config: RenderConfig) -> Recipe:
     """
     if config.retargeted or (config.demonstrations and not config.run):
         return _of_retargeted(config)
-    if config.run and isinstance(load_config(Path(config.run).expanduser()).trainer, PoseMapperConfig):
+    if config.run and load_config(Path(config.run).expanduser()).trainer.name == "pose_mapper":
         return _of_mapper(config)
     return _of_policy(config)
 
@@ -89,14 +87,13 @@ def _of_policy(config: RenderConfig) -> Recipe:
     """A policy's rollout, with the lower bound and an arm at rest."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
     _check_unused(config, "a run of trainer=ppo", "demonstrations", "learner", "limits", "seed")
-    job = make_trainer(trained, run_dir)
-    assert isinstance(job, PPOTrainer)
-    index = demonstration_index(job.evaluator, config.split, config.demonstration)
-    _, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
+    trainer = make_ppo_trainer(trained, run_dir)
+    index = demonstration_index(trainer.evaluator, config.split, config.demonstration)
+    _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
     title = f"{trained.env.name}, {config.split.replace('_', '-')} demonstration {config.demonstration}"
 
     def make() -> Clip:
-        story = RolloutFrames(job.evaluator, job.evaluate(params), index, FRAMES_PER_SECOND)
+        story = RolloutFrames(trainer.evaluator, trainer.evaluate(params), index, FRAMES_PER_SECOND)
         curves = (
             Curve("holding the start pose", story.hold, _HOLD),
             Curve("policy", story.distance, {"color": "tab:blue"}),

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -144,19 +144,17 @@ def _portable(config: ExportConfig) -> Portable:
         "learner": learner.name,
         "learner_joints": list(learner.joint_names),
     }
-    if isinstance(trained.trainer, PPOConfig):
+    if trained.trainer.name == "ppo":
         return _policy(trained, run_dir, steps, common)
     return _mapper(PoseMapper.load(run_dir, steps), common)
 
 
 def _check_meant_for(name: str, expert: Embodiment, learner: Embodiment) -> None:
     meant = env_config(name).build_arms().embodiments
-    for role, own, wanted in zip(
-        ("expert", "learner"), (expert, learner), env_config(name).build_arms().embodiments, strict=True
-    ):
-        if (own.name, own.joint_names) != (wanted.name, wanted.joint_names):
+    for role, own, other in zip(("expert", "learner"), (expert, learner), meant, strict=True):
+        if (own.name, own.joint_names) != (other.name, other.joint_names):
             raise ValueError(
-                f"learner: {name} has the {role} {wanted.name} with joints {', '.join(wanted.joint_names)}, "
+                f"learner: {name} has the {role} {other.name} with joints {', '.join(other.joint_names)}, "
                 f"but the run's is {own.name} with joints {', '.join(own.joint_names)}"
             )
 
@@ -166,7 +164,7 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str
     expert, learner = arms.embodiments
     layout = observation_layout(expert, learner, trained.env.preview)
     size = layout[-1]["stop"]
-    config: PPOConfig = trained.trainer  # type: ignore[assignment] - saved resolved: the machine does not matter
+    config = cast(PPOConfig, trained.trainer).resolve()  # saved with all values: the machine does not matter
     params = load_checkpoint(run_dir, training.params_template(config, size, learner.num_joints), steps)[1]
     controller = training.make_controller(config, size, learner.num_joints)(jax.device_get(params))
     scale = jnp.asarray(torque_scale(arms.learner, trained.env.action_scale, trained.env.control_dt))

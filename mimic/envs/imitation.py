@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,11 @@ class ArmState:
     demonstration: Int[Array, ""]
     key: Array
     load: Load | None = None
+
+
+def arm_state(state: State) -> ArmState:
+    """What an episode's brax state carries of the learner."""
+    return cast(ArmState, state.pipeline_state)
 
 
 class ImitationEnv(Env):
@@ -138,7 +143,7 @@ class ImitationEnv(Env):
 
     def step(self, state: State, action: Float[Array, " joints"]) -> State:
         """Holds a torque for one control step."""
-        before: ArmState = state.pipeline_state  # type: ignore[assignment]
+        before = arm_state(state)
         command = jnp.clip(action, -1.0, 1.0)
         step = before.step + 1
         randomization = self.config.randomization

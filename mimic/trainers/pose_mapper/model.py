@@ -23,7 +23,7 @@ from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import pose_limits
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings
 from mimic.trainers.run_config import load_config
 
 Params = Any
@@ -63,12 +63,12 @@ class MapperModel:
     expert: Embodiment
     learner: Embodiment
     metric: MetricConfig
-    config: PoseMapperConfig
+    config: PoseMapperSettings
 
     @functools.cached_property
     def _network(self) -> _Network:
-        outputs = int(self.config.heads or 1) * self.learner.num_joints * 2
-        hidden_layers, activation = tuple(self.config.hidden_layers or ()), str(self.config.activation)
+        outputs = self.config.heads * self.learner.num_joints * 2
+        hidden_layers, activation = tuple(self.config.hidden_layers), self.config.activation
         return _Network(hidden_layers, outputs, activation, self.config.dropout)
 
     @functools.cached_property
@@ -106,7 +106,7 @@ class MapperModel:
         training = dropout_key is not None
         rngs = {"dropout": dropout_key} if training else None
         outputs = self._network.apply(params, self._inputs(qpos), training=training, rngs=rngs)
-        outputs = jnp.reshape(outputs, (config.heads, self.learner.num_joints, 2))  # type: ignore[arg-type]
+        outputs = jnp.reshape(outputs, (config.heads, self.learner.num_joints, 2))  # type: ignore[arg-type] - flax annotates all that apply may return
         lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.learner.joint_range).T)
         within = (lower + upper) / 2 + (upper - lower) / 2 * jnp.tanh(outputs[..., 0])
         if config.outputs == "tanh":
@@ -199,7 +199,7 @@ class PoseMapper:
                 )
 
 
-def make_model(env: EnvConfig, config: PoseMapperConfig) -> MapperModel:
+def make_model(env: EnvConfig, config: PoseMapperSettings) -> MapperModel:
     """The mapper of an environment's arms and metric.
 
     Raises:
