@@ -118,6 +118,16 @@ def _similarity_cell(key: str, value: float) -> str:
     return f"{value:.1f} deg" if key.endswith("_deg") else f"{value:.3f}"
 
 
+def similarity_texts(similarity: Mapping[str, float]) -> dict[str, tuple[str, str]]:
+    """Label and value of each measure of one moment by the measure's name, as the viewer and videos show them."""
+
+    def text(name: str) -> str:
+        return f"{similarity[name]:.0f}°" if name.endswith("_deg") else f"{similarity[name]:.3f}"
+
+    headers = SIMILARITY_HEADERS.items()
+    return {name: (header.replace("\n", " "), text(name)) for name, header in headers if name in similarity}
+
+
 def report_table(report: Mapping[str, Any], job: Job) -> Table:
     """The figures of a report, training next to held-out data."""
     table = Table(title=f"{report['env']}  {report['trainer']}  seed {report['seed']}", title_justify="left")
