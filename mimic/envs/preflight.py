@@ -46,7 +46,7 @@ class Nearness:
 
 
 def nearness(expert: Arm, learner: Arm, config: EnvConfig) -> Nearness:
-    """Kinematic bound and holding still, on a few random demonstrations.
+    """Kinematic bound and holding the start pose, on a few random demonstrations.
 
     Raises:
       ValueError: the expert's limits leave it no goal.
