@@ -91,7 +91,7 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
     over_time.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, clip.curve_time[-1]))
     over_time.legend(fontsize="small", loc="best")  # never over a curve where there is room
     over_time.grid(alpha=0.3)
-    values = _add_similarity(figure, (left, 0.44, width, 0.1), clip)
+    values = _add_similarity(figure, (left, 0.42, width, 0.12), clip)
     links = figure.add_axes((left, 0.09, width, 0.25))
     bars = links.bar(range(len(clip.bar_names)), clip.bars[0], color="tab:blue")
     links.set_xticks(range(len(clip.bar_names)), [name.replace("link", "") for name in clip.bar_names])
@@ -126,8 +126,8 @@ def _add_similarity(figure: Figure, place: tuple[float, float, float, float], cl
     values = {}
     for column, (name, (label, value)) in enumerate(texts.items()):
         at: Any = {"x": (column + 0.5) / len(texts), "transform": panel.transAxes, "ha": "center", "va": "center"}
-        panel.text(y=0.75, s=label, fontsize=9, color="dimgrey", **at)
-        values[name] = panel.text(y=0.2, s=value, fontsize=13, **at)
+        panel.text(y=0.72, s=label.replace(" ", "\n"), fontsize=9, color="dimgrey", **at)
+        values[name] = panel.text(y=0.12, s=value, fontsize=13, **at)
     return values
 
 
