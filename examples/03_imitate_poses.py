@@ -49,7 +49,7 @@ def mean_distance(learner_poses):
 # ---- Four answers ----------------------------------------------------------------------------------------------------
 #
 # A random pose is the scale. Copying the angles of the joints that both arms have is what one would try first: it is
-# half as bad, since a joint's angle means something else once its neighbours are locked. The paper descends from one
+# a third as bad, since a joint's angle means something else once its neighbours are locked. The paper descends from one
 # start with a constant step. The optimiser descends from thirteen, with a Newton method that turns round where the
 # distance is concave. `jax.jit` around it keeps the compiled program for the next poses of the same number.
 

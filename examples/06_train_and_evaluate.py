@@ -53,10 +53,10 @@ command(
 
 # ---- The report ------------------------------------------------------------------------------------------------------
 #
-# The optimality gap is the number to look at: 0 is the kinematic bound, the best that the learner's joints allow at each
-# moment, and 1 is holding the start pose. On demonstrations that it was trained on the policy does far better than on
-# others: sixteen are few to learn from. A gap on held-out ones says more of a policy than the one that it was trained
-# for.
+# The optimality gap is the number to look at: 0 is the kinematic bound, the best that the learner's joints allow at
+# each moment, and 1 is holding the start pose. On demonstrations that it was trained on the policy does far better than
+# on others: sixteen are few to learn from. A gap on held-out ones says more of a policy than the one that it was
+# trained for.
 
 report = json.loads((run / "report.json").read_text())
 gap, distance = report["optimality_gap"], report["mean_distance"]
