@@ -108,7 +108,7 @@ def _draw_unseen(results: dict[str, Any], out: Path) -> None:
         axes.plot(curves["time"], curves["mean"], color=colour, label=label)
         axes.fill_between(curves["time"], curves["low"], curves["high"], color=colour, alpha=0.2, lw=0)
     axes.plot(curves["time"], curves["hold"], ":", color="grey", label="holding the start pose")
-    title = "32 unseen demonstrations, 7 to 7 joints: the kinematic bound is 0"
+    title = "32 unseen demonstrations, 7 to 7 joints: kinematic bound 0"
     axes.set(xlabel="time [s]", ylabel="embodiment distance", title=title, yscale="log", ylim=(1e-5, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
