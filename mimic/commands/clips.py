@@ -1,7 +1,7 @@
 """What a video shows, as plain numbers; made of a policy's rollout, a pose mapper, or retargeted motions."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
 from mimic.metric.kinematics import link_states
+from mimic.metric.similarity import centre_line_table, similarity
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_ppo_trainer
@@ -49,6 +50,7 @@ class Clip:
       curves: embodiment distances.
       bars: [samples, links] what each link of the learner adds to the distance.
       bar_names: of these links.
+      similarity: measures of `mimic.similarity` of the poses by name, each [frames].
     """
 
     title: str
@@ -59,6 +61,7 @@ class Clip:
     curves: tuple[Curve, ...]
     bars: Float[np.ndarray, "samples links"]
     bar_names: tuple[str, ...]
+    similarity: Mapping[str, Float[np.ndarray, " frames"]]
 
 
 class Recipe(NamedTuple):
@@ -84,7 +87,7 @@ def prepare_clip(config: RenderConfig) -> Recipe:
 
 
 def _of_policy(config: RenderConfig) -> Recipe:
-    """A policy's rollout, with the lower bound and an arm at rest."""
+    """A policy's rollout, with the kinematic bound and an arm at rest."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
     _check_unused(config, "a run of trainer=ppo", "demonstrations", "learner", "limits", "seed")
     trainer = make_ppo_trainer(trained, run_dir)
@@ -97,11 +100,13 @@ def _of_policy(config: RenderConfig) -> Recipe:
         curves = (
             Curve("holding the start pose", story.hold, _HOLD),
             Curve("policy", story.distance, {"color": "tab:blue"}),
-            Curve("lower bound", story.bound, _OPTIMUM),
+            Curve("kinematic bound", story.bound, _OPTIMUM),
         )
         steps = story.dt * np.arange(1, len(story.distance) + 1)
         poses = story.expert, story.learner
-        return Clip(title, ("expert", "learner"), story.time, poses, steps, curves, story.by_link, story.link_names)
+        alike = _similarity((trainer.evaluator.env.expert, trainer.evaluator.env.learner), poses)
+        bars = story.by_link, story.link_names
+        return Clip(title, ("expert", "learner"), story.time, poses, steps, curves, *bars, alike)
 
     return Recipe(trained.env, run_dir / "videos" / f"{config.split}-{config.demonstration}.mp4", make)
 
@@ -193,7 +198,14 @@ def _static_clip(
         Curve("optimal poses", np.asarray(optimum.distance), _OPTIMUM),
     )
     labels = "expert", f"learner, {by}"
-    return Clip(title, labels, time, (qpos, learner_qpos), time, curves, by_link, learner.link_names)
+    poses = qpos, learner_qpos
+    alike = _similarity((expert, learner), poses)
+    return Clip(title, labels, time, poses, time, curves, by_link, learner.link_names, alike)
+
+
+def _similarity(arms: tuple[Embodiment, Embodiment], poses: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
+    """How alike two arms look in each frame."""
+    return similarity(*(centre_line_table(arm, qpos) for arm, qpos in zip(arms, poses, strict=True)))
 
 
 def _resampled(motions: Demonstrations, number: int) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from jaxtyping import UInt8  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from matplotlib.text import Text  # noqa: E402
 from PIL import Image  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
@@ -21,6 +23,7 @@ from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
 from mimic.commands.config import RenderConfig  # noqa: E402
 from mimic.compilation import use_compilation_cache  # noqa: E402
+from mimic.evaluation.labels import similarity_texts  # noqa: E402
 
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760  # pixels of the width that show the arms
@@ -80,18 +83,20 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
         for place, label in zip((0.27, 0.73), clip.labels, strict=True)
     ]
     texts.append(room.text(0.02, 0.95, clip.title, transform=room.transAxes, fontsize=12))
-    over_time = figure.add_axes((share + 0.07, 0.57, 1 - share - 0.09, 0.36))
+    left, width = share + 0.07, 1 - share - 0.09
+    over_time = figure.add_axes((left, 0.66, width, 0.28))
     for curve in clip.curves:
         over_time.plot(clip.curve_time, curve.values, label=curve.label, **curve.style)
     now = over_time.axvline(0, color="tab:red", lw=1)
     over_time.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, clip.curve_time[-1]))
     over_time.legend(fontsize="small", loc="best")  # never over a curve where there is room
     over_time.grid(alpha=0.3)
-    links = figure.add_axes((share + 0.07, 0.09, 1 - share - 0.09, 0.32))
+    values = _add_similarity(figure, (left, 0.42, width, 0.12), clip)
+    links = figure.add_axes((left, 0.09, width, 0.25))
     bars = links.bar(range(len(clip.bar_names)), clip.bars[0], color="tab:blue")
     links.set_xticks(range(len(clip.bar_names)), [name.replace("link", "") for name in clip.bar_names])
     links.set(title="by link of the learner", ylim=(0, 1.05 * clip.bars.max()))
-    moving = [picture, *texts, now, *bars]
+    moving = [picture, *texts, now, *values.values(), *bars]
     for artist in moving:
         artist.set_animated(True)
     canvas: Any = figure.canvas
@@ -103,11 +108,31 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
         now.set_xdata([time, time])
         for bar, height in zip(bars, clip.bars[sample], strict=True):
             bar.set_height(height)
+        for name, (_, value) in similarity_texts(_similarity_at(clip, frame)).items():
+            values[name].set_text(value)
         canvas.restore_region(background)
         for artist in moving:
             figure.draw_artist(artist)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
     plt.close(figure)
+
+
+def _add_similarity(figure: Figure, place: tuple[float, float, float, float], clip: Clip) -> dict[str, Text]:
+    """The measures of similarity in columns, label above value. Gives the values, which change with the frame."""
+    panel = figure.add_axes(place)
+    panel.axis("off")
+    panel.set_title("similarity (0: alike; lengths in chain lengths)")
+    texts = similarity_texts(_similarity_at(clip, 0))
+    values = {}
+    for column, (name, (label, value)) in enumerate(texts.items()):
+        at: Any = {"x": (column + 0.5) / len(texts), "transform": panel.transAxes, "ha": "center", "va": "center"}
+        panel.text(y=0.72, s=label.replace(" ", "\n"), fontsize=9, color="dimgrey", **at)
+        values[name] = panel.text(y=0.12, s=value, fontsize=13, **at)
+    return values
+
+
+def _similarity_at(clip: Clip, frame: int) -> dict[str, float]:
+    return {name: float(values[frame]) for name, values in clip.similarity.items()}
 
 
 def _write_video(out: Path, frames: Any) -> list[Image.Image]:

@@ -20,6 +20,7 @@ from mimic.commands.render import draw_frames, prepare_video
 from mimic.envs import env_config
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.recording import record_demonstrations
+from mimic.metric.similarity import centre_line, similarity
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 STEPS = 4  # of a motion: 0.4 s, 13 frames
@@ -90,6 +91,17 @@ def test_retargeted_motions_are_shown_as_they_are(files):
     assert clip.bars.shape == (len(clip.time), 4) and np.all(np.isfinite(clip.bars))
 
 
+def test_each_frame_has_the_measures_of_similarity(files):
+    recipe = prepare_clip(RenderConfig(**files))
+    clip = recipe.make()
+    arms = build_arm(recipe.env.expert).embodiment, build_arm(recipe.env.learner).embodiment
+    frame = 5
+    lines = (centre_line(arm, poses[frame]) for arm, poses in zip(arms, clip.poses, strict=True))
+    for name, expected in similarity(*lines).items():
+        assert clip.similarity[name].shape == clip.time.shape
+        assert clip.similarity[name][frame] == pytest.approx(float(expected), rel=1e-4)  # degrees in float32
+
+
 def test_a_frame_shows_the_moment(files):
     recipe = prepare_clip(RenderConfig(**files))
     clip = recipe.make()
@@ -99,7 +111,7 @@ def test_a_frame_shows_the_moment(files):
     assert first.shape == last.shape == (640, 1280, 3)
     changed = np.any(first != last, axis=-1)
     assert changed[:, :380].any() and changed[:, 380:760].any()  # both arms
-    assert changed[:, 760:].any()  # the line of the time
+    assert changed[:280, 760:].any() and changed[340:380, 760:].any()  # the line of the time; similarity
 
 
 def test_a_video_has_all_frames(files, tmp_path):
