@@ -114,7 +114,7 @@ def test_bad_demonstration_files(refused, demonstrations, tmp_path, change, mess
 @pytest.mark.parametrize(
     ("bodies", "message"),
     [
-        ('<body><geom size=".1"/></body>', "no hinge"),
+        ('<body><geom size=".1"/></body>', "no revolute joint"),
         (
             f"<body>{HINGE.format('a')}<body>{HINGE.format('b')}</body><body>{HINGE.format('c')}</body></body>",
             "branch",
