@@ -93,7 +93,7 @@ def test_unnamed_joints_get_names():
 
 def test_links_of_length_zero_are_merged_with_a_message(caplog):
     wrist = hinge("c", axis="0 1 0", inner=TIP)  # same anchor as b
-    chain._warn_of_merged.cache_clear()
+    chain._warn_merged.cache_clear()
     with caplog.at_level(logging.WARNING):
         arm = load_mjcf(toy(wrist))
     assert (arm.joint_names, arm.link_names, arm.link_joint) == (("a", "b", "c"), ("link1", "link3"), (0, 2))

@@ -22,15 +22,9 @@ def simulation_model(
     Args:
       source: any model.
       joint_names: revolute joints to keep.
-      locked: angle [rad] of removed joints, by name; joints that are in neither are removed at angle 0.
+      locked: angle [rad] of removed joints, by name; other removed joints stay at angle 0.
     """
-    locked = locked or {}
-    spec = mujoco.MjSpec()
-    spec.compiler.fusestatic = True
-    spec.compiler.autolimits = False
-    spec.compiler.degree = False  # the reference angles below are in radians
-    spec.option.disableflags = int(_IGNORED)
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    locked, spec = locked or {}, _empty_spec()
     bodies = {0: spec.worldbody}
     for body_id in range(1, source.nbody):
         body = source.body(body_id)
@@ -53,6 +47,16 @@ def simulation_model(
         for joint, anchor, axis in kept:
             _add_joint(target, joint, anchor, axis, reference=float(source.qpos0[joint.qposadr[0]]))
     return spec.compile()
+
+
+def _empty_spec() -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.compiler.fusestatic = True
+    spec.compiler.autolimits = False
+    spec.compiler.degree = False  # the reference angles of the joints are in radians
+    spec.option.disableflags = int(_IGNORED)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    return spec
 
 
 def _add_joint(body: mujoco.MjsBody, joint: Any, anchor: np.ndarray, axis: np.ndarray, reference: float) -> None:
