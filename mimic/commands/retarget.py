@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from rich.console import Console
 from rich.table import Table
 
-from mimic.arms.arm import rated_speed
+from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import RetargetConfig
 from mimic.commands.progress import similarity_table
@@ -22,7 +22,7 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.motions import largest_jump, optimal_motions
-from mimic.retargeting.pose import pose_limits
+from mimic.retargeting.pose import continuous_joints, wrap_angles
 from mimic.trainers.pose_mapper.model import PoseMapper
 
 
@@ -56,7 +56,7 @@ def retarget(
       ValueError: demonstrations of another arm, poses outside its range, or a mapper between other arms.
     """
     _check(demonstrations, expert)
-    rated, jump = rated_speed(learner), largest_jump(learner, demonstrations.dt)
+    rated, jump = finite_velocity_limit(learner), largest_jump(learner, demonstrations.dt)
     expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
     if mapper is None:
         found = optimal_motions(expert, learner, expert_qpos, metric, jump, seed)
@@ -103,15 +103,12 @@ def follow_mapper(
     model = mapper.model
     candidates = jax.jit(jax.vmap(jax.vmap(functools.partial(model.candidates, mapper.params))))(qpos)
     distances = jax.jit(jax.vmap(jax.vmap(jax.vmap(model.distance, (None, 0)))))(qpos, candidates)
-    full_turn = np.isinf(pose_limits(model.learner, np.float32)[0])
-
-    def turn(change: Array) -> Array:
-        return jnp.where(full_turn, change - 2 * jnp.pi * jnp.round(change / (2 * jnp.pi)), change)
+    continuous = continuous_joints(model.learner)
 
     def one(candidates: Array, distances: Array) -> tuple[Array, Array]:
         def forth(cost: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
             before, after, distance = now
-            change = jnp.abs(turn(after[None] - before[:, None]))
+            change = jnp.abs(wrap_angles(after[None] - before[:, None], continuous))
             total = cost[:, None] + jnp.maximum(change - largest_jump, 0).sum(axis=-1)
             return total.min(axis=0) + distance, total.argmin(axis=0)
 
@@ -122,7 +119,7 @@ def follow_mapper(
         proposed = jnp.take_along_axis(candidates, chosen[:, None, None], axis=1)[:, 0]
 
         def follow(pose: Array, target: Array) -> tuple[Array, tuple[Array, Array]]:
-            change = turn(target - pose)
+            change = wrap_angles(target - pose, continuous)
             bounded = jnp.clip(change, -largest_jump, largest_jump)
             return pose + bounded, (pose + bounded, jnp.all(bounded == change))
 

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import Arm, rated_speed
+from mimic.arms.arm import Arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.demonstrations import Demonstrations
 
@@ -134,7 +134,7 @@ def _reach_path(
 
     model, embodiment = arm.model, arm.embodiment
     hand = model.nbody - 1
-    rated = rated_speed(embodiment) * _REACH_SPEED_SHARE
+    rated = finite_velocity_limit(embodiment) * _REACH_SPEED_SHARE
     limits = [mink.VelocityLimit(model, dict(zip(embodiment.joint_names, rated, strict=True)))]
     configuration = mink.Configuration(model, np.asarray(embodiment.home, float))
     start = configuration.get_transform_frame_to_world(hand, "body")
