@@ -11,6 +11,7 @@ from mimic.commands.config import EvaluateConfig
 from mimic.commands.progress import SearchProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
+from mimic.config import new_folder
 from mimic.envs.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
@@ -34,10 +35,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
     run_dir = Path(config.run).expanduser()
     trained = load_config(run_dir)  # saved resolved: the machine does not matter
     check_checkpoint(run_dir, config.checkpoint)
-    out = Path(config.out).expanduser() if config.out else None
-    if out and (out.exists() or not out.parent.is_dir()):
-        reason = "exists; name a new folder" if out.exists() else f"there is no folder {str(out.parent)!r}"
-        raise ValueError(f"out: {str(out)!r}: {reason}")
+    out = new_folder("out", config.out) if config.out else None
     with stopwatch.stage("build"):
         trained, trainer = _trainer_to_evaluate(trained, run_dir, config)
         steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
@@ -47,8 +45,8 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         with stopwatch.stage("evaluate"):
             with SearchProgress(console, config.search.iterations) as progress:
                 outcome, controller = trainer.run_controller(config.controller, params, config.search, progress.update)
-            figures = {**trainer.figures(outcome), **trainer.details(outcome, config.controller)}
-        report = make_report(trained, trainer, figures, stopwatch, steps, 0)
+            metrics = {**trainer.metrics(outcome), **trainer.details(outcome, config.controller)}
+        report = make_report(trained, trainer, metrics, stopwatch, steps, 0)
         report |= {**controller, "evaluated": _conditions(trained, config)}
         show_report(console, report, trainer)
         if out:

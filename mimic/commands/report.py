@@ -20,14 +20,14 @@ def show_report(console: Console, report: Mapping[str, Any], trainer: Trainer) -
 
 
 def make_report(
-    config: TrainConfig, trainer: Trainer, figures: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
+    config: TrainConfig, trainer: Trainer, metrics: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
 ) -> dict[str, Any]:
     """What report.json holds.
 
     Args:
       config: of the run.
       trainer: of the run.
-      figures: of the evaluation.
+      metrics: metrics and details of the evaluation.
       stopwatch: of the process.
       steps: that the evaluated parameters were trained for.
       trained: steps that this process trained.
@@ -37,7 +37,7 @@ def make_report(
         "env": config.env.name,
         "trainer": config.trainer.name,
         "seed": config.seed,
-        **figures,
+        **metrics,
         "wall_time_s": wall_time,
         trainer.unit: steps,
         "steps_per_second": trained / wall_time["train"] if wall_time["train"] else 0.0,

@@ -135,9 +135,9 @@ def _train(
             group.end(0)
         with stopwatch.stage("evaluate"):
             outcome = trainer.evaluate(params)
-            figures = {**trainer.figures(outcome), **trainer.details(outcome)}
+            metrics = {**trainer.metrics(outcome), **trainer.details(outcome)}
         done_before = restore[0] if restore else 0
-        report = make_report(config, trainer, figures, stopwatch, steps, steps - done_before)
+        report = make_report(config, trainer, metrics, stopwatch, steps, steps - done_before)
         write_report(run_dir, report)
         trainer.save_outcome(run_dir, outcome)
     show_report(console, report, trainer)
@@ -154,7 +154,7 @@ def _train_and_log(
     stopwatch: Stopwatch,
     console: Console,
 ) -> tuple[int, Params]:
-    """Trains; evaluates, logs and shows the result after each stretch. Steps and parameters of the result."""
+    """Trains; evaluates, logs and shows the result after each training epoch. Steps and parameters of the result."""
     done_before = restore[0] if restore else 0
     with contextlib.ExitStack() as stack:
         loggers = [MetricsLog(run_dir), *make_loggers(config.loggers, run_dir, to_dict(config))]
@@ -163,25 +163,25 @@ def _train_and_log(
         progress = stack.enter_context(TrainingProgress(console, trainer.total_steps, done_before))
         stack.enter_context(stopwatch.stage("train"))
 
-        def on_evaluation(step: int, params: Params, metrics: Mapping[str, float]) -> bool:
+        def on_evaluation(step: int, params: Params, training_metrics: Mapping[str, float]) -> bool:
             with stopwatch.stage("evaluate"):
-                figures = trainer.figures(trainer.evaluate(params))
-                if metrics:
-                    row = {f"quality/{key}": value for key, value in _flat(figures).items()}
-                    row |= {f"training/{key}": value for key, value in metrics.items()}
+                metrics = trainer.metrics(trainer.evaluate(params))
+                if training_metrics:
+                    row = {f"quality/{key}": value for key, value in _flat(metrics).items()}
+                    row |= {f"training/{key}": value for key, value in training_metrics.items()}
                     row["wall_time_s"] = time.perf_counter() - stopwatch.started
                     for logger in loggers:
                         logger.write(step, row)
-                progress.update(step, trainer.status(figures), metrics.get("sps"))
-            return trainer.good_enough(figures)
+                progress.update(step, trainer.status(metrics), training_metrics.get("sps"))
+            return trainer.good_enough(metrics)
 
         return trainer.train(run_dir, on_evaluation, signals, restore)
 
 
-def _flat(figures: Mapping[str, Any]) -> dict[str, float]:
-    """Nested figures as one level, split names behind a dot."""
+def _flat(metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Nested metrics as one level, with keys METRIC.SPLIT."""
     flat: dict[str, float] = {}
-    for key, value in figures.items():
+    for key, value in metrics.items():
         if isinstance(value, Mapping):
             flat |= {f"{key}.{name}": number for name, number in value.items()}
         else:
