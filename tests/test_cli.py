@@ -155,7 +155,7 @@ def test_bad_retargeting_input(refused, demonstrations, tmp_path):
         ("figures", ["out=new", "only=[contour]"], "expected some of"),
         ("render", [], "run: expected the run directory"),
         ("render", ["run=missing"], "not a run directory"),
-        ("render", ["run=missing", "split=test"], "expected one of held_out, train, got 'test'"),
+        ("render", ["run=missing", "split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
 def test_bad_input_of_pictures(refused, command, arguments, message):
