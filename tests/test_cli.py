@@ -5,11 +5,13 @@ import os
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 
+import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.recording import record_demonstrations
 
@@ -185,6 +187,13 @@ def test_unreadable_run_directories(refused, tmp_path, command, key, config, mes
     if config is not None:
         (run_dir / "config.yaml").write_text(config)
     assert message in refused(command, f"{key}={run_dir}")
+
+
+def test_all_commands_are_listed():
+    commands = {f"mimic.{file.stem}" for file in (Path(mimic.__file__).parent / "conf").glob("*.yaml")}
+    result = subprocess.run([sys.executable, "-m", "mimic"], capture_output=True, text=True, timeout=60, check=False)
+    listed = [line.split(maxsplit=1) for line in result.stdout.splitlines()[2:]]
+    assert result.returncode == 0 and {module for module, _ in listed} == commands
 
 
 def test_help_names_the_environments():
