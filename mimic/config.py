@@ -1,6 +1,6 @@
 """Typed configs: frozen dataclasses as OmegaConf schemas, and what is wrong with a value in one line."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,24 +40,50 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
 
 
 def new_file(name: str, path: str) -> Path:
-    """Where a command shall write a file.
+    """The file that a command creates.
 
     Args:
-      name: of the key.
-      path: its value.
+      name: config key.
+      path: value of the key.
 
     Raises:
-      ValueError: no path, one that exists, or one in no folder.
+      ValueError: the path is empty, it exists, or its parent folder does not.
     """
     if not path:
         raise ValueError(f"{name}: expected a file, as in {name}=FILE")
-    file = Path(path).expanduser()
-    if file.exists() or not file.parent.is_dir():
-        reason = "exists; name a new file" if file.exists() else f"there is no folder {str(file.parent)!r}"
-        raise ValueError(f"{name}: {str(file)!r}: {reason}")
-    return file
+    return _new_path(name, path, "file")
+
+
+def new_folder(name: str, path: str) -> Path:
+    """The folder that a command creates.
+
+    Args:
+      name: config key.
+      path: value of the key.
+
+    Raises:
+      ValueError: the path exists, or its parent folder does not.
+    """
+    return _new_path(name, path, "folder")
+
+
+def _new_path(name: str, path: str, kind: str) -> Path:
+    new = Path(path).expanduser()
+    if new.exists() or not new.parent.is_dir():
+        reason = f"exists; name a new {kind}" if new.exists() else f"there is no folder {str(new.parent)!r}"
+        raise ValueError(f"{name}: {str(new)!r}: {reason}")
+    return new
 
 
 def to_dict(config: Any) -> dict[str, Any]:
     """A config as plain containers, for files."""
     return OmegaConf.to_container(OmegaConf.structured(config), resolve=True)  # type: ignore[return-value]
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one level with dotted keys, such as optimality_gap.train. Empty mappings stay values."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        is_nested = isinstance(value, Mapping) and value
+        flat |= flatten(value, f"{prefix}{key}.") if is_nested else {f"{prefix}{key}": value}
+    return flat
