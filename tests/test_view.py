@@ -240,7 +240,7 @@ def test_without_viser_the_extra_is_named(refused, monkeypatch):
 
 
 def test_nothing_of_the_view_but_its_page_needs_viser():
-    modules = ", ".join(f"mimic.viewer.{name}" for name in ("drawing", "live", "playback", "shapes", "viewer"))
+    modules = ", ".join(f"mimic.viewer.{name}" for name in ("html", "live_session", "playback", "meshes", "follower"))
     code = f"import sys; sys.modules['viser'] = None; import {modules}"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 

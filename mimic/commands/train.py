@@ -87,7 +87,7 @@ def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[s
         )
     merged = OmegaConf.merge(run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
     config = cast(TrainConfig, OmegaConf.to_object(merged))
-    total = config.trainer.total_steps
+    total = config.trainer.resolve().total_steps
     if steps >= total:
         raise ValueError(
             f"resume: {str(run_dir)!r} has been trained for {steps} of {total} steps; "

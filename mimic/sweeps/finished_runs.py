@@ -170,7 +170,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
 
 def _progress(path: Path, config: TrainConfig, history: Mapping[str, Mapping[int, float]]) -> str:
     step = max((step for column in history.values() for step in column), default=0)
-    total = config.trainer.total_steps
+    total = config.trainer.resolve().total_steps
     return f"no {REPORT}: stopped or still running, at {step:,} of {total:,} steps; resume={path} goes on with it"
 
 

@@ -68,6 +68,10 @@ class TrainerConfig:
         """How long resolved settings train."""
         raise NotImplementedError
 
+    def resolve(self) -> "TrainerConfig":
+        """The settings with every field filled in. Raises a `ValueError` where a value is out of range."""
+        raise NotImplementedError
+
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig(TrainerConfig):
