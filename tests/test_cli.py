@@ -82,10 +82,10 @@ def contents(demonstrations, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("truncated", "not a whole npz file"),
-        ("text", "not a whole npz file"),
+        ("truncated", "not a complete npz file"),
+        ("text", "not a complete npz file"),
         ("pickled", "pickled objects"),
-        ("bare pickle", "not a whole npz file"),
+        ("bare pickle", "not a complete npz file"),
         ("not finite", "values that are not finite"),
         ("other arm", "panda"),
         ("other step", "0.2"),

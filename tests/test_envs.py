@@ -218,9 +218,9 @@ def _rewritten(path, **changes):
     ("damage", "message"),
     [
         (lambda path: path.unlink(), "no file"),
-        (lambda path: path.write_bytes(path.read_bytes()[:300]), "not a whole npz"),
-        (lambda path: path.write_text("hello"), "not a whole npz"),
-        (lambda path: _with_array(path), "it holds a single array"),
+        (lambda path: path.write_bytes(path.read_bytes()[:300]), "not a complete npz"),
+        (lambda path: path.write_text("hello"), "not a complete npz"),
+        (lambda path: _with_array(path), "it has a single array"),
         (lambda path: _rewritten(path, seed=np.arange(2)), "seed"),
         (lambda path: _rewritten(path, arm=np.array(["a", "b"])), "arm"),
         (lambda path: _rewritten(path, goals=np.array([{}, None], dtype=object)), "pickled objects"),

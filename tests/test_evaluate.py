@@ -119,7 +119,7 @@ def test_crossovers_are_trained_on_and_not_evaluated():
         (["checkpoint=7"], "has no checkpoint 7; it has 0"),
         (["out=."], "exists; name a new folder"),
         (["out=no/new"], "there is no folder 'no'"),
-        (["mass=0"], "randomization.mass: expected [least, largest] factor above 0, got [0.0, 0.0]"),
+        (["mass=0"], "randomization.mass: expected [minimum, maximum] factor above 0, got [0.0, 0.0]"),
         (["torque_noise=-1"], "randomization.torque_noise: expected at least 0, got -1"),
         (["mass=[0,1]"], "mass"),
         (["demonstrations=missing.npz"], "no file at 'missing.npz'"),
@@ -132,9 +132,9 @@ def test_bad_evaluations(refused, run_dir, arguments, message):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("mass=[0,1]", "randomization.mass: expected [least, largest] factor above 0, got [0.0, 1.0]"),
-        ("damping=[2,1]", "randomization.damping: expected [least, largest] factor above 0, got [2.0, 1.0]"),
-        ("mass=[1]", "randomization.mass: expected [least, largest] factor above 0, got [1.0]"),
+        ("mass=[0,1]", "randomization.mass: expected [minimum, maximum] factor above 0, got [0.0, 1.0]"),
+        ("damping=[2,1]", "randomization.damping: expected [minimum, maximum] factor above 0, got [2.0, 1.0]"),
+        ("mass=[1]", "randomization.mass: expected [minimum, maximum] factor above 0, got [1.0]"),
         ("torque_noise=-1", "randomization.torque_noise: expected at least 0, got -1"),
         ("torque_noise=nan", "randomization.torque_noise: expected at least 0, got nan"),
     ],
@@ -155,7 +155,7 @@ def too_fast(demonstrations):
         (lambda given: dataclasses.replace(given, arm="panda"), "recorded with the joints joint1, joint2, joint3 of"),
         (lambda given: dataclasses.replace(given, dt=0.2), "recorded with a time step of 0.2 s"),
         (lambda given: given.of_length(HORIZON - 1), "19 steps long, but an episode of the environment has 20"),
-        (too_fast, "joint3 of demonstration 1 turns at 100 rad/s at 0.4 s, but its rated speed is"),
+        (too_fast, "joint3 of demonstration 1 has a velocity of 100 rad/s at 0.4 s, but its velocity limit is"),
     ],
 )
 def test_unfit_demonstrations(refused, run_dir, unseen, tmp_path, change, message):
@@ -176,7 +176,7 @@ def test_demonstrations_beyond_the_torque_limits(refused, tmp_path):
     assert given.torque is not None
     given.torque[1, 4, 2] = 87.1
     given.save(tmp_path / "unfit.npz")
-    message = "joint3 of demonstration 1 is held at 87.1 N m at 0.4 s, but its torque limit is 87 N m"
+    message = "joint3 of demonstration 1 has a torque of 87.1 N m at 0.4 s, but its torque limit is 87 N m"
     arguments = [f"run={folder}", f"demonstrations={tmp_path / 'unfit.npz'}", "compilation_cache="]
     assert message in refused("evaluate", *arguments)
 

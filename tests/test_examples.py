@@ -146,7 +146,7 @@ def test_demonstrations(said, tmp_path):
         np.testing.assert_allclose(waves.qpos[number_of_wave, :, 0], expected, atol=1e-3)  # splines of 0.02 s
     assert "velocities differentiated: True" in said
     assert re.search(r"degrees.csv is refused: .* expected rad in", said)
-    assert re.search(r"clock.csv is refused: .* its rated speed is", said)
+    assert re.search(r"clock.csv is refused: .* its velocity limit is", said)
     assert 0 < number(r"mean lower bound over the first wave: (\S+)", said) < 0.5
     assert is_picture(tmp_path / "waves_and_bound.png") and is_picture(tmp_path / "waves.png")
 

@@ -107,7 +107,9 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
         )
         steps = rollout.dt * np.arange(1, len(rollout.distance) + 1)
         poses = rollout.expert, rollout.learner
-        return Clip(title, ("expert", "learner"), rollout.time, poses, steps, curves, rollout.by_link, rollout.link_names)
+        return Clip(
+            title, ("expert", "learner"), rollout.time, poses, steps, curves, rollout.by_link, rollout.link_names
+        )
 
     return ClipPlan(trained.env, run_dir / "videos" / f"{config.split}-{config.demonstration}.mp4", compute)
 

@@ -46,7 +46,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         with stopwatch.stage("evaluate"):
             with SearchProgress(console, config.search.iterations) as progress:
                 outcome, controller = trainer.run_controller(config.controller, params, config.search, progress.update)
-            metrics = {**trainer.figures(outcome), **trainer.details(outcome, config.controller)}
+            metrics = {**trainer.metrics(outcome), **trainer.details(outcome, config.controller)}
         report = make_report(trained, trainer, metrics, stopwatch, steps, 0)
         report |= {**controller, "evaluated": _conditions(trained, config)}
         show_report(console, report, trainer)

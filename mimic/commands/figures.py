@@ -8,6 +8,7 @@ from rich.console import Console
 
 from mimic.commands import train
 from mimic.commands.config import FiguresConfig
+from mimic.config import check_new
 from mimic.envs import env_config
 from mimic.paper_figures.poses import FIGURES, save_figure
 from mimic.runs.checkpoints import checkpoint_steps
@@ -28,9 +29,8 @@ def prepare_figures(config: FiguresConfig) -> Callable[[], int]:
         raise ValueError(f"only: expected some of {', '.join(FIGURES)}, got {unknown[0]!r}")
     names = config.only or list(FIGURES)
     out = Path(config.out).expanduser()
-    existing = [out / f"{name}.png" for name in names if (out / f"{name}.png").exists()]
-    if existing:
-        raise ValueError(f"out: {str(existing[0])!r} exists; name another folder")
+    for name in names:
+        check_new("out", out / f"{name}.png", "name another folder")
     if out.exists() and not out.is_dir():
         raise ValueError(f"out: {str(out)!r} is a file; expected a folder")
     runs = Path(config.runs).expanduser() if config.runs else out / "runs"

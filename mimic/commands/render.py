@@ -21,6 +21,7 @@ from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
 from mimic.commands.config import RenderConfig  # noqa: E402
 from mimic.compilation import use_compilation_cache  # noqa: E402
+from mimic.config import check_new  # noqa: E402
 
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760  # pixels, width of the arms' picture
@@ -61,8 +62,7 @@ def _new_video(config: RenderConfig, default_out: Path | None) -> Path:
     if out.suffix != ".mp4":
         raise ValueError(f"out: expected a file that ends in .mp4, got {str(out)!r}")
     for path in (out, out.with_suffix(".gif")):
-        if path.exists():
-            raise ValueError(f"out: {str(path)!r} exists; name a new file")
+        check_new("out", path, "name a new file")
     if config.out and not out.parent.is_dir():
         raise ValueError(f"out: there is no folder {str(out.parent)!r}")
     return out

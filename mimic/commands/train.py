@@ -139,7 +139,7 @@ def _train(
             group.end(0)
         with stopwatch.stage("evaluate"):
             outcome = trainer.evaluate(params)
-            metrics = {**trainer.figures(outcome), **trainer.details(outcome)}
+            metrics = {**trainer.metrics(outcome), **trainer.details(outcome)}
         resumed_steps = restore[0] if restore else 0
         report = make_report(config, trainer, metrics, stopwatch, steps, steps - resumed_steps)
         write_report(run_dir, report)
@@ -169,7 +169,7 @@ def _train_and_log(
 
         def on_evaluation(step: int, params: Params, training_metrics: Mapping[str, float]) -> bool:
             with stopwatch.stage("evaluate"):
-                metrics = trainer.figures(trainer.evaluate(params))
+                metrics = trainer.metrics(trainer.evaluate(params))
                 if training_metrics:
                     row = {f"quality/{key}": value for key, value in flatten(metrics).items()}
                     row |= {f"training/{key}": value for key, value in training_metrics.items()}
