@@ -62,11 +62,11 @@ def curves(clip):
 
 
 def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
-    recipe = prepare_clip(RenderConfig(run=str(mapper_run), demonstration=1, seed=5))
-    clip, mapper = recipe.make(), mimic.PoseMapper.load(mapper_run)
-    assert recipe.out == mapper_run / "videos" / "pd-seed5-1.mp4"
+    plan = prepare_clip(RenderConfig(run=str(mapper_run), demonstration=1, seed=5))
+    clip, mapper = plan.compute(), mimic.PoseMapper.load(mapper_run)
+    assert plan.out == mapper_run / "videos" / "pd-seed5-1.mp4"
     expert, learner = clip.poses
-    recorded = record_demonstrations(build_arm(recipe.env.expert), 2, seed=5, horizon=STEPS)
+    recorded = record_demonstrations(build_arm(plan.env.expert), 2, seed=5, horizon=STEPS)
     np.testing.assert_allclose(expert[::EVERY], recorded.qpos[1], atol=1e-6)
     np.testing.assert_allclose(learner, mapper(expert.astype(np.float32)), atol=ROUNDING)
     shown = curves(clip)
@@ -79,7 +79,7 @@ def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
 
 
 def test_retargeted_motions_are_shown_as_they_are(files):
-    clip = prepare_clip(RenderConfig(**files, demonstration=1)).make()
+    clip = prepare_clip(RenderConfig(**files, demonstration=1)).compute()
     env = env_config("planar4dof")
     for shown, arm in zip(clip.poses, (env.expert, env.learner), strict=True):
         motions = swings(build_arm(arm).embodiment)
@@ -91,10 +91,10 @@ def test_retargeted_motions_are_shown_as_they_are(files):
 
 
 def test_a_frame_shows_the_moment(files):
-    recipe = prepare_clip(RenderConfig(**files))
-    clip = recipe.make()
+    plan = prepare_clip(RenderConfig(**files))
+    clip = plan.compute()
     few = dataclasses.replace(clip, time=clip.time[:2], poses=tuple(poses[[0, -1]] for poses in clip.poses))
-    with ArmScene([recipe.env.expert, recipe.env.learner], width=160, height=120) as scene:
+    with ArmScene([plan.env.expert, recipe.env.learner], width=160, height=120) as scene:
         first, last = draw_frames(scene, few)
     assert first.shape == last.shape == (640, 1280, 3)
     changed = np.any(first != last, axis=-1)
@@ -118,14 +118,14 @@ def test_a_video_has_all_frames(files, tmp_path):
         ({}, "out: expected a file, as in out=FILE.mp4"),
         ({"out": "swing.gif"}, "expected a file that ends in .mp4"),
         ({"learner": ""}, "learner: expected what mimic.retarget was given"),
-        ({"retargeted": ""}, "retargeted: expected what mimic.retarget was given or wrote"),
+        ({"retargeted": ""}, "retargeted: expected with retargeted=FILE"),
         ({"demonstrations": ""}, "demonstrations: expected what mimic.retarget was given"),
         ({"demonstrations": "none.npz"}, "no file at 'none.npz'"),
         ({"learner": "planar7dof"}, "demonstrations: expected motions of planar4 .* got planar7"),
         ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
-        ({"demonstration": 2}, "demonstration: expected 0 to 1, those of the file, got 2"),
-        ({"run": "runs/NAME"}, "run: does not go with retargeted=FILE"),
-        ({"seed": 1}, "seed: does not go with retargeted=FILE"),
+        ({"demonstration": 2}, "demonstration: expected an index of the file from 0 to 1, got 2"),
+        ({"run": "runs/NAME"}, "run: has no effect with retargeted=FILE"),
+        ({"seed": 1}, "seed: has no effect with retargeted=FILE"),
     ],
 )
 def test_bad_files_are_rejected_in_one_line(files, changes, message):
@@ -145,7 +145,7 @@ def test_motions_of_another_length_are_rejected(files, tmp_path):
 
 def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
     bad: list[tuple[dict[str, Any], str]] = [
-        ({"split": "train"}, "split: does not go with a run of trainer=pose_mapper"),
+        ({"split": "train"}, "split: has no effect with a run of trainer=pose_mapper"),
         ({"seed": -1}, "demonstration, seed: expected at least 0"),
         ({"checkpoint": 7}, "checkpoint"),
         ({"demonstrations": files["retargeted"]}, "demonstrations: expected motions of planar7"),

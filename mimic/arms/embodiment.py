@@ -193,10 +193,10 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
     directions = [(link.end - link.start) / link.length for link in links]
     segments = [(start, end, index) for index, link in enumerate(links) for start, end in link.segments]
     return Embodiment(
-        joint_axis=_snap(np.stack([joint.axis for joint in joints])),
-        joint_anchor=_snap(np.stack([joint.anchor for joint in joints])),
-        link_position=_snap(np.stack([link.start + frame_at * (link.end - link.start) for link in links])),
-        link_rotation=_snap(np.stack([_rotation_to(direction) for direction in directions])),
+        joint_axis=snap_to_units(np.stack([joint.axis for joint in joints])),
+        joint_anchor=snap_to_units(np.stack([joint.anchor for joint in joints])),
+        link_position=snap_to_units(np.stack([link.start + frame_at * (link.end - link.start) for link in links])),
+        link_rotation=snap_to_units(np.stack([_rotation_to(direction) for direction in directions])),
         link_lengths=np.array([link.length for link in links]),
         joint_range=np.array([joint.range for joint in joints]),
         torque_limit=np.array([joint.torque_limit for joint in joints]),
@@ -218,8 +218,8 @@ def segment_arm(arm: Embodiment) -> Embodiment:
     lengths = np.linalg.norm(end - start, axis=1)
     return dataclasses.replace(
         arm,
-        link_position=_snap(start),
-        link_rotation=_snap(np.stack([_rotation_to(way) for way in (end - start) / lengths[:, None]])),
+        link_position=snap_to_units(start),
+        link_rotation=snap_to_units(np.stack([_rotation_to(way) for way in (end - start) / lengths[:, None]])),
         link_lengths=lengths,
         link_names=tuple(f"segment{i + 1}" for i in range(len(lengths))),
         link_joint=tuple(arm.link_joint[link] for link in arm.segment_link),
@@ -239,8 +239,11 @@ def _locked_embodiment(chain: Chain, angles: dict[str, float], name: str, links:
     return from_chain(lock(chain, angles, links), name="-".join([name, *angles]))
 
 
-def _snap(values: np.ndarray) -> np.ndarray:
-    """Values that quaternions and sines left within 1e-12 of -1, 0 or 1, made exact: those cost nothing (`spatial`)."""
+def snap_to_units(values: np.ndarray) -> np.ndarray:
+    """Values within 1e-12 of -1, 0 or 1 set to these numbers exactly; others as they are.
+
+    Quaternions and sines leave such rounding errors. Exact zeros and ones cost nothing: see `mimic.metric.spatial`.
+    """
     nearest = np.clip(np.round(values), -1, 1)
     return np.where(np.abs(values - nearest) < 1e-12, nearest, values)
 

@@ -22,7 +22,7 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.motions import largest_jump, optimal_motions
-from mimic.retargeting.pose import pose_limits
+from mimic.retargeting.pose import continuous_joints, wrap_angles
 from mimic.trainers.pose_mapper.model import PoseMapper
 
 
@@ -106,12 +106,12 @@ def follow_mapper(
     model = mapper.model
     candidates = jax.jit(jax.vmap(jax.vmap(functools.partial(model.candidates, mapper.params))))(qpos)
     distances = jax.jit(jax.vmap(jax.vmap(jax.vmap(model.distance, (None, 0)))))(qpos, candidates)
-    limits = pose_limits(model.learner, np.float32)
+    continuous = continuous_joints(model.learner)
 
     def motion(candidates: Array, distances: Array) -> tuple[Array, Array]:
         def extend(cost: Array, step: tuple[Array, Array, Array]) -> tuple[Array, Array]:
             previous, current, distance = step
-            change = jnp.abs(wrap_full_turns(current[None] - previous[:, None], limits))
+            change = jnp.abs(wrap_angles(current[None] - previous[:, None], continuous))
             total = cost[:, None] + jnp.maximum(change - largest_jump, 0).sum(axis=-1)
             return total.min(axis=0) + distance, total.argmin(axis=0)
 
@@ -122,7 +122,7 @@ def follow_mapper(
         proposed = jnp.take_along_axis(candidates, heads[:, None, None], axis=1)[:, 0]
 
         def follow(pose: Array, target: Array) -> tuple[Array, tuple[Array, Array]]:
-            change = wrap_full_turns(target - pose, limits)
+            change = wrap_angles(target - pose, continuous)
             bounded = jnp.clip(change, -largest_jump, largest_jump)
             return pose + bounded, (pose + bounded, jnp.all(bounded == change))
 
