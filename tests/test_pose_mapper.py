@@ -155,7 +155,7 @@ def test_limited_joints_stay_within_their_limits():
     found = mapper(poses(mapper, 64))
     assert np.any(found < lower + 1e-3) and np.any(found > upper - 1e-3)
     assert np.all((found >= lower - 1e-5) & (found <= upper + 1e-5))
-    with pytest.raises(ValueError, match="joint1 at 3.0000 rad is outside its range"):
+    with pytest.raises(ValueError, match="joint1 at 3.0000 rad is outside of its range"):
         mapper(np.array([3.0, 0, 0, -1, 0, 1, 0]))
 
 

@@ -94,7 +94,7 @@ def test_a_frame_shows_the_moment(files):
     plan = prepare_clip(RenderConfig(**files))
     clip = plan.compute()
     few = dataclasses.replace(clip, time=clip.time[:2], poses=tuple(poses[[0, -1]] for poses in clip.poses))
-    with ArmScene([plan.env.expert, recipe.env.learner], width=160, height=120) as scene:
+    with ArmScene([plan.env.expert, plan.env.learner], width=160, height=120) as scene:
         first, last = draw_frames(scene, few)
     assert first.shape == last.shape == (640, 1280, 3)
     changed = np.any(first != last, axis=-1)
