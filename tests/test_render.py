@@ -117,9 +117,9 @@ def test_a_video_has_all_frames(files, tmp_path):
     [
         ({}, "out: expected a file, as in out=FILE.mp4"),
         ({"out": "swing.gif"}, "expected a file that ends in .mp4"),
-        ({"learner": ""}, "learner: expected what mimic.retarget was given"),
+        ({"learner": ""}, "learner: expected with retargeted=FILE"),
         ({"retargeted": ""}, "retargeted: expected with retargeted=FILE"),
-        ({"demonstrations": ""}, "demonstrations: expected what mimic.retarget was given"),
+        ({"demonstrations": ""}, "demonstrations: expected with retargeted=FILE"),
         ({"demonstrations": "none.npz"}, "no file at 'none.npz'"),
         ({"learner": "planar7dof"}, "demonstrations: expected motions of planar4 .* got planar7"),
         ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
@@ -138,7 +138,7 @@ def test_motions_of_another_length_are_rejected(files, tmp_path):
     learner = build_arm(env_config("planar4dof").learner).embodiment
     swings(learner, count=1).save(tmp_path / "one.npz")
     with pytest.raises(
-        ValueError, match="expected 2 motions of 4 steps of 0.1 s, as the demonstrations, got 1 motions"
+        ValueError, match="expected 2 motions of 4 steps of 0.1 s, as in demonstrations, got 1 motions"
     ):
         prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
 
@@ -149,7 +149,7 @@ def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
         ({"seed": -1}, "demonstration, seed: expected at least 0"),
         ({"checkpoint": 7}, "checkpoint"),
         ({"demonstrations": files["retargeted"]}, "demonstrations: expected motions of planar7"),
-        ({"demonstrations": files["demonstrations"], "demonstration": 3}, "expected 0 to 1"),
+        ({"demonstrations": files["demonstrations"], "demonstration": 3}, "from 0 to 1"),
     ]
     for changes, message in bad:
         with pytest.raises(ValueError, match=message):
