@@ -1,7 +1,7 @@
 """Content of a video as arrays: a policy's rollout, the poses of a pose mapper, or retargeted motions."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
 from mimic.metric.kinematics import link_states
+from mimic.metric.similarity import centre_line_table, similarity
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_ppo_trainer
@@ -49,6 +50,7 @@ class Clip:
       curves: embodiment distances over time.
       bars: contribution of each link of the learner to the distance, [samples, links].
       bar_names: names of these links.
+      similarity: measures of `mimic.metric.similarity` of the poses, each of shape [frames].
     """
 
     title: str
@@ -59,6 +61,7 @@ class Clip:
     curves: tuple[Curve, ...]
     bars: Float[np.ndarray, "samples links"]
     bar_names: tuple[str, ...]
+    similarity: Mapping[str, Float[np.ndarray, " frames"]]
 
 
 class ClipPlan(NamedTuple):
@@ -90,7 +93,7 @@ def prepare_clip(config: RenderConfig) -> ClipPlan:
 
 
 def _policy_clip(config: RenderConfig) -> ClipPlan:
-    """A policy's rollout, with the lower bound and the distance of holding the start pose."""
+    """A policy's rollout, with the kinematic bound and the distance of holding the start pose."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
     _check_unused(config, "a run of trainer=ppo", "demonstrations", "learner", "limits", "seed")
     trainer = make_ppo_trainer(trained, run_dir)
@@ -103,13 +106,13 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
         curves = (
             Curve("holding the start pose", rollout.hold, _HOLD),
             Curve("policy", rollout.distance, {"color": "tab:blue"}),
-            Curve("lower bound", rollout.bound, _OPTIMUM),
+            Curve("kinematic bound", rollout.bound, _OPTIMUM),
         )
         steps = rollout.dt * np.arange(1, len(rollout.distance) + 1)
         poses = rollout.expert, rollout.learner
-        return Clip(
-            title, ("expert", "learner"), rollout.time, poses, steps, curves, rollout.by_link, rollout.link_names
-        )
+        measures = _similarity((trainer.evaluator.env.expert, trainer.evaluator.env.learner), poses)
+        bars = rollout.by_link, rollout.link_names
+        return Clip(title, ("expert", "learner"), rollout.time, poses, steps, curves, *bars, measures)
 
     return ClipPlan(trained.env, run_dir / "videos" / f"{config.split}-{config.demonstration}.mp4", compute)
 
@@ -201,7 +204,14 @@ def _static_clip(
         Curve("optimal poses", np.asarray(optimum.distance), _OPTIMUM),
     )
     labels = "expert", f"learner, {by}"
-    return Clip(title, labels, time, (qpos, learner_qpos), time, curves, by_link, learner.link_names)
+    poses = qpos, learner_qpos
+    measures = _similarity((expert, learner), poses)
+    return Clip(title, labels, time, poses, time, curves, by_link, learner.link_names, measures)
+
+
+def _similarity(arms: tuple[Embodiment, Embodiment], poses: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
+    """Similarity measures of two arms at each frame."""
+    return similarity(*(centre_line_table(arm, qpos) for arm, qpos in zip(arms, poses, strict=True)))
 
 
 def _resampled(motions: Demonstrations, number: int) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from jaxtyping import UInt8  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from matplotlib.text import Text  # noqa: E402
 from PIL import Image  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
@@ -22,6 +24,7 @@ from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: 
 from mimic.commands.config import RenderConfig  # noqa: E402
 from mimic.compilation import use_compilation_cache  # noqa: E402
 from mimic.config import check_new  # noqa: E402
+from mimic.evaluation.labels import similarity_texts  # noqa: E402
 
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760  # pixels, width of the arms' picture
@@ -74,8 +77,8 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
     The static artists are drawn once and blitted: drawing all of them for each frame costs as much as rendering.
     """
     figure = plt.figure(figsize=(_SIZE[0] / _DPI, _SIZE[1] / _DPI), dpi=_DPI)
-    width = _SCENE / _SIZE[0]  # fraction of the frame that shows the arms
-    scene_axes = figure.add_axes((0, 0, width, 1))
+    scene_width = _SCENE / _SIZE[0]  # fraction of the frame that shows the arms
+    scene_axes = figure.add_axes((0, 0, scene_width, 1))
     scene_axes.axis("off")
     picture = scene_axes.imshow(scene.image([poses[0] for poses in clip.poses]), interpolation="nearest")
     texts = [
@@ -83,18 +86,20 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
         for place, label in zip((0.27, 0.73), clip.labels, strict=True)
     ]
     texts.append(scene_axes.text(0.02, 0.95, clip.title, transform=scene_axes.transAxes, fontsize=12))
-    over_time = figure.add_axes((width + 0.07, 0.57, 1 - width - 0.09, 0.36))
+    left, plot_width = scene_width + 0.07, 1 - scene_width - 0.09
+    over_time = figure.add_axes((left, 0.66, plot_width, 0.28))
     for curve in clip.curves:
         over_time.plot(clip.curve_time, curve.values, label=curve.label, **curve.style)
     now = over_time.axvline(0, color="tab:red", lw=1)
     over_time.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, clip.curve_time[-1]))
     over_time.legend(fontsize="small", loc="best")  # where it hides the curves least
     over_time.grid(alpha=0.3)
-    links = figure.add_axes((width + 0.07, 0.09, 1 - width - 0.09, 0.32))
+    similarity = _add_similarity(figure, (left, 0.42, plot_width, 0.12), clip)
+    links = figure.add_axes((left, 0.09, plot_width, 0.25))
     bars = links.bar(range(len(clip.bar_names)), clip.bars[0], color="tab:blue")
     links.set_xticks(range(len(clip.bar_names)), [name.replace("link", "") for name in clip.bar_names])
     links.set(title="contribution of each learner link", ylim=(0, 1.05 * clip.bars.max()))
-    animated = [picture, *texts, now, *bars]
+    animated = [picture, *texts, now, *similarity.values(), *bars]
     for artist in animated:
         artist.set_animated(True)
     canvas: Any = figure.canvas
@@ -106,11 +111,31 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
         now.set_xdata([time, time])
         for bar, height in zip(bars, clip.bars[sample], strict=True):
             bar.set_height(height)
+        for name, (_, value) in similarity_texts(_similarity_at(clip, frame)).items():
+            similarity[name].set_text(value)
         canvas.restore_region(background)
         for artist in animated:
             figure.draw_artist(artist)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
     plt.close(figure)
+
+
+def _add_similarity(figure: Figure, bounds: tuple[float, float, float, float], clip: Clip) -> dict[str, Text]:
+    """Adds the similarity measures in columns and returns the texts of their values, which change with the frame."""
+    panel = figure.add_axes(bounds)
+    panel.axis("off")
+    panel.set_title("similarity (0: identical; lengths in chain lengths)")
+    texts = similarity_texts(_similarity_at(clip, 0))
+    values = {}
+    for column, (name, (label, value)) in enumerate(texts.items()):
+        position: Any = {"x": (column + 0.5) / len(texts), "transform": panel.transAxes, "ha": "center", "va": "center"}
+        panel.text(y=0.72, s=label.replace(" ", "\n"), fontsize=9, color="dimgrey", **position)
+        values[name] = panel.text(y=0.12, s=value, fontsize=13, **position)
+    return values
+
+
+def _similarity_at(clip: Clip, frame: int) -> dict[str, float]:
+    return {name: float(values[frame]) for name, values in clip.similarity.items()}
 
 
 def _write_video(out: Path, frames: Any) -> list[Image.Image]:

@@ -12,7 +12,12 @@ import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 
 from mimic.arms.embodiment import Embodiment, planar_arm  # noqa: E402
-from mimic.metric.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence  # noqa: E402
+from mimic.metric.correspondence import (  # noqa: E402
+    arc_length_correspondence,
+    hard_correspondence,
+    overlap_correspondence,
+    soft_correspondence,
+)
 from mimic.metric.distance import DistanceWeights, link_distances  # noqa: E402
 from mimic.metric.kinematics import link_states  # noqa: E402
 from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
@@ -59,7 +64,8 @@ def draw_links() -> Any:
 
 def draw_correspondence() -> Any:
     """Draws both chains on [0, 1], and correspondence matrices W from overlap and from the distances in one pose."""
-    figure, (chains, *maps) = plt.subplots(1, 4, figsize=(11, 3), layout="constrained", width_ratios=(1.6, 1, 1, 1))
+    ratios = 1.6, 1, 1, 1, 1
+    figure, (chains, *maps) = plt.subplots(1, 5, figsize=(13, 3), layout="constrained", width_ratios=ratios)
     for height, arm, colour, label in ((1, _EXPERT, EXPERT_COLOUR, "expert"), (0, _LEARNER, LEARNER_COLOUR, "learner")):
         _draw_chain(chains, arm, height, colour)
         chains.text(-0.03, height, label, ha="right", va="center", color=colour)
@@ -69,6 +75,7 @@ def draw_correspondence() -> Any:
     distances = link_distances(*states, _ROTATION)
     soft: Callable[..., Any] = functools.partial(soft_correspondence, xi=_XI)
     matrices = {
+        "arc length (default)": arc_length_correspondence(_EXPERT, _LEARNER),
         "overlap": overlap_correspondence(_EXPERT, _LEARNER),
         "hard": hard_correspondence(distances),
         rf"soft, $\xi = {_XI:g}$": soft(distances),

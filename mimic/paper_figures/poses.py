@@ -17,6 +17,7 @@ import numpy as np  # noqa: E402
 from mimic.arms.embodiment import planar_arm  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs import env_config  # noqa: E402
+from mimic.metric.config import MetricConfig  # noqa: E402
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
 from mimic.metric.distance import DistanceWeights, adaptive_weights  # noqa: E402
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
@@ -54,15 +55,20 @@ def draw_weights(load_mapper: LoadMapper) -> Any:
 
 
 def draw_contours(load_mapper: LoadMapper) -> Any:
-    """Draws the distance over all poses of an identical two-link arm, with every local minimum (paper, Fig. 2 d-f)."""
+    """Draws the distance over all poses of an identical two-link arm, with every local minimum.
+
+    Panels d-f are those of Fig. 2 of the paper; panel g shows the default metric.
+    """
     del load_mapper
+    default = MetricConfig()
     metrics = (
         ("state-dependent W", hard_correspondence, DistanceWeights(1.5, 1.0)),
         ("state-dependent W, adaptive weights", hard_correspondence, adaptive_weights),
         ("static W, rotation only", overlap_correspondence(_TWO_LINKS, _TWO_LINKS), DistanceWeights(0.0, 1.0)),
+        ("default metric", default.make_correspondence(_TWO_LINKS, _TWO_LINKS), default.make_weights()),
     )
-    figure, all_axes = plt.subplots(1, 3, figsize=(10, 3.5), sharey=True, layout="constrained")
-    for letter, axes, (name, correspondence, weights) in zip("def", all_axes, metrics, strict=True):
+    figure, all_axes = plt.subplots(1, 4, figsize=(13, 3.6), sharey=True, layout="constrained")
+    for letter, axes, (name, correspondence, weights) in zip("defg", all_axes, metrics, strict=True):
         angles, distance = distance_landscape(_TWO_LINKS, _TWO_LINKS, _CONTOUR_POSE, correspondence, weights)
         filled = axes.contourf(angles, angles, distance.T, levels=24, cmap="viridis")
         axes.contour(angles, angles, distance.T, levels=24, colors="black", linewidths=0.2)
@@ -71,7 +77,7 @@ def draw_contours(load_mapper: LoadMapper) -> Any:
         axes.plot(angles[minima[:, 0]], angles[minima[:, 1]], "o", color="white", mec="black", ms=6)
         axes.plot(angles[best[0]], angles[best[1]], "*", color="red", mec="white", ms=13)
         count = f"{len(minima)} local minima" if len(minima) > 1 else "1 local minimum"
-        axes.set_title(f"({letter})  {name}: {count}", fontsize="small")
+        axes.set_title(f"({letter})  {name}:\n{count}", fontsize="small")
         axes.set(xlabel=r"$\hat q_1$ [rad]", aspect="equal")
         figure.colorbar(filled, ax=axes, shrink=0.75, ticks=matplotlib.ticker.MaxNLocator(6))
     all_axes[0].set_ylabel(r"$\hat q_2$ [rad]")
