@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from rich.console import Console
 from rich.table import Table
 
-from mimic.arms.arm import rated_speed
+from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import RetargetConfig
 from mimic.commands.progress import similarity_table
@@ -57,7 +57,7 @@ def retarget(
       ValueError: the demonstrations belong to another arm or leave its joint range, or the mapper is for other arms.
     """
     _check(demonstrations, expert)
-    rated, jump = rated_speed(learner), largest_jump(learner, demonstrations.dt)
+    rated, jump = finite_velocity_limit(learner), largest_jump(learner, demonstrations.dt)
     expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
     if mapper is None:
         solution = optimal_motions(expert, learner, expert_qpos, metric, jump, seed)
