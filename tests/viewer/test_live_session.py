@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.arms.arm import ArmConfig, build_arm, rated_speed
+from mimic.arms.arm import ArmConfig, build_arm, finite_velocity_limit
 from mimic.commands import train
 from mimic.envs import env_config
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
