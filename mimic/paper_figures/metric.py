@@ -1,4 +1,4 @@
-"""Pictures that explain the metric: what is compared, and which links with which."""
+"""Figures that explain the metric: link frames, distances and correspondence matrices."""
 
 import functools
 from collections.abc import Callable
@@ -31,7 +31,7 @@ _TRANSLATION, _ROTATION = DistanceWeights(translation=1.0, rotation=0.0), Distan
 
 
 def draw_links() -> Any:
-    """Two arms with the frames of their links, and the distances of all pairs of links in position and direction."""
+    """Draws two arms with the frames of their links, and the position and rotation distances of all pairs of links."""
     figure, (arms, *maps) = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained", width_ratios=(1.5, 1, 1))
     positions, directions = [], []
     for arm, pose, colour, label in (
@@ -63,7 +63,7 @@ def draw_links() -> Any:
 
 
 def draw_correspondence() -> Any:
-    """Both chains laid on [0, 1], and the matrices W that are made of it, or of the distances in one pose."""
+    """Draws both chains on [0, 1], and correspondence matrices W from overlap and from the distances in one pose."""
     ratios = 1.6, 1, 1, 1, 1
     figure, (chains, *maps) = plt.subplots(1, 5, figsize=(13, 3), layout="constrained", width_ratios=ratios)
     for height, arm, colour, label in ((1, _EXPERT, EXPERT_COLOUR, "expert"), (0, _LEARNER, LEARNER_COLOUR, "learner")):
@@ -86,7 +86,7 @@ def draw_correspondence() -> Any:
 
 
 def _draw_angle(axes: Any, corner: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
-    """The angle between two directions, drawn where the second one starts."""
+    """Draws the angle between two directions at the start of the second one."""
     axes.plot(*np.transpose([corner, corner + 1.4 * _ARROW * first]), ":", color="black", lw=1)
     angles = np.degrees([np.arctan2(*direction[::-1]) for direction in (first, second)])
     low, high = sorted(angles)
@@ -109,8 +109,8 @@ def _draw_chain(axes: Any, arm: Embodiment, height: float, colour: str) -> None:
 def _draw_matrix(axes: Any, matrix: np.ndarray, title: str) -> None:
     axes.imshow(matrix, cmap="viridis", vmin=0)
     for (row, column), value in np.ndenumerate(matrix):
-        light = value > 0.6 * matrix.max()
-        axes.text(column, row, f"{value:.2f}", ha="center", va="center", color="black" if light else "white")
+        is_light = value > 0.6 * matrix.max()
+        axes.text(column, row, f"{value:.2f}", ha="center", va="center", color="black" if is_light else "white")
     rows, columns = matrix.shape
     axes.set(xticks=range(columns), yticks=range(rows), title=title, xlabel="learner link", ylabel="expert link")
     axes.set_xticklabels(range(1, columns + 1))

@@ -63,11 +63,11 @@ def curves(clip):
 
 
 def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
-    recipe = prepare_clip(RenderConfig(run=str(mapper_run), demonstration=1, seed=5))
-    clip, mapper = recipe.make(), mimic.PoseMapper.load(mapper_run)
-    assert recipe.out == mapper_run / "videos" / "pd-seed5-1.mp4"
+    plan = prepare_clip(RenderConfig(run=str(mapper_run), demonstration=1, seed=5))
+    clip, mapper = plan.compute(), mimic.PoseMapper.load(mapper_run)
+    assert plan.out == mapper_run / "videos" / "pd-seed5-1.mp4"
     expert, learner = clip.poses
-    recorded = record_demonstrations(build_arm(recipe.env.expert), 2, seed=5, horizon=STEPS)
+    recorded = record_demonstrations(build_arm(plan.env.expert), 2, seed=5, horizon=STEPS)
     np.testing.assert_allclose(expert[::EVERY], recorded.qpos[1], atol=1e-6)
     np.testing.assert_allclose(learner, mapper(expert.astype(np.float32)), atol=ROUNDING)
     shown = curves(clip)
@@ -80,7 +80,7 @@ def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
 
 
 def test_retargeted_motions_are_shown_as_they_are(files):
-    clip = prepare_clip(RenderConfig(**files, demonstration=1)).make()
+    clip = prepare_clip(RenderConfig(**files, demonstration=1)).compute()
     env = env_config("planar4dof")
     for shown, arm in zip(clip.poses, (env.expert, env.learner), strict=True):
         motions = swings(build_arm(arm).embodiment)
@@ -92,9 +92,9 @@ def test_retargeted_motions_are_shown_as_they_are(files):
 
 
 def test_each_frame_has_the_measures_of_similarity(files):
-    recipe = prepare_clip(RenderConfig(**files))
-    clip = recipe.make()
-    arms = build_arm(recipe.env.expert).embodiment, build_arm(recipe.env.learner).embodiment
+    plan = prepare_clip(RenderConfig(**files))
+    clip = plan.compute()
+    arms = build_arm(plan.env.expert).embodiment, build_arm(plan.env.learner).embodiment
     frame = 5
     lines = (centre_line(arm, poses[frame]) for arm, poses in zip(arms, clip.poses, strict=True))
     for name, expected in similarity(*lines).items():
@@ -103,10 +103,10 @@ def test_each_frame_has_the_measures_of_similarity(files):
 
 
 def test_a_frame_shows_the_moment(files):
-    recipe = prepare_clip(RenderConfig(**files))
-    clip = recipe.make()
+    plan = prepare_clip(RenderConfig(**files))
+    clip = plan.compute()
     few = dataclasses.replace(clip, time=clip.time[:2], poses=tuple(poses[[0, -1]] for poses in clip.poses))
-    with ArmScene([recipe.env.expert, recipe.env.learner], width=160, height=120) as scene:
+    with ArmScene([plan.env.expert, plan.env.learner], width=160, height=120) as scene:
         first, last = draw_frames(scene, few)
     assert first.shape == last.shape == (640, 1280, 3)
     changed = np.any(first != last, axis=-1)
@@ -129,15 +129,15 @@ def test_a_video_has_all_frames(files, tmp_path):
     [
         ({}, "out: expected a file, as in out=FILE.mp4"),
         ({"out": "swing.gif"}, "expected a file that ends in .mp4"),
-        ({"learner": ""}, "learner: expected what mimic.retarget was given"),
-        ({"retargeted": ""}, "retargeted: expected what mimic.retarget was given or wrote"),
-        ({"demonstrations": ""}, "demonstrations: expected what mimic.retarget was given"),
+        ({"learner": ""}, "learner: expected with retargeted=FILE"),
+        ({"retargeted": ""}, "retargeted: expected with retargeted=FILE"),
+        ({"demonstrations": ""}, "demonstrations: expected with retargeted=FILE"),
         ({"demonstrations": "none.npz"}, "no file at 'none.npz'"),
         ({"learner": "planar7dof"}, "demonstrations: expected motions of planar4 .* got planar7"),
         ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
-        ({"demonstration": 2}, "demonstration: expected 0 to 1, those of the file, got 2"),
-        ({"run": "runs/NAME"}, "run: does not go with retargeted=FILE"),
-        ({"seed": 1}, "seed: does not go with retargeted=FILE"),
+        ({"demonstration": 2}, "demonstration: expected an index of the file from 0 to 1, got 2"),
+        ({"run": "runs/NAME"}, "run: has no effect with retargeted=FILE"),
+        ({"seed": 1}, "seed: has no effect with retargeted=FILE"),
     ],
 )
 def test_bad_files_are_rejected_in_one_line(files, changes, message):
@@ -149,19 +149,17 @@ def test_bad_files_are_rejected_in_one_line(files, changes, message):
 def test_motions_of_another_length_are_rejected(files, tmp_path):
     learner = build_arm(env_config("planar4dof").learner).embodiment
     swings(learner, count=1).save(tmp_path / "one.npz")
-    with pytest.raises(
-        ValueError, match="expected 2 motions of 4 steps of 0.1 s, as the demonstrations, got 1 motions"
-    ):
+    with pytest.raises(ValueError, match="expected 2 motions of 4 steps of 0.1 s, as in demonstrations, got 1 motions"):
         prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
 
 
 def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
     bad: list[tuple[dict[str, Any], str]] = [
-        ({"split": "train"}, "split: does not go with a run of trainer=pose_mapper"),
+        ({"split": "train"}, "split: has no effect with a run of trainer=pose_mapper"),
         ({"seed": -1}, "demonstration, seed: expected at least 0"),
         ({"checkpoint": 7}, "checkpoint"),
         ({"demonstrations": files["retargeted"]}, "demonstrations: expected motions of planar7"),
-        ({"demonstrations": files["demonstrations"], "demonstration": 3}, "expected 0 to 1"),
+        ({"demonstrations": files["demonstrations"], "demonstration": 3}, "from 0 to 1"),
     ]
     for changes, message in bad:
         with pytest.raises(ValueError, match=message):
@@ -173,7 +171,7 @@ def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
     [
         ([], "run: expected the run directory"),
         (["run=missing"], "not a run directory"),
-        (["run=missing", "split=test"], "expected one of held_out, train, got 'test'"),
+        (["run=missing", "split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
 def test_bad_input_of_the_command(refused, arguments, message):

@@ -147,7 +147,7 @@ def test_velocities_are_checked_without_torques_and_rounding_passes(recorded):
     ("change", "message"),
     [
         (lambda recorded: dataclasses.replace(recorded, arm="other"), "recorded with the joints"),
-        (lambda recorded: changed(recorded, "qvel", 3.0), "turns at"),
+        (lambda recorded: changed(recorded, "qvel", 3.0), "has a velocity of"),
         (lambda recorded: recorded.select([0]), "holds 1, but count=1 to train on and held_out=1 are asked for"),
     ],
     ids=["another arm", "too fast", "too few"],

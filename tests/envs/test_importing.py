@@ -63,7 +63,7 @@ def test_a_table_becomes_demonstrations_that_training_takes(tmp_path, monkeypatc
                    velocity_names=[f"qdot_{i}" for i in numbers])  # fmt: skip
     out = tmp_path / "swing.npz"
     said = run(monkeypatch, capsys, f"source={source}", f"out={out}")
-    assert "1 demonstrations, 50 steps of 0.1 s; velocities: as in the file" in said
+    assert "1 demonstrations, 50 steps of 0.1 s; velocities: from the file" in said
     assert {path.name for path in tmp_path.iterdir()} == {"swing.csv", "swing.npz", "swing.png"}
     loaded = mimic.load_demonstrations(out)
     qpos, qvel = swing(0.1 * np.arange(51))
