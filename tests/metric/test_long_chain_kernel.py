@@ -79,7 +79,7 @@ def test_the_kernel_computes_what_the_composition_does(x64, long_kernel, case):
     correspondence = overlap_correspondence(*arms) if correspondence is None else correspondence
     batch = motions(arms, fused_kernel.DEFAULT.block + 1)  # the last block is partial
     expected = values_and_gradients(arms, correspondence, weights, batch)
-    distance = motion_distance(*arms, correspondence, weights)
+    distance = motion_distance(arms[0], arms[1], correspondence, weights)
     np.testing.assert_allclose(jax.jit(jax.vmap(distance))(*batch)[:, None], expected[0], atol=1e-13)  # rounding
     for by in ((2,), ARGUMENTS):
         value, gradients = jax.jit(jax.vmap(jax.value_and_grad(distance, by)))(*batch)
