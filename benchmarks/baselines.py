@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize  # pyri
 
 import mimic
 from benchmarks.mujoco_task import MujocoTask
-from mimic.trainers.config import PPOConfig
+from mimic.trainers.config import PPOSettings
 
 STEPS = 256  # of each arm in a batch: 4096 arms at once, as on a GPU, would be as many processes
 
@@ -51,21 +51,21 @@ def make_arm(name: str, seed: int) -> Callable[[], GymnasiumArm]:
     return make
 
 
-def learn(name: str, config: PPOConfig, batches: int, stretches: int) -> tuple[int, list[float]]:
+def learn(name: str, config: PPOSettings, batches: int, stretches: int) -> tuple[int, list[float]]:
     """Environment steps of a stretch of so many batches, and the seconds of each stretch."""
     arms = os.cpu_count() or 1
     workers = SubprocVecEnv([make_arm(name, seed) for seed in range(arms)], start_method="spawn")
     model = PPO(
         "MlpPolicy",
         VecNormalize(workers, norm_reward=False),
-        learning_rate=config.learning_rate,  # type: ignore[arg-type]
+        learning_rate=config.learning_rate,
         n_steps=STEPS,
-        batch_size=max(arms * STEPS // config.num_minibatches, 2),  # type: ignore[operator]
-        n_epochs=config.num_updates_per_batch,  # type: ignore[arg-type]
-        gamma=config.discounting,  # type: ignore[arg-type]
+        batch_size=max(arms * STEPS // config.num_minibatches, 2),
+        n_epochs=config.num_updates_per_batch,
+        gamma=config.discounting,
         gae_lambda=config.gae_lambda,
         clip_range=config.clipping_epsilon,
-        ent_coef=config.entropy_cost,  # type: ignore[arg-type]
+        ent_coef=config.entropy_cost,
         max_grad_norm=config.max_grad_norm,
         policy_kwargs={"net_arch": list(config.hidden_layers or ())},
         device="cpu",

@@ -36,14 +36,14 @@ from benchmarks.record import write_results  # noqa: E402
 from mimic import compat  # noqa: E402
 from mimic.envs.imitation import ImitationEnv  # noqa: E402
 from mimic.envs.wrappers import wrap_for_training  # noqa: E402
-from mimic.trainers.config import PPOConfig  # noqa: E402
+from mimic.trainers.config import PPOConfig, PPOSettings  # noqa: E402
 from mimic.trainers.ppo import training  # noqa: E402
 from mimic.trainers.ppo.programs import make_programs  # noqa: E402
 
 ON_PROCESSOR = "stable-baselines3, C MuJoCo"
 _STRETCHES = 6  # the first compiles
 
-Case = Callable[[str, PPOConfig, int], dict[str, float]]
+Case = Callable[[str, PPOSettings, int], dict[str, float]]
 
 
 def rates(steps: int, seconds: Sequence[float]) -> dict[str, float]:
@@ -57,10 +57,10 @@ def rates(steps: int, seconds: Sequence[float]) -> dict[str, float]:
     }
 
 
-def learn(env: ImitationEnv, config: PPOConfig, batches: int) -> dict[str, float]:
+def learn(env: ImitationEnv, config: PPOSettings, batches: int) -> dict[str, float]:
     """PPO as `mimic.train` runs it, in stretches of so many batches."""
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    schedule = optax.constant_schedule(config.learning_rate)  # type: ignore[arg-type]
+    schedule = optax.constant_schedule(config.learning_rate)
     seconds: list[float] = []
     began = time.perf_counter()
     begin, program = make_programs(env, config, networks, batches, schedule, None)
@@ -74,7 +74,7 @@ def learn(env: ImitationEnv, config: PPOConfig, batches: int) -> dict[str, float
 
 
 def learn_by_brax(
-    env: Env, wrap: Callable[..., Env], horizon: int, config: PPOConfig, batches: int
+    env: Env, wrap: Callable[..., Env], horizon: int, config: PPOSettings, batches: int
 ) -> dict[str, float]:
     """Brax's own training loop, in stretches of so many batches."""
     compat.mend_brax()
@@ -102,7 +102,7 @@ def learn_by_brax(
     return rates(steps, seconds)
 
 
-def settings(config: PPOConfig) -> dict[str, Any]:
+def settings(config: PPOSettings) -> dict[str, Any]:
     """Of a resolved config, under brax's names."""
     return {
         "num_envs": config.num_envs,
@@ -120,7 +120,7 @@ def settings(config: PPOConfig) -> dict[str, Any]:
     }
 
 
-def _brax_networks(config: PPOConfig) -> Callable[..., Any]:
+def _brax_networks(config: PPOSettings) -> Callable[..., Any]:
     hidden = tuple(config.hidden_layers or ())
     return functools.partial(make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden)
 
@@ -129,17 +129,17 @@ def own(physics: str) -> Case:
     return lambda name, config, batches: learn(mimic.make(name, physics=physics), config, batches)
 
 
-def in_brax_loop(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+def in_brax_loop(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
     env = mimic.make(name, physics="fused")
     return learn_by_brax(env, wrap_for_training, env.config.horizon, config, batches)
 
 
-def carried(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+def carried(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
     env = mimic.make(name, physics="mjx")
     return learn_by_brax(stock.StockEnv(env), stock.wrap, env.config.horizon, config, batches)
 
 
-def one_at_a_time(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+def one_at_a_time(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
     from benchmarks import baselines  # needs packages that mimic does not
 
     return rates(*baselines.learn(name, config, batches, _STRETCHES))
@@ -154,7 +154,7 @@ CASES: dict[str, Case] = {
 }
 
 
-def run(name: str, config: PPOConfig, cases: Sequence[str], batches: int) -> list[dict[str, Any]]:
+def run(name: str, config: PPOSettings, cases: Sequence[str], batches: int) -> list[dict[str, Any]]:
     """A row for each case; what cannot run is a row that says why."""
     rows = []
     for case in cases:

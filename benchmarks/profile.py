@@ -23,7 +23,7 @@ from rich.table import Table
 
 import mimic
 from benchmarks.record import write_results
-from mimic.trainers.config import PPOConfig
+from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import make_programs
 
@@ -89,9 +89,9 @@ def busy(events: Iterable[Event]) -> float:
 def profile(name: str, batches: int) -> dict[str, Any]:
     """One call of the training program."""
     env = mimic.make(name, physics="fused")
-    config = PPOConfig().resolve(jax.default_backend(), jax.device_count())
+    config = PPOSettings().resolve(jax.default_backend(), jax.device_count())
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    schedule = optax.constant_schedule(config.learning_rate)  # type: ignore[arg-type]
+    schedule = optax.constant_schedule(config.learning_rate)
     begin, program = make_programs(env, config, networks, batches, schedule, None)
     learning, _ = jax.block_until_ready(program()(begin()(0)))
     with tempfile.TemporaryDirectory() as folder:

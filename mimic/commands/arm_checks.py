@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +10,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale, with_minimum_armature
+from mimic.arms.arm import DEFAULT_VELOCITY_LIMIT, Arm, ArmConfig, arm_spec, torque_scale, with_minimum_armature
 from mimic.arms.embodiment import load_arm
 from mimic.envs.config import EnvConfig
 from mimic.envs.recording import record_demonstrations
-from mimic.metric.distance import embodiment_distance
-from mimic.metric.kinematics import LinkStates, link_state_table
+from mimic.metric.kinematics import link_state_table
 from mimic.retargeting.kinematic_bound import closest_motion
 
 _DEMONSTRATIONS, _EVERY = 2, 5  # few, and of them every fifth step: a rough value in seconds
@@ -46,29 +44,23 @@ class ReachableDistance:
 
 
 def reachable_distance(expert: Arm, learner: Arm, config: EnvConfig) -> ReachableDistance:
-    """Kinematic bound and holding still, on a few random demonstrations.
+    """Kinematic bound and holding the start pose, on a few random demonstrations.
 
     Raises:
       ValueError: the expert's limits leave it no goal.
     """
     recorded = record_demonstrations(expert, _DEMONSTRATIONS, horizon=config.horizon, dt=config.control_dt)
-    pair, metric = (expert.embodiment, learner.embodiment), config.metric
-    correspondence, weights = metric.make_correspondence(*pair), metric.make_weights()
-    measure: dict[str, Any] = {"rotation": metric.rotation_measure, "reduction": metric.reduction}
+    pair = expert.embodiment, learner.embodiment
+    metric = config.metric.build(*pair)
     qpos, qvel = (
         x[:, 1::_EVERY].reshape(-1, expert.embodiment.num_joints).astype(np.float32)
         for x in (recorded.qpos, recorded.qvel)
     )
 
-    def distance(expert_states: LinkStates, learner_states: LinkStates) -> jax.Array:
-        return embodiment_distance(expert_states, learner_states, correspondence, weights, **measure)
-
     home = np.broadcast_to(np.asarray(learner.embodiment.home), (len(qpos), learner.embodiment.num_joints))
     still = link_state_table(learner.embodiment, home, np.zeros_like(home))
-    hold = jax.jit(jax.vmap(distance))(link_state_table(expert.embodiment, qpos, qvel), still)
-    found = jax.jit(lambda qpos, qvel: closest_motion(*pair, qpos, qvel, correspondence, weights, **measure))(
-        qpos, qvel
-    )
+    hold = jax.jit(jax.vmap(metric))(link_state_table(expert.embodiment, qpos, qvel), still)
+    found = jax.jit(lambda qpos, qvel: closest_motion(*pair, qpos, qvel, **metric.arguments))(qpos, qvel)
     return ReachableDistance(
         float(jnp.mean(found.distance)), float(jnp.mean(hold)), qpos[:, None], np.asarray(found.qpos)[:, None]
     )
@@ -110,7 +102,7 @@ def assumptions(config: ArmConfig, arm: Arm) -> Iterator[str]:
     without = names[~np.isfinite(embodiment.velocity_limit)]
     if without.size:
         yield (
-            f"no rated speed for {_listed(without)}: {UNKNOWN_SPEED:.2f} rad/s is assumed; a custom numeric "
+            f"no rated speed for {_listed(without)}: {DEFAULT_VELOCITY_LIMIT:.2f} rad/s is assumed; a custom numeric "
             "velocity_limit in the MJCF, one number for each joint, states it"
         )
     without = names[~np.isfinite(embodiment.torque_limit)]

@@ -1,4 +1,4 @@
-"""`python -m mimic.evaluate`: repeats the report of a run from a checkpoint alone, or for another controller."""
+"""`python -m mimic.evaluate`: evaluates a run from a checkpoint, or another controller in place of its policy."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,61 +7,60 @@ from typing import Any
 
 from rich.console import Console
 
-from mimic import compat
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.progress import SearchProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
+from mimic.config import new_folder
 from mimic.envs.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.make import make_trainer
+from mimic.trainers.make import make_ppo_trainer, make_trainer
 from mimic.trainers.run_config import load_config
-from mimic.trainers.trainer import Params, Trainer
+from mimic.trainers.trainer import Trainer
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
-    """An evaluation of a run from a checkpoint alone, ready to start.
+    """Checks the config of an evaluation and restores the run from its checkpoint.
 
     Raises:
-      ValueError: no run directory, no such checkpoint, an `out` that exists, or what only a policy can be asked for.
+      ValueError: the run directory or the checkpoint is missing, `out` exists, or the options need a policy and the
+        run has none.
     """
     stopwatch = Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
     if not config.run:
         raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
-    trained = load_config(run_dir)  # saved resolved: the machine does not matter
+    trained = load_config(run_dir)  # saved with all values resolved, so that they do not depend on this machine
     check_checkpoint(run_dir, config.checkpoint)
-    out = Path(config.out).expanduser() if config.out else None
-    if out and (out.exists() or not out.parent.is_dir()):
-        reason = "exists; name a new folder" if out.exists() else f"there is no folder {str(out.parent)!r}"
-        raise ValueError(f"out: {str(out)!r}: {reason}")
+    out = new_folder("out", config.out) if config.out else None
     with stopwatch.stage("build"):
-        trained, job = _job_to_evaluate(trained, run_dir, config)
-        steps, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
+        trained, trainer = _trainer_to_evaluate(trained, run_dir, config)
+        steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
 
     def run() -> None:
         console = Console()
         with stopwatch.stage("evaluate"):
-            outcome, controller = _outcome(job, params, config, console)
-            figures = {**job.figures(outcome), **job.details(outcome, config.controller)}
-        report = make_report(trained, job, figures, stopwatch, steps, 0)
+            with SearchProgress(console, config.search.iterations) as progress:
+                outcome, controller = trainer.run_controller(config.controller, params, config.search, progress.update)
+            metrics = {**trainer.metrics(outcome), **trainer.details(outcome, config.controller)}
+        report = make_report(trained, trainer, metrics, stopwatch, steps, 0)
         report |= {**controller, "evaluated": _conditions(trained, config)}
-        show_report(console, report, job)
+        show_report(console, report, trainer)
         if out:
             out.mkdir()
-            job.save_outcome(out, outcome, config.controller)
+            trainer.save_outcome(out, outcome, config.controller)
             write_report(out, report)
             console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
 
     return run
 
 
-def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
-    """A run as it was, or with other demonstrations, physics or loads."""
+def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
+    """The trainer of a run, with the demonstrations, the physics and the arm parameters of the evaluation."""
     factors = {"mass": config.mass, "damping": config.damping}
     changes: dict[str, Any] = {key: [value, value] for key, value in factors.items() if value is not None}
     if config.torque_noise is not None:
@@ -79,15 +78,12 @@ def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig
         randomization=dataclasses.replace(trained.env.randomization, **changes),
     )
     trained = dataclasses.replace(trained, env=env)
-    compat.import_mjx()
-    from mimic.trainers.ppo.trainer import PPOTrainer
-
     unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
-    return trained, PPOTrainer(trained, run_dir, unseen)
+    return trained, make_ppo_trainer(trained, run_dir, unseen)
 
 
 def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
-    """What an evaluation was made under."""
+    """The conditions of an evaluation, for its report."""
     env = trained.env
     return {
         "run": config.run,
@@ -95,23 +91,3 @@ def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
         "physics": env.physics,
         **dataclasses.asdict(env.randomization),
     }
-
-
-def _outcome(job: Trainer, params: Params, config: EvaluateConfig, console: Console) -> tuple[Any, dict[str, Any]]:
-    """What a controller did, and what the report says of the controller."""
-    if config.controller == "policy":
-        return job.evaluate(params), {}
-    from mimic.trainers.ppo.trainer import PPOTrainer
-
-    assert isinstance(job, PPOTrainer)
-    if config.controller == "searched":
-        from mimic.evaluation.searched_torques import search_torques
-
-        policy = job.controller(params)
-        with SearchProgress(console, config.search.iterations) as progress:
-            outcome, starts = search_torques(job.evaluator, policy, config.search, progress.update)
-        return outcome, {"trainer": "searched", "search": dataclasses.asdict(config.search), "starts": starts}
-    from mimic.evaluation.tracking_controllers import run_controller
-
-    outcome, frequency = run_controller(job.evaluator, config.controller)
-    return outcome, {"trainer": config.controller, "frequency_rad_s": frequency}

@@ -11,7 +11,7 @@ from tests.helpers import random_arms
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
 
-# Craig's DH table from the maker's manual, and the segments that the metric compares, at the zero pose .
+# Craig's DH table from the manufacturer's manual, and the segments that the metric compares, at the zero pose .
 DH = [  # a_{i-1} [m], d_i [m], alpha_{i-1} [rad]
     (0, 0.333, 0),
     (0, 0, -np.pi / 2),
@@ -37,7 +37,7 @@ ENDS = [
 # --- the Panda --------------------------------------------------------------------------------------------------------
 
 
-def test_panda_has_the_makers_kinematics(x64):
+def test_panda_has_the_manufacturers_kinematics(x64):
     """The flange of a random pose, by the DH table."""
     qpos = np.random.default_rng(0).uniform(-2, 2, 7)
     T = np.eye(4)
@@ -189,7 +189,7 @@ def test_planar_arm_refuses_bad_lengths(lengths):
 
 @pytest.mark.parametrize("frame_at", [-0.1, 1.1, np.nan])
 def test_planar_arm_refuses_a_frame_off_the_link(frame_at):
-    with pytest.raises(ValueError, match=r"^frame_at: expected a share of the link in \[0, 1\], got "):
+    with pytest.raises(ValueError, match=r"^frame_at: expected a fraction of the link in \[0, 1\], got "):
         planar_arm([1.0], frame_at=frame_at)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.model_files import LARGEST_FILE, read_model, read_spec
+from mimic.arms.model_files import MAX_FILE_SIZE, read_model, read_spec
 from tests.helpers import original_model
 
 POSES = 40
@@ -84,10 +84,10 @@ def test_an_arm_that_others_wrote_moves_as_its_model_says(x64, name):
 
 
 def test_the_arm_of_a_scene_is_its_longest_chain(x64):
-    """A kitchen around a Franka: it includes files outside of its folder, so that MuJoCo itself must read it."""
+    """A kitchen around a Franka: it includes files outside its folder, so that MuJoCo itself must read it."""
     reach, _ = other("Fetch")
     file = reach.parents[1] / "kitchen_franka" / "kitchen_assets" / "kitchen_env_model.xml"
-    with pytest.raises(ValueError, match="outside of its folder"):
+    with pytest.raises(ValueError, match="outside its folder"):
         mimic.load_mjcf(file)
     model = mujoco.MjModel.from_xml_path(str(file))
     arm = mimic.load_mjcf(model)
@@ -181,24 +181,24 @@ FILES = {
     "an entity bomb": (BOMB, "'.*arm.xml' declares a document type or entities; expected plain MJCF or URDF$"),
     "an include outside": (
         '<mujoco><include file="../other.xml"/></mujoco>',
-        "'.*arm.xml' includes '../other.xml', which is outside of its folder; expected files in ",
+        "'.*arm.xml' includes '../other.xml', which is outside its folder; expected files in ",
     ),
     "an absolute include": (
         '<mujoco><include file="/etc/hosts"/></mujoco>',
         "'.*arm.xml' includes '/etc/hosts', which is outside",
     ),
-    "an include of itself": ('<mujoco><include file="arm.xml"/></mujoco>', "'.*arm.xml' is no MJCF or URDF model"),
+    "an include of itself": ('<mujoco><include file="arm.xml"/></mujoco>', "'.*arm.xml' is not an MJCF or URDF model"),
     "a missing mesh": (
         '<mujoco><asset><mesh name="a" file="a.stl"/></asset>'
         '<worldbody><geom type="mesh" mesh="a"/></worldbody></mujoco>',
-        "'.*arm.xml' needs the file 'a.stl', which is not there; expected all its files beside it$",
+        "'.*arm.xml' needs the file 'a.stl', which does not exist; expected all its files next to it$",
     ),
     "no inertia": (
         "<mujoco><worldbody><body><joint/></body></worldbody></mujoco>",
         "'.*arm.xml' has a moving body without inertia; expected an <inertial>",
     ),
-    "huge": (" " * (LARGEST_FILE + 1), "'.*arm.xml' has 32 MiB; expected a model of at most 32 MiB of XML$"),
-    "a broken URDF": ('<robot name="a"><link name="b"></robot>', "'.*arm.xml' is no MJCF or URDF model"),
+    "huge": (" " * (MAX_FILE_SIZE + 1), "'.*arm.xml' has 32 MiB; expected a model of at most 32 MiB of XML$"),
+    "a broken URDF": ('<robot name="a"><link name="b"></robot>', "'.*arm.xml' is not an MJCF or URDF model"),
 }
 
 

@@ -93,7 +93,7 @@ def test_unnamed_joints_get_names():
 
 def test_links_of_length_zero_are_merged_with_a_message(caplog):
     wrist = hinge("c", axis="0 1 0", inner=TIP)  # same anchor as b
-    chain._warn_of_merged.cache_clear()
+    chain._warn_merged.cache_clear()
     with caplog.at_level(logging.WARNING):
         arm = load_mjcf(toy(wrist))
     assert (arm.joint_names, arm.link_names, arm.link_joint) == (("a", "b", "c"), ("link1", "link3"), (0, 2))
@@ -157,13 +157,17 @@ BETWEEN = (
 )
 STATIC = '<body name="hand" pos="0.5 0 0"><geom size="0.01"/><site name="palm"/></body>'
 MODELS = {
-    "no joint": (lambda: model('<geom size="1"/>'), {}, "the model has no hinge joint$"),
-    "slides only": (lambda: model('<body><joint type="slide"/><geom size="1"/></body>'), {}, "the model has no hinge"),
-    "none behind base": (lambda: toy(TIP), {"base": "B"}, "the model has no hinge joint between base and tip"),
+    "no joint": (lambda: model('<geom size="1"/>'), {}, "the model has no revolute joint$"),
+    "slides only": (
+        lambda: model('<body><joint type="slide"/><geom size="1"/></body>'),
+        {},
+        "the model has no revolute",
+    ),
+    "none behind base": (lambda: toy(TIP), {"base": "B"}, "the model has no revolute joint between base and tip"),
     "branch": (
         lambda: model(BRANCH),
         {},
-        "the model branches: bodies 'B' and 'C' lead to 1 hinges each; name one end with tip=",
+        "the model branches: bodies 'B' and 'C' lead to 1 revolute joints each; name one end with tip=",
     ),
     "two arms": (
         lambda: model(hinge("a", body="A") + hinge("b", body="B")),
@@ -173,7 +177,7 @@ MODELS = {
     "slide": (
         lambda: model(hinge("a", body="A", inner=BETWEEN)),
         {},
-        "expected hinges only; joint 's' on the chain is a slide: start behind it with base=",
+        "expected revolute joints only; joint 's' on the chain is a slide: start distal to it with base=",
     ),
     "weld": (
         lambda: toy(TIP, '<equality><weld name="tie" body1="B"/></equality>'),
@@ -232,11 +236,11 @@ def test_an_active_loop_between_sites_is_refused(active):
 
 FILES = {
     "missing": (None, "no MJCF or URDF file at '.*arm.xml'$"),
-    "empty": ("", "'.*arm.xml' is no MJCF or URDF model that MuJoCo reads: "),
-    "not xml": ("joint1 = 3", "'.*arm.xml' is no MJCF or URDF model that MuJoCo reads: "),
-    "not mjcf": ("<html><body/></html>", "'.*arm.xml' is no MJCF or URDF model that MuJoCo reads: "),
-    "broken": ("<mujoco><worldbody><body>", "'.*arm.xml' is no MJCF or URDF model that MuJoCo reads: "),
-    "misspelt": ("<mujoco><worldbody><boby/></worldbody></mujoco>", "'.*arm.xml' is no MJCF or URDF model .*boby"),
+    "empty": ("", "'.*arm.xml' is not an MJCF or URDF model that MuJoCo can read: "),
+    "not xml": ("joint1 = 3", "'.*arm.xml' is not an MJCF or URDF model that MuJoCo can read: "),
+    "not mjcf": ("<html><body/></html>", "'.*arm.xml' is not an MJCF or URDF model that MuJoCo can read: "),
+    "broken": ("<mujoco><worldbody><body>", "'.*arm.xml' is not an MJCF or URDF model that MuJoCo can read: "),
+    "misspelt": ("<mujoco><worldbody><boby/></worldbody></mujoco>", "'.*arm.xml' is not an MJCF or URDF model .*boby"),
 }
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.arms.arm import ArmConfig, build_arm, simulation_model
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.simulation_model import simulation_model
 from mimic.envs import dynamics
 from mimic.envs.config import PHYSICS
 from mimic.envs.physics import Load, make_advance

@@ -79,7 +79,7 @@ def test_the_kernel_computes_what_the_composition_does(x64, long_kernel, case):
     correspondence = overlap_correspondence(*arms) if correspondence is None else correspondence
     batch = motions(arms, fused_kernel.DEFAULT.block + 1)  # the last block is partial
     value, *gradients = values_and_gradients(arms, correspondence, weights, batch)
-    distance = motion_distance(*arms, correspondence, weights)
+    distance = motion_distance(arms[0], arms[1], correspondence, weights)
     found: list = [jax.jit(jax.vmap(distance))(*batch)]
     expected = [value]
     for by in ((2,), ARGUMENTS):

@@ -160,6 +160,37 @@ def test_devices_see_different_arms_and_learn_the_same(physics):
     assert ended.returncode == 0, ended.stderr[-2000:]
 
 
+def test_entropy_cost_and_discount_change_with_the_progress():
+    config = PPOConfig(entropy_cost=0.2, final_entropy_cost=0.1, discounting=0.9, final_discounting=0.5).resolve("cpu")
+    assert config.at(0.0) == config
+    assert config.at(0.5).entropy_cost == pytest.approx(0.11) and config.at(0.5).discounting == pytest.approx(0.7)
+    assert config.at(1.0).entropy_cost == pytest.approx(0.02) and config.at(1.0).discounting == pytest.approx(0.5)
+    constant = PPOConfig(discounting=0.4).resolve("cpu")
+    assert constant.at(0.5) is constant and constant.final_discounting == 0.4
+
+
+def test_a_batch_learns_by_the_settings_of_its_progress():
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    small = {"num_envs": 4, "batch_size": 4, "num_minibatches": 1, "num_updates_per_batch": 1, "hidden_layers": [8]}
+
+    def after(batches, **settings):
+        config = PPOConfig(**small, **settings).resolve("cpu")  # type: ignore[arg-type]
+        networks = training.make_networks(config, env.observation_size, env.action_size)
+        rate = optax.constant_schedule(1e-3)
+        begin, learn = programs.make_programs(env, config, networks, 1, rate, None, lambda count: count / 2)
+        state, learn = begin()(7), learn()
+        for _ in range(batches):
+            state, _ = learn(state)
+        return jax.device_get(state.params)
+
+    constant, decayed = {"entropy_cost": 0.2}, {"entropy_cost": 0.2, "final_entropy_cost": 0.0}
+    rounding = {"rtol": 1e-5, "atol": 1e-7}  # other programs, in float32
+    jax.tree.map(lambda *x: np.testing.assert_allclose(*x, **rounding), after(1, **constant), after(1, **decayed))
+    policies = after(2, **constant)[1], after(2, **decayed)[1]
+    apart = jax.tree.map(lambda *x: float(np.abs(x[0] - x[1]).max()), *policies)
+    assert max(jax.tree.leaves(apart)) > 1e-4  # Adam moves by 1e-3 an update, whatever the gradient's size
+
+
 def test_both_programs_are_compiled_with_the_options_of_a_run(monkeypatch):
     monkeypatch.setattr(programs, "compiler_options", lambda: {"no_option_of_xla": True})
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})

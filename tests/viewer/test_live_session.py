@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.arms.arm import ArmConfig, build_arm, rated_speed
+from mimic.arms.arm import ArmConfig, build_arm, finite_velocity_limit
 from mimic.commands import train
 from mimic.envs import env_config
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
@@ -91,7 +91,7 @@ def test_no_joint_of_the_learner_jumps(live, env):
         assert after is not None
         change = [after.learner[name] - frame.learner[name] for name in arm.joint_names]
         change = np.abs(np.angle(np.exp(1j * np.array(change))))
-        assert np.all(change <= rated_speed(arm) * TICK + 1e-5)  # rounding of angles near pi
+        assert np.all(change <= finite_velocity_limit(arm) * TICK + 1e-5)  # rounding of angles near pi
         frame = after
 
 
