@@ -17,12 +17,13 @@ from rich.console import Console  # noqa: E402
 from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from mimic.arms.arm import Arm, ArmConfig, rated_speed, torque_scale
+from mimic.arms.arm import Arm, ArmConfig, finite_velocity_limit, torque_scale
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.commands.arm_checks import ReachableDistance, assumptions, calmed, joint_ranges, reachable_distance, warnings  # noqa: E402
 from mimic.commands.config import InspectConfig  # noqa: E402
 from mimic.commands.progress import similarity_table  # noqa: E402
+from mimic.config import new_folder  # noqa: E402
 from mimic.envs.config import EnvConfig
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
 from mimic.paper_figures.pose_picture import PosePairs, nearest_poses, readable_poses, save_poses  # noqa: E402
@@ -37,7 +38,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     Raises:
       ValueError: an arm that cannot be trained, no OpenGL for the picture, or an `out` that exists.
     """
-    out = _new_folder(config.out)
+    out = new_folder("out", config.out) if config.out else None
     env = EnvConfig(name="pair", expert=config.expert, learner=config.learner, limits=config.limits)
     expert, learner = env.build_arms()
     joints, links = _joints(learner, config.learner, env), _links(expert, learner, env)
@@ -124,21 +125,11 @@ def _arm_words(key: str, arm: ArmConfig) -> list[str]:
     return [shlex.quote(word) if "{" in word else word for word in (word.replace("'", "") for word in words)]
 
 
-def _new_folder(path: str) -> Path | None:
-    if not path:
-        return None
-    folder = Path(path).expanduser()
-    if folder.exists() or not folder.parent.is_dir():
-        reason = "exists; name a new folder" if folder.exists() else f"there is no folder {str(folder.parent)!r}"
-        raise ValueError(f"out: {str(folder)!r}: {reason}")
-    return folder
-
-
 def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]:
     embodiment = arm.embodiment
     columns = {
         "range": joint_ranges(config, arm).tolist(),
-        "rated speed": rated_speed(embodiment).tolist(),
+        "rated speed": finite_velocity_limit(embodiment).tolist(),
         "speed is assumed": (~np.isfinite(embodiment.velocity_limit)).tolist(),
         "torque limit": [float(x) if np.isfinite(x) else None for x in embodiment.torque_limit],
         "torque offered": torque_scale(arm, env.action_scale, env.control_dt).tolist(),

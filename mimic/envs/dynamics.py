@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from mimic.arms.embodiment import snap_to_units
 from mimic.metric.spatial import (
     IDENTITY,
     ZERO,
@@ -37,7 +38,6 @@ from mimic.metric.spatial import (
 
 _Z: Vector = (0.0, 0.0, 1.0)
 _NONE: Rotation = (ZERO, ZERO, ZERO)
-_ROUNDING = 1e-12  # what rotations to and fro leave of a zero
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,8 +94,8 @@ def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
         previous_frame, previous_origin = frame, origin
         frame, origin = _frame(axis, previous_frame), anchor + axis @ (previous_origin - anchor) * axis
         pose = np.eye(4)
-        pose[:3, :3] = _rounded(previous_frame.T @ frame)
-        pose[:3, 3] = _rounded(previous_frame.T @ (origin - previous_origin))
+        pose[:3, :3] = snap_to_units(previous_frame.T @ frame)
+        pose[:3, 3] = snap_to_units(previous_frame.T @ (origin - previous_origin))
         body = int(model.jnt_bodyid[joint])
         carries = last_joint[body] == joint  # of several joints in one body, the last one moves it
         poses.append(pose)
@@ -328,9 +328,3 @@ def _mass(model: mujoco.MjModel, data: mujoco.MjData, body: int, frame: np.ndarr
     result[:3, :3] = axes @ np.diag(inertia.sum() / 2 - inertia) @ axes.T
     centre = np.append(frame.T @ (data.xipos[body] - origin), 1.0)
     return result + model.body_mass[body] * np.outer(centre, centre)
-
-
-def _rounded(values: np.ndarray) -> np.ndarray:
-    """Exact zeros and ones where they are meant: what is known to be zero is not computed."""
-    near = np.round(values)
-    return np.where(np.abs(values - near) < _ROUNDING, near, values)
