@@ -84,9 +84,11 @@ class PPOConfig(TrainerConfig):
       num_updates_per_batch: passes over a batch.
       learning_rate: of Adam at the start.
       final_learning_rate: as a share of it at the end; the decay is linear.
-      discounting: of the reward.
+      discounting: of the reward, at the start.
+      final_discounting: at the end; the change is linear. The same as at the start where None.
       gae_lambda: of the advantage estimate.
-      entropy_cost: reward for a wide action distribution.
+      entropy_cost: reward for a wide action distribution, at the start.
+      final_entropy_cost: as a share of it at the end; the change is linear.
       clipping_epsilon: of the policy ratio.
       max_grad_norm: gradients are clipped to it: see `updated` in mimic/trainers/ppo/updates.py.
       reward_scaling: of the reward inside PPO.
@@ -111,8 +113,10 @@ class PPOConfig(TrainerConfig):
     learning_rate: float | None = None
     final_learning_rate: float | None = None
     discounting: float | None = None
+    final_discounting: float | None = None
     gae_lambda: float = 0.9
     entropy_cost: float | None = None
+    final_entropy_cost: float = 1.0
     clipping_epsilon: float = 0.2
     max_grad_norm: float = 1.0
     reward_scaling: float = 10.0
@@ -139,7 +143,10 @@ class PPOConfig(TrainerConfig):
         preset = PRESETS[name]
         if self.target_gap > 0:
             preset = {**preset, "evaluations": _LOOKS * preset["evaluations"]}
-        settings = PPOSettings(**{**_filled_in(self, preset), "preset": name})
+        fields = _filled_in(self, preset)
+        if self.final_discounting is None:
+            fields["final_discounting"] = fields["discounting"]
+        settings = PPOSettings(**{**fields, "preset": name})
         settings.check(devices)
         return settings
 
@@ -157,6 +164,7 @@ class PPOSettings(PPOConfig):
     learning_rate: float = MISSING
     final_learning_rate: float = MISSING
     discounting: float = MISSING
+    final_discounting: float = MISSING
     entropy_cost: float = MISSING
     hidden_layers: list[int] = MISSING
     crossovers: int = MISSING
@@ -169,7 +177,7 @@ class PPOSettings(PPOConfig):
         for key in ("learning_rate", "max_grad_norm", "reward_scaling", "clipping_epsilon"):
             if not 0 < getattr(self, key) < math.inf:
                 raise ValueError(f"trainer.{key}: expected a number above 0, got {getattr(self, key)}")
-        for key in ("discounting", "gae_lambda", "final_learning_rate"):
+        for key in ("discounting", "final_discounting", "gae_lambda", "final_learning_rate", "final_entropy_cost"):
             if not 0 <= getattr(self, key) <= 1:
                 raise ValueError(f"trainer.{key}: expected a number in [0, 1], got {getattr(self, key)}")
         for key in ("target_gap", "crossovers"):
@@ -192,6 +200,20 @@ class PPOSettings(PPOConfig):
     def total_steps(self) -> int:
         """Environment steps."""
         return self.num_timesteps
+
+    def at(self, progress: Any) -> "PPOSettings":
+        """What holds at a fraction of the training: the entropy cost and the discount of that moment.
+
+        Args:
+          progress: in [0, 1], a number or a scalar array.
+        """
+        if self.final_entropy_cost == 1 and self.final_discounting == self.discounting:
+            return self
+        return dataclasses.replace(
+            self,
+            entropy_cost=self.entropy_cost * (1 + progress * (self.final_entropy_cost - 1)),
+            discounting=self.discounting + progress * (self.final_discounting - self.discounting),
+        )
 
     @property
     def steps_per_batch(self) -> int:

@@ -68,6 +68,7 @@ def make_programs(
     batches: int,
     learning_rate: optax.Schedule,
     restored: Params | None,
+    progress: optax.Schedule = lambda count: 0.0,
 ) -> tuple[
     Background[Callable[[int], TrainingState]], Background[Callable[[TrainingState], tuple[TrainingState, Metrics]]]
 ]:
@@ -80,6 +81,7 @@ def make_programs(
       batches: that one call of the second program collects and learns from.
       learning_rate: of Adam, at each update from 0 on.
       restored: parameters to go on from.
+      progress: the fraction of the training that is done at each update, see `PPOSettings.at`.
 
     Returns:
       What begins, of a seed; and what learns, which gives the means of the loss's metrics too.
@@ -98,7 +100,9 @@ def make_programs(
 
     training = env, config, networks, optimizer, mesh.size
     begin = program(functools.partial(_begin, *training), (same, same, same), learning)
-    learn = program(functools.partial(_learn, *training, batches), (learning,), (learning, same), donate_argnums=0)
+    learn = program(
+        functools.partial(_learn, *training, progress, batches), (learning,), (learning, same), donate_argnums=0
+    )
     expert_states = jax.device_get(env.expert_states)
     start = jax.eval_shape(begin, 0, restored, expert_states)
     lowered = learn.lower(start)
@@ -145,6 +149,7 @@ def _learn(
     networks: ppo_networks.PPONetworks,
     optimizer: optax.GradientTransformation,
     devices: int,
+    progress: optax.Schedule,
     batches: int,
     learning: TrainingState,
 ) -> tuple[TrainingState, Metrics]:
@@ -154,9 +159,7 @@ def _learn(
     minibatch = config.batch_size // devices
     # A GPU pauses between CUDA graphs, and none goes beyond a pass of a loop. On one GPU compiling takes what it saves.
     updates_in_a_pass = 2 if devices > 1 else 1
-    how = updates.UpdateConfig(
-        networks, config, optimizer, axis=_AXIS, staggered=a_process_for_each_gpu(), unroll=updates_in_a_pass
-    )
+    staggered = a_process_for_each_gpu()
 
     def unroll(learning: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
         """Steps of all arms, [time + 1, arms, ...]."""
@@ -185,6 +188,8 @@ def _learn(
         passes = jax.random.split(key_order, config.num_updates_per_batch)
         count = len(unrolls.observation)
         order = jax.vmap(lambda key: jax.random.permutation(key, count))(passes).reshape(-1, minibatch)
+        now = config.at(progress(learning.policy.optimizer[0].count))
+        how = updates.UpdateConfig(networks, now, optimizer, _AXIS, staggered, updates_in_a_pass)
         learners = learning.policy, learning.value
         (policy, value), metrics = updates.updated(learners, statistics, unrolls, order, key_loss, how)
         learning = dataclasses.replace(learning, policy=policy, value=value, statistics=statistics, key=key)
@@ -192,5 +197,6 @@ def _learn(
 
     learning, metrics = jax.lax.scan(batch, learning, None, length=batches)
     means = dict(zip(updates.METRICS, jax.lax.pmean(metrics.mean(axis=0), _AXIS), strict=True))
-    loss = means["policy_loss"] + means["value_loss"] - config.entropy_cost * means["entropy"]
+    now = config.at(progress(learning.policy.optimizer[0].count))
+    loss = means["policy_loss"] + means["value_loss"] - now.entropy_cost * means["entropy"]
     return learning, {"loss": loss, **means}

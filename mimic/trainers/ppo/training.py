@@ -130,7 +130,8 @@ def _stretches(
     all_batches = -(-left // config.steps_per_batch)
     batches = max(round(all_batches / evaluations), 1)
     networks = make_networks(config, env.observation_size, env.action_size)
-    begin, learn = make_programs(env, config, networks, batches, _learning_rate(config, step), restored)
+    progress = _progress(config, step)
+    begin, learn = make_programs(env, config, networks, batches, _learning_rate(config, progress), restored, progress)
     on_compiling()
     learning = begin()((seed + step) % 2**31)  # what a 32-bit integer holds
     yield _Stretch(step, jax.device_get(learning.params), {})
@@ -147,11 +148,14 @@ def _stretches(
         yield _Stretch(step, jax.device_get(learning.params), {**speed, **metrics})
 
 
-def _learning_rate(config: PPOSettings, done_steps: int) -> optax.Schedule:
-    """A linear decay over the updates of the whole training, from those that are done."""
+def _progress(config: PPOSettings, done_steps: int) -> optax.Schedule:
+    """The fraction of the whole training that is done after a number of updates beyond `done_steps`."""
     updates_per_batch = config.num_minibatches * config.num_updates_per_batch
     updates = config.num_timesteps // config.steps_per_batch * updates_per_batch
     done_updates = done_steps // config.steps_per_batch * updates_per_batch
-    start = config.learning_rate
-    schedule = optax.linear_schedule(start, start * config.final_learning_rate, updates)
+    schedule = optax.linear_schedule(0.0, 1.0, updates)
     return lambda count: schedule(count + done_updates)
+
+
+def _learning_rate(config: PPOSettings, progress: optax.Schedule) -> optax.Schedule:
+    return lambda count: config.learning_rate * (1 + progress(count) * (config.final_learning_rate - 1))
