@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int
 
-from mimic.arms.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.metric import spatial
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
@@ -81,7 +81,7 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
     correspondence, weights = metric.correspondence, cast(DistanceWeights, metric.weights)
     directions, positions = (_pair_weights(correspondence, w) for w in (weights.rotation, weights.translation))
     pairs = _counting_pairs(correspondence, weights.translation)
-    arm = _of_chain_length_one(learner)
+    arm = in_chain_lengths(learner)
 
     def target(states: LinkStates) -> StaticTarget:
         assert states.direction is not None
@@ -134,9 +134,3 @@ def _pull(unit: Array, strength: Array, points: Array, weights: Array, own: Bool
     """On one link, as scalars: taken out of their arrays once, not in each step of a descent."""
     mine = np.flatnonzero(own)
     return Pull(spatial.vector(unit), strength, [spatial.vector(points[i]) for i in mine], [weights[i] for i in mine])
-
-
-def _of_chain_length_one(arm: Embodiment) -> Embodiment:
-    """The arm with its lengths in chain lengths."""
-    unit = 1 / arm.chain_length
-    return dataclasses.replace(arm, joint_anchor=unit * arm.joint_anchor, link_position=unit * arm.link_position)

@@ -7,7 +7,7 @@ import pytest
 from jax.typing import DTypeLike
 
 from mimic import motion_distance
-from mimic.arms.embodiment import load_mjcf, panda, planar_arm
+from mimic.arms.embodiment import in_chain_lengths, load_mjcf, panda, planar_arm
 from mimic.metric import fused_kernel, long_chain_kernel
 from mimic.metric import motion_distance as motion
 from mimic.metric.correspondence import overlap_correspondence
@@ -40,7 +40,7 @@ CASES = {
 
 def plan(arms, correspondence, weights):
     factors = motion._factors(np.asarray(correspondence, float), weights)
-    return long_chain_kernel.plan([motion._of_length_one(arm) for arm in arms], factors)
+    return long_chain_kernel.plan([in_chain_lengths(arm) for arm in arms], factors)
 
 
 def walk_of(*case):
