@@ -23,8 +23,9 @@ from mimic.metric import spatial
 from mimic.metric.spatial import Rotation, Scalar, Vector
 from mimic.retargeting.optimizers import Derivatives
 
-# s [chain lengths]. Newton steps overshoot a kink that is many s away, so a descent begins with the rough smoothing. Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone
-# leaves more than 1e-4 of distance on 55 % of them, both on 3 %; with 1e-4 alone 89 % converge.
+# s [chain lengths]. Newton steps overshoot a kink that is many s away, so a descent begins with the rough smoothing.
+# Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone leaves
+# more than 1e-4 of distance on 55 % of them, both on 3 %; with 1e-4 alone 89 % converge.
 ROUGH_SMOOTHING, SMOOTHING = 1e-2, 1e-3
 
 Symmetric = tuple[Scalar, ...]  # xx, xy, xz, yy, yz, zz of a symmetric 3x3 matrix

@@ -38,7 +38,8 @@ def bfgs(
     """Monotone quasi-Newton descent (BFGS update: Nocedal and Wright 2006, eq. 6.17).
 
     Each iteration evaluates one point. A step that does not descend is repeated with a shorter length, but it updates
-    the inverse Hessian too. BFGS also converges on norms with a kink at the minimum (Lewis and Overton 2013), only slower.
+    the inverse Hessian too. BFGS also converges on norms with a kink at the minimum (Lewis and Overton 2013), only
+    slower.
 
     Args:
       objective: of [N] coordinates.
