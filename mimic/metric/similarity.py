@@ -5,6 +5,7 @@ The measures thus compare arms of different size and number of links, independen
 They assume that both base frames coincide.
 """
 
+import dataclasses
 from types import ModuleType
 from typing import Any
 
@@ -17,6 +18,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
+from mimic.metric.spatial import array_library
 
 SAMPLES = 64  # of a centre line
 MEASURES = ("centre_line_distance", "tangent_angle_deg", "frechet_distance", "hand_position_error", "hand_angle_deg")
@@ -60,7 +62,7 @@ def centre_line_table(
     segments = segment_arm(arm)
     length = float(segments.chain_length)
     states = link_state_table(segments, qpos, np.zeros_like(qpos))
-    return _sampled(arm, states.replace(position=states.position * np.float32(length)), samples)  # type: ignore[attr-defined]
+    return _sampled(arm, dataclasses.replace(states, position=states.position * np.float32(length)), samples)
 
 
 def _sampled(arm: Embodiment, segments: LinkStates, samples: int) -> CentreLine:
@@ -69,7 +71,7 @@ def _sampled(arm: Embodiment, segments: LinkStates, samples: int) -> CentreLine:
         raise ValueError(f"samples: expected at least 1, got {samples}")
     start, direction = segments.position, segments.direction
     assert direction is not None
-    numpy = _library(start)
+    numpy = array_library(start)
     lengths = np.linalg.norm(np.asarray(arm.segment_end) - np.asarray(arm.segment_start), axis=1)
     ends = np.cumsum(lengths)
     arc = (np.arange(samples) + 0.5) / samples * ends[-1]
@@ -111,7 +113,7 @@ def frechet_distance(expert: CentreLine, learner: CentreLine) -> Float[Any, "*ba
       expert: centre line of the expert.
       learner: centre line of the learner, with any number of samples.
     """
-    numpy = _library(expert.points)
+    numpy = array_library(expert.points)
     # [3, samples, *batch]: batches are contiguous, which is fast in NumPy.
     a, b = (numpy.moveaxis(line.points, (-1, -2), (0, 1)) for line in (expert, learner))
     return _frechet(a, b) if numpy is jnp else _frechet_numpy(a, np.ascontiguousarray(b))
@@ -188,17 +190,13 @@ def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, 
     return dict(zip(MEASURES, values, strict=True))
 
 
-def _library(values: Any) -> ModuleType:
-    return np if isinstance(values, np.ndarray) else jnp
-
-
 def _norm(vectors: Any) -> Any:
     """Length along the last axis, with derivative 0 at 0."""
-    numpy = _library(vectors)
+    numpy = array_library(vectors)
     square = (vectors * vectors).sum(axis=-1)
     return numpy.where(square > 0, numpy.sqrt(numpy.where(square > 0, square, 1)), 0)
 
 
 def _angle(a: Any, b: Any) -> Any:
     """Angle between unit vectors, from their difference and sum: accurate at 0 and at pi."""
-    return 2 * _library(a).arctan2(_norm(a - b), _norm(a + b))
+    return 2 * array_library(a).arctan2(_norm(a - b), _norm(a + b))

@@ -8,6 +8,7 @@ are then not computed. This leaves a third of the operations of a Panda's forwar
 
 import math
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
@@ -27,6 +28,11 @@ ZERO: Vector = (0.0, 0.0, 0.0)
 def scalar(number: Any) -> Scalar:
     """A Python float where it is a NumPy number."""
     return float(number) if isinstance(number, np.generic | np.ndarray) else number
+
+
+def array_library(values: Any) -> ModuleType:
+    """NumPy for a NumPy array, else `jax.numpy`."""
+    return np if isinstance(values, np.ndarray) else jnp
 
 
 def vector(array: Float[Any, "3"]) -> Vector:
@@ -136,8 +142,8 @@ def add_outer(matrix: Rotation, a: Vector, b: Vector) -> Rotation:
 
 def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:
     """exp([axis] angle) for a unit axis (Rodrigues); computed by NumPy for a NumPy array of angles."""
-    library = np if isinstance(angle, np.ndarray) else jnp
-    sine, cosine = library.sin(angle), library.cos(angle)
+    numpy = array_library(angle)
+    sine, cosine = numpy.sin(angle), numpy.cos(angle)
     versine = 1 - cosine
 
     def entry(i: int, j: int) -> Scalar:
@@ -148,7 +154,10 @@ def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:
         towards_axis = times(axis[3 - i - j], sine)
         return plus(times(versine, square), towards_axis if (i - j) % 3 == 1 else times(-1.0, towards_axis))
 
-    return tuple(tuple(entry(i, j) for j in range(3)) for i in range(3))  # pyright: ignore[reportReturnType]
+    def row(i: int) -> Vector:
+        return entry(i, 0), entry(i, 1), entry(i, 2)
+
+    return row(0), row(1), row(2)
 
 
 def stack(vectors: Sequence[Sequence[Scalar]], dtype: Any) -> Float[Array, "n m"]:

@@ -2,8 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +16,13 @@ from mimic.arms.embodiment import Embodiment
 from mimic.config import check_choice
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import LinkStates, link_states
+from mimic.metric.spatial import array_library
 from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, gradient_descent, newton
 from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
 
 Method = Literal["newton", "gradient_descent"]
 METHODS = ("newton", "gradient_descent")
+AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 _ITERATIONS = {"newton": 16, "gradient_descent": 1000}
 _TRACKING_ITERATIONS = 6  # Newton steps from the pose at the neighbouring time
@@ -89,7 +91,7 @@ def imitate_pose(
     Raises:
       ValueError: poses of the wrong shape or not finite, an unknown method, or a count below its minimum.
     """
-    poses = _checked_poses(expert, qpos, "qpos")
+    poses = checked_poses(expert, jnp.asarray(qpos))
     check_choice("method", method, METHODS)
     count = _ITERATIONS[method] if iterations is None else iterations
     if starts < 0 or count < 2:
@@ -128,7 +130,7 @@ def imitate_pose(
 
     flat_warm = None
     if warm_start is not None:
-        flat_warm = _checked_poses(learner, warm_start, "warm_start").reshape(-1, learner.num_joints)
+        flat_warm = checked_poses(learner, jnp.asarray(warm_start), "warm_start").reshape(-1, learner.num_joints)
         flat_warm = jnp.broadcast_to(flat_warm, (int(np.prod(batch)), learner.num_joints))
     solutions = jax.jit(solve)(poses.reshape(-1, expert.num_joints), flat_warm)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solutions)
@@ -169,7 +171,7 @@ def imitate_trajectory(
     Raises:
       ValueError: what `imitate_pose` rejects, or a jump that is not above 0.
     """
-    poses = _checked_poses(expert, qpos, "qpos")
+    poses = checked_poses(expert, jnp.asarray(qpos))
     if poses.ndim != 2:
         raise ValueError(f"qpos: expected shape [time, {expert.num_joints}], got {poses.shape}")
     if not np.all(np.asarray(largest_jump) > 0):
@@ -281,8 +283,8 @@ def wrap_angles(angles: Float[Any, "*batch joints"], where: Any = True, *, centr
       where: joints that are wrapped; all by default.
       centre: middle of the interval [rad].
     """
-    library = np if isinstance(angles, np.ndarray) else jnp
-    return library.where(where, angles - 2 * np.pi * library.round((angles - centre) / (2 * np.pi)), angles)
+    numpy = array_library(angles)
+    return numpy.where(where, angles - 2 * np.pi * numpy.round((angles - centre) / (2 * np.pi)), angles)
 
 
 def shared_joints(
@@ -291,14 +293,24 @@ def shared_joints(
     """The expert's values in the joints that both arms have by name; zero in the learner's other joints."""
     names = expert.joint_names
     index = np.array([names.index(name) if name in names else -1 for name in learner.joint_names])
-    library = np if isinstance(values, np.ndarray) else jnp
-    return library.where(index >= 0, values[..., index], 0)
+    return array_library(values).where(index >= 0, values[..., index], 0)
 
 
-def _checked_poses(arm: Embodiment, values: ArrayLike, name: str) -> Array:
-    poses = jnp.asarray(values)
-    if poses.ndim < 1 or poses.shape[-1] != arm.num_joints:
-        raise ValueError(f"{name}: expected shape [..., {arm.num_joints}] for {arm.name}, got {poses.shape}")
+def checked_poses(arm: Embodiment, poses: AnyArray, name: str = "qpos", *, axes: Sequence[str] = ()) -> AnyArray:
+    """The poses as floating-point numbers.
+
+    Args:
+      arm: the embodiment.
+      poses: joint angles [rad], NumPy or JAX array.
+      name: of the argument, for the error.
+      axes: names of the required axes before that of the joints.
+
+    Raises:
+      ValueError: the shape is not [..., *axes, joints], or an angle is not finite.
+    """
+    if poses.ndim <= len(axes) or poses.shape[-1] != arm.num_joints:
+        shape = ", ".join(["...", *axes, str(arm.num_joints)])
+        raise ValueError(f"{name}: expected shape [{shape}] for {arm.name}, got {poses.shape}")
     poses = poses if jnp.issubdtype(poses.dtype, jnp.floating) else poses.astype(float)
     if not isinstance(poses, Tracer) and not np.all(np.isfinite(np.asarray(poses))):
         raise ValueError(f"{name}: expected finite angles [rad], got some that are not")

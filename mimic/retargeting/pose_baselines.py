@@ -11,8 +11,8 @@ import numpy as np
 
 from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.metric.similarity import centre_line_table
-from mimic.retargeting.pose import pose_limits, shared_joints
-from mimic.retargeting.segment_alignment import Poses, align_segments, checked_poses
+from mimic.retargeting.pose import checked_poses, pose_limits, shared_joints
+from mimic.retargeting.segment_alignment import Poses, align_segments
 
 IK_EVERY = 5  # inverse kinematics solves every fifth sample of a motion; a solve takes 0.1 ms
 _TRACKING_STEPS = 6  # from the solution of the previous solved sample
@@ -37,7 +37,7 @@ def copy_joints(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses |
     Returns:
       The learner's poses [rad]; None where the arms have no joint name in common.
     """
-    qpos = checked_poses(expert, qpos)
+    qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
     if not set(expert.joint_names) & set(learner.joint_names):
         return None
     lower, upper = pose_limits(learner, qpos.dtype)
@@ -46,7 +46,7 @@ def copy_joints(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses |
 
 def hold_home(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses:
     """Holds the learner's home pose; arguments as for `copy_joints`."""
-    shape = checked_poses(expert, qpos).shape[:-1]
+    shape = checked_poses(expert, np.asarray(qpos), axes=("time",)).shape[:-1]
     return np.broadcast_to(np.asarray(learner.home, qpos.dtype), (*shape, learner.num_joints)).copy()
 
 
@@ -67,7 +67,7 @@ def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int 
     Raises:
       ValueError: `qpos` is not [..., time, n] or not finite, or `every` is below 1.
     """
-    qpos = checked_poses(expert, qpos)
+    qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
     if every < 1:
         raise ValueError(f"every: expected at least 1, got {every}")
     time = qpos.shape[-2]

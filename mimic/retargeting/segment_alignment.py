@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.kinematics import joint_frames
-from mimic.retargeting.pose import pose_limits, wrap_angles
+from mimic.retargeting.pose import checked_poses, pose_limits, wrap_angles
 from mimic.retargeting.subproblems import (
     PARALLEL,
     bend_to_angle,
@@ -81,7 +81,7 @@ def align_segments(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Pose
     Raises:
       ValueError: `qpos` is not [..., time, n], or not finite.
     """
-    qpos = checked_poses(expert, qpos)
+    qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
     expert_marks = landmarks(expert)
     learner_marks = expert_marks if _same_segments(expert, learner) else landmarks(learner)
     if expert_marks is None or learner_marks is None:
@@ -170,20 +170,6 @@ def _steps(parts: list[PartJoints]) -> list[tuple[int, list[int]]]:
             steps.append((part, [*joints, *(following.joints if both else ())]))
         is_done = both
     return steps
-
-
-def checked_poses(arm: Embodiment, qpos: Poses) -> Poses:
-    """The poses as floating-point numbers.
-
-    Raises:
-      ValueError: they are not [..., time, joints], or not finite.
-    """
-    qpos = np.asarray(qpos)
-    if qpos.ndim < 2 or qpos.shape[-1] != arm.num_joints:
-        raise ValueError(f"qpos: expected shape [..., time, {arm.num_joints}] for {arm.name}, got {qpos.shape}")
-    if not np.all(np.isfinite(qpos)):
-        raise ValueError("qpos: expected finite angles [rad], got some that are not")
-    return qpos if np.issubdtype(qpos.dtype, np.floating) else qpos.astype(float)
 
 
 def _orient(
