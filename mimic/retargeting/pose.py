@@ -93,17 +93,16 @@ def imitate_pose(
     """
     poses = checked_poses(expert, jnp.asarray(qpos))
     check_choice("method", method, METHODS)
+    # Longer than 40 lines: argument checks, and functions that share the arguments.
     count = _ITERATIONS[method] if iterations is None else iterations
     if starts < 0 or count < 2:
         raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {count}")
     if kept is not None and kept < 1:
         raise ValueError(f"kept: expected at least 1, or None for all, got {kept}")
-    rough = count if kept is None else max(int(_ROUGH_FRACTION * count), 1)
     key = jax.random.key(0) if key is None else key
     batch = poses.shape[:-1]
     objective = pose_objective(learner, Metric(correspondence, weights, rotation, reduction))
     limits, continuous = pose_limits(learner, poses.dtype), continuous_joints(learner)
-    descend = newton if method == "newton" else gradient_descent
 
     def solve(poses: Array, warm: Array | None) -> PoseImitation:
         random_poses = _random_poses(learner, key, max(starts, 1), poses.dtype)
@@ -114,13 +113,7 @@ def imitate_pose(
             target = objective.target(states)
             guesses = _initial_guesses(objective, expert, learner, target, pose, random_poses if starts else None)
             guesses = guesses if warm is None else warm[None]
-            of_qpos = functools.partial(objective.derivatives, target)
-            rough_of_qpos = of_qpos if kept is None else functools.partial(objective.rough_derivatives, target)
-            solutions = jax.vmap(lambda guess: descend(rough_of_qpos, guess, limits, rough))(guesses)
-            if kept is not None:
-                best = jax.lax.top_k(-solutions.value, min(kept, len(guesses)))[1]
-                solutions = jax.vmap(lambda guess: descend(of_qpos, guess, limits, count - rough))(solutions.qpos[best])
-            solution: Solution = jax.tree.map(lambda x: x[jnp.argmin(solutions.value)], solutions)
+            solution = _minimise(objective, target, guesses, limits, method, count, kept)
             distance = objective.distance(states, link_states(learner, solution.qpos))
             is_flat = solution.gradient_norm <= _FLAT * scale
             return PoseImitation(wrap_angles(solution.qpos, continuous), distance, is_flat)
@@ -134,6 +127,27 @@ def imitate_pose(
         flat_warm = jnp.broadcast_to(flat_warm, (int(np.prod(batch)), learner.num_joints))
     solutions = jax.jit(solve)(poses.reshape(-1, expert.num_joints), flat_warm)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solutions)
+
+
+def _minimise(
+    objective: PoseObjective,
+    target: Target,
+    guesses: Float[Array, "guesses joints"],
+    limits: tuple[np.ndarray, np.ndarray],
+    method: Method,
+    iterations: int,
+    kept: int | None,
+) -> Solution:
+    """The best of the descents from all guesses, of which `kept` continue after the rough iterations."""
+    descend = newton if method == "newton" else gradient_descent
+    rough = iterations if kept is None else max(int(_ROUGH_FRACTION * iterations), 1)
+    of_qpos = functools.partial(objective.derivatives, target)
+    rough_of_qpos = of_qpos if kept is None else functools.partial(objective.rough_derivatives, target)
+    solutions = jax.vmap(lambda guess: descend(rough_of_qpos, guess, limits, rough))(guesses)
+    if kept is not None:
+        best = jax.lax.top_k(-solutions.value, min(kept, len(guesses)))[1]
+        solutions = jax.vmap(lambda guess: descend(of_qpos, guess, limits, iterations - rough))(solutions.qpos[best])
+    return jax.tree.map(lambda x: x[jnp.argmin(solutions.value)], solutions)
 
 
 def imitate_trajectory(
@@ -171,6 +185,7 @@ def imitate_trajectory(
     Raises:
       ValueError: what `imitate_pose` rejects, or a jump that is not above 0.
     """
+    # Longer than 40 lines: argument checks, and functions that share the arguments.
     poses = checked_poses(expert, jnp.asarray(qpos))
     if poses.ndim != 2:
         raise ValueError(f"qpos: expected shape [time, {expert.num_joints}], got {poses.shape}")

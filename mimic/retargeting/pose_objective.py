@@ -131,8 +131,8 @@ def _weighted_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 
     return np.argwhere(has_weight)
 
 
-def _pull(unit: Array, strength: Array, points: Array, weights: Array, own: Bool[np.ndarray, " pairs"]) -> Pull:
+def _pull(unit: Array, strength: Array, points: Array, weights: Array, is_on_link: Bool[np.ndarray, " pairs"]) -> Pull:
     """Pull on one link as scalars, extracted from the arrays once and not in each step of a descent."""
-    indices = np.flatnonzero(own)
+    indices = np.flatnonzero(is_on_link)
     points_of_link = [spatial.vector(points[i]) for i in indices]
     return Pull(spatial.vector(unit), strength, points_of_link, [weights[i] for i in indices])
