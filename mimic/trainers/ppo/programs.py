@@ -21,7 +21,7 @@ from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from mimic.compilation import Background, a_process_for_each_gpu, compiler_options
+from mimic.compilation import Background, a_process_for_each_gpu, compiler_options, in_background
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import fresh_episodes
 from mimic.metric.kinematics import LinkStates
@@ -96,16 +96,13 @@ def compile_training(
     learn = _over_devices(mesh, epoch, (state,), (state, replicated), donate_argnums=0)
     expert_states = jax.device_get(env.expert_states)
     lowered = learn.lower(jax.eval_shape(start, 0, restored, expert_states))
-    compiled_learn = Background(lowered.compile)
-    compiled_learn.start()
+    compiled_learn = in_background(lowered.compile)  # before the other, because it takes longer
 
     def compile_start() -> Callable[[int], TrainingState]:
         compiled = start.lower(0, restored, expert_states).compile()
         return lambda seed: compiled(seed, restored, expert_states)
 
-    compiled_start = Background(compile_start)
-    compiled_start.start()
-    return compiled_start, compiled_learn
+    return in_background(compile_start), compiled_learn
 
 
 def _over_devices(mesh: Mesh, function: Any, inputs: Any, outputs: Any, **options: Any) -> Any:

@@ -16,8 +16,7 @@ from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo.programs import Params, compile_training, initial_params
-
-OnEvaluation = Callable[[int, Params, dict[str, float]], bool]  # (steps, parameters, training metrics) -> stop?
+from mimic.trainers.trainer import OnEvaluation
 
 
 def make_networks(config: PPOSettings, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
@@ -67,9 +66,8 @@ def train(
       config: the trainer's settings.
       run_dir: folder of the checkpoints.
       seed: random seed of networks, exploration and resets.
-      on_evaluation: called after each training epoch with the environment steps so far, the parameters and training
-        metrics: means of the losses' metrics, environment steps per second (sps) and seconds of training (walltime).
-        Training ends when it returns True. The first call has the initial parameters and no metrics.
+      on_evaluation: called for the initial parameters, without metrics, and after each training epoch; the metrics are
+        those of the losses, environment steps per second (sps) and seconds of training (walltime).
       signals: signals of the process; after one, training ends at the next checkpoint.
       restore: steps and parameters to continue from. Networks and observation statistics are kept; the moments of the
         optimiser and the states of the environments are reset.
@@ -131,17 +129,16 @@ def _checkpoints(
     batches = max(round(all_batches / evaluations), 1)
     networks = make_networks(config, env.observation_size, env.action_size)
     progress = _progress(config, step)
-    begin, learn = compile_training(
-        env, config, networks, batches, _learning_rate(config, progress), restored, progress
-    )
+    learning_rate = _learning_rate(config, progress)
+    start, learn = compile_training(env, config, networks, batches, learning_rate, restored, progress)
     on_compiling()
-    learning = begin()((seed + step) % 2**31)  # what a 32-bit integer holds
-    yield _Stretch(step, jax.device_get(learning.params), {})
+    state = start()((seed + step) % 2**31)  # the range of a 32-bit integer
+    yield _Checkpoint(step, jax.device_get(state.params), {})
     walltime = 0.0
     for _ in range(-(-all_batches // batches)):
-        program = learn()
+        run_epoch = learn()
         began = time.perf_counter()
-        learning, means = program(learning)
+        state, means = run_epoch(state)
         metrics = {name: float(value) for name, value in jax.device_get(means).items()}
         seconds = time.perf_counter() - began
         walltime += seconds
