@@ -61,6 +61,7 @@ class TrainingState:
         return self.statistics, self.policy.params, self.value.params
 
 
+# Above 40 lines because of its docstring.
 def compile_training(
     env: ImitationEnv,
     config: PPOSettings,

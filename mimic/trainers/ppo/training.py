@@ -48,6 +48,7 @@ def make_controller(config: PPOSettings, observation_size: int, action_size: int
     return controller
 
 
+# Above 40 lines because of its docstring.
 def train(
     env: ImitationEnv,
     config: PPOSettings,
