@@ -18,7 +18,7 @@ from mimic.trainers.pose_mapper.model import MapperModel, Params
 from mimic.trainers.trainer import OnEvaluation
 
 _WARM_UP = 0.02  # fraction of the updates over which the learning rate rises
-# Fraction of the loss that is the mean over all heads, so that no head is left untrained; the rest is the nearest head's.
+# Fraction of the loss that is the mean over all heads, so that each head is trained; the rest is the nearest head's.
 _ALL_HEADS = 0.1
 
 Poses = Float[Array, "poses joints"]
