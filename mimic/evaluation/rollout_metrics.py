@@ -21,6 +21,7 @@ MIN_SPAN = 0.25  # of the distance of holding the start pose, that a best motion
 _ROUNDING = 1e-5  # float32 error of a torque at its limit (relative), or of a joint at the end of its range (rad)
 
 
+# Above 40 lines because of its docstring.
 def measure(
     env: "ImitationEnv",
     learner: LinkStates,
