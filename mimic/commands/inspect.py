@@ -174,7 +174,7 @@ def _arm_words(key: str, arm: ArmConfig) -> list[str]:
 def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]:
     embodiment = arm.embodiment
     columns = {
-        "range": joint_ranges(config, arm).tolist(),
+        "range": arm_checks.joint_ranges(config, arm).tolist(),
         "rated speed": finite_velocity_limit(embodiment).tolist(),
         "speed is assumed": (~np.isfinite(embodiment.velocity_limit)).tolist(),
         "torque limit": [float(x) if np.isfinite(x) else None for x in embodiment.torque_limit],
@@ -246,8 +246,8 @@ def _headline(expert: Arm, learner: Arm) -> str:
 def _distance_line(reachable: arm_checks.ReachableDistance, expert: Arm) -> str:
     bound, hold = reachable.bound, reachable.hold
     return (
-        f"distance on random demonstrations of {expert.embodiment.name}: {bound:.3f} for the best poses, {hold:.3f} for "
-        f"holding the start pose; imitation can reduce it by {1 - bound / hold:.0%}"
+        f"distance on random demonstrations of {expert.embodiment.name}: {bound:.3f} for the best poses, {hold:.3f} "
+        f"for holding the start pose; imitation can reduce it by {1 - bound / hold:.0%}"
     )
 
 
