@@ -45,7 +45,7 @@ def test_what_is_said_of_an_arm(inspected, arm_file, tmp_path):
         "ur_like: 6 joints, 6 links",
         "expert panda: 7 joints",
         "6 actuators (6 servos on position)",
-        "beyond the tip, held where the model has them; what they carry stays as mass: left (slide), right (slide)",
+        "distal to the tip, fixed; their bodies stay as mass: left (slide), right (slide)",
         "1 equality constraints",
         "no velocity limit for pan, lift",
         "no <inertial> in pan_link",
