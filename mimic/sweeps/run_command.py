@@ -40,7 +40,7 @@ class RunCommand:
     environment: dict[str, str | None] = dataclasses.field(default_factory=dict)
 
     def __call__(self) -> Outcome:
-        """Runs the command to its end. Forwards SIGTERM; sends SIGTERM for the KeyboardInterrupt with which Ray cancels."""
+        """Runs the command to its end. Forwards SIGTERM, and a KeyboardInterrupt, with which Ray cancels, as SIGTERM."""
         variables = {**os.environ, **self.environment}
         with (Path(self.folder) / self.log).open("a") as log:
             process = subprocess.Popen(
