@@ -40,7 +40,7 @@ class RunCommand:
     environment: dict[str, str | None] = dataclasses.field(default_factory=dict)
 
     def __call__(self) -> Outcome:
-        """Runs the command to its end. Forwards SIGTERM, and a KeyboardInterrupt, with which Ray cancels, as SIGTERM."""
+        """Runs the command to its end. Forwards SIGTERM, and KeyboardInterrupt (Ray's way to cancel) as SIGTERM."""
         variables = {**os.environ, **self.environment}
         with (Path(self.folder) / self.log).open("a") as log:
             process = subprocess.Popen(

@@ -129,14 +129,7 @@ def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None 
     expert = build_arm(env.expert, env.limits, env.metric.links).embodiment
     arm = learner_arm(env, settings.locked)
     learner = arm.embodiment
-    base_metric = dataclasses.replace(env.metric, correspondence=settings.correspondence).build(expert, learner)
-
-    def metric(weights: Array) -> Metric:
-        if env.metric.adaptive:
-            return base_metric
-        # A constant weight of 0 removes its term, which makes the optimiser's derivatives much simpler.
-        constant = DistanceWeights(0.0 if settings.translation == 0 else weights[0], weights[1])
-        return dataclasses.replace(base_metric, weights=constant)
+    metric = _metric_of_weights(env, settings, expert, learner)
 
     def follow(qpos: Array, current: Array, weights: Array) -> Array:
         if mapper is not None:
@@ -160,6 +153,22 @@ def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None 
     functions = CompiledFunctions(arm, _compiled(follow, q, q_hat, w), _compiled(compare, q, q_hat, w), None)
     yield functions
     yield dataclasses.replace(functions, best=_compiled(best, q, w))
+
+
+def _metric_of_weights(
+    env: EnvConfig, settings: Settings, expert: Embodiment, learner: Embodiment
+) -> Callable[[Array], Metric]:
+    """The metric as a function of the weights (translation, rotation)."""
+    base_metric = dataclasses.replace(env.metric, correspondence=settings.correspondence).build(expert, learner)
+
+    def metric(weights: Array) -> Metric:
+        if env.metric.adaptive:
+            return base_metric
+        # A constant weight of 0 removes its term, which makes the optimiser's derivatives much simpler.
+        constant = DistanceWeights(0.0 if settings.translation == 0 else weights[0], weights[1])
+        return dataclasses.replace(base_metric, weights=constant)
+
+    return metric
 
 
 def _compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:

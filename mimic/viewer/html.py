@@ -132,13 +132,8 @@ def chart(
     def y(value: np.ndarray) -> np.ndarray:
         return _TOP + (1 - value / top) * inner[1]
 
-    parts = []
-    for fraction in (0.0, 0.5, 1.0):
-        height = float(y(np.array(fraction * top / 1.08)))
-        parts.append(
-            f'<line x1="{_LEFT}" x2="{_WIDTH - 6}" y1="{height:.1f}" y2="{height:.1f}" stroke="#e4e4e4"/>'
-            f'<text x="{_LEFT - 4}" y="{height + 3:.1f}" text-anchor="end">{fraction * top / 1.08:.3f}</text>'
-        )
+    ticks = [fraction * top / 1.08 for fraction in (0.0, 0.5, 1.0)]
+    parts = [_grid_line(tick, float(y(np.array(tick)))) for tick in ticks]
     for label, values, colour in curves:
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x(time), y(values), strict=True) if b == b)
         dashes = ' stroke-dasharray="4 3"' if label != curves[0][0] else ""
@@ -147,11 +142,17 @@ def chart(
         mark = float(x(np.array(now)))
         parts.append(f'<line x1="{mark:.1f}" x2="{mark:.1f}" y1="{_TOP}" y2="{_HEIGHT - _BOTTOM}" stroke="#d62728"/>')
     for index, (label, _, colour) in enumerate(curves):
-        parts.append(
-            f'<text x="{_LEFT + 6 + 78 * index}" y="{_HEIGHT - 3}" fill="{colour}">{html.escape(label)}</text>'
-        )
+        x_label = _LEFT + 6 + 78 * index
+        parts.append(f'<text x="{x_label}" y="{_HEIGHT - 3}" fill="{colour}">{html.escape(label)}</text>')
     parts.append(f'<text x="{_WIDTH - 6}" y="{_HEIGHT - 3}" text-anchor="end">{last:.1f} s</text>')
     return (
         f'<svg id="mimic-chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" style="width:100%;padding:0 8px" '
         f'font-size="9" fill="#666" font-family="sans-serif">{"".join(parts)}</svg>'
+    )
+
+
+def _grid_line(value: float, height: float) -> str:
+    return (
+        f'<line x1="{_LEFT}" x2="{_WIDTH - 6}" y1="{height:.1f}" y2="{height:.1f}" stroke="#e4e4e4"/>'
+        f'<text x="{_LEFT - 4}" y="{height + 3:.1f}" text-anchor="end">{value:.3f}</text>'
     )

@@ -16,6 +16,7 @@ from mimic.viewer.follower import (
     CompiledFunctions,
     FunctionCache,
     Mapper,
+    PoseComparison,
     Settings,
     home_angles,
     initial_settings,
@@ -161,18 +162,10 @@ class LiveSession:
           ValueError: the requested settings are invalid; the previous settings are restored.
         """
         with self._lock:
-            settings = self.settings
-            try:
-                functions = self._functions.get(settings)
-            except ValueError:
-                self.settings = self._active
-                raise
-            if functions is None:  # continue with the previous settings
-                settings = self._active
-                functions = self._functions.get(settings)
+            functions = self._activate_functions()
             if functions is None:
                 return None
-            self._active = settings
+            settings = self._active
             self._advance_expert(dt)
             arm, expert = functions.learner.embodiment, self._pose
             current = np.array([self._angles[name] for name in arm.joint_names], np.float32)
@@ -190,13 +183,28 @@ class LiveSession:
                 and bool(np.all(np.abs(pose - current) < _REST_ANGLE))
             )
             self._rest_key = (request, functions.best is None) if is_at_rest else None
+            return self._frame(functions, comparison, bound)
+
+    def _activate_functions(self) -> CompiledFunctions | None:
+        """The functions of the requested settings, or until these are compiled, of the previous settings."""
+        try:
+            functions = self._functions.get(self.settings)
+        except ValueError:
+            self.settings = self._active
+            raise
+        if functions is None:
+            return self._functions.get(self._active)
+        self._active = self.settings
+        return functions
+
+    def _frame(self, functions: CompiledFunctions, comparison: PoseComparison, bound: float) -> Frame:
         distance = float(comparison.distance)
         return Frame(
-            expert=dict(zip(self.expert.joint_names, map(float, expert), strict=True)),
+            expert=dict(zip(self.expert.joint_names, map(float, self._pose), strict=True)),
             learner=dict(self._angles),
-            locked=settings.locked,
+            locked=self._active.locked,
             expert_links=self.expert.link_names,
-            learner_links=arm.link_names,
+            learner_links=functions.learner.embodiment.link_names,
             distance=distance,
             bound=min(bound, distance),  # many initial guesses may miss a minimum that the path has reached
             matrix=np.asarray(comparison.matrix),
