@@ -132,8 +132,7 @@ def chart(
     def y(value: np.ndarray) -> np.ndarray:
         return _TOP + (1 - value / top) * inner[1]
 
-    ticks = [fraction * top / 1.08 for fraction in (0.0, 0.5, 1.0)]
-    parts = [_grid_line(tick, float(y(np.array(tick)))) for tick in ticks]
+    parts = [_grid_line(float(tick), float(y(tick))) for tick in np.array([0.0, 0.5, 1.0]) * top / 1.08]
     for label, values, colour in curves:
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x(time), y(values), strict=True) if b == b)
         dashes = ' stroke-dasharray="4 3"' if label != curves[0][0] else ""
