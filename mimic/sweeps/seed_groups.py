@@ -69,7 +69,7 @@ def drop_repeated(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], list[
     for run in sorted(runs, key=lambda run: run.finished):
         key = (_fingerprint(run), run.seed)
         if key in newest:
-            repeated.append(LeftOut(newest[key].name, f"{run.name} has the same settings and seed and is newer"))
+            repeated.append(LeftOut(newest[key].name, f"{run.name} has the same settings and seed, and is newer"))
         newest[key] = run
     newest_ids = set(map(id, newest.values()))
     return [run for run in runs if id(run) in newest_ids], repeated
