@@ -120,7 +120,7 @@ def test_demonstrations_of_another_arm_time_step_or_length_are_rejected(recorded
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("torque", 87.1, "joint3 of demonstration 1 has a torque of 87.1 N m at 0.4 s, but its torque limit is 87 N m"),
+        ("torque", 87.1, "has a torque of 87.1 N m at 0.4 s, but its torque limit is 87 N m"),
         (
             "qvel",
             -2.2,
