@@ -69,6 +69,19 @@ def interpreted(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.fixture
+def gpu_kernels(interpreted, monkeypatch: pytest.MonkeyPatch):
+    """Batched functions take the GPU kernels that they have, interpreted on the CPU; a list of those taken."""
+    taken = []
+
+    def choose(*rows, cuda, default):
+        taken.append(cuda)
+        return cuda(*rows)
+
+    monkeypatch.setattr(jax.lax, "platform_dependent", choose)
+    return taken
+
+
+@pytest.fixture
 def unchecked():
     """Turns the shape checks off: what a user without them is told about bad input."""
     jaxtyping_config.update("jaxtyping_disable", True)

@@ -2,8 +2,11 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+import mimic
 
 
 @pytest.mark.parametrize(
@@ -70,6 +73,13 @@ def test_unreadable_run_directories(refused, tmp_path, command, key, config, mes
     if config is not None:
         (run_dir / "config.yaml").write_text(config)
     assert message in refused(command, f"{key}={run_dir}")
+
+
+def test_all_commands_are_listed():
+    commands = {f"mimic.{file.stem}" for file in (Path(mimic.__file__).parent / "conf").glob("*.yaml")}
+    result = subprocess.run([sys.executable, "-m", "mimic"], capture_output=True, text=True, timeout=60, check=False)
+    listed = [line.split(maxsplit=1) for line in result.stdout.splitlines()[2:]]
+    assert result.returncode == 0 and {module for module, _ in listed} == commands
 
 
 def test_help_names_the_environments():

@@ -44,7 +44,7 @@ class ReachableDistance:
 
 
 def reachable_distance(expert: Arm, learner: Arm, config: EnvConfig) -> ReachableDistance:
-    """Kinematic bound and holding still, on a few random demonstrations.
+    """Kinematic bound and holding the start pose, on a few random demonstrations.
 
     Raises:
       ValueError: the expert's limits leave it no goal.

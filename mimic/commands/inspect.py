@@ -23,6 +23,7 @@ from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.commands.arm_checks import ReachableDistance, assumptions, calmed, joint_ranges, reachable_distance, warnings  # noqa: E402
 from mimic.commands.config import InspectConfig  # noqa: E402
 from mimic.commands.progress import similarity_table  # noqa: E402
+from mimic.config import new_folder  # noqa: E402
 from mimic.envs.config import EnvConfig
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
 from mimic.paper_figures.pose_picture import PosePairs, nearest_poses, readable_poses, save_poses  # noqa: E402
@@ -37,7 +38,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     Raises:
       ValueError: an arm that cannot be trained, no OpenGL for the picture, or an `out` that exists.
     """
-    out = _new_folder(config.out)
+    out = new_folder("out", config.out) if config.out else None
     env = EnvConfig(name="pair", expert=config.expert, learner=config.learner, limits=config.limits)
     expert, learner = env.build_arms()
     joints, links = _joints(learner, config.learner, env), _links(expert, learner, env)
@@ -122,16 +123,6 @@ def _arm_words(key: str, arm: ArmConfig) -> list[str]:
         if value:
             words.append(f"{key}.{name}={str(value if isinstance(value, dict) else list(value)).replace(' ', '')}")
     return [shlex.quote(word) if "{" in word else word for word in (word.replace("'", "") for word in words)]
-
-
-def _new_folder(path: str) -> Path | None:
-    if not path:
-        return None
-    folder = Path(path).expanduser()
-    if folder.exists() or not folder.parent.is_dir():
-        reason = "exists; name a new folder" if folder.exists() else f"there is no folder {str(folder.parent)!r}"
-        raise ValueError(f"out: {str(folder)!r}: {reason}")
-    return folder
 
 
 def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]:

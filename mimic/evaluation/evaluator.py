@@ -1,4 +1,4 @@
-"""How good a controller is: every demonstration once, against the kinematic bound and against holding still."""
+"""How good a controller is: every demonstration once, against the kinematic bound and holding the start pose."""
 
 import csv
 import functools

@@ -44,7 +44,7 @@ def plot_training(folder: Path, figure_name: str, label: str, *, of: str, title:
 
 
 def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, controller: str, title: str) -> None:
-    """Mean distance over the time of an episode, between the kinematic bound and holding still."""
+    """Mean distance over the time of an episode, between the kinematic bound and holding the start pose."""
     time = evaluator.env.config.control_dt * np.arange(1, evaluator.env.config.horizon + 1)
     figure, all_axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
     for axes, (split, part) in zip(all_axes, evaluator.parts.items(), strict=True):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # brax and MJX, which pose mappers need not
 
 Table = dict[str, Float[np.ndarray, " demonstrations"]]
 WORST = 3  # demonstrations of each split that are named
-LEAST_SPAN = 0.25  # of the distance of holding the start pose, that a best motion must save for a gap to mean something
+MIN_SPAN = 0.25  # of the distance of holding the start pose, that a best motion must save for a gap to mean something
 _ROUNDING = 1e-5  # what float32 leaves of a torque at its limit, or of a joint at its stop; relative and in rad
 
 
@@ -138,4 +138,4 @@ def has_gap(bound: Any, hold: Any) -> Any:
     gaps of hundreds of percent.
     """
     bound, hold = np.asarray(bound), np.asarray(hold)
-    return (bound <= (1 - LEAST_SPAN) * hold) & (hold > 0)
+    return (bound <= (1 - MIN_SPAN) * hold) & (hold > 0)

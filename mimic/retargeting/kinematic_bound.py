@@ -100,7 +100,7 @@ def closest_motion(
 
     The result is an upper estimate of the true minimum. The reference was the best of three searches, the longest from
     64 random poses. At none of 6600 steps, of ten pairs of arm and metric, was the error above 1e-3; at 21 it was above
-    0.1 %, at most 2.6e-4 (`benchmarks.bound`, benchmarks/results/bound_cpu.json). Those steps are 0.1 s apart. In
+    0.1 %, at most 3.3e-4 (`benchmarks.bound`, benchmarks/results/bound_cpu.json). Those steps are 0.1 s apart. In
     motions of four steps 1.5 s apart the error was above 1e-3 at 1 of 24 steps with hard correspondence, adaptive
     weights and "angle", and at none with the default metric.
 

@@ -85,7 +85,7 @@ class Programs:
       learner: the arm.
       follow: (expert_qpos, learner_qpos, weights) -> the nearest minimum to the learner's present pose.
       measure: (expert_qpos, learner_qpos, weights) -> `Measured`.
-      best: (expert_qpos, weights) -> the best pose of many starts, and its distance: the lower bound. None until it
+      best: (expert_qpos, weights) -> the best pose of many starts, and its distance: the kinematic bound. None until it
         is compiled too, which takes longest.
     """
 
@@ -118,7 +118,7 @@ def home_angles(env: EnvConfig) -> Mapping[str, float]:
 
 
 def compile_programs(env: EnvConfig, settings: Settings, mapper: Mapper | None = None) -> Iterator[Programs]:
-    """Compiles, which takes seconds: first what the learner moves by, then the same with the lower bound.
+    """Compiles, which takes seconds: first what the learner moves by, then the same with the kinematic bound.
 
     Args:
       env: the arms and the rest of the metric.

@@ -132,7 +132,7 @@ class LiveSession:
 
     @property
     def is_compiling(self) -> bool:
-        """Whether what is asked for is still being compiled, the lower bound included."""
+        """Whether what is asked for is still being compiled, the kinematic bound included."""
         return not self._programs.is_complete(self.settings)
 
     def compile(self) -> Programs:

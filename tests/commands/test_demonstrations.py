@@ -22,7 +22,7 @@ def test_the_command_records_what_the_library_does(kind, tmp_path):
     command = [sys.executable, "-m", "mimic.demonstrations", f"kind={kind}", "count=3", "seed=5", f"out={out}"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
     assert result.returncode == 0, result.stderr[-2000:]
-    assert "all stay within the torque limits and rated speeds of panda" in result.stdout
+    assert "all stay within the torque limits and velocity limits of panda" in result.stdout
     assert result.stdout.endswith(f"results: {out}\n")
     assert {path.name for path in tmp_path.iterdir()} == {"demonstrations.npz", "demonstrations.png"}
     loaded, expected = mimic.load_demonstrations(out), mimic.record_demonstrations(panda(), 3, kind=kind, seed=5)
@@ -55,5 +55,5 @@ def test_bad_input_of_the_command(refused, tmp_path, arguments, message):
 
 def test_no_goal_within_the_limits_is_the_users_to_mend(tmp_path):
     config = mimic.env_config("planar4dof", control_dt=0.9)
-    with pytest.raises(ValueError, match="break its limits"):
+    with pytest.raises(ValueError, match="exceed its limits"):
         prepare_recording(RecordingConfig(config, count=1, out=str(tmp_path / "new.npz")))

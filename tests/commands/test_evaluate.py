@@ -119,7 +119,7 @@ def test_crossovers_are_trained_on_and_not_evaluated():
         (["checkpoint=7"], "has no checkpoint 7; it has 0"),
         (["out=."], "exists; name a new folder"),
         (["out=no/new"], "there is no folder 'no'"),
-        (["mass=0"], "randomization.mass: expected [least, largest] factor above 0, got [0.0, 0.0]"),
+        (["mass=0"], "randomization.mass: expected [minimum, maximum] factor above 0, got [0.0, 0.0]"),
         (["torque_noise=-1"], "randomization.torque_noise: expected at least 0, got -1"),
         (["mass=[0,1]"], "mass"),
         (["demonstrations=missing.npz"], "no file at 'missing.npz'"),
@@ -132,9 +132,9 @@ def test_bad_evaluations(refused, run_dir, arguments, message):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("mass=[0,1]", "randomization.mass: expected [least, largest] factor above 0, got [0.0, 1.0]"),
-        ("damping=[2,1]", "randomization.damping: expected [least, largest] factor above 0, got [2.0, 1.0]"),
-        ("mass=[1]", "randomization.mass: expected [least, largest] factor above 0, got [1.0]"),
+        ("mass=[0,1]", "randomization.mass: expected [minimum, maximum] factor above 0, got [0.0, 1.0]"),
+        ("damping=[2,1]", "randomization.damping: expected [minimum, maximum] factor above 0, got [2.0, 1.0]"),
+        ("mass=[1]", "randomization.mass: expected [minimum, maximum] factor above 0, got [1.0]"),
         ("torque_noise=-1", "randomization.torque_noise: expected at least 0, got -1"),
         ("torque_noise=nan", "randomization.torque_noise: expected at least 0, got nan"),
     ],
@@ -153,7 +153,7 @@ def too_fast(demonstrations):
     ("change", "message"),
     [
         (lambda given: dataclasses.replace(given, arm="panda"), "recorded with the joints joint1, joint2, joint3 of"),
-        (too_fast, "joint3 of demonstration 1 turns at 100 rad/s at 0.4 s, but its rated speed is"),
+        (too_fast, "joint3 of demonstration 1 has a velocity of 100 rad/s at 0.4 s, but its velocity limit is"),
     ],
 )
 def test_unfit_demonstrations(refused, run_dir, unseen, tmp_path, change, message):

@@ -82,7 +82,7 @@ def test_an_arm_that_runs_away_is_given_rotors(inspected, tmp_path):
 @pytest.mark.slow
 def test_how_near_an_equal_arm_can_come(inspected):
     said = inspected("panda")
-    ((bound, hold, share),) = re.findall(r"best poses: (\S+), of holding still: (\S+); (\d+)% of it", said)
+    ((bound, hold, share),) = re.findall(r"best poses: (\S+), of holding the start pose: (\S+); (\d+)% of it", said)
     assert float(bound) < 0.01 < 0.1 < float(hold) and int(share) > 95
 
 

@@ -20,6 +20,7 @@ from mimic.commands.render import draw_frames, prepare_video
 from mimic.envs import env_config
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.recording import record_demonstrations
+from mimic.metric.similarity import centre_line, similarity
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 STEPS = 4  # of a motion: 0.4 s, 13 frames
@@ -62,11 +63,11 @@ def curves(clip):
 
 
 def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
-    recipe = prepare_clip(RenderConfig(run=str(mapper_run), demonstration=1, seed=5))
-    clip, mapper = recipe.make(), mimic.PoseMapper.load(mapper_run)
-    assert recipe.out == mapper_run / "videos" / "pd-seed5-1.mp4"
+    plan = prepare_clip(RenderConfig(run=str(mapper_run), demonstration=1, seed=5))
+    clip, mapper = plan.compute(), mimic.PoseMapper.load(mapper_run)
+    assert plan.out == mapper_run / "videos" / "pd-seed5-1.mp4"
     expert, learner = clip.poses
-    recorded = record_demonstrations(build_arm(recipe.env.expert), 2, seed=5, horizon=STEPS)
+    recorded = record_demonstrations(build_arm(plan.env.expert), 2, seed=5, horizon=STEPS)
     np.testing.assert_allclose(expert[::EVERY], recorded.qpos[1], atol=1e-6)
     np.testing.assert_allclose(learner, mapper(expert.astype(np.float32)), atol=ROUNDING)
     shown = curves(clip)
@@ -79,7 +80,7 @@ def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
 
 
 def test_retargeted_motions_are_shown_as_they_are(files):
-    clip = prepare_clip(RenderConfig(**files, demonstration=1)).make()
+    clip = prepare_clip(RenderConfig(**files, demonstration=1)).compute()
     env = env_config("planar4dof")
     for shown, arm in zip(clip.poses, (env.expert, env.learner), strict=True):
         motions = swings(build_arm(arm).embodiment)
@@ -90,16 +91,27 @@ def test_retargeted_motions_are_shown_as_they_are(files):
     assert clip.bars.shape == (len(clip.time), 4) and np.all(np.isfinite(clip.bars))
 
 
+def test_each_frame_has_the_measures_of_similarity(files):
+    plan = prepare_clip(RenderConfig(**files))
+    clip = plan.compute()
+    arms = build_arm(plan.env.expert).embodiment, build_arm(plan.env.learner).embodiment
+    frame = 5
+    lines = (centre_line(arm, poses[frame]) for arm, poses in zip(arms, clip.poses, strict=True))
+    for name, expected in similarity(*lines).items():
+        assert clip.similarity[name].shape == clip.time.shape
+        assert clip.similarity[name][frame] == pytest.approx(float(expected), rel=1e-4)  # degrees in float32
+
+
 def test_a_frame_shows_the_moment(files):
-    recipe = prepare_clip(RenderConfig(**files))
-    clip = recipe.make()
+    plan = prepare_clip(RenderConfig(**files))
+    clip = plan.compute()
     few = dataclasses.replace(clip, time=clip.time[:2], poses=tuple(poses[[0, -1]] for poses in clip.poses))
-    with ArmScene([recipe.env.expert, recipe.env.learner], width=160, height=120) as scene:
+    with ArmScene([plan.env.expert, plan.env.learner], width=160, height=120) as scene:
         first, last = draw_frames(scene, few)
     assert first.shape == last.shape == (640, 1280, 3)
     changed = np.any(first != last, axis=-1)
     assert changed[:, :380].any() and changed[:, 380:760].any()  # both arms
-    assert changed[:, 760:].any()  # the line of the time
+    assert changed[:280, 760:].any() and changed[340:380, 760:].any()  # the line of the time; similarity
 
 
 def test_a_video_has_all_frames(files, tmp_path):
@@ -117,15 +129,15 @@ def test_a_video_has_all_frames(files, tmp_path):
     [
         ({}, "out: expected a file, as in out=FILE.mp4"),
         ({"out": "swing.gif"}, "expected a file that ends in .mp4"),
-        ({"learner": ""}, "learner: expected what mimic.retarget was given"),
-        ({"retargeted": ""}, "retargeted: expected what mimic.retarget was given or wrote"),
-        ({"demonstrations": ""}, "demonstrations: expected what mimic.retarget was given"),
+        ({"learner": ""}, "learner: expected with retargeted=FILE"),
+        ({"retargeted": ""}, "retargeted: expected with retargeted=FILE"),
+        ({"demonstrations": ""}, "demonstrations: expected with retargeted=FILE"),
         ({"demonstrations": "none.npz"}, "no file at 'none.npz'"),
         ({"learner": "planar7dof"}, "demonstrations: expected motions of planar4 .* got planar7"),
         ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
-        ({"demonstration": 2}, "demonstration: expected 0 to 1, those of the file, got 2"),
-        ({"run": "runs/NAME"}, "run: does not go with retargeted=FILE"),
-        ({"seed": 1}, "seed: does not go with retargeted=FILE"),
+        ({"demonstration": 2}, "demonstration: expected an index of the file from 0 to 1, got 2"),
+        ({"run": "runs/NAME"}, "run: has no effect with retargeted=FILE"),
+        ({"seed": 1}, "seed: has no effect with retargeted=FILE"),
     ],
 )
 def test_bad_files_are_rejected_in_one_line(files, changes, message):
@@ -137,19 +149,17 @@ def test_bad_files_are_rejected_in_one_line(files, changes, message):
 def test_motions_of_another_length_are_rejected(files, tmp_path):
     learner = build_arm(env_config("planar4dof").learner).embodiment
     swings(learner, count=1).save(tmp_path / "one.npz")
-    with pytest.raises(
-        ValueError, match="expected 2 motions of 4 steps of 0.1 s, as the demonstrations, got 1 motions"
-    ):
+    with pytest.raises(ValueError, match="expected 2 motions of 4 steps of 0.1 s, as in demonstrations, got 1 motions"):
         prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
 
 
 def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
     bad: list[tuple[dict[str, Any], str]] = [
-        ({"split": "train"}, "split: does not go with a run of trainer=pose_mapper"),
+        ({"split": "train"}, "split: has no effect with a run of trainer=pose_mapper"),
         ({"seed": -1}, "demonstration, seed: expected at least 0"),
         ({"checkpoint": 7}, "checkpoint"),
         ({"demonstrations": files["retargeted"]}, "demonstrations: expected motions of planar7"),
-        ({"demonstrations": files["demonstrations"], "demonstration": 3}, "expected 0 to 1"),
+        ({"demonstrations": files["demonstrations"], "demonstration": 3}, "from 0 to 1"),
     ]
     for changes, message in bad:
         with pytest.raises(ValueError, match=message):
@@ -161,7 +171,7 @@ def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
     [
         ([], "run: expected the run directory"),
         (["run=missing"], "not a run directory"),
-        (["run=missing", "split=test"], "expected one of held_out, train, got 'test'"),
+        (["run=missing", "split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
 def test_bad_input_of_the_command(refused, arguments, message):

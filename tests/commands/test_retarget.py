@@ -31,7 +31,7 @@ def test_the_motions_load_and_do_not_jump(recorded, tmp_path):
     out = tmp_path / "learner.npz"
     result = command(f"demonstrations={recorded}", "learner=planar4dof", f"out={out}")
     assert result.returncode == 0, result.stderr[-2000:]
-    assert "largest jump" in result.stdout
+    assert "maximum jump" in result.stdout
     motions = mimic.load_demonstrations(out)
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     motions.check_fits(env.learner, 0.1, 50)

@@ -22,8 +22,8 @@ from mimic.commands.config import ViewConfig
         (["run=missing"], "not a run directory"),
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),
-        (["run=a", "expert=panda"], "a run brings its own arms"),
-        (["split=test"], "expected one of held_out, train, got 'test'"),
+        (["run=a", "expert=panda"], "expected neither with run= or mapper="),
+        (["split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
 def test_bad_input(refused, arguments, message, monkeypatch):

@@ -83,10 +83,12 @@ def test_examples_use_what_is_public(name):
 
 @example("01_metric")
 def test_metric(said, tmp_path):
-    ((rest, copied, bound),) = re.findall(r"holding still: (\S+)   copied angles: (\S+)   lower bound: (\S+)", said)
+    pattern = r"holding the start pose: (\S+)   copied angles: (\S+)   kinematic bound: (\S+)"
+    ((rest, copied, bound),) = re.findall(pattern, said)
     assert 0 < float(bound) < float(copied) < float(rest)
     gap = (float(copied) - float(bound)) / (float(rest) - float(bound))
-    assert number(r"1 for holding still: (\S+)%", said) / 100 == pytest.approx(gap, abs=0.006)  # of four digits
+    said_gap = number(r"1 for holding the start pose: (\S+)%", said) / 100
+    assert said_gap == pytest.approx(gap, abs=0.006)  # of four digits
     shares = [float(share) for share in re.findall(r"^  link\S+ +(\S+)  \(", said, re.MULTILINE)]
     assert len(shares) == 7 and sum(shares) == pytest.approx(float(copied), abs=3e-4)
     parts = ("translation", "rotation", "linear_velocity", "angular_velocity")
@@ -126,7 +128,8 @@ def test_pose_mapper(said, tmp_path):
         number(rf"\n{name} +(\d+) poses a second", said.replace(",", "")) for name in ("optimiser", "mapper")
     )
     assert mapper > optimiser
-    distances = [number(rf"\n{name} +mean distance (\S+)", said) for name in ("optimiser", "mapper", "holding still")]
+    names = "optimiser", "mapper", "zero pose"
+    distances = [number(rf"\n{name} +mean distance (\S+)", said) for name in names]
     assert distances == sorted(distances)
     for name in ("optimised", "mapped"):
         motions = mimic.load_demonstrations(tmp_path / f"{name}.npz")
@@ -146,8 +149,8 @@ def test_demonstrations(said, tmp_path):
         np.testing.assert_allclose(waves.qpos[number_of_wave, :, 0], expected, atol=1e-3)  # splines of 0.02 s
     assert "velocities differentiated: True" in said
     assert re.search(r"degrees.csv is refused: .* expected rad in", said)
-    assert re.search(r"clock.csv is refused: .* its rated speed is", said)
-    assert 0 < number(r"mean lower bound over the first wave: (\S+)", said) < 0.5
+    assert re.search(r"clock.csv is refused: .* its velocity limit is", said)
+    assert 0 < number(r"mean kinematic bound over the first wave: (\S+)", said) < 0.5
     assert is_picture(tmp_path / "waves_and_bound.png") and is_picture(tmp_path / "waves.png")
 
 

@@ -65,14 +65,14 @@ def without(name):
     return lambda path: np.savez(path, **{key: value for key, value in arrays(path).items() if key != name})
 
 
-NOT_WHOLE = "is not a whole npz file of demonstrations: "
+NOT_WHOLE = "is not a complete npz file of demonstrations: "
 DAMAGES = {
     "missing": (lambda path: path.unlink(), "no file at"),
     "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-1000]), NOT_WHOLE),
     "cut early": (lambda path: path.write_bytes(path.read_bytes()[:300]), NOT_WHOLE),
     "text": (lambda path: path.write_text("not an archive"), NOT_WHOLE),
     "pickle": (lambda path: path.write_bytes(pickle.dumps(arrays(path))), NOT_WHOLE),
-    "one array": (save_array, NOT_WHOLE + "it holds a single array"),
+    "one array": (save_array, NOT_WHOLE + "it has a single array"),
     "pickled array": (with_arrays(goals=np.array([{}, None], object)), NOT_WHOLE + "it holds pickled objects"),
     "no velocities": (without("qvel"), "it lacks qvel; expected are "),
     "another format": (with_arrays(format=np.array("other")), "has format 'other', expected "),
@@ -120,8 +120,12 @@ def test_demonstrations_of_another_arm_time_step_or_length_are_rejected(recorded
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("torque", 87.1, "joint3 of demonstration 1 is held at 87.1 N m at 0.4 s, but its torque limit is 87 N m"),
-        ("qvel", -2.2, "joint3 of demonstration 1 turns at -2.2 rad/s at 0.4 s, but its rated speed is 2.175 rad/s"),
+        ("torque", 87.1, "has a torque of 87.1 N m at 0.4 s, but its torque limit is 87 N m"),
+        (
+            "qvel",
+            -2.2,
+            "joint3 of demonstration 1 has a velocity of -2.2 rad/s at 0.4 s, but its velocity limit is 2.175 rad/s",
+        ),
     ],
 )
 def test_what_the_expert_cannot_do_is_rejected(recorded, key, value, message):
@@ -132,7 +136,7 @@ def test_what_the_expert_cannot_do_is_rejected(recorded, key, value, message):
 def test_velocities_are_checked_without_torques_and_rounding_passes(recorded):
     arm = panda().embodiment
     bare = dataclasses.replace(recorded, torque=None)
-    with pytest.raises(ValueError, match="turns at"):
+    with pytest.raises(ValueError, match="has a velocity of"):
         mimic.check_effort(changed(bare, "qvel", 3.0), arm)
     at_limit = changed(changed(recorded, "qvel", np.float32(2.175)), "torque", -87.0)
     mimic.check_effort(at_limit, arm)
@@ -143,7 +147,7 @@ def test_velocities_are_checked_without_torques_and_rounding_passes(recorded):
     ("change", "message"),
     [
         (lambda recorded: dataclasses.replace(recorded, arm="other"), "recorded with the joints"),
-        (lambda recorded: changed(recorded, "qvel", 3.0), "turns at"),
+        (lambda recorded: changed(recorded, "qvel", 3.0), "has a velocity of"),
         (lambda recorded: recorded.select([0]), "holds 1, but count=1 to train on and held_out=1 are asked for"),
     ],
     ids=["another arm", "too fast", "too few"],

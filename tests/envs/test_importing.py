@@ -63,7 +63,7 @@ def test_a_table_becomes_demonstrations_that_training_takes(tmp_path, monkeypatc
                    velocity_names=[f"qdot_{i}" for i in numbers])  # fmt: skip
     out = tmp_path / "swing.npz"
     said = run(monkeypatch, capsys, f"source={source}", f"out={out}")
-    assert "1 demonstrations, 50 steps of 0.1 s; velocities: as in the file" in said
+    assert "1 demonstrations, 50 steps of 0.1 s; velocities: from the file" in said
     assert {path.name for path in tmp_path.iterdir()} == {"swing.csv", "swing.npz", "swing.png"}
     loaded = mimic.load_demonstrations(out)
     qpos, qvel = swing(0.1 * np.arange(51))
@@ -132,7 +132,7 @@ NUMBERED = [f"q_{i}" for i in range(1, 8)]
         (lambda path: table(path, names=NUMBERED, time=TIME[:100]), [], "lasts 1.98 s, but an episode 5 s"),
         (lambda path: table(path, names=NUMBERED, time=TIME[::-1]), [], "at times that increase"),
         (lambda path: table(path, names=NUMBERED, factor=np.nan), [], "not finite"),
-        (lambda path: table(path, names=NUMBERED, factor=6.0, time=TIME), ["limits=none"], "turns at"),
+        (lambda path: table(path, names=NUMBERED, factor=6.0, time=TIME), ["limits=none"], "has a velocity of"),
         (lambda path: path.write_text("time,q_1\n0,a\n"), [], "is no table of numbers below a header"),
         (lambda path: path.write_text(""), [], "is no table of numbers below a header"),
         (lambda path: table(path, names=NUMBERED), ["kind=reach"], "kind: expected none with source=FILE"),

@@ -9,7 +9,7 @@ import pytest
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.simulation_model import simulation_model
-from mimic.envs import dynamics, physics
+from mimic.envs import dynamics
 from mimic.envs.config import PHYSICS
 from mimic.envs.physics import Load, make_advance
 from mimic.metric import fused_kernel
@@ -206,19 +206,19 @@ def test_a_batch_steps_as_each_of_its_arms(planar):
             np.testing.assert_allclose(batched[i], single, atol=1e-5)  # rounding of velocities up to 10 rad/s
 
 
-@pytest.mark.usefixtures("interpreted")
-def test_the_kernel_computes_what_the_plain_program_does(planar):
+def test_the_kernel_steps_as_the_plain_function_does(planar, gpu_kernels):
     """The GPU kernel, interpreted on the CPU, for a batch that is no multiple of its block."""
-    count = physics._LAYOUT.block + 1
+    count = fused_kernel.DEFAULT.block + 1
     model, states, loads = planar
-    step = physics._scalar_step(dynamics.segments(model), 0.01, 2)
-    on_gpu = fused_kernel.gpu_kernel(step, (3, 3), physics._LAYOUT)
+    advance = make_advance(model, 0.01, 2, "fused")
     rows = [jnp.resize(x, (count, *x.shape[1:])) for x in (*states, *loads)]
-    found = jax.jit(lambda *rows: on_gpu(*rows[:3], jnp.stack(rows[3:], axis=1)))(*rows)
-    expected = jax.jit(jax.vmap(make_advance(model, 0.01, 2, "fused")))(*rows[:3], Load(*rows[3:]))
-    for values, reference in zip(found, expected, strict=True):
-        assert values.shape == (count, 3)
-        np.testing.assert_allclose(values, reference, atol=1e-5)  # as above
+    batch = jax.jit(jax.vmap(advance))(*rows[:3], Load(*rows[3:]))
+    assert len(gpu_kernels) == 1
+    alone = jax.jit(advance)
+    expected = [alone(*(x[i] for x in states), Load(*(x[i] for x in loads))) for i in range(5)]
+    for index, values in enumerate(batch):
+        reference = np.stack([one[index] for one in expected])
+        np.testing.assert_allclose(values, np.resize(reference, (count, 3)), atol=1e-5)  # as above
 
 
 def test_the_kernel_lowers_without_a_gpu(planar):

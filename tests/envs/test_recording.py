@@ -74,5 +74,5 @@ def test_what_diverges_is_no_demonstration(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of what diverges
     arm = panda()
     unlimited = dataclasses.replace(arm.embodiment, velocity_limit=np.full(7, np.inf))
-    with pytest.raises(ValueError, match="break its limits"):
+    with pytest.raises(ValueError, match="exceed its limits"):
         mimic.record_demonstrations(dataclasses.replace(arm, embodiment=unlimited), 1, dt=2.0)

@@ -18,6 +18,7 @@ from mimic.evaluation.rollout_metrics import gaps, has_gap, measure
 from mimic.evaluation.tracking_controllers import run_controller
 from mimic.metric.kinematics import link_state_table
 from mimic.trainers.ppo.trainer import PPOTrainer
+from tests.helpers.metric_cases import planar_optimum
 
 COUNT, HELD_OUT, HORIZON = 5, 4, 30
 SPLITS = {"train": slice(0, COUNT), "held_out": slice(COUNT, None)}
@@ -267,3 +268,19 @@ def test_no_rollout_goes_below_the_bound():
     for seed in range(5):
         gain = np.random.default_rng(seed).normal(size=size) * 0.02 * seed
         assert np.all(np.asarray(rollout(gain).distance) > evaluator.lower_bound - 1e-4)
+
+
+def test_bound_and_holding_are_those_of_the_samples_after_each_step():
+    """In closed form: of planar arms by directions. 1e-4: what the search may leave."""
+    metric = {"correspondence": "overlap", "translation": 0.0, "linear_velocity": 0.0, "angular_velocity": 0.0}
+    few = {"count": 1, "held_out": 1}
+    config = mimic.env_config("planar4dof", demonstrations=few, horizon=12, metric=metric, physics="fused")
+    training, held_out = training_and_held_out(config)
+    evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
+    env = evaluator.env
+    optimum = planar_optimum(env.expert, env.learner, env.demonstrations.qpos)
+    np.testing.assert_allclose(evaluator.lower_bound, optimum[:, 1:], atol=1e-4)
+    assert np.abs(np.diff(optimum, axis=1)).max() > 5e-3  # a bound one sample early would be noticed
+    weights, angles = np.asarray(env.correspondence), np.cumsum(env.demonstrations.qpos, axis=-1)
+    straight = np.pi / 2 * (weights.sum() - (np.cos(angles) @ weights).sum(axis=-1)) / weights.size
+    np.testing.assert_allclose(evaluator.hold_distance, straight[:, 1:], atol=1e-5)  # float32

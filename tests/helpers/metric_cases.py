@@ -33,3 +33,14 @@ def states(arm, seed=0, dtype: DTypeLike = np.float32):
     rng = np.random.default_rng(seed)
     qpos, qvel = rng.uniform(-np.pi, np.pi, arm.num_joints), rng.uniform(-2, 2, arm.num_joints)
     return link_states(arm, qpos.astype(dtype), qvel.astype(dtype))
+
+
+def planar_optimum(expert, learner, qpos):
+    """Closed form of the least distance of directions, by overlap: [...] of poses [..., joints] of a planar expert.
+
+    Each link of the learner points along the sum of the directions that correspond to it.
+    """
+    angles = np.cumsum(qpos, axis=-1)
+    weights = np.asarray(overlap_correspondence(expert, learner))
+    pull = np.abs(np.exp(1j * angles) @ weights)
+    return np.pi / 2 * (weights.sum() - pull.sum(axis=-1)) / weights.size

@@ -7,13 +7,14 @@ import pytest
 from jax.typing import DTypeLike
 
 from mimic import motion_distance
-from mimic.arms.embodiment import panda, planar_arm
+from mimic.arms.embodiment import load_mjcf, panda, planar_arm
 from mimic.metric import fused_kernel
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
 from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
 from mimic.metric.kinematics import LONG, link_states
 from tests.helpers.lowering import gpu_program
 from tests.helpers.metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, WEIGHTS
+from tests.helpers.random_arms import random_arm
 
 PAIRS = {
     "panda 7->4": (panda(), panda(locked=(3, 6, 7))),
@@ -211,23 +212,32 @@ def test_the_kernel_computes_what_the_plain_program_does(count):
         np.testing.assert_allclose(values, reference, rtol=1e-6)  # float32, fused and not
 
 
-def test_value_and_gradient_are_one_kernel_on_a_gpu():
-    arms = EXPERT, LEARNER
+@pytest.mark.parametrize("pair", ["planar", "long"])
+def test_value_and_gradient_are_one_kernel_on_a_gpu(pair):
+    arms = PAIRS[pair]
     distance = motion_distance(*arms, overlap_correspondence(*arms))
     batch = motions(arms, dtype=np.float32)
     for function in (distance, jax.value_and_grad(distance, (2, 3)), jax.grad(distance, 0)):
-        program = jax.jit(jax.vmap(function))
-        assert gpu_program(program, *batch).count("triton") == 1
-        assert "triton" not in program.lower(*batch).as_text()
+        compiled = jax.jit(jax.vmap(function))
+        assert gpu_program(compiled, *batch).count("triton") == 1
+        assert "triton" not in compiled.lower(*batch).as_text()
+
+
+@pytest.mark.parametrize("pair", ["planar", "long"])
+def test_the_kernel_lowers_in_double_precision(x64, pair):
+    arms = PAIRS[pair]
+    gradient = jax.vmap(jax.grad(motion_distance(*arms, overlap_correspondence(*arms)), 2))
+    assert "triton" in gpu_program(jax.jit(gradient), *motions(arms))
 
 
 @pytest.mark.gpu
-def test_the_gpu_computes_what_double_precision_does():
-    arms = PAIRS["panda 7->4"]
+@pytest.mark.parametrize("pair", ["panda 7->4", "random, long"])
+def test_the_gpu_computes_what_double_precision_does(pair):
+    arms = (load_mjcf(random_arm(4, 40)), load_mjcf(random_arm(7, 20))) if pair == "random, long" else PAIRS[pair]
     metric = overlap_correspondence(*arms), PAPER_WEIGHTS
     batch = motions(arms, 10_001, np.float32)
     found = jax.jit(jax.vmap(jax.value_and_grad(motion_distance(*arms, *metric), ALL_ARGUMENTS)))(*batch)
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         plain = jax.jit(jax.vmap(jax.value_and_grad(composed(arms, *metric), ALL_ARGUMENTS)))
         expected = plain(*(np.asarray(x, np.float64) for x in batch))
-    assert largest_difference(found, expected) < 1e-5
+    assert largest_difference(found, expected) < 1e-5  # float32, there and back over up to 40 joints

@@ -14,6 +14,7 @@ from mimic.metric.kinematics import link_states
 from mimic.retargeting import pose_objective
 from mimic.retargeting.closed_form import SMOOTHING
 from mimic.retargeting.pose import imitate_pose, imitate_trajectory
+from tests.helpers.metric_cases import planar_optimum
 
 DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.0)
 DEFAULT = MetricConfig()
@@ -32,14 +33,6 @@ PAIRS = {
 
 def poses(arm, count, seed=0):
     return np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, arm.num_joints)).astype(np.float32)
-
-
-def planar_optimum(expert, learner, qpos):
-    """Closed form: each free planar link points along the sum of the directions that correspond to it."""
-    angles = np.cumsum(qpos, axis=-1)
-    weights = np.asarray(overlap_correspondence(expert, learner))
-    pull = np.abs(np.exp(1j * angles) @ weights)
-    return np.pi / 2 * (weights.sum() - pull.sum(axis=-1)) / weights.size
 
 
 @pytest.mark.parametrize("name", ["planar 7->4", "planar 4->7"])

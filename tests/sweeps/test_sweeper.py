@@ -217,7 +217,7 @@ def test_in_one_process_an_error_ends_its_run_and_a_signal_the_sweep(capsys):
         raise ZeroDivisionError("no arms")
 
     def outcome(work):
-        return cli._run_of_a_sweep(lambda _: work, OmegaConf.create())
+        return cli._sweep_run(lambda _: work, OmegaConf.create())
 
     assert outcome(broken) == Outcome(1, "ZeroDivisionError: no arms")
     assert "Traceback" in capsys.readouterr().err

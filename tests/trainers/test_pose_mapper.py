@@ -195,7 +195,7 @@ def test_a_regularised_run_differs_in_training_and_repeats_its_report(tmp_path):
     assert plain["quality"] != regularised["quality"]
     job = PoseMapperTrainer(run_config(tmp_path, dropout=0.3, **SHORT))
     mapper = mimic.PoseMapper.load(tmp_path / "regularised")
-    assert job.figures(job.evaluate(mapper.params))["quality"] == pytest.approx(regularised["quality"], rel=1e-5)
+    assert job.metrics(job.evaluate(mapper.params))["quality"] == pytest.approx(regularised["quality"], rel=1e-5)
 
 
 @pytest.mark.parametrize(

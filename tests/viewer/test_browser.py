@@ -23,7 +23,7 @@ MISSING = [name for name in ("viser", "playwright") if importlib.util.find_spec(
 MISSING += [] if BROWSER else ["chromium"]
 SOFTWARE_GL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 LEARNER = (500, 250, 960, 650)  # pixels of the page where it stands
-LATEST = 120_000  # ms for anything, on a busy machine: the lower bound has to be compiled
+LATEST = 120_000  # ms for anything, on a busy machine: the kinematic bound has to be compiled
 
 pytestmark = [
     pytest.mark.slow,

@@ -18,7 +18,7 @@ from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings, TrainConfig
 from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model
-from mimic.trainers.trainer import Figures, OnEvaluation, Params, Row, Trainer
+from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
 
 # Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.
 _TRAINING, _VALIDATION, _HELD_OUT, _CHANCE = range(4)
@@ -166,7 +166,7 @@ class PoseMapperTrainer(Trainer):
         _ = self._optimisation  # compiled beside the evaluation where there was no training
         return jax.device_get(self._evaluation()(params, self._every))
 
-    def figures(self, outcome: _Judged) -> Figures:
+    def metrics(self, outcome: _Judged) -> Metrics:
         """Quality and what it is made of, by split; angles on held-out poses."""
         reference = self._reference
 
@@ -200,7 +200,7 @@ class PoseMapperTrainer(Trainer):
         )
         return np.median(to_expert, axis=0), np.median(_angle(learner, optimum), axis=0)
 
-    def details(self, outcome: _Judged, controller: str = "mapper") -> Figures:
+    def details(self, outcome: _Judged, controller: str = "mapper") -> Metrics:
         """How alike held-out poses look, beside the optimiser's and the baselines'; of the first of them."""
         model, count = self._model, min(_SIMILARITY_POSES, self.settings.held_out_poses)
         expert, mapped, optimum = (
@@ -210,16 +210,16 @@ class PoseMapperTrainer(Trainer):
         poses = {"mapper": mapped, "nearest_poses": optimum}
         return {"similarity": pose_similarity(model.expert, model.learner, expert, poses, split="held_out")}
 
-    def status(self, figures: Figures) -> str:
+    def status(self, metrics: Metrics) -> str:
         """Distance and quality."""
-        quality, distance = figures["quality"], figures["mean_distance"]["validation"]
+        quality, distance = metrics["quality"], metrics["mean_distance"]["validation"]
         return f"distance {distance:.4f}  above the optimum {quality['train']:.2%}, unseen {quality['validation']:.2%}"
 
-    def good_enough(self, figures: Figures) -> bool:
+    def good_enough(self, metrics: Metrics) -> bool:
         """At the target quality on validation poses."""
-        return figures["quality"]["validation"] <= self.settings.target_quality
+        return metrics["quality"]["validation"] <= self.settings.target_quality
 
-    def rows(self, figures: Figures) -> list[Row]:
+    def rows(self, metrics: Metrics) -> list[Row]:
         """Quality and what it is made of."""
         by_split: tuple[tuple[str, str, str], ...] = (
             ("above the optimum (0 best, 1 a random pose)", "quality", "{:.2%}"),
@@ -228,13 +228,13 @@ class PoseMapperTrainer(Trainer):
             ("  random poses", "random_distance", "{:.4f}"),
         )
         rows = [
-            (label, form.format(figures[key]["train"]), form.format(figures[key]["held_out"]))
+            (label, form.format(metrics[key]["train"]), form.format(metrics[key]["held_out"]))
             for label, key, form in by_split
         ]
-        to_optimum = max(figures["link_angle_to_optimum_deg_by_link"].values())
+        to_optimum = max(metrics["link_angle_to_optimum_deg_by_link"].values())
         return [
             *rows,
-            ("median angle to the expert's links", "", f"{figures['link_angle_error_deg']:.1f} deg"),
+            ("median angle to the expert's links", "", f"{metrics['link_angle_error_deg']:.1f} deg"),
             ("median angle to the optimum, worst link", "", f"{to_optimum:.1f} deg"),
         ]
 
