@@ -228,6 +228,19 @@ def segment_arm(arm: Embodiment) -> Embodiment:
     )
 
 
+def in_chain_lengths(arm: Embodiment) -> Embodiment:
+    """The arm with all lengths in units of its chain length."""
+    length = arm.chain_length
+    return dataclasses.replace(
+        arm,
+        joint_anchor=arm.joint_anchor / length,
+        link_position=arm.link_position / length,
+        link_lengths=arm.link_lengths / length,
+        segment_start=arm.segment_start / length,
+        segment_end=arm.segment_end / length,
+    )
+
+
 def _model(path_or_model: str | os.PathLike[str] | mujoco.MjModel) -> mujoco.MjModel:
     return path_or_model if isinstance(path_or_model, mujoco.MjModel) else read_model(path_or_model)
 

@@ -143,7 +143,7 @@ def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]
 
 
 def _links(expert: Arm, learner: Arm, env: EnvConfig) -> list[dict[str, Any]]:
-    arm, shares = learner.embodiment, env.metric.shares(expert.embodiment, learner.embodiment)
+    arm, shares = learner.embodiment, env.metric.link_fractions(expert.embodiment, learner.embodiment)
     return [
         {
             "link": name,
@@ -210,7 +210,7 @@ def _save_picture(path: Path, image: np.ndarray, expert: Arm, learner: Arm, env:
     left.imshow(image)
     left.axis("off")
     left.set_title(f"{expert.embodiment.name} (expert), {learner.embodiment.name} (learner)")
-    shares = env.metric.shares(expert.embodiment, learner.embodiment)
+    shares = env.metric.link_fractions(expert.embodiment, learner.embodiment)
     right.imshow(shares, cmap="Blues", vmin=0, vmax=1)
     for (row, column), share in np.ndenumerate(shares):
         if share > 0.005:

@@ -92,7 +92,7 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
     return advance
 
 
-def _scalar_step(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: int) -> fused_kernel.Program:
+def _scalar_step(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: int) -> fused_kernel.ScalarFunction:
     """The same on scalars."""
 
     def step(qpos: Any, qvel: Any, torque: Any, load: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:

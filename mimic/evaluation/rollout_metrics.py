@@ -47,7 +47,7 @@ def measure(
       torque: that was held in each step [N m].
     """
     arm = env.learner
-    shares = env.config.metric.shares(env.expert, arm)
+    shares = env.config.metric.link_fractions(env.expert, arm)
     expert = {key: np.asarray(value)[:, 1 : qpos.shape[1] + 1] for key, value in vars(env.expert_states).items()}
     cosine = np.einsum("dtix,dtjx->dtij", expert["direction"], np.asarray(learner.direction))
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=1)

@@ -21,7 +21,7 @@ def optimal_motions(
     """`imitate_trajectory` of each of the expert's motions [motions, time, joints]."""
     arguments = metric.build(expert, learner).arguments
 
-    def one(qpos: jax.Array) -> PoseImitation:
+    def imitate(qpos: jax.Array) -> PoseImitation:
         return imitate_trajectory(
             expert,
             learner,
@@ -32,4 +32,4 @@ def optimal_motions(
         )
 
     # One demonstration after the other: the tracked minima already fill the processor, and memory stays small.
-    return jax.jit(lambda all_qpos: jax.lax.map(one, all_qpos))(qpos)
+    return jax.jit(lambda all_qpos: jax.lax.map(imitate, all_qpos))(qpos)

@@ -9,7 +9,7 @@ from mimic.commands import train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from tests.helpers.pages import PAGES, REPOSITORY, Block, check, commands, module, read_blocks, run_page
 
-README = (REPOSITORY / "README.md").read_text()
+DOCS = REPOSITORY / "docs"
 QUICK = ("install.md", "metric.md", "own_arm.md")  # run by `make test`; all by `make test-all`
 
 
@@ -21,9 +21,19 @@ def python(page):
     return [block.text for block in read_blocks(page.read_text()) if block.kind == "python"]
 
 
-def test_the_first_example_of_the_readme_runs():
+def test_the_example_of_the_readme_runs():
     scope: dict = {}
     exec(python(REPOSITORY / "README.md")[0], scope)  # noqa: S102 - our own text
+    assert scope["solution"].qpos.shape == (4,)
+
+
+def test_the_readme_is_short():
+    assert len((REPOSITORY / "README.md").read_text().split()) <= 700
+
+
+def test_the_example_of_the_library_runs():
+    scope: dict = {}
+    exec(python(DOCS / "library.md")[0], scope)  # noqa: S102 - our own text
     assert scope["bound"].shape == (scope["demonstrations"].horizon + 1,)
     assert scope["gradient"].shape == (4,)
 
@@ -36,8 +46,8 @@ def test_the_examples_on_poses_run(monkeypatch, tmp_path):
     config = TrainConfig(mimic.env_config("panda4dof"), trainer, run_dir="runs/panda4dof", compilation_cache="")
     assert train.prepare_training(config, 0.0)() == 0
     scope: dict = {}
-    exec("\n".join(python(REPOSITORY / "docs" / "static_pose_imitation.md")), scope)  # noqa: S102 - our own text
-    assert scope["found"].qpos.shape == (100, 4) and scope["learner_poses"].shape == (10, 4)
+    exec("\n".join(python(DOCS / "static_pose_imitation.md")), scope)  # noqa: S102 - our own text
+    assert scope["solution"].qpos.shape == (100, 4) and scope["learner_poses"].shape == (10, 4)
     assert scope["followed"].qpos.shape == (50, 4)
 
 
@@ -93,10 +103,10 @@ def test_bad_commands_are_found(command, monkeypatch, tmp_path):
         check(commands(Block("bash", command, None, True))[0], monkeypatch)
 
 
-def test_the_readme_names_every_environment_and_only_what_exists():
+def test_pages_name_every_environment_and_only_functions_that_exist():
     for name in mimic.environments():
-        assert f"`{name}`" in README
-    table = README.split("| to | call |")[1].split("\n\n")[0]
+        assert f"`{name}`" in (DOCS / "training.md").read_text()
+    table = (DOCS / "library.md").read_text().split("| to | call |")[1].split("\n\n")[0]
     for name in re.findall(r"`(\w+)`", table):
         assert hasattr(mimic, name), name
 

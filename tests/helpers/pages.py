@@ -1,4 +1,4 @@
-"""What README.md and the pages in docs show: their blocks, and how each is checked and run.
+"""What README.md, CONTRIBUTING.md and the pages in docs show: their blocks, and how each is checked and run.
 
 Fences say what a block is. `bash`, or an indented block: commands. `python`: code, where all blocks of a page share
 their names. A `title="FILE"` after the language: a file that the reader saves. Anything else (`text`): to be read.
@@ -31,7 +31,10 @@ from mimic import cli
 from mimic.sweeps.sweeper import Sweeper
 from tests.helpers.repository import REPOSITORY
 
-PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("**/*.md"))]
+PAGES = [
+    *(REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md")),
+    *sorted((REPOSITORY / "docs").glob("**/*.md")),
+]
 
 NOT_RUN = (
     "make",

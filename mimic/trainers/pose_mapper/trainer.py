@@ -194,7 +194,9 @@ class PoseMapperTrainer(Trainer):
         directions = reference.expert_direction, outcome.direction, reference.optimum.direction
         expert, learner, optimum = (self._by_split(direction)["held_out"] for direction in directions)
         to_expert = np.einsum(
-            "ij,pij->pj", model.metric.shares(model.expert, model.learner), _angle(expert[:, :, None], learner[:, None])
+            "ij,pij->pj",
+            model.metric.link_fractions(model.expert, model.learner),
+            _angle(expert[:, :, None], learner[:, None]),
         )
         return np.median(to_expert, axis=0), np.median(_angle(learner, optimum), axis=0)
 
