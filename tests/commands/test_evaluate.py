@@ -5,48 +5,19 @@ import dataclasses
 import json
 import shutil
 
-import jax
 import numpy as np
 import pytest
 
-import mimic
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs.imitation import training_and_held_out
-from mimic.runs.checkpoints import save_checkpoint
+from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.ppo import training
-from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import save_config
-
-COUNT, HELD_OUT, HORIZON = 4, 2, 20
-
-
-def environment(learner=(0.5, 0.5)):
-    return mimic.env_config(
-        "planar4dof",
-        expert={"link_lengths": [0.4, 0.3, 0.3]},
-        learner={"link_lengths": list(learner)},
-        demonstrations={"count": COUNT, "held_out": HELD_OUT},
-        horizon=HORIZON,
-        physics="fused",
-    )
-
-
-def untrained_run(folder, **settings):
-    """What a training run leaves, but with the parameters that it starts from: no training is compiled."""
-    trainer = PPOConfig(hidden_layers=[8], preset="cpu")
-    config = TrainConfig(environment(**settings), trainer, compilation_cache="")
-    job = PPOTrainer(config, None)
-    folder.mkdir()
-    save_config(folder, dataclasses.replace(config, trainer=job.settings))
-    job.save_inputs(folder)
-    env = job.evaluator.env
-    networks = training.make_networks(job.settings, env.observation_size, env.action_size)
-    save_checkpoint(folder, 0, initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
-    return folder
+from tests.helpers.untrained_run import COUNT, HORIZON, environment, untrained_run
 
 
 @pytest.fixture(scope="module")
@@ -102,13 +73,17 @@ def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_pat
     assert plain["mean_distance"] != heavy["mean_distance"]
 
 
-def test_crossovers_are_trained_on_and_not_evaluated():
+def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
+    trained = []
+    monkeypatch.setattr(training, "train", lambda env, *_, **__: trained.append(env))
     trainer = PPOConfig(hidden_layers=[8], preset="cpu", crossovers=3)
     job = make_trainer(TrainConfig(environment(), trainer), None)
     assert isinstance(job, PPOTrainer)
-    assert job._env.demonstrations.count == COUNT + 3
+    job.train(tmp_path, lambda *_: False, Signals(), None)
+    (env,) = trained
+    assert env.demonstrations.count == COUNT + 3
     assert job.evaluator.training_env.demonstrations.count == COUNT
-    np.testing.assert_array_equal(job._env.demonstrations.qpos[:COUNT], job.evaluator.env.demonstrations.qpos[:COUNT])
+    np.testing.assert_array_equal(env.demonstrations.qpos[:COUNT], job.evaluator.env.demonstrations.qpos[:COUNT])
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.envs import imitation
 from mimic.envs.config import RandomizationConfig
 from mimic.envs.physics import Load
 from mimic.envs.wrappers import wrap_for_training
@@ -112,15 +113,16 @@ def test_noise_moves_the_arm_anew_in_each_step_and_episode(plain):
         assert np.abs(a - b).max() > 1e-3
 
 
-def showing_torques(env):
-    """The environment with an arm whose speed is the torque that it was given, as a share of the largest."""
-    env._advance = lambda qpos, qvel, torque, load: (qpos, torque / env.torque_scale)
-    return env
+@pytest.fixture
+def noisy(monkeypatch):
+    """An environment with noise, and an arm whose velocity becomes the torque [N m] that it was given."""
+    monkeypatch.setattr(imitation, "make_advance", lambda *_: lambda qpos, qvel, torque, load: (qpos, torque))
+    return make(torque_noise=0.1)
 
 
-def test_noise_is_of_the_given_size_and_within_the_largest_torque():
+def test_noise_is_of_the_given_size_and_within_the_largest_torque(noisy):
     """5000 draws: their standard deviation is known to 1 %, and 5 % is five times that."""
-    env = showing_torques(make(torque_noise=0.1))
+    env = noisy
 
     @jax.jit
     @jax.vmap
@@ -128,7 +130,7 @@ def test_noise_is_of_the_given_size_and_within_the_largest_torque():
         start = env.reset(key)
         first = env.step(start, ACTION)
         second, beyond = env.step(first, ACTION), env.step(start, 1 + ACTION)
-        return [state.pipeline_state.qvel for state in (first, second, beyond)]  # type: ignore[union-attr]
+        return [state.pipeline_state.qvel / env.torque_scale for state in (first, second, beyond)]  # type: ignore[union-attr]
 
     first, second, beyond = map(np.asarray, torques(jax.random.split(jax.random.PRNGKey(0), 5000)))
     for drawn in (first, second):
@@ -138,12 +140,12 @@ def test_noise_is_of_the_given_size_and_within_the_largest_torque():
     assert np.abs(beyond).max() <= 1
 
 
-def test_noise_shares_no_key_with_the_next_episode():
+def test_noise_shares_no_key_with_the_next_episode(noisy):
     """Folding a small number into a key gives what splitting it does."""
-    env = showing_torques(make(torque_noise=0.1))
+    env = noisy
     state = env.reset(jax.random.PRNGKey(0))
     keys = jax.random.split(state.pipeline_state.key, 3)
     for _ in range(3):
         state = env.step(state, jnp.zeros(2))
-        noise = state.pipeline_state.qvel / 0.1
+        noise = state.pipeline_state.qvel / env.torque_scale / 0.1
         assert not any(np.allclose(noise, jax.random.normal(key, (2,)), atol=1e-3) for key in keys)

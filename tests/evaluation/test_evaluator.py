@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
@@ -181,13 +182,11 @@ def test_a_gap_that_would_mean_nothing_is_not_given():
     assert has_gap(0.075, 0.1) and not has_gap(0.0751, 0.1)
 
 
-def test_a_report_says_why_there_is_no_gap(evaluator):
+def test_a_report_says_why_there_is_no_gap(evaluator, monkeypatch):
     """The bound is raised to where it saves less than a quarter of the distance of holding the start pose."""
-    close = copy.copy(evaluator)
-    references = evaluator._references()
-    close._references = lambda: references._replace(bound=0.9 * references.hold)  # pyright: ignore
-    ran = rollouts(evaluator, distance=2 * references.hold)
-    figures = {**close.summary(ran), "worst_demonstrations": close.worst(ran)}
+    monkeypatch.setattr(Evaluator, "lower_bound", property(lambda evaluator: 0.9 * evaluator.hold_distance))
+    ran = rollouts(evaluator, distance=2 * evaluator.hold_distance)
+    figures = {**evaluator.summary(ran), "worst_demonstrations": evaluator.worst(ran)}
     assert all(np.isnan(gap) for gap in figures["optimality_gap"].values())
     assert figures["worst_demonstrations"] == {"train": {}, "held_out": {}}
     rows = PPOTrainer.rows(object.__new__(PPOTrainer), figures)
@@ -212,7 +211,7 @@ def test_the_table_as_a_file(evaluator, tmp_path):
 def test_pictures_show_all_and_name_the_controller(evaluator, monkeypatch, tmp_path, plot):
     """The held-out demonstrations went worse than the training ones, whose axes come first."""
     figures = []
-    monkeypatch.setattr(plots, "_save", lambda figure, out: figures.append(figure))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     ran = between(evaluator, [0.1] * COUNT + [3.0, 2.0, 1.0, 0.0])
     plot(evaluator, ran, tmp_path / "picture.png", controller="pd", title="env")
     (figure,) = figures

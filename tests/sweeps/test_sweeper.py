@@ -11,12 +11,11 @@ import time
 
 import pytest
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
 
 from mimic import cli
 from mimic.sweeps.launchers import gpus_of
 from mimic.sweeps.run_command import RunCommand
-from mimic.sweeps.sweeper import Outcome, path_of, path_override
+from mimic.sweeps.sweeper import path_of, path_override
 from tests.helpers.run_directories import write_run
 from tests.helpers.tiny import TINY
 
@@ -212,19 +211,36 @@ def test_each_slot_has_gpus_of_its_own():
         gpus_of(2, 1, "0,1")
 
 
-def test_in_one_process_an_error_ends_its_run_and_a_signal_the_sweep(capsys):
-    def broken():
-        raise ZeroDivisionError("no arms")
+@pytest.fixture
+def sweep(tmp_path, monkeypatch):
+    """A function that sweeps a command over folders, whose work is a function of the folder's name; its exit code."""
+    monkeypatch.chdir(tmp_path)
 
-    def outcome(work):
-        return cli._sweep_run(lambda _: work, OmegaConf.create())
+    def run(work, *folders):
+        arguments = ["-m", f"folder={','.join(folders)}", "hydra.sweep.dir=sweep"]
+        monkeypatch.setattr(sys, "argv", ["mimic.collect", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            cli.run(lambda config: lambda: work(config.folder), "collect")
+        return stop.value.code
 
-    assert outcome(broken) == Outcome(1, "ZeroDivisionError: no arms")
+    return run
+
+
+def test_in_one_process_an_error_ends_its_run_alone(sweep, tmp_path, capsys):
+    assert sweep(lambda folder: {"fine": None, "three": 3}[folder], "unknown", "fine", "three") == 1
+    runs = json.loads((tmp_path / "sweep" / "sweep.json").read_text())["runs"]
+    assert [(run["exit_code"], run["reason"]) for run in runs] == [
+        (1, "KeyError: 'unknown'"),
+        (0, ""),
+        (3, "exit code 3"),
+    ]
     assert "Traceback" in capsys.readouterr().err
-    assert outcome(lambda: None) == Outcome() and outcome(lambda: 3) == Outcome(3, "exit code 3")
-    with pytest.raises(SystemExit) as stop:
-        outcome(lambda: 143)
-    assert stop.value.code == 143
+
+
+def test_in_one_process_a_signal_ends_the_sweep(sweep):
+    begun = []
+    assert sweep(lambda folder: begun.append(folder) or {"stopped": 143}.get(folder), "fine", "stopped", "more") == 143
+    assert begun == ["fine", "stopped"]
 
 
 SHORT = [*TINY, "env.physics=fused", "trainer.num_timesteps=2000", "trainer.evaluations=1"]
