@@ -2,13 +2,13 @@
 
     python -m benchmarks.kernel [--out FILE] [--batches 1e2 ... 1e8] [--links 3 ... 64] [--methods mimic ...]
 
-All methods compute the same: forward kinematics with velocities, link distances with the paper's weights, the static
-overlap correspondence, the mean; "gradient" is the value with the gradient by the learner's qpos and qvel, "all" by
-both arms'. The pairs of poses are made on the device. Batches are of the Panda with 7 joints and the one with 4; links
-are of two planar arms with as many. `mimic` is `motion_distance`, `composition` its parts as they are called one by
-one, `matrices` a straightforward JAX program on 4x4 matrices, `torch` the same in PyTorch, where it is installed. What
-does not fit into memory, or follows a case of more than PATIENCE seconds a call, has no figures. Limits of the device,
-from the same run: memory traffic of a copy, and the rate of fused multiply-adds.
+All methods compute the same: forward kinematics with velocities, link distances with the default weights and
+correspondence (`MetricConfig`), the mean; "gradient" is the value with the gradient by the learner's qpos and qvel,
+"all" by both arms'. The pairs of poses are made on the device. Batches are of the Panda with 7 joints and the one with
+4; links are of two planar arms with as many. `mimic` is `motion_distance`, `composition` its parts as they are called
+one by one, `matrices` a straightforward JAX program on 4x4 matrices, `torch` the same in PyTorch, where it is
+installed. What does not fit into memory, or follows a case of more than PATIENCE seconds a call, has no figures. Limits
+of the device, from the same run: memory traffic of a copy, and the rate of fused multiply-adds.
 """
 
 import argparse

@@ -4,8 +4,8 @@
 
 Quality is (d - d_best) / (d_random - d_best), where d_best is the least distance that any method found for a pose, and
 a search from 512 random starts with 60 Newton steps each: 0 is the best known pose, 1 a random one. "Global" is the
-share of poses within 0.1 % of d_best. Poses of the expert are uniform in [-pi, pi]; the metric is the paper's static,
-rotational one. "One start" is the paper's way, from the angles that both arms share. mink drives the learner's links to
+share of poses within 0.1 % of d_best. Poses of the expert are uniform in [-pi, pi]; the metric is the default one,
+`MetricConfig`. "One start" is the paper's way, from the angles that both arms share. mink drives the learner's links to
 the full orientations of the expert's links that they overlap most, which asks for more than directions.
 """
 

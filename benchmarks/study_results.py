@@ -107,8 +107,8 @@ def _draw_unseen(results: dict[str, Any], out: Path) -> None:
         curves = results[f"{name}--unseen"][0]["curves"]
         axes.plot(curves["time"], curves["mean"], color=colour, label=label)
         axes.fill_between(curves["time"], curves["low"], curves["high"], color=colour, alpha=0.2, lw=0)
-    axes.plot(curves["time"], curves["hold"], ":", color="grey", label="holding still")
-    title = "32 unseen demonstrations, 7 to 7 joints: the lower bound is 0"
+    axes.plot(curves["time"], curves["hold"], ":", color="grey", label="holding the start pose")
+    title = "32 unseen demonstrations, 7 to 7 joints: kinematic bound 0"
     axes.set(xlabel="time [s]", ylabel="embodiment distance", title=title, yscale="log", ylim=(1e-5, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
@@ -148,7 +148,7 @@ def _draw_locked(results: dict[str, Any], out: Path) -> None:
                 bound[j - 1, i - 1] = entry["lower_bound"]["held_out"]
                 gap[j - 1, i - 1] = 100 * entry["optimality_gap"]["held_out"]
     for axes, values, title, form in (
-        (all_axes[0], bound, "lower bound of the distance", "{:.3f}"),
+        (all_axes[0], bound, "kinematic bound of the distance", "{:.3f}"),
         (all_axes[1], gap, "optimality gap of PPO, unseen [%]", "{:.1f}"),
     ):
         picture = axes.imshow(values, cmap="viridis_r" if axes is all_axes[0] else "magma_r")

@@ -1,6 +1,6 @@
 """How often the live view can show something new: `python -m benchmarks.view [--env NAME]`; prints, writes nothing.
 
-The update is all that happens between a new pose of the expert and what is sent: following, the lower bound, the
+The update is all that happens between a new pose of the expert and what is sent: following, the kinematic bound, the
 distances, the drawings. The page adds viser's work for all clients; what a browser needs to draw is its own.
 """
 

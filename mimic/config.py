@@ -1,6 +1,6 @@
 """Typed configs: frozen dataclasses as OmegaConf schemas, checks of values, and one-line error messages."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,3 +76,12 @@ def check_new(name: str, path: Path, advice: str) -> None:
 def to_dict(config: Any) -> dict[str, Any]:
     """Returns a config as dicts and lists, for files."""
     return OmegaConf.to_container(OmegaConf.structured(config), resolve=True)  # type: ignore[return-value]
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one level with dotted keys, such as optimality_gap.train. Empty mappings stay values."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        is_nested = isinstance(value, Mapping) and value
+        flat |= flatten(value, f"{prefix}{key}.") if is_nested else {f"{prefix}{key}": value}
+    return flat

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale, with_minimum_armature
+from mimic.arms.arm import DEFAULT_VELOCITY_LIMIT, Arm, ArmConfig, arm_spec, torque_scale, with_minimum_armature
 from mimic.arms.embodiment import load_arm
 from mimic.envs.config import EnvConfig
 from mimic.envs.recording import record_demonstrations
@@ -44,7 +44,7 @@ class ReachableDistance:
 
 
 def reachable_distance(expert: Arm, learner: Arm, config: EnvConfig) -> ReachableDistance:
-    """Kinematic bound and holding still, on a few random demonstrations.
+    """Kinematic bound and holding the start pose, on a few random demonstrations.
 
     Raises:
       ValueError: the expert's limits leave it no goal.
@@ -102,7 +102,7 @@ def assumptions(config: ArmConfig, arm: Arm) -> Iterator[str]:
     without = names[~np.isfinite(embodiment.velocity_limit)]
     if without.size:
         yield (
-            f"no rated speed for {_listed(without)}: {UNKNOWN_SPEED:.2f} rad/s is assumed; a custom numeric "
+            f"no rated speed for {_listed(without)}: {DEFAULT_VELOCITY_LIMIT:.2f} rad/s is assumed; a custom numeric "
             "velocity_limit in the MJCF, one number for each joint, states it"
         )
     without = names[~np.isfinite(embodiment.torque_limit)]

@@ -1,4 +1,4 @@
-"""`python -m mimic.evaluate`: repeats the report of a run from a checkpoint alone, or for another controller."""
+"""`python -m mimic.evaluate`: evaluates a run from a checkpoint, or another controller in place of its policy."""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,17 +23,18 @@ from mimic.trainers.trainer import Trainer
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
-    """An evaluation of a run from a checkpoint alone, ready to start.
+    """Checks the config of an evaluation and restores the run from its checkpoint.
 
     Raises:
-      ValueError: no run directory, no such checkpoint, an `out` that exists, or what only a policy can be asked for.
+      ValueError: the run directory or the checkpoint is missing, `out` exists, or the options need a policy and the
+        run has none.
     """
     stopwatch = Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
     if not config.run:
         raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
-    trained = load_config(run_dir)  # saved resolved: the machine does not matter
+    trained = load_config(run_dir)  # saved with all values resolved, so that they do not depend on this machine
     check_checkpoint(run_dir, config.checkpoint)
     out = new_folder("out", config.out) if config.out else None
     with stopwatch.stage("build"):
@@ -59,7 +60,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
 
 
 def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
-    """A run as it was, or with other demonstrations, physics or loads."""
+    """The trainer of a run, with the demonstrations, the physics and the arm parameters of the evaluation."""
     factors = {"mass": config.mass, "damping": config.damping}
     changes: dict[str, Any] = {key: [value, value] for key, value in factors.items() if value is not None}
     if config.torque_noise is not None:
@@ -82,7 +83,7 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
 
 
 def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
-    """What an evaluation was made under."""
+    """The conditions of an evaluation, for its report."""
     env = trained.env
     return {
         "run": config.run,

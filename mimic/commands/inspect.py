@@ -17,7 +17,7 @@ from rich.console import Console  # noqa: E402
 from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from mimic.arms.arm import Arm, ArmConfig, rated_speed, torque_scale
+from mimic.arms.arm import Arm, ArmConfig, finite_velocity_limit, torque_scale
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.commands.arm_checks import ReachableDistance, assumptions, calmed, joint_ranges, reachable_distance, warnings  # noqa: E402
@@ -129,7 +129,7 @@ def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]
     embodiment = arm.embodiment
     columns = {
         "range": joint_ranges(config, arm).tolist(),
-        "rated speed": rated_speed(embodiment).tolist(),
+        "rated speed": finite_velocity_limit(embodiment).tolist(),
         "speed is assumed": (~np.isfinite(embodiment.velocity_limit)).tolist(),
         "torque limit": [float(x) if np.isfinite(x) else None for x in embodiment.torque_limit],
         "torque offered": torque_scale(arm, env.action_scale, env.control_dt).tolist(),

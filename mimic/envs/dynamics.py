@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from mimic.arms.embodiment import snap_to_units
 from mimic.metric.spatial import (
     IDENTITY,
     ZERO,
@@ -37,7 +38,6 @@ from mimic.metric.spatial import (
 
 _Z: Vector = (0.0, 0.0, 1.0)
 _NONE: Rotation = (ZERO, ZERO, ZERO)
-_ROUNDING = 1e-12  # error of a zero after rotations and their inverses
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,8 +96,8 @@ def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
         previous_frame, previous_origin = frame, origin
         frame, origin = _frame(axis, previous_frame), anchor + axis @ (previous_origin - anchor) * axis
         pose = np.eye(4)
-        pose[:3, :3] = _rounded(previous_frame.T @ frame)
-        pose[:3, 3] = _rounded(previous_frame.T @ (origin - previous_origin))
+        pose[:3, :3] = snap_to_units(previous_frame.T @ frame)
+        pose[:3, 3] = snap_to_units(previous_frame.T @ (origin - previous_origin))
         body = int(model.jnt_bodyid[joint])
         has_body = last_joint[body] == joint  # if a body has several joints, the others move no mass of their own
         poses.append(pose)
@@ -332,9 +332,3 @@ def _mass(model: mujoco.MjModel, data: mujoco.MjData, body: int, frame: np.ndarr
     result[:3, :3] = axes @ np.diag(inertia.sum() / 2 - inertia) @ axes.T
     centre = np.append(frame.T @ (data.xipos[body] - origin), 1.0)
     return result + model.body_mass[body] * np.outer(centre, centre)
-
-
-def _rounded(values: np.ndarray) -> np.ndarray:
-    """Rounds to exact zeros and ones within the rounding error, so that products with them are not computed."""
-    nearest = np.round(values)
-    return np.where(np.abs(values - nearest) < _ROUNDING, nearest, values)

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import Arm, rated_speed
+from mimic.arms.arm import Arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.config import check_choice
 from mimic.envs.demonstrations import Demonstrations
@@ -136,7 +136,7 @@ def _reach_path(
 
     model, embodiment = arm.model, arm.embodiment
     hand = model.nbody - 1
-    max_velocity = rated_speed(embodiment) * _REACH_SPEED_FRACTION
+    max_velocity = finite_velocity_limit(embodiment) * _REACH_SPEED_FRACTION
     limits = [mink.VelocityLimit(model, dict(zip(embodiment.joint_names, max_velocity, strict=True)))]
     configuration = mink.Configuration(model, np.asarray(embodiment.home, float))
     start = configuration.get_transform_frame_to_world(hand, "body")

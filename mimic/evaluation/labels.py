@@ -1,5 +1,7 @@
 """Keys and display names of splits, measures of similarity and baselines."""
 
+from collections.abc import Mapping
+
 SPLITS = ("train", "held_out")
 SIMILARITY_HEADERS = {  # positions in chain lengths
     "centre_line_distance": "centre\nline",
@@ -16,3 +18,13 @@ SIMILARITY_NAMES = {  # display names that differ from their keys
     "align_segments": "aligning segments",
     "hold_home": "holding start pose",
 }
+
+
+def similarity_texts(similarity: Mapping[str, float]) -> dict[str, tuple[str, str]]:
+    """Label and value of each measure of one moment by the measure's name, as the viewer and videos show them."""
+
+    def text(name: str) -> str:
+        return f"{similarity[name]:.0f}°" if name.endswith("_deg") else f"{similarity[name]:.3f}"
+
+    headers = SIMILARITY_HEADERS.items()
+    return {name: (header.replace("\n", " "), text(name)) for name, header in headers if name in similarity}

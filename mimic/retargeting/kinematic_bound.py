@@ -99,7 +99,7 @@ def closest_motion(
 
     The result is the best of this search, an upper estimate of the true minimum. Against a reference of three searches,
     the longest of them from 64 random poses, at none of 6600 steps of ten pairs of arm and metric it was off by more
-    than 1e-3, and at 21 by more than 0.1 %, at most 2.6e-4 (`benchmarks.bound`, benchmarks/results/bound_cpu.json).
+    than 1e-3, and at 21 by more than 0.1 %, at most 3.3e-4 (`benchmarks.bound`, benchmarks/results/bound_cpu.json).
     Those steps are 0.1 s apart: in motions of four steps 1.5 s apart it missed by more than 1e-3 at 1 of 24 steps with
     hard correspondence, adaptive weights and "angle", and at none with the default metric.
 

@@ -99,7 +99,7 @@ def imitate_pose(
     key = jax.random.key(0) if key is None else key
     batch = poses.shape[:-1]
     objective = pose_objective(learner, Metric(correspondence, weights, rotation, reduction))
-    limits = pose_limits(learner, poses.dtype)
+    limits, continuous = pose_limits(learner, poses.dtype), continuous_joints(learner)
     descend = newton if method == "newton" else gradient_descent
 
     def solve(poses: Array, warm: Array | None) -> PoseImitation:
@@ -119,7 +119,7 @@ def imitate_pose(
                 ends = jax.vmap(lambda start: descend(of_qpos, start, limits, count - rough))(ends.qpos[chosen])
             end: Solution = jax.tree.map(lambda x: x[jnp.argmin(ends.value)], ends)
             left = objective.distance(states, link_states(learner, end.qpos))
-            return PoseImitation(_wrapped(end.qpos, limits), left, end.gradient_norm <= _FLAT * scale)
+            return PoseImitation(wrap_angles(end.qpos, continuous), left, end.gradient_norm <= _FLAT * scale)
 
         in_axes = (0, None if warm is None else 0)
         return jax.vmap(one, in_axes)(poses, warm)
@@ -228,17 +228,35 @@ def imitate_trajectory(
         if objective.rough_derivatives is not objective.derivatives:
             found = refined(found)
         left = jax.vmap(lambda state, q: objective.distance(state, link_states(learner, q)))(states, found.qpos)
-        shift = _wrapped(found.qpos[0], limits) - found.qpos[0]
+        shift = wrap_angles(found.qpos[0], continuous_joints(learner)) - found.qpos[0]
         return PoseImitation(found.qpos + shift, left, found.gradient_norm <= _FLAT * scale)
 
     return jax.jit(solve)(poses)
 
 
 def pose_limits(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Joint ranges, lower and upper; infinite for a joint that can do a full turn."""
+    """Lower and upper joint limits [rad]; infinite for `continuous_joints`."""
     lower, upper = np.asarray(arm.joint_range).T
-    full = upper - lower >= 2 * np.pi - 1e-4  # a model's text rounds pi
-    return np.where(full, -np.inf, lower).astype(dtype), np.where(full, np.inf, upper).astype(dtype)
+    continuous = continuous_joints(arm)
+    return np.where(continuous, -np.inf, lower).astype(dtype), np.where(continuous, np.inf, upper).astype(dtype)
+
+
+def continuous_joints(arm: Embodiment) -> Bool[np.ndarray, " joints"]:
+    """Which joints can rotate by a full revolution: their range is 2 pi or more."""
+    lower, upper = np.asarray(arm.joint_range).T
+    return upper - lower >= 2 * np.pi - 1e-4  # models round pi in their text
+
+
+def wrap_angles(angles: Float[Any, "*batch joints"], where: Any = True, *, centre: Any = 0.0) -> Any:
+    """Angles shifted by full revolutions into [centre - pi, centre + pi].
+
+    Args:
+      angles: NumPy or JAX array [rad].
+      where: joints that are wrapped; all by default.
+      centre: middle of the interval [rad].
+    """
+    library = np if isinstance(angles, np.ndarray) else jnp
+    return library.where(where, angles - 2 * np.pi * library.round((angles - centre) / (2 * np.pi)), angles)
 
 
 def shared_joints(
@@ -303,8 +321,3 @@ def _starts(
     values = jax.vmap(jax.vmap(lambda states: objective.value(target, states)))(tried.states)
     nearest = jnp.take_along_axis(tried.qpos, jnp.argmin(values, axis=1)[:, None, None], axis=1)[:, 0]
     return jnp.concatenate([own[None], nearest])
-
-
-def _wrapped(qpos: Array, limits: tuple[np.ndarray, np.ndarray]) -> Array:
-    """Joints that can do a full turn, in [-pi, pi]."""
-    return jnp.where(np.isinf(limits[0]), qpos - 2 * jnp.pi * jnp.round(qpos / (2 * jnp.pi)), qpos)

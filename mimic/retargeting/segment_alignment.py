@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.kinematics import joint_frames
-from mimic.retargeting.pose import pose_limits
+from mimic.retargeting.pose import pose_limits, wrap_angles
 from mimic.retargeting.subproblems import (
     PARALLEL,
     bend_to_angle,
@@ -316,6 +316,5 @@ def _are_parallel(placement: Placement, joint: int, other: int) -> bool:
 
 
 def _wrapped(arm: Embodiment, angles: np.ndarray, joints: list[int]) -> np.ndarray:
-    """Angles in [-pi, pi], or the turn of them nearest to the middle of a joint's range."""
-    middle = np.asarray(arm.joint_range, float)[joints].mean(axis=1)
-    return angles - 2 * np.pi * np.round((angles - middle) / (2 * np.pi))
+    """Angles within pi of the middle of each joint's range."""
+    return wrap_angles(angles, centre=np.asarray(arm.joint_range, float)[joints].mean(axis=1))

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mimic.config import to_dict
+from mimic.config import flatten, to_dict
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import CONFIG, METRICS, REPORT
 from mimic.runs.provenance import versions
@@ -155,7 +155,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     if missing:
         reason = f"diverged, without a meaningful gap, or of another version ({version})"
         return LeftOut(name, f"{reason}: {REPORT} has no number {missing[0]}")
-    settings = _flat(to_dict(config))
+    settings = flatten(to_dict(config))
     return FinishedRun(
         name=name,
         trainer=config.trainer.name,
@@ -170,7 +170,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
 
 def _progress(path: Path, config: TrainConfig, history: Mapping[str, Mapping[int, float]]) -> str:
     step = max((step for column in history.values() for step in column), default=0)
-    total = config.trainer.total_steps
+    total = config.trainer.resolve().total_steps
     return f"no {REPORT}: stopped or still running, at {step:,} of {total:,} steps; resume={path} goes on with it"
 
 
@@ -189,13 +189,5 @@ def _history(path: Path) -> dict[str, dict[int, float]]:
 
 def _numbers(report: Mapping[str, Any]) -> dict[str, float]:
     """Those for all data, or by split; null, which stands for what is not finite, is none."""
-    flat = _flat({key: report[key] for key in report if key not in ("worst_demonstrations", "seed")})
+    flat = flatten({key: report[key] for key in report if key not in ("worst_demonstrations", "seed")})
     return {key: x for key, x in flat.items() if isinstance(x, int | float) and not key.startswith("hardware")}
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested values by dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) and value else {f"{prefix}{key}": value}
-    return flat

@@ -70,6 +70,10 @@ class TrainerConfig:
         """Length of a training with resolved settings."""
         raise NotImplementedError
 
+    def resolve(self) -> "TrainerConfig":
+        """The settings with every field filled in. Raises a `ValueError` where a value is out of range."""
+        raise NotImplementedError
+
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig(TrainerConfig):

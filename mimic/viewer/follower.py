@@ -18,7 +18,7 @@ from mimic.metric.config import CORRESPONDENCES
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
-from mimic.retargeting.pose import imitate_pose, pose_limits
+from mimic.retargeting.pose import continuous_joints, imitate_pose, wrap_angles
 
 Mapper = Callable[[Array], Array]  # the expert's pose -> the learner's
 
@@ -85,7 +85,7 @@ class Programs:
       learner: the arm.
       follow: (expert_qpos, learner_qpos, weights) -> the nearest minimum to the learner's present pose.
       measure: (expert_qpos, learner_qpos, weights) -> `Measured`.
-      best: (expert_qpos, weights) -> the best pose of many starts, and its distance: the lower bound. None until it
+      best: (expert_qpos, weights) -> the best pose of many starts, and its distance: the kinematic bound. None until it
         is compiled too, which takes longest.
     """
 
@@ -118,7 +118,7 @@ def home_angles(env: EnvConfig) -> Mapping[str, float]:
 
 
 def compile_programs(env: EnvConfig, settings: Settings, mapper: Mapper | None = None) -> Iterator[Programs]:
-    """Compiles, which takes seconds: first what the learner moves by, then the same with the lower bound.
+    """Compiles, which takes seconds: first what the learner moves by, then the same with the kinematic bound.
 
     Args:
       env: the arms and the rest of the metric.
@@ -218,12 +218,6 @@ class ProgramCache:
             self._made[key] = error
 
 
-def turned(arm: Embodiment, change: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
-    """Changes of angles [rad] the short way round, for joints that can do a full turn."""
-    full_turn = np.isinf(pose_limits(arm, change.dtype)[0])
-    return np.where(full_turn, change - 2 * np.pi * np.round(change / (2 * np.pi)), change)
-
-
 def step_towards(
     arm: Embodiment,
     present: Float[np.ndarray, " joints"],
@@ -231,6 +225,7 @@ def step_towards(
     largest_jump: Float[np.ndarray, " joints"],
 ) -> tuple[Float[np.ndarray, " joints"], bool]:
     """The next pose on the way to a goal, no joint faster than its bound [rad]; and whether it is there."""
-    change = turned(arm, goal - present)
+    continuous = continuous_joints(arm)
+    change = wrap_angles(goal - present, continuous)
     after = present + np.clip(change, -largest_jump, largest_jump)
-    return turned(arm, after), bool(np.all(np.abs(change) <= largest_jump))
+    return wrap_angles(after, continuous), bool(np.all(np.abs(change) <= largest_jump))

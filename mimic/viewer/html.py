@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from mimic.evaluation.labels import SIMILARITY_HEADERS
-from mimic.metric.similarity import MEASURES
+from mimic.evaluation.labels import similarity_texts
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
 _BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)
@@ -93,7 +92,7 @@ def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[s
     return (
         '<div style="display:flex;gap:22px;padding:4px 12px">'
         + one("mimic-distance", "embodiment distance", distance, LEARNER)
-        + one("mimic-bound", "lower bound", bound, BOUND)
+        + one("mimic-bound", "kinematic bound", bound, BOUND)
         + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px">'
         f"{html.escape(note)}</div>{_measures(similarity or {})}"
     )
@@ -102,10 +101,9 @@ def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[s
 def _measures(similarity: Mapping[str, float]) -> str:
     """The measures of similarity in one line, each under its name."""
     cells = "".join(
-        f'<div><div style="font-size:10px;color:#777">{html.escape(SIMILARITY_HEADERS[name].replace(chr(10), " "))}'
-        f'</div><div id="mimic-{name}" style="font-size:13px;font-variant-numeric:tabular-nums">'
-        f"{f'{value:.0f}°' if name.endswith('_deg') else f'{value:.3f}'}</div></div>"
-        for name, value in ((name, similarity[name]) for name in MEASURES if name in similarity)  # jit sorts names
+        f'<div><div style="font-size:10px;color:#777">{html.escape(label)}</div>'
+        f'<div id="mimic-{name}" style="font-size:13px;font-variant-numeric:tabular-nums">{text}</div></div>'
+        for name, (label, text) in similarity_texts(similarity).items()
     )
     return f'<div style="display:flex;gap:14px;padding:4px 12px">{cells}</div>' if cells else ""
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import build_arm, rated_speed
+from mimic.arms.arm import build_arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
 from mimic.viewer.follower import Mapper, ProgramCache, Programs, Settings, home_angles, initial_settings, step_towards
@@ -132,7 +132,7 @@ class LiveSession:
 
     @property
     def is_compiling(self) -> bool:
-        """Whether what is asked for is still being compiled, the lower bound included."""
+        """Whether what is asked for is still being compiled, the kinematic bound included."""
         return not self._programs.is_complete(self.settings)
 
     def compile(self) -> Programs:
@@ -220,7 +220,7 @@ class LiveSession:
     ) -> np.ndarray:
         """The learner's next pose: no joint goes faster than its rated speed."""
         arm = programs.learner.embodiment
-        jump = rated_speed(arm).astype(np.float32) * dt
+        jump = finite_velocity_limit(arm).astype(np.float32) * dt
         goal = self._goal
         if goal is None or goal.shape != present.shape:
             goal = np.asarray(programs.follow(self._pose, present, weights))

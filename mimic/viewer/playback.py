@@ -45,7 +45,7 @@ class Playback:
 
     def run(self) -> None:
         """Runs the policy on all demonstrations, and computes their bounds."""
-        with Console().status("running the policy on all demonstrations, and computing the lower bound"):
+        with Console().status("running the policy on all demonstrations, and computing the kinematic bound"):
             self._rollouts = self._trainer.evaluate(self._params)
             _ = self._evaluator.lower_bound
 

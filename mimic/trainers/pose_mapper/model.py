@@ -21,7 +21,7 @@ from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
-from mimic.retargeting.pose import pose_limits
+from mimic.retargeting.pose import continuous_joints, pose_limits, wrap_angles
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings
 from mimic.trainers.run_config import load_config
@@ -113,7 +113,7 @@ class MapperModel:
         if config.outputs == "tanh":
             return within
         on_circle = jnp.arctan2(outputs[..., 1], outputs[..., 0])  # continuous in the outputs at pi
-        return jnp.where(np.isinf(pose_limits(self.learner, qpos.dtype)[0]), on_circle, within)
+        return jnp.where(continuous_joints(self.learner), on_circle, within)
 
     def __call__(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
         """The nearest of the poses that the heads propose."""
@@ -129,8 +129,7 @@ class MapperModel:
             assert states.direction is not None
             return jnp.concatenate([states.position.ravel(), states.direction.ravel()])
         lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.expert.joint_range).T)
-        full_turn = np.isinf(pose_limits(self.expert, qpos.dtype)[0])
-        qpos = jnp.where(full_turn, qpos - 2 * jnp.pi * jnp.round(qpos / (2 * jnp.pi)), qpos)
+        qpos = wrap_angles(qpos, continuous_joints(self.expert))
         return (2 * qpos - lower - upper) / (upper - lower)
 
 
