@@ -119,3 +119,11 @@ def test_links_lead_somewhere(page):
         assert target.exists(), link
         headings = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE) if heading else []
         assert not heading or heading in [text.lower().replace(" ", "-") for text in headings], link
+
+
+def test_contributing_names_files_that_exist():
+    text = (REPOSITORY / "CONTRIBUTING.md").read_text()
+    paths = [path for path in re.findall(r"`((?:mimic|tests|docs)/[\w/.]+)`", text) if "NAME" not in path]
+    assert len(paths) > 30
+    for path in paths:
+        assert (REPOSITORY / path).exists(), path
