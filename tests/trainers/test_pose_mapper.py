@@ -113,7 +113,7 @@ def test_resume_goes_on(tmp_path):
     run_dir = tmp_path / "run"
     short = train(run_dir, epochs=4)
     config = TrainConfig(resume=str(run_dir), compilation_cache="")
-    with pytest.raises(ValueError, match="give a larger trainer.epochs"):
+    with pytest.raises(ValueError, match="increase trainer.epochs"):
         session.prepare_training(config, 0.0)
     assert session.prepare_training(config, 0.0, [f"resume={run_dir}", "trainer.epochs=8"])() == 0
     report = json.loads((run_dir / "report.json").read_text())
