@@ -73,7 +73,7 @@ DAMAGES = {
     "text": (lambda path: path.write_text("not an archive"), NOT_WHOLE),
     "pickle": (lambda path: path.write_bytes(pickle.dumps(arrays(path))), NOT_WHOLE),
     "one array": (save_array, NOT_WHOLE + "it has a single array"),
-    "pickled array": (with_arrays(goals=np.array([{}, None], object)), NOT_WHOLE + "it holds pickled objects"),
+    "pickled array": (with_arrays(goals=np.array([{}, None], object)), NOT_WHOLE + "it has pickled objects"),
     "no velocities": (without("qvel"), "it lacks qvel; expected are "),
     "another format": (with_arrays(format=np.array("other")), "has format 'other', expected "),
     "integers": (with_arrays(qpos=np.zeros((2, 51, 7), int)), "qpos in .* must be floating point, got int64"),
@@ -148,7 +148,7 @@ def test_velocities_are_checked_without_torques_and_rounding_passes(recorded):
     [
         (lambda recorded: dataclasses.replace(recorded, arm="other"), "recorded with the joints"),
         (lambda recorded: changed(recorded, "qvel", 3.0), "has a velocity of"),
-        (lambda recorded: recorded.select([0]), "holds 1, but count=1 to train on and held_out=1 are asked for"),
+        (lambda recorded: recorded.select([0]), r"has 1, expected at least count \+ held_out = 1 \+ 1"),
     ],
     ids=["another arm", "too fast", "too few"],
 )

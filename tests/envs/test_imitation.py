@@ -50,6 +50,7 @@ def test_reward_and_observation_follow_the_demonstration_step_by_step():
         mimic.link_states(env.expert, *(np.asarray(x[which, sample], np.float32) for x in (motions.qpos, motions.qvel)))
         for sample in range(7)
     ]
+    metric = env.metric.correspondence, env.metric.weights
     actions = np.random.default_rng(0).uniform(-1, 1, (6, env.action_size)).astype(np.float32)
     state, step = env.begin(env.start(jax.random.PRNGKey(0), which)), jax.jit(env.step)
     for i in range(7):
@@ -59,7 +60,7 @@ def test_reward_and_observation_follow_the_demonstration_step_by_step():
         leaves = [np.ravel(leaf) for states in shown for leaf in jax.tree.leaves(states)]
         np.testing.assert_allclose(state.obs, np.concatenate(leaves), atol=1e-5)
         assert state.done == (i == 6)
-        distances = [mimic.embodiment_distance(each, learner, env.correspondence, env.weights) for each in expert]
+        distances = [mimic.embodiment_distance(each, learner, *metric) for each in expert]
         if i > 0:
             assert state.reward == pytest.approx(-float(distances[i]), abs=1e-5)
             others = np.delete(distances, i)

@@ -280,6 +280,6 @@ def test_bound_and_holding_are_those_of_the_samples_after_each_step():
     optimum = planar_optimum(env.expert, env.learner, env.demonstrations.qpos)
     np.testing.assert_allclose(evaluator.lower_bound, optimum[:, 1:], atol=1e-4)
     assert np.abs(np.diff(optimum, axis=1)).max() > 5e-3  # a bound one sample early would be noticed
-    weights, angles = np.asarray(env.correspondence), np.cumsum(env.demonstrations.qpos, axis=-1)
+    weights, angles = np.asarray(env.metric.correspondence), np.cumsum(env.demonstrations.qpos, axis=-1)
     straight = np.pi / 2 * (weights.sum() - (np.cos(angles) @ weights).sum(axis=-1)) / weights.size
     np.testing.assert_allclose(evaluator.hold_distance, straight[:, 1:], atol=1e-5)  # float32
