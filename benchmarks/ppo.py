@@ -38,7 +38,7 @@ from mimic.envs.imitation import ImitationEnv  # noqa: E402
 from mimic.envs.wrappers import wrap_for_training  # noqa: E402
 from mimic.trainers.config import PPOConfig, PPOSettings  # noqa: E402
 from mimic.trainers.ppo import training  # noqa: E402
-from mimic.trainers.ppo.programs import make_programs  # noqa: E402
+from mimic.trainers.ppo.programs import compile_training  # noqa: E402
 
 ON_PROCESSOR = "stable-baselines3, C MuJoCo"
 _STRETCHES = 6  # the first compiles
@@ -63,7 +63,7 @@ def learn(env: ImitationEnv, config: PPOSettings, batches: int) -> dict[str, flo
     schedule = optax.constant_schedule(config.learning_rate)
     seconds: list[float] = []
     began = time.perf_counter()
-    begin, program = make_programs(env, config, networks, batches, schedule, None)
+    begin, program = compile_training(env, config, networks, batches, schedule, None)
     learning = begin()(0)
     for _ in range(_STRETCHES):
         learning, metrics = program()(learning)

@@ -25,7 +25,7 @@ import mimic
 from benchmarks.record import write_results
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo import training
-from mimic.trainers.ppo.programs import make_programs
+from mimic.trainers.ppo.programs import compile_training
 
 # What a kernel is, by its name; the first that fits.
 KINDS = (
@@ -92,7 +92,7 @@ def profile(name: str, batches: int) -> dict[str, Any]:
     config = PPOSettings().resolve(jax.default_backend(), jax.device_count())
     networks = training.make_networks(config, env.observation_size, env.action_size)
     schedule = optax.constant_schedule(config.learning_rate)
-    begin, program = make_programs(env, config, networks, batches, schedule, None)
+    begin, program = compile_training(env, config, networks, batches, schedule, None)
     learning, _ = jax.block_until_ready(program()(begin()(0)))
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):

@@ -8,6 +8,7 @@ needs EGL or OSMesa (see docs/install.md).
 """
 
 import argparse
+import importlib.resources
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
@@ -20,8 +21,6 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 import mimic
-from mimic.arms.embodiment import panda_path
-from mimic.metric.config import MetricConfig
 
 OUT = Path(__file__).resolve().parent / "images" / "imitation.gif"
 LOCKED = (), (), (3, 6, 7), (2, 3, 6, 7)  # of the expert and the learners
@@ -69,8 +68,8 @@ def _retarget(
     expert: mimic.Embodiment, learner: mimic.Embodiment, motion: Float[np.ndarray, "frames joints"]
 ) -> tuple[Float[np.ndarray, "frames learner_joints"], Float[np.ndarray, " frames"]]:
     """The learner's motion [rad] and its distance."""
-    metric = MetricConfig()
-    correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
+    correspondence = mimic.arc_length_correspondence(expert, learner)
+    weights = mimic.DistanceWeights(translation=1.0, rotation=1.0)
     jump = np.asarray(learner.velocity_limit) * FRAME / 1000
     solution = jax.jit(
         lambda qpos: mimic.imitate_trajectory(expert, learner, qpos, correspondence, weights, largest_jump=jump)
@@ -86,7 +85,7 @@ def _link_colours(expert: mimic.Embodiment, arm: mimic.Embodiment) -> list[str]:
 
 def _write_coloured(path: Path, colours: Sequence[str]) -> None:
     """The Panda's model with coloured links: link i is on body i."""
-    tree = ElementTree.parse(panda_path())
+    tree = ElementTree.parse(str(importlib.resources.files("mimic") / "xml" / "panda.xml"))
     for number, colour in enumerate(colours, start=1):
         body = tree.find(f".//body[@name='body{number}']")
         assert body is not None

@@ -1,4 +1,4 @@
-"""`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and lower bound."""
+"""`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and kinematic bound."""
 
 from mimic import cli
 from mimic.commands.config import InspectConfig

@@ -197,7 +197,7 @@ class InspectConfig:
       learner: arm to inspect.
       expert: arm that it should imitate.
       limits: see `EnvConfig`.
-      bound: whether to compute the lower bound of the distance, which takes a minute.
+      bound: whether to compute the kinematic bound of the distance, which takes a minute.
       out: new folder for a picture of both arms with their correspondence, a picture of expert poses with the
         learner's nearest poses (only with `bound`), and a JSON file of all results.
     """

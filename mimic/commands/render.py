@@ -30,6 +30,8 @@ _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760  # pixels, width of the arms' picture
 _GIF_EVERY, _GIF_SCALE = 3, 0.5
 
+Bounds = tuple[float, float, float, float]  # left, bottom, width, height as fractions of the frame
+
 
 def prepare_video(config: RenderConfig) -> Callable[[], None]:
     """Checks the config of a video and opens the renderer.
@@ -78,27 +80,11 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
     """
     figure = plt.figure(figsize=(_SIZE[0] / _DPI, _SIZE[1] / _DPI), dpi=_DPI)
     scene_width = _SCENE / _SIZE[0]  # fraction of the frame that shows the arms
-    scene_axes = figure.add_axes((0, 0, scene_width, 1))
-    scene_axes.axis("off")
-    picture = scene_axes.imshow(scene.image([poses[0] for poses in clip.poses]), interpolation="nearest")
-    texts = [
-        scene_axes.text(place, 0.04, label, transform=scene_axes.transAxes, ha="center", fontsize=13)
-        for place, label in zip((0.27, 0.73), clip.labels, strict=True)
-    ]
-    texts.append(scene_axes.text(0.02, 0.95, clip.title, transform=scene_axes.transAxes, fontsize=12))
-    left, plot_width = scene_width + 0.07, 1 - scene_width - 0.09
-    over_time = figure.add_axes((left, 0.66, plot_width, 0.28))
-    for curve in clip.curves:
-        over_time.plot(clip.curve_time, curve.values, label=curve.label, **curve.style)
-    now = over_time.axvline(0, color="tab:red", lw=1)
-    over_time.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, clip.curve_time[-1]))
-    over_time.legend(fontsize="small", loc="best")  # where it hides the curves least
-    over_time.grid(alpha=0.3)
-    similarity = _add_similarity(figure, (left, 0.42, plot_width, 0.12), clip)
-    links = figure.add_axes((left, 0.09, plot_width, 0.25))
-    bars = links.bar(range(len(clip.bar_names)), clip.bars[0], color="tab:blue")
-    links.set_xticks(range(len(clip.bar_names)), [name.replace("link", "") for name in clip.bar_names])
-    links.set(title="contribution of each learner link", ylim=(0, 1.05 * clip.bars.max()))
+    left, width = scene_width + 0.07, 1 - scene_width - 0.09
+    picture, texts = _add_scene(figure, (0, 0, scene_width, 1), scene, clip)
+    now = _add_curves(figure, (left, 0.66, width, 0.28), clip)
+    similarity = _add_similarity(figure, (left, 0.42, width, 0.12), clip)
+    bars = _add_bars(figure, (left, 0.09, width, 0.25), clip)
     animated = [picture, *texts, now, *similarity.values(), *bars]
     for artist in animated:
         artist.set_animated(True)
@@ -120,7 +106,41 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
     plt.close(figure)
 
 
-def _add_similarity(figure: Figure, bounds: tuple[float, float, float, float], clip: Clip) -> dict[str, Text]:
+def _add_scene(figure: Figure, bounds: Bounds, scene: ArmScene, clip: Clip) -> tuple[Any, list[Text]]:
+    """Adds the picture of the arms, and the title and labels, which are drawn over it in each frame."""
+    axes = figure.add_axes(bounds)
+    axes.axis("off")
+    picture = axes.imshow(scene.image([poses[0] for poses in clip.poses]), interpolation="nearest")
+    texts = [
+        axes.text(place, 0.04, label, transform=axes.transAxes, ha="center", fontsize=13)
+        for place, label in zip((0.27, 0.73), clip.labels, strict=True)
+    ]
+    texts.append(axes.text(0.02, 0.95, clip.title, transform=axes.transAxes, fontsize=12))
+    return picture, texts
+
+
+def _add_curves(figure: Figure, bounds: Bounds, clip: Clip) -> Any:
+    """Adds the distances over time and returns the line that marks the current time."""
+    axes = figure.add_axes(bounds)
+    for curve in clip.curves:
+        axes.plot(clip.curve_time, curve.values, label=curve.label, **curve.style)
+    now = axes.axvline(0, color="tab:red", lw=1)
+    axes.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, clip.curve_time[-1]))
+    axes.legend(fontsize="small", loc="best")  # where it hides the curves least
+    axes.grid(alpha=0.3)
+    return now
+
+
+def _add_bars(figure: Figure, bounds: Bounds, clip: Clip) -> Any:
+    """Adds the bars of the learner's links and returns them."""
+    axes = figure.add_axes(bounds)
+    bars = axes.bar(range(len(clip.bar_names)), clip.bars[0], color="tab:blue")
+    axes.set_xticks(range(len(clip.bar_names)), [name.replace("link", "") for name in clip.bar_names])
+    axes.set(title="contribution of each learner link", ylim=(0, 1.05 * clip.bars.max()))
+    return bars
+
+
+def _add_similarity(figure: Figure, bounds: Bounds, clip: Clip) -> dict[str, Text]:
     """Adds the similarity measures in columns and returns the texts of their values, which change with the frame."""
     panel = figure.add_axes(bounds)
     panel.axis("off")

@@ -34,7 +34,7 @@ def retarget(
     *,
     mapper: PoseMapper | None = None,
     seed: int = 0,
-) -> tuple[Demonstrations, dict[str, Any]]:
+) -> tuple[Demonstrations, dict[str, Any]]:  # longer than 40 lines for its docstring
     """Retargets demonstrations of the expert to the learner, pose by pose, with bounded joint velocities.
 
     No joint exceeds its velocity limit, or pi rad/s where the limit is unknown. Velocities are central differences.
@@ -57,32 +57,35 @@ def retarget(
       ValueError: the demonstrations belong to another arm or leave its joint range, or the mapper is for other arms.
     """
     _check(demonstrations, expert)
-    rated, jump = finite_velocity_limit(learner), largest_jump(learner, demonstrations.dt)
+    jump = largest_jump(learner, demonstrations.dt)
     expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
     if mapper is None:
         solution = optimal_motions(expert, learner, expert_qpos, metric, jump, seed)
-        qpos, distance, settled = (np.asarray(x) for x in (solution.qpos, solution.distance, solution.converged))
+        learner_qpos, distance, settled = solution.qpos, solution.distance, solution.converged
     else:
         mapper.check_fits(expert, learner)
-        qpos, distance, settled = follow_mapper(mapper, expert_qpos, jump)
-    qpos = np.asarray(qpos, float)
-    velocity = np.gradient(qpos, demonstrations.dt, axis=1)
-    motions = Demonstrations(
-        qpos=qpos,
-        qvel=np.clip(velocity, -rated, rated),  # float32 rounding may lift a jump above its bound
-        goals=qpos[:, -1],
-        dt=demonstrations.dt,
-        arm=learner.name,
-        joint_names=learner.joint_names,
-        seed=demonstrations.seed,
-    )
+        learner_qpos, distance, settled = follow_mapper(mapper, expert_qpos, jump)
+    qpos = np.asarray(learner_qpos, float)
     report = {
-        "distance": float(np.mean(distance)),
+        "distance": float(np.mean(np.asarray(distance))),
         "largest_jump": float(np.abs(np.diff(qpos, axis=1)).max()),
-        "settled": float(np.mean(settled)),
+        "settled": float(np.mean(np.asarray(settled))),
         "similarity": pose_similarity(expert, learner, demonstrations.qpos, {"retargeted": qpos}),
     }
-    return motions, report
+    return _motions(learner, qpos, demonstrations.dt, demonstrations.seed), report
+
+
+def _motions(learner: Embodiment, qpos: np.ndarray, dt: float, seed: int) -> Demonstrations:
+    limit, velocity = finite_velocity_limit(learner), np.gradient(qpos, dt, axis=1)
+    return Demonstrations(
+        qpos=qpos,
+        qvel=np.clip(velocity, -limit, limit),  # float32 rounding may lift a jump above its bound
+        goals=qpos[:, -1],
+        dt=dt,
+        arm=learner.name,
+        joint_names=learner.joint_names,
+        seed=seed,
+    )
 
 
 def follow_mapper(
@@ -109,16 +112,7 @@ def follow_mapper(
     continuous = continuous_joints(model.learner)
 
     def motion(candidates: Array, distances: Array) -> tuple[Array, Array]:
-        def extend(cost: Array, step: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            previous, current, distance = step
-            change = jnp.abs(wrap_angles(current[None] - previous[:, None], continuous))
-            total = cost[:, None] + jnp.maximum(change - largest_jump, 0).sum(axis=-1)
-            return total.min(axis=0) + distance, total.argmin(axis=0)
-
-        cost, predecessors = jax.lax.scan(extend, distances[0], (candidates[:-1], candidates[1:], distances[1:]))
-        last_head = cost.argmin()
-        _, heads = jax.lax.scan(lambda head, row: (row[head], row[head]), last_head, predecessors, reverse=True)
-        heads = jnp.append(heads, last_head)
+        heads = _select_heads(candidates, distances, largest_jump, continuous)
         proposed = jnp.take_along_axis(candidates, heads[:, None, None], axis=1)[:, 0]
 
         def follow(pose: Array, target: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -132,6 +126,21 @@ def follow_mapper(
     poses, settled = jax.jit(jax.vmap(motion))(candidates, distances)
     distance = jax.jit(jax.vmap(jax.vmap(model.distance)))(qpos, poses)
     return np.asarray(poses), np.asarray(distance), np.asarray(settled)
+
+
+def _select_heads(candidates: Array, distances: Array, largest_jump: np.ndarray, continuous: np.ndarray) -> Array:
+    """The head [time] of the mapper for each step of a motion, by dynamic programming; see `follow_mapper`."""
+
+    def extend(cost: Array, step: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        previous, current, distance = step
+        change = jnp.abs(wrap_angles(current[None] - previous[:, None], continuous))
+        total = cost[:, None] + jnp.maximum(change - largest_jump, 0).sum(axis=-1)
+        return total.min(axis=0) + distance, total.argmin(axis=0)
+
+    cost, predecessors = jax.lax.scan(extend, distances[0], (candidates[:-1], candidates[1:], distances[1:]))
+    last_head = cost.argmin()
+    _, heads = jax.lax.scan(lambda head, row: (row[head], row[head]), last_head, predecessors, reverse=True)
+    return jnp.append(heads, last_head)
 
 
 def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:

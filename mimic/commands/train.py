@@ -45,8 +45,7 @@ def prepare_training(
       signals: records the signals received; replaced by the group's signals where there is a group.
 
     Returns:
-      A function that trains, evaluates and reports. It returns the exit code: 0, or 128 plus the number of the signal
-      that stopped it.
+      A function that trains, evaluates and reports. It returns 0, or 128 plus the number of the signal that stopped it.
 
     Raises:
       ValueError: the config, the arms, the demonstrations or the checkpoint are invalid.
@@ -67,8 +66,8 @@ def prepare_training(
     config = dataclasses.replace(config, trainer=trainer.settings)
     if group and not is_first:
         return lambda: _follow(trainer, restore, group)
-    received = group.signals if group else signals or Signals()
-    return lambda: _train(config, trainer, run_dir, restore, stopwatch, group, received)
+    signals = group.signals if group else signals or Signals()
+    return lambda: _train(config, trainer, run_dir, restore, stopwatch, group, signals)
 
 
 def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
@@ -117,16 +116,12 @@ def _train(
 ) -> int:
     """Trains, evaluates and reports; returns the exit code."""
     console = Console()
-    device = hardware()["device"]
     with noted_signals(signals):  # also during the report: training is done, so a signal has no effect
         run_dir.mkdir(parents=True, exist_ok=restore is not None)
         save_config(run_dir, config)
         trainer.save_inputs(run_dir)
-        console.print(
-            f"{trainer.headline} on {device} (preset {trainer.settings.preset})\nrun directory: {run_dir}",
-            highlight=False,
-            soft_wrap=True,
-        )
+        headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
+        console.print(f"{headline}\nrun directory: {run_dir}", highlight=False, soft_wrap=True)
         try:
             steps, params = _train_and_log(config, trainer, run_dir, signals, restore, stopwatch, console)
         except Interrupted as interruption:

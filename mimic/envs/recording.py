@@ -33,6 +33,7 @@ _MAX_DRAWS = 100
 _Control = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 
 
+# Above 40 lines because of its docstring.
 def record_demonstrations(
     arm: Arm,
     count: int,

@@ -1,4 +1,4 @@
-"""Splits of the demonstrations and names of measures, as keys and as people read them."""
+"""Keys and display names of splits, measures of similarity and baselines."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ SIMILARITY_HEADERS = {  # positions in chain lengths
     "hand_angle_deg": "hand\nangle",
 }
 SPLIT_NAMES = {"train": "training", "held_out": "held out"}
-SIMILARITY_NAMES = {  # of what moves the learner, where the name is not said by its key
+SIMILARITY_NAMES = {  # display names that differ from their keys
     "nearest_poses": "nearest poses (metric)",
     "copy_joints": "copying shared joints",
     "hand_ik": "IK of the scaled hand",

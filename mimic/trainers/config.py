@@ -210,7 +210,7 @@ class PPOSettings(PPOConfig):
         return self.num_timesteps
 
     def at(self, progress: Any) -> "PPOSettings":
-        """What holds at a fraction of the training: the entropy cost and the discount of that moment.
+        """Returns the settings at a fraction of the training, with the entropy cost and the discount factor there.
 
         Args:
           progress: in [0, 1], a number or a scalar array.

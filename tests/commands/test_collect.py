@@ -117,7 +117,7 @@ def test_what_is_left_out_is_named_and_the_rest_is_kept(six, capsys):
     assert "diverged" in reasons["diverged"] and "optimality_gap.train" in reasons["diverged"]
     assert "report.json cannot be read" in reasons["torn"]
     assert "of mimic 0.0.1, and this is" in reasons["of-old"] and "momentum" in reasons["of-old"]
-    assert reasons["refused"] == "seed=7: failed: no such arm" and reasons["waiting"] == "seed=8: not begun"
+    assert reasons["refused"] == "seed=7: failed: no such arm" and reasons["waiting"] == "seed=8: not started"
     assert len(reasons) == 6
     assert [len(group["seeds"]) for group in collected(six)["groups"]] == [3, 3]
 
@@ -155,7 +155,7 @@ def test_bad_input(refused, tmp_path):
     [
         (["{}/missing"], "there is no such folder"),
         (["{}"], "expected runs with a report.json, found none; 1 without: stopped: no report.json"),
-        (["{}/both"], "the runs are of pose_mapper and ppo, which have no figure in common; choose by only="),
+        (["{}/both"], "the runs are of pose_mapper and ppo, which have no metric in common; choose with only="),
         (["{}/both", "out={}/file"], "is a file; expected a folder"),
         (["{}/both", "only=sac"], "only: expected one of ppo, pose_mapper, got 'sac'"),
     ],

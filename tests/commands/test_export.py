@@ -155,7 +155,7 @@ def test_a_mapper_of_other_arms_than_its_config_says_is_refused(refused, tmp_pat
     mapper_run(tmp_path / "run")
     config = PoseMapperConfig(preset="paper", hidden_layers=[16, 16]).resolve()
     save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda3dof"), config))
-    assert "it is of other arms or another network" in refused("export", f"run={tmp_path / 'run'}", "out=new.onnx")
+    assert "it has other arms or another network" in refused("export", f"run={tmp_path / 'run'}", "out=new.onnx")
 
 
 def test_a_missing_package_is_named(refused, tmp_path, monkeypatch):

@@ -45,9 +45,9 @@ def test_what_is_said_of_an_arm(inspected, arm_file, tmp_path):
         "ur_like: 6 joints, 6 links",
         "expert panda: 7 joints",
         "6 actuators (6 servos on position)",
-        "beyond the tip, held where the model has them; what they carry stays as mass: left (slide), right (slide)",
+        "distal to the tip, fixed; their bodies stay as mass: left (slide), right (slide)",
         "1 equality constraints",
-        "no rated speed for pan, lift",
+        "no velocity limit for pan, lift",
         "no <inertial> in pan_link",
     ):
         assert text in said, said
@@ -75,15 +75,16 @@ def test_an_arm_that_runs_away_is_given_rotors(inspected, tmp_path):
     file = tmp_path / "light.xml"
     file.write_text(original_model.ur_like(armature=0.0))
     said = inspected(file, "bound=false")
-    assert "mind: random torques take a joint to" in said
+    assert "warning: random torques accelerate a joint to" in said
     assert re.search(r"train it: .* env.learner.armature=\S+ env.learner.damping=\S+ env.physics=fused", said)
 
 
 @pytest.mark.slow
 def test_how_near_an_equal_arm_can_come(inspected):
     said = inspected("panda")
-    ((bound, hold, share),) = re.findall(r"best poses: (\S+), of holding the start pose: (\S+); (\d+)% of it", said)
-    assert float(bound) < 0.01 < 0.1 < float(hold) and int(share) > 95
+    line = r"(\S+) for the best poses, (\S+) for holding the start pose; imitation can reduce it by (\d+)%"
+    ((bound, hold, percent),) = re.findall(line, said)
+    assert float(bound) < 0.01 < 0.1 < float(hold) and int(percent) > 95
 
 
 @pytest.mark.parametrize(

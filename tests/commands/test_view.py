@@ -37,7 +37,7 @@ def test_a_port_that_is_taken_is_refused(refused, monkeypatch):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert f"port: expected one that is free at 127.0.0.1, got {port}" in refused("view", f"port={port}")
+        assert f"port: expected a free port at 127.0.0.1, got {port}" in refused("view", f"port={port}")
 
 
 def test_without_viser_the_extra_is_named(refused, monkeypatch):

@@ -91,7 +91,7 @@ def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
         (["-m", "env=panda5dof,panda4dof"], "unknown env 'panda5dof'; valid are"),
         (["-m", "seed=0,one"], "could not be converted to Integer"),
         (["-m", "hydra/launcher=slurm"], "unknown hydra/launcher 'slurm'; valid are basic, ray, submitit_local, submi"),
-        (["hydra/launcher=submitit_local"], "expected with a sweep alone; add -m"),
+        (["hydra/launcher=submitit_local"], "expected only with a sweep; add -m"),
         (["-m", "hydra/launcher=submitit_local", "hydra.launcher.paralel=2"], "valid are _target_, parallel, gpus_per"),
         (["-m", "hydra/launcher=submitit_local", "hydra.launcher.parallel=0"], "parallel: expected at least 1, got 0"),
     ],
@@ -160,7 +160,7 @@ def after_begin(folder, act):
         ("import sys; print('so far', flush=True); sys.exit('error: no such arm')", 1, "no such arm; log: log"),
         ("raise ValueError('broken')", 1, "ValueError: broken; log: log"),
         ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", 1, "killed by SIGKILL; log: log"),
-        ("raise SystemExit(143)", 143, "stopped by SIGTERM; go on with: python -m program resume=run"),
+        ("raise SystemExit(143)", 143, "stopped by SIGTERM; continue with: python -m program resume=run"),
     ],
 )
 def test_what_became_of_a_run(program, text, exit_code, reason):

@@ -15,7 +15,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from mimic.trainers.distributed import process_group
-from mimic.trainers.distributed.local_processes import LocalProcesses, Told, told
+from mimic.trainers.distributed.local_processes import LocalProcess, LocalProcesses, local_process
 from mimic.trainers.distributed.process_group import DistributedConfig
 from mimic.trainers.run_config import run_schema
 from tests.helpers.repository import REPOSITORY
@@ -159,29 +159,29 @@ def test_what_both_processes_refuse_is_one_line(tmp_path):
     assert code == 2 and shown.count("expected a multiple of") == 1, shown
 
 
-def test_other_processes_are_told_who_they_are(monkeypatch):
+def test_each_started_process_knows_its_place(monkeypatch):
     """Each is the same command; what it says last is kept, and it is killed if it does not end."""
-    program = "import sys; from mimic.trainers.distributed.local_processes import told; this = told();"
-    program += " print('x' * 3000, this, file=sys.stderr)"
+    program = "import sys; from mimic.trainers.distributed.local_processes import local_process;"
+    program += " print('x' * 3000, local_process(), file=sys.stderr)"
     monkeypatch.setattr(sys, "orig_argv", ["python", "-c", program])
     others = LocalProcesses(3)
-    assert others.lost_at_start() is None
+    assert others.ended_at_start() is None
     others.end(patience_s=60)
     for index in (1, 2):
-        said = others.said(index)
-        assert said.startswith("xx") and len(said) <= 2000
-        assert said.endswith(str(Told(others.address, 3, index, os.getpid())))
+        output = others.error_output(index)
+        assert output.startswith("xx") and len(output) <= 2000
+        assert output.endswith(str(LocalProcess(others.address, 3, index, os.getpid())))
     monkeypatch.setattr(sys, "orig_argv", ["python", "-c", "import time; time.sleep(100)"])
     others = LocalProcesses(3)
-    assert others.gone() is None and others.said(1) == ""
+    assert others.first_ended() is None and others.error_output(1) == ""
     others.end(patience_s=0)
-    assert others.gone() == others.lost_at_start() == 1
-    assert others.said(1) == "ended by signal 9 (Killed)"
+    assert others.first_ended() == others.ended_at_start() == 1
+    assert others.error_output(1) == "ended by signal 9 (Killed)"
 
 
-def test_who_is_told_nothing_is_the_first(monkeypatch):
+def test_a_process_that_was_not_started_is_the_first(monkeypatch):
     monkeypatch.delenv("MIMIC_LOCAL_PROCESS", raising=False)
-    assert told() is None
+    assert local_process() is None
 
 
 def test_a_process_without_its_first_ends(monkeypatch):
@@ -189,7 +189,7 @@ def test_a_process_without_its_first_ends(monkeypatch):
     monkeypatch.setenv("MIMIC_LOCAL_PROCESS", "127.0.0.1:1 2 1 1")
     monkeypatch.setattr(os, "getppid", lambda: 2)
     with pytest.raises(SystemExit):
-        told()
+        local_process()
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_a_process_without_its_first_ends(monkeypatch):
     ],
 )
 def test_there_is_a_gpu_for_each_process_of_a_host(monkeypatch, asked, gpus, platforms, expected):
-    monkeypatch.setattr(process_group, "gpus", lambda: gpus)
+    monkeypatch.setattr(process_group, "gpu_count", lambda: gpus)
     monkeypatch.setenv("JAX_PLATFORMS", platforms)
     if isinstance(expected, int):
         assert process_group.processes_here(asked) == expected

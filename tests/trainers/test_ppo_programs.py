@@ -45,7 +45,7 @@ def one_batch():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(updates, "value_loss", of_value)
         patch.setattr(updates, "policy_loss", of_policy)
-        begin, learn = programs.make_programs(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+        begin, learn = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
         start = begin()(7)
         before = jax.device_get(start)
         after, metrics = jax.device_get(learn()(start))
@@ -136,7 +136,7 @@ env = mimic.make("planar4dof", physics=sys.argv[1], demonstrations={"count": 3, 
 config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
                    hidden_layers=[8]).resolve("cpu", 2)
 networks = training.make_networks(config, env.observation_size, env.action_size)
-begin, learn = programs.make_programs(env, config, networks, 2, optax.constant_schedule(1e-3), None)
+begin, learn = programs.compile_training(env, config, networks, 2, optax.constant_schedule(1e-3), None)
 start = begin()(7)
 before = jax.device_get(start.params)
 after, metrics = learn()(start)
@@ -177,7 +177,7 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
         config = PPOConfig(**small, **settings).resolve("cpu")  # type: ignore[arg-type]
         networks = training.make_networks(config, env.observation_size, env.action_size)
         rate = optax.constant_schedule(1e-3)
-        begin, learn = programs.make_programs(env, config, networks, 1, rate, None, lambda count: count / 2)
+        begin, learn = programs.compile_training(env, config, networks, 1, rate, None, lambda count: count / 2)
         state, learn = begin()(7), learn()
         for _ in range(batches):
             state, _ = learn(state)
@@ -196,7 +196,7 @@ def test_both_programs_are_compiled_with_the_options_of_a_run(monkeypatch):
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    for program in programs.make_programs(env, config, networks, 1, optax.constant_schedule(1e-3), None):
+    for program in programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None):
         with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
             program()
 
@@ -212,6 +212,6 @@ def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):
     for scheduling in ("SERIALIZE", given[_SCHEDULING]):
         options = {**given, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
         monkeypatch.setattr(programs, "compiler_options", lambda options=options: options)
-        begin, learn = programs.make_programs(env, config, networks, 5, optax.constant_schedule(1e-3), None)
+        begin, learn = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
         learned.append(jax.device_get(learn()(begin()(7))))
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))

@@ -37,8 +37,8 @@ class Case:
         """By mimic: policy and value, metrics."""
         policy, value = (updates.begin(params, self.optimizer) for params in self.params)
         of_run = self.networks, self.config, self.optimizer
-        how = updates.UpdateConfig(*of_run, axis="devices", staggered=staggered, unroll=unroll)
-        return updates.updated((policy, value), self.statistics, unrolls, order, key, how)
+        config = updates.UpdateConfig(*of_run, axis="devices", staggered=staggered, unroll=unroll)
+        return updates.updated((policy, value), self.statistics, unrolls, order, key, config)
 
     def expected(self):
         """One update after the other, array by array, the means over the devices by hand."""

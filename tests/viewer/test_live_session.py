@@ -29,7 +29,7 @@ def env():
 def live(env, compiled):
     """A fresh session that shares compiled programs with the others."""
     session = LiveSession(env)
-    session._programs = compiled
+    session._functions = compiled
     return session
 
 
@@ -37,7 +37,7 @@ def live(env, compiled):
 def compiled(env):
     session = LiveSession(env)
     session.compile()
-    return session._programs
+    return session._functions
 
 
 def settle(session, seconds=6.0):
@@ -165,11 +165,11 @@ def test_locking_the_last_joint_is_refused_and_undone():
     assert session.settings == before
 
 
-def test_settings_that_differ_in_weights_alone_share_programs(env):
+def test_settings_that_differ_only_in_weights_share_functions(env):
     settings = initial_settings(env)
     assert settings.locked == ("joint3", "joint6", "joint7") and settings.correspondence == "arc_length"
-    assert dataclasses.replace(settings, rotation=0.3).program_key == settings.program_key
-    assert dataclasses.replace(settings, correspondence="hard").program_key != settings.program_key
+    assert dataclasses.replace(settings, rotation=0.3).compilation_key == settings.compilation_key
+    assert dataclasses.replace(settings, correspondence="hard").compilation_key != settings.compilation_key
     with pytest.raises(ValueError, match="expected one of arc_length, overlap, hard, soft"):
         Settings((), "none", 0.0, 1.0)
 
