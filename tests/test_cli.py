@@ -37,7 +37,7 @@ def test_bad_training_input(refused, arguments, message):
     assert message in refused("train", *arguments)
 
 
-def test_bad_input_of_a_whole_process():
+def test_bad_input_ends_the_process_with_one_line():
     result = subprocess.run(
         [sys.executable, "-m", "mimic.train", "env=panda5dof"], capture_output=True, text=True, timeout=60, check=False
     )

@@ -48,7 +48,7 @@ def test_all_environments_are_registered():
     assert isinstance(env.unwrapped, VectorEnv) and env.num_envs == 2
 
 
-def test_it_is_the_brax_environment(imitation):
+def test_it_equals_the_brax_environment(imitation):
     env = Env(imitation)
     obs, _ = env.reset(seed=3, options={"demonstration": 2})
     state = imitation.begin(imitation.start(jax.random.PRNGKey(0), 2))
@@ -63,7 +63,7 @@ def test_it_is_the_brax_environment(imitation):
         assert (terminated, truncated) == (index == 5, False)
 
 
-def test_arms_start_anew_in_the_step_that_ends_an_episode(imitation, vector):
+def test_arms_restart_in_the_step_that_ends_an_episode(imitation, vector):
     assert vector.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     obs, _ = vector.reset(seed=0)
     assert obs.shape == (5, imitation.observation_size) and vector.observation_space.contains(obs)

@@ -20,7 +20,7 @@ REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_
     ],
     ids=["import", "help"],
 )
-def test_what_is_heavy_is_imported_when_it_is_needed(code):
+def test_heavy_packages_are_imported_late(code):
     result = subprocess.run([sys.executable, "-c", code + REPORT], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr[-2000:]
     imported = set(result.stdout.splitlines()[-1].split())

@@ -215,7 +215,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("case", MODELS)
-def test_bad_models_are_refused(case):
+def test_bad_models_are_rejected(case):
     make, options, message = MODELS[case]
     with pytest.raises(ValueError, match=f"^{message}") as error:
         load_mjcf(make(), **options)
@@ -223,7 +223,7 @@ def test_bad_models_are_refused(case):
 
 
 @pytest.mark.parametrize("active", [True, False])
-def test_an_active_loop_between_sites_is_refused(active):
+def test_an_active_loop_between_sites_is_rejected(active):
     arm = hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B", inner=STATIC))
     weld = f'<equality><weld name="tie" site1="palm" site2="wall" active="{str(active).lower()}"/></equality>'
     tied = model('<site name="wall"/>' + arm, weld)
@@ -245,7 +245,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("case", FILES)
-def test_bad_files_are_refused(tmp_path, case):
+def test_bad_files_are_rejected(tmp_path, case):
     content, message = FILES[case]
     path = tmp_path / "arm.xml"
     if content is not None:
@@ -255,6 +255,6 @@ def test_bad_files_are_refused(tmp_path, case):
     assert "\n" not in str(error.value)
 
 
-def test_a_directory_is_no_file(tmp_path):
+def test_a_directory_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="^no MJCF or URDF file at "):
         load_mjcf(tmp_path)

@@ -53,7 +53,7 @@ def test_bad_input_of_the_command(refused, tmp_path, arguments, message):
     assert message in refused("demonstrations", *(argument.format(taken=taken) for argument in arguments))
 
 
-def test_no_goal_within_the_limits_is_the_users_to_mend(tmp_path):
+def test_no_goal_within_the_limits_is_an_input_error(tmp_path):
     config = mimic.env_config("planar4dof", control_dt=0.9)
     with pytest.raises(ValueError, match="exceed its limits"):
         prepare_recording(RecordingConfig(config, count=1, out=str(tmp_path / "new.npz")))

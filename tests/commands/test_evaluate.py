@@ -40,7 +40,7 @@ def evaluate(run_dir, out, **settings):
         return json.loads((out / "report.json").read_text()), list(csv.DictReader(file))
 
 
-def test_holding_still_has_a_gap_of_one(run_dir, tmp_path):
+def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path):
     """On the physics that the run did not train with. 1e-5: float32, once from rollouts and once from the home pose."""
     report, rows = evaluate(run_dir, tmp_path / "new", controller="hold", physics="mjx")
     assert report["trainer"] == "hold"

@@ -102,7 +102,7 @@ def test_each_frame_has_the_measures_of_similarity(files):
         assert clip.similarity[name][frame] == pytest.approx(float(expected), rel=1e-4)  # degrees in float32
 
 
-def test_a_frame_shows_the_moment(files):
+def test_frames_show_both_arms_and_the_time(files):
     plan = prepare_clip(RenderConfig(**files))
     clip = plan.compute()
     few = dataclasses.replace(clip, time=clip.time[:2], poses=tuple(poses[[0, -1]] for poses in clip.poses))
@@ -153,7 +153,7 @@ def test_motions_of_another_length_are_rejected(files, tmp_path):
         prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
 
 
-def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
+def test_bad_input_for_a_mapper_is_rejected(mapper_run, files):
     bad: list[tuple[dict[str, Any], str]] = [
         ({"split": "train"}, "split: has no effect with a run of trainer=pose_mapper"),
         ({"seed": -1}, "demonstration, seed: expected at least 0"),

@@ -58,7 +58,7 @@ def test_a_run_directory_holds_everything(finished):
     assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 4
 
 
-def test_a_run_compiles_few_programs(finished):
+def test_a_run_compiles_few_functions(finished):
     """Each takes a tenth of a second and more on a GPU."""
     _, result = finished
     names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", result.stderr)
@@ -98,7 +98,7 @@ def test_a_video_shows_the_whole_motion(finished):
     assert beyond.returncode == 2 and "expected 0 to 1, the held_out ones of the run, got 2" in beyond.stderr
 
 
-def test_resume_goes_on_from_the_last_checkpoint(finished, tmp_path):
+def test_resume_continues_from_the_last_checkpoint(finished, tmp_path):
     run_dir = shutil.copytree(finished[0], tmp_path / "run")
     result = command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
     assert result.returncode == 0, result.stderr[-2000:]

@@ -58,7 +58,7 @@ def is_picture(path):
     return len([count for count, _ in colours if count > 20]) > 10
 
 
-def test_there_are_eight_and_the_index_has_them_all():
+def test_the_index_lists_all_eight_examples():
     index = (EXAMPLES / "README.md").read_text()
     assert [name[:2] for name in NAMES] == [f"{n:02}" for n in range(1, 9)]
     for name in NAMES:

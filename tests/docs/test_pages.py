@@ -75,7 +75,7 @@ def test_pages_run(page, monkeypatch, tmp_path):
     run_page(page, tmp_path)
 
 
-def test_every_page_is_read_as_it_is_written():
+def test_every_block_of_a_page_is_recognised():
     """What the reader would not recognise as a block must not go unnoticed."""
     page = "a\n\n    B=1 srun python -m m  # c\n    make x\n\n<!-- not run: no -->\n\n```python\n  d\n```\n"
     page += '```xml title="e.xml"\n<f/>\n```'
@@ -112,7 +112,7 @@ def test_pages_name_every_environment_and_only_functions_that_exist():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
-def test_links_lead_somewhere(page):
+def test_links_resolve(page):
     for link in re.findall(r"\]\(((?!http)[^)]+)\)", page.read_text()):
         path, _, heading = link.partition("#")
         target = page.parent / path if path else page

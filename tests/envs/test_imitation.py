@@ -78,7 +78,7 @@ def test_a_runaway_ends_the_episode_and_never_pays(planar_env):
     assert after.reward == pytest.approx(worst_rest, rel=1e-5)
 
 
-def test_hardware_limits_cost_where_they_are_near_and_beyond():
+def test_hardware_limits_are_penalised_near_and_beyond_them():
     free, limited = (
         mimic.make("panda4dof", physics="fused", demonstrations=FEW, limits=limits, limit_weight=2.0)
         for limits in ("none", "hardware")
@@ -99,7 +99,7 @@ def test_hardware_limits_cost_where_they_are_near_and_beyond():
         assert after.reward == pytest.approx(-float(costs), rel=1e-6)
 
 
-def test_training_and_held_out_are_apart():
+def test_training_and_held_out_demonstrations_differ():
     training, held_out = training_and_held_out(mimic.env_config("planar4dof", demonstrations=FEW))
     assert (training.count, held_out.count) == (6, 2)
     assert not np.isin(held_out.goals, training.goals).any()
@@ -118,11 +118,11 @@ def test_training_and_held_out_are_apart():
         ({"learner": {"locked": [9]}}, "unknown joint 9"),
     ],
 )
-def test_bad_overrides_are_refused(overrides, message):
+def test_bad_overrides_are_rejected(overrides, message):
     with pytest.raises(ValueError, match=message):
         mimic.make("panda4dof", **overrides)
 
 
-def test_unknown_environment_names_the_known():
+def test_an_unknown_environment_lists_the_valid_ones():
     with pytest.raises(ValueError, match="panda3dof, panda4dof, panda7dof, planar4dof"):
         mimic.make("panda5dof")

@@ -112,7 +112,7 @@ def test_locomujoco_files_are_split_and_their_free_joint_is_left_out(tmp_path):
         np.testing.assert_allclose(imported.qvel[which], qvel, atol=1e-5)
 
 
-def test_joints_of_other_names_are_told(tmp_path):
+def test_joint_names_of_the_file_can_be_given(tmp_path):
     names = [f"panda_{i}" for i in "abcdefg"]
     source = archive(tmp_path / "loco.npz", joint_names=np.array(["root", *names]))
     imported, _ = mimic.import_demonstrations(source, mimic.panda(), joints=names)
@@ -163,5 +163,5 @@ def test_bad_archives(refused, tmp_path, changes, message):
     assert message in refused("demonstrations", f"source={path}", "out=new.npz")
 
 
-def test_joints_without_a_file_are_refused(refused):
+def test_joint_names_without_a_file_are_rejected(refused):
     assert "joints: expected only with source=FILE" in refused("demonstrations", "out=new.npz", "joints=[a]")

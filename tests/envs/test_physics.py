@@ -85,7 +85,7 @@ def assert_near(found, expected, rtol=RTOL):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_acceleration_and_inverse_are_mujocos(x64, name):
+def test_forward_and_inverse_dynamics_equal_those_of_mujoco(x64, name):
     model = build_arm(ARMS[name]).model
     qpos, qvel, torque = random_states(model)
     qacc = mujoco_acceleration(model, qpos, qvel, torque)
@@ -104,7 +104,7 @@ def test_random_arms_move_as_in_their_own_model(x64, seed):
     assert_near(ours(dynamics.inverse, model, qpos, qvel, qacc), torque)
 
 
-def test_random_arms_have_what_is_hard():
+def test_random_arms_include_the_hard_cases():
     sources = [random_arm(seed) for seed in SEEDS]
     assert any(source.body_jntnum.max() == 2 for source in sources)
     assert any(source.qpos0.any() for source in sources)
@@ -177,7 +177,7 @@ def test_both_physics_step_a_loaded_arm_as_mujoco_does(x64, kind):
         assert_near(np.asarray(values), reference)
 
 
-def test_mjx_brings_no_empty_array_into_a_program():
+def test_mjx_adds_no_empty_array_to_a_compiled_function():
     """With one, jaxlib 0.11.2 crashes on a program for several devices; 0.10.2 and 0.12.0 do not."""
     model, empty = build_arm(ARMS["planar"]).model, np.zeros((0, 3), np.float32)
     state = [jnp.asarray(x[0]) for x in random_states(model)]
@@ -229,7 +229,7 @@ def test_the_kernel_lowers_without_a_gpu(planar):
     assert "triton" not in batched.lower(*states).as_text()
 
 
-def test_default_steps_keep_the_tip_where_it_belongs():
+def test_default_substeps_keep_the_tip_within_1_mm():
     """1 s of random torques against RK4 at 0.5 ms: 1 mm, a thousandth of the arm's reach; 0.2 mm when written."""
     env = mimic.make("panda4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     arm, model, substeps, dt = env.learner, env.arm.model, env.config.substeps, env.config.control_dt
@@ -265,7 +265,7 @@ def test_default_steps_keep_the_tip_where_it_belongs():
     assert np.linalg.norm(apart, axis=-1).max() < 1e-3
 
 
-def test_fused_and_mjx_stay_together_over_an_episode():
+def test_fused_and_mjx_agree_over_an_episode():
     """5 s of demonstrations' torques in single precision, without feedback; 2e-6 rad when written."""
     env = mimic.make("panda7dof", demonstrations={"count": 8, "held_out": 1})
     motions, dt = env.demonstrations, env.config.control_dt

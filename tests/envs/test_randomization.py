@@ -55,7 +55,7 @@ def test_loads_differ_between_episodes_and_fill_their_range(varied):
     assert abs(np.corrcoef(np.stack(loads))[0, 1]) < 0.15  # more than 4 standard deviations of chance
 
 
-def test_one_range_leaves_the_other_factor_as_it_is():
+def test_randomising_one_factor_leaves_the_other_fixed():
     load = make(mass=[0.5, 2.0], damping=[1.5, 1.5]).start(jax.random.PRNGKey(0)).load
     assert load is not None and load.damping == 1.5 and 0.5 < load.mass < 2
 
@@ -105,7 +105,7 @@ def test_a_heavier_arm_moves_as_in_mujoco(plain, physics):
     np.testing.assert_allclose(stepped(env), [*data.qpos, *data.qvel], atol=1e-5)
 
 
-def test_noise_moves_the_arm_anew_in_each_step_and_episode(plain):
+def test_noise_differs_between_steps_and_episodes(plain):
     noisy, silent = make(torque_noise=0.2), make(torque_noise=0.0)
     np.testing.assert_array_equal(stepped(silent), stepped(plain))
     np.testing.assert_array_equal(stepped(noisy), stepped(noisy))
@@ -120,7 +120,7 @@ def noisy(monkeypatch):
     return make(torque_noise=0.1)
 
 
-def test_noise_is_of_the_given_size_and_within_the_largest_torque(noisy):
+def test_noise_has_the_given_size_and_torques_stay_within_the_maximum(noisy):
     """5000 draws: their standard deviation is known to 1 %, and 5 % is five times that."""
     env = noisy
 

@@ -49,7 +49,7 @@ def rollouts(evaluator, turned=(0.0, 0.0), faster=(0.0, 0.0), distance=None):
     return Rollouts(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, 0 * qpos, distance)))
 
 
-def test_no_error_where_the_learner_does_as_the_expert(evaluator):
+def test_errors_are_zero_where_the_learner_moves_as_the_expert(evaluator):
     """0.05 deg is what the arc cosine leaves of float32 near 1; velocities of some rad/s are rounded by 1e-6."""
     table = evaluator.table(rollouts(evaluator))
     assert np.all(table["link_angle_error_deg"] < 0.05)
@@ -58,7 +58,7 @@ def test_no_error_where_the_learner_does_as_the_expert(evaluator):
 
 
 @pytest.mark.parametrize(("by", "links"), [((0.3, 0.0), (0.3, 0.3)), ((0.0, -0.3), (0, 0.3)), ((0.3, -0.3), (0.3, 0))])
-def test_errors_are_those_of_a_known_turn(evaluator, by, links):
+def test_errors_equal_a_known_rotation(evaluator, by, links):
     """An angle or speed at a joint moves all links beyond it. Tolerances as above."""
     turned = evaluator.table(rollouts(evaluator, turned=by))
     names = evaluator.env.learner.link_names
@@ -70,7 +70,7 @@ def test_errors_are_those_of_a_known_turn(evaluator, by, links):
     assert np.all(faster["link_angle_error_deg"] < 0.05)
 
 
-def test_angles_count_by_the_share_of_each_expert_link():
+def test_angles_are_weighted_by_the_fraction_of_each_expert_link():
     """One learner link along x against expert links at 0 and at 90 degrees.
 
     By overlap W has 1 + 3/4 and 1 + 1/4, the fractions of the expert's links and of the learner's: 5/12 for the second.
@@ -175,14 +175,14 @@ def test_similarity_of_a_turned_arm_is_in_the_report(evaluator):
         assert summary["hand_ik"]["hand_position_error"][split] < 0.05  # interpolated between every fifth sample
 
 
-def test_a_gap_that_would_mean_nothing_is_not_given():
+def test_a_meaningless_gap_is_not_reported():
     distance, bound, hold = np.array([[0.2, 0.2, 0.0], [0.087, 0.075, 0.0], [0.101, 0.1, 0.0]])
     found = gaps(distance, bound, hold)
     assert np.isnan(found[[0, 2]]).all() and found[1] == pytest.approx(5.0)
     assert has_gap(0.075, 0.1) and not has_gap(0.0751, 0.1)
 
 
-def test_a_report_says_why_there_is_no_gap(evaluator, monkeypatch):
+def test_a_report_explains_a_missing_gap(evaluator, monkeypatch):
     """The bound is raised to where it saves less than a quarter of the distance of holding the start pose."""
     monkeypatch.setattr(Evaluator, "lower_bound", property(lambda evaluator: 0.9 * evaluator.hold_distance))
     ran = rollouts(evaluator, distance=2 * evaluator.hold_distance)
@@ -208,7 +208,7 @@ def test_the_table_as_a_file(evaluator, tmp_path):
 
 
 @pytest.mark.parametrize("plot", [plots.plot_quality, plots.plot_demonstrations])
-def test_pictures_show_all_and_name_the_controller(evaluator, monkeypatch, tmp_path, plot):
+def test_plots_show_all_values_and_name_the_controller(evaluator, monkeypatch, tmp_path, plot):
     """The held-out demonstrations went worse than the training ones, whose axes come first."""
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
@@ -222,7 +222,7 @@ def test_pictures_show_all_and_name_the_controller(evaluator, monkeypatch, tmp_p
         assert all(np.all((line.get_ydata() >= low) & (line.get_ydata() <= high)) for line in axes.lines)
 
 
-def test_holding_is_what_the_gap_is_measured_against(evaluator):
+def test_holding_the_start_pose_is_the_reference_of_the_gap(evaluator):
     """1e-6: float32, of the same distances in another program."""
     ran, frequency = run_controller(evaluator, "hold")
     np.testing.assert_allclose(ran.distance, evaluator.hold_distance, atol=1e-6)
@@ -239,13 +239,13 @@ def test_exact_dynamics_track_better_than_none(evaluator):
         assert 5 * found[0][split] < found[1][split] < 0.1  # it does without the coupling of joints
 
 
-def test_controllers_that_ask_for_too_much_get_the_largest_torque(evaluator):
+def test_actions_out_of_range_get_the_maximum_torque(evaluator):
     greedy = jax.jit(lambda: evaluator.rollout(lambda state: jnp.array([5.0, -5.0])))()
     scale = np.asarray(evaluator.env.torque_scale)
     np.testing.assert_array_equal(greedy.torque, np.broadcast_to(scale * [1, -1], greedy.torque.shape))
 
 
-def test_a_learner_that_can_do_what_the_expert_does_needs_no_search(monkeypatch):
+def test_the_bound_of_an_equal_arm_needs_no_search(monkeypatch):
     monkeypatch.setattr(evaluation, "closest_motion", None)  # would fail
     config = mimic.env_config("panda7dof", demonstrations={"count": 2, "held_out": 1}, physics="fused")
     training, held_out = training_and_held_out(config)
@@ -269,7 +269,7 @@ def test_no_rollout_goes_below_the_bound():
         assert np.all(np.asarray(rollout(gain).distance) > evaluator.lower_bound - 1e-4)
 
 
-def test_bound_and_holding_are_those_of_the_samples_after_each_step():
+def test_bound_and_hold_distance_belong_to_the_samples_after_each_step():
     """In closed form: of planar arms by directions. 1e-4: what the search may leave."""
     metric = {"correspondence": "overlap", "translation": 0.0, "linear_velocity": 0.0, "angular_velocity": 0.0}
     few = {"count": 1, "held_out": 1}

@@ -231,7 +231,7 @@ def test_float32_stays_float32_under_x64(x64, arm):
     assert link_states(arm, q32.astype(jnp.float64)).position.dtype == jnp.float64
 
 
-def test_whole_numbers_are_angles_too(unchecked):
+def test_integer_angles_are_accepted(unchecked):
     arm = planar_arm([0.4, 0.6])
     assert link_states(arm, np.array([0, 1])).position.dtype == jnp.float32  # pyright: ignore[reportArgumentType]
 
@@ -242,7 +242,7 @@ def test_annotated_shapes_are_checked_while_testing():
 
 
 @pytest.mark.parametrize("shape", [(), (6,), (8,), (7, 1), (5, 7)])
-def test_wrong_shapes_are_refused(unchecked, shape):
+def test_wrong_shapes_are_rejected(unchecked, shape):
     arm, good, bad = panda(), np.zeros(7, np.float32), np.zeros(shape, np.float32)
     for what, call in {
         "qpos": [
@@ -259,7 +259,7 @@ def test_wrong_shapes_are_refused(unchecked, shape):
             assert ("jax.vmap" in str(error.value)) == (len(shape) > 1)
 
 
-def test_the_table_of_link_states_is_what_they_are():
+def test_the_table_of_link_states_equals_link_states():
     arm = mimic.panda(locked=[3])
     qpos, qvel = np.random.default_rng(0).normal(size=(2, 3, 4, arm.num_joints))
     table = link_state_table(arm, qpos, qvel)

@@ -40,7 +40,7 @@ def test_minima_are_counted_across_the_seam():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_bad_input_is_refused():
+def test_bad_input_is_rejected():
     with pytest.raises(ValueError, match="learner: expected 2 joints, got 3"):
         distance_landscape(ARM, planar_arm([1, 1, 1]), EXPERT_POSE, hard_correspondence, adaptive_weights)
     with pytest.raises(ValueError, match="resolution: expected at least 3"):

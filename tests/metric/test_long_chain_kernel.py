@@ -74,7 +74,7 @@ def values_and_gradients(arms, correspondence, weights, batch):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_kernel_computes_what_the_composition_does(x64, long_kernel, case):
+def test_the_kernel_equals_the_composition(x64, long_kernel, case):
     arms, correspondence, weights = CASES[case]
     correspondence = overlap_correspondence(*arms) if correspondence is None else correspondence
     batch = motions(arms, fused_kernel.DEFAULT.block + 1)  # the last block is partial

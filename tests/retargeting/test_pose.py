@@ -110,7 +110,7 @@ def test_joint_limits_are_kept():
     assert held.any() and np.mean(found.converged) > 0.95
 
 
-def test_distances_are_those_of_the_poses_and_no_nearby_pose_is_nearer():
+def test_distances_belong_to_the_poses_and_no_nearby_pose_is_better():
     expert, learner = PAIRS["panda 7->4"]
     qpos = poses(expert, 8)
     for weights, correspondence, tolerance in (
@@ -132,7 +132,7 @@ def test_distances_are_those_of_the_poses_and_no_nearby_pose_is_nearer():
             assert np.all(batched(qpos, near) > found.distance - tolerance)
 
 
-def test_newton_beats_plain_descent():
+def test_newton_beats_gradient_descent():
     expert, learner = PAIRS["panda 7->4"]
     qpos, correspondence = poses(expert, 32), overlap_correspondence(expert, learner)
     newton, plain = (
@@ -143,7 +143,7 @@ def test_newton_beats_plain_descent():
     assert np.mean(plain.distance - newton.distance) < 1e-2  # the paper's way gets near
 
 
-def test_descents_that_are_given_up_are_not_missed():
+def test_dropped_initial_guesses_are_not_missed():
     expert, learner = PAIRS["planar 7->4"]
     arguments = expert, learner, poses(expert, 64), overlap_correspondence(expert, learner), DIRECTIONS
     few, every = (imitate_pose(*arguments, kept=kept) for kept in (2, None))
@@ -201,7 +201,7 @@ def test_trajectories_do_not_jump(metric, limits):
         (np.zeros(7), {"warm_start": np.zeros(7)}, r"warm_start: expected shape \[..., 4\]"),
     ],
 )
-def test_bad_input_is_refused(qpos, options, message):
+def test_bad_input_is_rejected(qpos, options, message):
     expert, learner = PAIRS["planar 7->4"]
     with pytest.raises(ValueError, match=message):
         imitate_pose(expert, learner, qpos, jnp.ones((7, 4)), DIRECTIONS, **options)

@@ -96,11 +96,11 @@ def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
         (["-m", "hydra/launcher=submitit_local", "hydra.launcher.parallel=0"], "parallel: expected at least 1, got 0"),
     ],
 )
-def test_bad_sweeps_leave_nothing_behind(refused, arguments, message):
+def test_bad_sweeps_write_nothing(refused, arguments, message):
     assert message in refused("train", *arguments)
 
 
-def test_slurm_and_packages_that_are_not_there(refused, monkeypatch):
+def test_missing_slurm_and_packages_are_reported(refused, monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert "expected a machine with Slurm's sbatch" in refused("train", "-m", "hydra/launcher=submitit_slurm")
     monkeypatch.setitem(sys.modules, "ray", None)
@@ -163,7 +163,7 @@ def after_begin(folder, act):
         ("raise SystemExit(143)", 143, "stopped by SIGTERM; continue with: python -m program resume=run"),
     ],
 )
-def test_what_became_of_a_run(program, text, exit_code, reason):
+def test_the_outcome_of_a_run_is_reported(program, text, exit_code, reason):
     outcome = program(text, run_dir="run")()
     assert (outcome.exit_code, outcome.reason) == (exit_code, reason)
 
@@ -180,7 +180,7 @@ def test_sigterm_is_passed_on(program, tmp_path):
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
-def test_a_time_limit_stops_a_run_and_lets_it_go_on(program, tmp_path):
+def test_a_time_limit_stops_a_run_that_can_be_resumed(program, tmp_path):
     """As submitit does: its handler asks for what to queue again, then ends the process."""
     run = program(WAITS, run_dir="run")
     (tmp_path / "run").mkdir()

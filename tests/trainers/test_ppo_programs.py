@@ -53,13 +53,13 @@ def one_batch():
     return before, after, shown, along
 
 
-def test_each_pass_shows_the_loss_each_transition(one_batch):
+def test_each_pass_uses_each_transition(one_batch):
     _, after, shown, along = one_batch
     assert int(after.statistics.count.lo) == UNROLLS * ARMS
     assert shown["now"] == pytest.approx(along @ after.statistics.mean, abs=1e-5)
 
 
-def test_what_is_seen_next_belongs_to_its_transition(one_batch):
+def test_the_next_observation_belongs_to_its_transition(one_batch):
     """Of unrolls of one step, what follows the first is what the second begins with."""
     before, after, shown, along = one_batch
     seen = UNROLLS * ARMS * after.statistics.mean - before.episodes.obs.sum(0) + after.episodes.obs.sum(0)
@@ -191,7 +191,7 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
     assert max(jax.tree.leaves(apart)) > 1e-4  # Adam moves by 1e-3 an update, whatever the gradient's size
 
 
-def test_both_programs_are_compiled_with_the_options_of_a_run(monkeypatch):
+def test_both_functions_are_compiled_with_the_options_of_a_run(monkeypatch):
     monkeypatch.setattr(programs, "compiler_options", lambda: {"no_option_of_xla": True})
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
@@ -203,7 +203,7 @@ def test_both_programs_are_compiled_with_the_options_of_a_run(monkeypatch):
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("physics", ["fused", "mjx"])
-def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):
+def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypatch):
     """To the bit, where XLA picks the same matrix products and adds in the same order."""
     env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
     config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")

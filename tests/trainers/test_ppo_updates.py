@@ -83,7 +83,7 @@ def case(x64):
 
 
 @pytest.mark.parametrize(("staggered", "unroll"), [(False, 1), (True, 1), (True, 2)])
-def test_updates_are_those_of_each_minibatch_in_turn(case, staggered, unroll):
+def test_updates_equal_those_of_each_minibatch_in_turn(case, staggered, unroll):
     on_all = jax.jit(jax.vmap(functools.partial(case.on_device, staggered, unroll), axis_name="devices"))
     learners, metrics = on_all(case.unrolls, case.order, case.keys)
     params, expected_metrics = case.expected()
@@ -96,7 +96,7 @@ def test_updates_are_those_of_each_minibatch_in_turn(case, staggered, unroll):
         assert set(np.ravel(learner.optimizer[0].count)) == {UPDATES}
 
 
-def test_each_message_waits_for_the_one_before(case, monkeypatch):
+def test_each_all_reduce_waits_for_the_one_before(case, monkeypatch):
     """Else NCCL could get two at once, on each GPU in an order of its own."""
     scan = jax.lax.scan
 

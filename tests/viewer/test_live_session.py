@@ -155,7 +155,7 @@ def test_a_trained_mapper_moves_the_learner(tmp_path):
     assert frame.bound < frame.distance  # it has hardly learned anything
 
 
-def test_locking_the_last_joint_is_refused_and_undone():
+def test_locking_the_last_joint_is_rejected_and_undone():
     session = LiveSession(env_config("planar4dof"))
     before = session.settings
     session.change(locked=("joint1", "joint2", "joint3", "joint4"))
@@ -174,7 +174,7 @@ def test_settings_that_differ_only_in_weights_share_functions(env):
         Settings((), "none", 0.0, 1.0)
 
 
-def test_a_joint_goes_the_short_way_round():
+def test_a_joint_takes_the_shorter_way_around():
     arm = mimic.panda()
     pose, is_there = step_towards(arm, np.full(7, 3.1), np.full(7, -3.1), np.full(7, 0.05))
     np.testing.assert_allclose(pose, 3.15 - 2 * np.pi)
