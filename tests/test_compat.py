@@ -1,4 +1,4 @@
-"""What mimic makes good in the packages that it uses."""
+"""Workarounds for the packages that mimic uses."""
 
 import copy
 import logging
@@ -53,7 +53,7 @@ def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
 @pytest.mark.slow
 @pytest.mark.skipif(not compat.needs_cpu_flag(), reason="this jax does not need the flag and aborts on it")
 def test_the_cpu_flag_speeds_up_kinematics(capsys):
-    """Times MJX's kinematics of 64 Pandas with and without it, each in a process of its own."""
+    """Times MJX's kinematics of 64 Pandas with and without it, in two processes."""
     code = (
         "import time, jax, jax.numpy as jnp, mujoco\nfrom mujoco import mjx\n"
         "from mimic.arms.embodiment import panda_path\n"

@@ -24,7 +24,7 @@ def test_background_functions_run_once():
 
 @pytest.mark.parametrize(("a_process_for_each", "count"), [(False, 2), (True, 3)])
 def test_options_for_gpus_are_known_to_jaxlib(monkeypatch, a_process_for_each, count):
-    """Which takes them on CPUs too, and refuses a wrong name or value."""
+    """It accepts them on CPUs too, and rejects a wrong name or value."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(compilation, "a_process_for_each_gpu", lambda: a_process_for_each)
     options = compiler_options()

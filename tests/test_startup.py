@@ -1,4 +1,4 @@
-"""What happens before the first training step: nothing heavy is imported, compiled or computed that is not needed."""
+"""Start-up: heavy packages are imported only when they are needed."""
 
 import subprocess
 import sys
@@ -37,7 +37,7 @@ def test_pose_mappers_need_no_simulator():
 
 
 def test_training_needs_no_meshes_and_no_contacts():
-    """Of MJX and brax; what is put off is there when it is asked for."""
+    """Those of MJX and brax are imported late, when something uses them."""
     code = "import sys\nfrom mimic import compat\ncompat.import_mjx()\nfrom mimic.commands import train"
     code += "\nfrom mimic.trainers.ppo import trainer"
     code += "\nprint(*sys.modules)"

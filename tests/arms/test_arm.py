@@ -1,4 +1,4 @@
-"""The arms of the environments: what is simulated of them, and how strong they are."""
+"""Arms as the environments use them: the simulation model and the maximum torques."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ def test_simulation_model_has_only_what_moves():
 
 
 def test_the_maximum_torque_takes_a_joint_to_twice_its_velocity_limit_in_a_step():
-    """Of a rod of 1 kg/m that turns about its end, with an armature of 0.02 kg m^2: in closed form."""
+    """Closed form for a rod of 1 kg/m that rotates about its end, with an armature of 0.02 kg m^2."""
     length, dt, action_scale = 0.5, 0.1, 1.5
     arm = build_arm(ArmConfig(model="planar", link_lengths=[length]))
     assert np.isinf(arm.embodiment.torque_limit).all()
@@ -27,7 +27,7 @@ def test_the_maximum_torque_takes_a_joint_to_twice_its_velocity_limit_in_a_step(
 
 @pytest.mark.parametrize("locked", [(), (3, 6, 7)])
 def test_no_action_exceeds_the_torque_limit(locked):
-    """Some joints of a Panda reach it at twice the default scale, all of them at a hundred times that."""
+    """Some joints of a Panda reach the limit at an action scale of 2, all of them at 100."""
     arm = build_arm(ArmConfig(locked=locked))
     limit = arm.embodiment.torque_limit
     unlimited = dataclasses.replace(arm, embodiment=dataclasses.replace(arm.embodiment, torque_limit=np.inf * limit))

@@ -9,7 +9,7 @@ from mimic.metric.kinematics import forward_kinematics, link_states
 from mimic.metric.similarity import centre_line
 from tests.helpers import random_arms
 
-pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
+pytestmark = pytest.mark.usefixtures("unchecked")  # the messages are those of mimic
 
 # Craig's DH table from the manufacturer's manual, and the segments that the metric compares, at the zero pose .
 DH = [  # a_{i-1} [m], d_i [m], alpha_{i-1} [rad]
@@ -88,7 +88,7 @@ def test_hardware_limits_lock_at_the_ready_pose():
     here, there = link_states(locked, locked.home), link_states(full, full.home)
     np.testing.assert_allclose(here.position, there.position, atol=1e-6)  # float32
     free = panda(locked={4: -1.0, 6: 0.5}, links="merged", limits="hardware")
-    assert free.joint_names == locked.joint_names  # angles that are given win over the ready pose
+    assert free.joint_names == locked.joint_names  # named angles override the ready pose
     assert abs(link_states(free, free.home).position - there.position[:5]).max() > 0.01
 
 

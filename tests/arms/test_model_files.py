@@ -1,4 +1,4 @@
-"""Arms from files: what is loaded moves and weighs as C MuJoCo says of the model as it was written."""
+"""Arms from files: kinematics and dynamics equal those of the original model in C MuJoCo."""
 
 import os
 import pathlib
@@ -32,7 +32,7 @@ OTHERS = {
 
 
 def other(name):
-    """The file of an arm that others wrote: from the installed package, or from the folder MIMIC_ARMS."""
+    """The file of a third-party arm, from the installed package or from the folder MIMIC_ARMS."""
     path, tip = OTHERS[name]
     package, _, inside = path.partition("/")
     found = find_spec(package)
@@ -45,7 +45,7 @@ def other(name):
 
 
 def largest_errors(file, original, tip, base=None):
-    """Of link states against `mj_forward`, and of the mass matrix and bias forces, over random poses and speeds."""
+    """Maximum errors of link states, and of the mass matrix and bias forces, over random poses and velocities."""
     arm = build_arm(ArmConfig(model=str(file), tip=tip, base=base))
     embodiment, simulated = arm.embodiment, mujoco.MjData(arm.model)
     qpos_at, qvel_at = original_model.addresses(original, embodiment.joint_names)
@@ -146,12 +146,12 @@ def test_unnamed_joints_are_named_and_can_be_simulated(tmp_path):
     assert [joint.name for joint in read_spec(file).joints] == [f"joint{number}" for number in range(1, 7)]
 
 
-@pytest.mark.parametrize("kind", ["slides", "hinges", "a chain"])
+@pytest.mark.parametrize("kind", ["slides", "revolute joints", "a chain"])
 def test_the_arm_ends_before_its_hand(tmp_path, kind):
     finger = '<body name="{0}" pos="{1} 0.1 0"><joint name="{0}" axis="0 0 1"/><geom size="0.01"/>{2}</body>'
     hands = {
         "slides": original_model.GRIPPER,
-        "hinges": finger.format("l", 0.1, "") + finger.format("r", -0.1, ""),
+        "revolute joints": finger.format("l", 0.1, "") + finger.format("r", -0.1, ""),
         "a chain": finger.format("l", 0.1, finger.format("l2", 0.1, "")) + finger.format("r", -0.1, ""),
     }
     file = tmp_path / "arm.xml"

@@ -11,7 +11,7 @@ from mimic.arms.rendering import ArmScene
 
 
 def test_a_missing_graphics_library_is_reported_when_something_is_drawn(tmp_path):
-    """PyOpenGL fails so where there is no libEGL."""
+    """PyOpenGL fails in this way where there is no libEGL."""
     (tmp_path / "OpenGL").mkdir()
     (tmp_path / "OpenGL" / "__init__.py").write_text("raise AttributeError('no eglQueryString')")
     code = "import mimic, mujoco.mjx; from mimic import ArmScene; ArmScene([mimic.ArmConfig()])"

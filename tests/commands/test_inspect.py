@@ -1,4 +1,4 @@
-"""A learner from a file, by the commands: inspected, trained, evaluated, shown."""
+"""`python -m mimic.inspect`, and the other commands with a learner from a file."""
 
 import json
 import re
@@ -29,7 +29,7 @@ def arm_file(tmp_path):
 
 @pytest.fixture
 def inspected(monkeypatch, capsys):
-    """A function that inspects an arm, by the command, and returns what is said."""
+    """A function that runs the command on an arm and returns its output."""
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["mimic.inspect", *map(str, arguments)])
@@ -101,13 +101,13 @@ def test_an_equal_arm_reaches_the_poses_of_the_expert(inspected):
         (["arm.xml", "tip=hand"], "tip"),
     ],
 )
-def test_bad_input_of_an_inspection(refused, arm_file, arguments, message):
-    assert message in refused("inspect", *(str(arm_file) if word == "arm.xml" else word for word in arguments))
+def test_bad_input_of_an_inspection(rejected, arm_file, arguments, message):
+    assert message in rejected("inspect", *(str(arm_file) if word == "arm.xml" else word for word in arguments))
 
 
 @pytest.mark.parametrize("role", ["expert", "learner"])
-def test_bad_arms_of_a_pair(refused, arm_file, role):
-    assert "no MJCF or URDF file" in refused("train", "env=pair", f"env.{role}=missing.xml")
+def test_bad_arms_of_a_pair(rejected, arm_file, role):
+    assert "no MJCF or URDF file" in rejected("train", "env=pair", f"env.{role}=missing.xml")
 
 
 def test_a_pair_takes_arms_by_file(arm_file):

@@ -1,4 +1,4 @@
-"""Videos of pose mappers and of retargeted motions: what they show, and what is rejected."""
+"""`python -m mimic.render` for pose mappers and retargeted motions: what videos show, and what is rejected."""
 
 import dataclasses
 from typing import Any
@@ -40,7 +40,7 @@ def mapper_run(tmp_path_factory):
 
 
 def swings(arm, count=2):
-    """Motions of an arm, each joint as a sine: angles and velocities belong together."""
+    """Sinusoidal motions of an arm, with the velocities that belong to the angles."""
     time = 0.1 * np.arange(STEPS + 1)[:, None]
     phase = np.arange(count)[:, None, None] + np.arange(arm.num_joints)
     qpos, qvel = 0.8 * np.sin(2 * time + phase), 1.6 * np.cos(2 * time + phase)
@@ -174,5 +174,5 @@ def test_bad_input_for_a_mapper_is_rejected(mapper_run, files):
         (["run=missing", "split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
-def test_bad_input_of_the_command(refused, arguments, message):
-    assert message in refused("render", *arguments)
+def test_bad_input_of_the_command(rejected, arguments, message):
+    assert message in rejected("render", *arguments)

@@ -1,4 +1,4 @@
-"""The commands, from the outside: what they write, refuse and survive."""
+"""`python -m mimic.train`: the run directory, evaluation, resuming and signals."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def command(module, *arguments, **more):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """One tiny run, whose compiles are logged."""
+    """One tiny run that logs what it compiles."""
     run_dir = tmp_path_factory.mktemp("runs") / "tiny"
     environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
     result = command("train", *TINY, f"run_dir={run_dir}", "compilation_cache=", env=environment)
@@ -59,7 +59,7 @@ def test_a_run_directory_holds_everything(finished):
 
 
 def test_a_run_compiles_few_functions(finished):
-    """Each takes a tenth of a second and more on a GPU."""
+    """Each takes a tenth of a second or more on a GPU."""
     _, result = finished
     names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", result.stderr)
     for program in ("_begin", "_learn", "rollouts", "closest"):

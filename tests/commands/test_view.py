@@ -26,24 +26,24 @@ from mimic.commands.config import ViewConfig
         (["split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
-def test_bad_input(refused, arguments, message, monkeypatch):
+def test_bad_input(rejected, arguments, message, monkeypatch):
     monkeypatch.setattr(view, "is_installed", lambda: True)
-    assert message in refused("view", *arguments, *([] if "port=0" in arguments else [f"port={free_port()}"]))
+    assert message in rejected("view", *arguments, *([] if "port=0" in arguments else [f"port={free_port()}"]))
 
 
-def test_a_port_that_is_taken_is_rejected(refused, monkeypatch):
+def test_a_port_that_is_taken_is_rejected(rejected, monkeypatch):
     monkeypatch.setattr(view, "is_installed", lambda: True)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert f"port: expected a free port at 127.0.0.1, got {port}" in refused("view", f"port={port}")
+        assert f"port: expected a free port at 127.0.0.1, got {port}" in rejected("view", f"port={port}")
 
 
-def test_the_extra_is_named_where_viser_is_missing(refused, monkeypatch):
+def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "viser" else find(name, *more))
-    assert "pip install 'mimic-mjx[view]'" in refused("view")
+    assert "pip install 'mimic-mjx[view]'" in rejected("view")
 
 
 def test_only_the_page_of_the_view_imports_viser():

@@ -1,4 +1,4 @@
-"""What the README and the pages in docs show, works: tests/helpers/pages.py says how blocks are checked and run."""
+"""Commands and code in README.md and the pages work; tests/helpers/pages.py describes how they are checked."""
 
 import re
 
@@ -76,7 +76,7 @@ def test_pages_run(page, monkeypatch, tmp_path):
 
 
 def test_every_block_of_a_page_is_recognised():
-    """What the reader would not recognise as a block must not go unnoticed."""
+    """A block that the parser overlooks would not be checked."""
     page = "a\n\n    B=1 srun python -m m  # c\n    make x\n\n<!-- not run: no -->\n\n```python\n  d\n```\n"
     page += '```xml title="e.xml"\n<f/>\n```'
     assert read_blocks(page) == [

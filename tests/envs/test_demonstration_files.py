@@ -160,7 +160,7 @@ def test_training_rejects_demonstrations_that_do_not_fit(recorded, tmp_path, cha
         training_and_held_out(config)
 
 
-def test_the_command_reports_a_damaged_file(refused, tmp_path):
+def test_the_command_reports_a_damaged_file(rejected, tmp_path):
     path = tmp_path / "demonstrations.npz"
     path.write_text("not an archive")
-    assert NOT_WHOLE in refused("train", "env=panda4dof", f"env.demonstrations.path={path}")
+    assert NOT_WHOLE in rejected("train", "env=panda4dof", f"env.demonstrations.path={path}")

@@ -1,4 +1,4 @@
-"""Demonstrations with what they take of the arm: `python -m mimic.demonstrations`, the file, and what is refused."""
+"""Demonstrations made of others: crossovers, and other lengths."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The environment, its physics and its demonstrations."""
+"""The environment: observations, rewards, ends of episodes, and its config."""
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +43,7 @@ def test_every_environment_resets_and_steps(name, limits):
 
 
 def test_reward_and_observation_follow_the_demonstration_step_by_step():
-    """Against its samples in the file: after i steps, sample i. 1e-5: float32, of a table made in double precision."""
+    """After i steps both use sample i of the demonstration. 1e-5: float32, of a table made in double precision."""
     env = mimic.make("planar4dof", preview=2, horizon=6, physics="fused", demonstrations=FEW)
     motions, which = env.demonstrations, 3
     expert = [

@@ -1,4 +1,4 @@
-"""Episodes that begin anew while others go on."""
+"""Restarts of episodes within a batch."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from mimic.envs.wrappers import wrap_for_training
 
 
 def test_observations_of_new_episodes_match_their_states():
-    """In a batch of which some episodes end: the wrapper puts the observations together by itself."""
+    """In a batch where some episodes end: the wrapper composes the observations itself."""
     env = mimic.make("planar4dof", demonstrations={"count": 3}, physics="fused")
     wrapped = wrap_for_training(env, env.config.horizon + 1)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 16))

@@ -153,7 +153,7 @@ def test_overlap_under_jit_with_the_arms_as_arguments():
 
 
 def test_merged_links_overlap_by_their_path_or_their_chord():
-    """A chord across a right angle: 2 along the path, sqrt(2) straight, beside a link of 1."""
+    """A chord across a right angle, 2 along the path and sqrt(2) straight, next to a link of 1."""
     bent = merged_by_a_right_angle()
     assert bent.link_lengths == pytest.approx([np.sqrt(2), 1.0])
     twin = planar_arm([2.0, 1.0])

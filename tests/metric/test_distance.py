@@ -36,7 +36,7 @@ from tests.helpers.metric_cases import (
 def worked_example():
     """Two arms with two links of 1 m, so L = 2. Positions and velocities by hand, divided by L.
 
-    Expert at (0, pi/2), with both joints at 1 rad/s: link 1 points along x and turns at 1 rad/s, link 2 along y at 2.
+    Expert at (0, pi/2), with both joints at 1 rad/s: link 1 points along x and rotates at 1 rad/s, link 2 along y at 2.
     Middles (1/2, 0) and (1, 1/2), velocities (0, 1/2) and (0, 1) + 2 (-1/2, 0) = (-1, 1).
     Learner stretched along x and at rest: middles (1/2, 0) and (3/2, 0).
     """
@@ -129,7 +129,7 @@ def test_arms_of_equal_shape_and_different_size_match():
 
 
 def test_rotating_both_arms_changes_nothing(x64):
-    """Distances do not depend on the direction of the base frame: joint 1 of both arms turns everything about z."""
+    """Distances do not depend on the direction of the base frame: joint 1 of both arms rotates all links about z."""
     a, b = panda(), panda(locked=(3, 6, 7))
     rng = np.random.default_rng(0)
     (qa, va), (qb, vb) = (rng.uniform(-2, 2, (2, arm.num_joints)) for arm in (a, b))
@@ -161,7 +161,7 @@ def test_weights_of_zero_cost_nothing():
     program = jax.make_jaxpr(functools.partial(link_distances, weights=DistanceWeights(rotation=1.0)))(a, b)
     used = jax.jit(functools.partial(link_distances, weights=DistanceWeights(rotation=1.0))).lower(a, b).as_text()
     assert "sqrt" in str(program)  # the distances are written down, and
-    assert "sqrt" not in used  # XLA is not given those that nothing uses
+    assert "sqrt" not in used  # XLA drops those that are unused
     assert not link_distances(a, b, DistanceWeights(rotation=0.0)).any()
 
 

@@ -82,10 +82,10 @@ def test_random_arms_move_as_in_mujoco(dtype, seed):
     assert_moves_as_in_mujoco(arm, model, dtype)
 
 
-@pytest.mark.parametrize("locked", [{}, {"hinge1": 0.3, "hinge7": -0.5}], ids=["free", "locked"])
+@pytest.mark.parametrize("locked", [{}, {"joint1": 0.3, "joint7": -0.5}], ids=["free", "locked"])
 @pytest.mark.parametrize("seed", [3, 4])
 def test_long_arms_move_as_in_mujoco(x64, seed, locked):
-    model = random_arms.random_arm(seed, hinges=LONG + 8)
+    model = random_arms.random_arm(seed, joints=LONG + 8)
     arm = load_mjcf(model, locked=locked, links="kept")
     assert arm.num_joints == LONG + 8 - len(locked) > LONG
     assert (-1 in arm.link_joint) == bool(locked)
@@ -115,7 +115,7 @@ def test_panda_moves_as_in_mujoco(dtype, locked, links):
 def test_locked_random_arm_moves_as_in_mujoco(x64, seed, links):
     model = random_arms.random_arm(seed)
     rng = np.random.default_rng(seed)
-    locked = {f"hinge{i + 1}": rng.uniform(-3, 3) for i in rng.permutation(model.njnt)[: model.njnt // 2]}
+    locked = {f"joint{i + 1}": rng.uniform(-3, 3) for i in rng.permutation(model.njnt)[: model.njnt // 2]}
     arm = load_mjcf(model, locked=locked, links=links)
     assert arm.num_joints == model.njnt - len(locked)
     if links == "kept":

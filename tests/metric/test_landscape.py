@@ -1,4 +1,4 @@
-"""The paper's finding on two-link arms, as numbers: which measure has one minimum, and which have more."""
+"""The paper's result for two-link arms: which measures have one minimum, and which have more."""
 
 import numpy as np
 import pytest

@@ -29,7 +29,7 @@ ALL_ARGUMENTS = (0, 1, 2, 3)
 
 
 def composed(arms, correspondence, weights, **options):
-    """What `motion_distance` stands for, of its parts."""
+    """The composition of functions that `motion_distance` equals."""
 
     def distance(*motion):
         states = link_states(arms[0], *motion[:2]), link_states(arms[1], *motion[2:])
@@ -130,7 +130,7 @@ def test_one_expert_pose_serves_a_batch_of_learners():
     ids=["planar", "panda", "long"],
 )
 def test_zero_with_finite_gradients_at_a_match(arm):
-    """Exactly, where each operation is rounded by itself; a compiled program may round the two arms differently."""
+    """Exactly without compilation; a compiled function may round the two arms differently."""
     distance = jax.value_and_grad(motion_distance(arm, arm, 2 * np.eye(arm.num_links), ALL_WEIGHTS), (2, 3))
     compiled, one = jax.jit(jax.vmap(distance)), jax.jit(distance)
     qpos, qvel, *_ = motions((arm, arm), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Pictures: that they are made, that they show what they should, and what is refused."""
+"""The picture of candidate points: which poses are optimal by points and by frames."""
 
 import numpy as np
 import pytest

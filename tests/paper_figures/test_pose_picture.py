@@ -1,4 +1,4 @@
-"""The picture of an expert's poses and the learner's nearest ones."""
+"""The picture of an expert's poses and the learner's closest poses."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The kinematic bound is a global minimum: nothing that is tried goes below it, and known answers are met."""
+"""The kinematic bound is a global minimum: no sampled motion is below it, and closed forms are reached."""
 
 import dataclasses
 import functools
@@ -114,7 +114,7 @@ def test_more_starts_change_nothing(name):
 
 
 def test_starts_iterations_and_seed_reach_the_search():
-    """After one iteration most of the result is due to where the search starts: more starts get lower, by 3 %."""
+    """After one iteration the result depends on the initial guesses: more of them lower it by 3 %."""
     expert, learner = planar_arm([1 / 4] * 4), planar_arm([1 / 3] * 3)
     # 130 times in no order: one start is no more than one then, and times have little to take from one another.
     qpos = jnp.float32(np.random.default_rng(4).uniform(-np.pi, np.pi, (130, 4)))
@@ -129,7 +129,7 @@ def test_starts_iterations_and_seed_reach_the_search():
 
 
 def searched(expert, learner, qpos, qvel, correspondence, weights, starts=64, iterations=150):
-    """[T] least distance of Adam from many random motions: a plain search that shares nothing with the bound's."""
+    """[T] minimum distance of Adam from many random motions: a search that shares no code with the bound's."""
 
     def descend(states, start):
         optimiser = optax.adam(optax.cosine_decay_schedule(0.1, iterations))

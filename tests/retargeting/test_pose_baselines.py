@@ -1,4 +1,4 @@
-"""Baselines for poses do what their closed forms promise, and stay within what the learner can do."""
+"""Baselines for poses reach their closed forms and stay within the limits of the learner."""
 
 import numpy as np
 import pytest
@@ -122,7 +122,7 @@ def test_the_panda_aligns_with_itself():
 
 @pytest.mark.parametrize("locked", [(1,), (2,), (3,), (4,), (5,), (6,), (7,), (3, 6, 7), (2, 3, 6, 7), (1, 4)])
 def test_aligning_a_part_is_no_worse_than_leaving_it_at_home(locked):
-    """Each part, with the joints that orient it put back to the home pose."""
+    """Each part, against the pose with the joints that orient it at home."""
     learner = panda(locked=locked)
     qpos = motion(PANDA, 200)
     found = align_segments(PANDA, learner, qpos)

@@ -1,4 +1,4 @@
-"""The closed form of the static measure against automatic differentiation, and what its smoothing costs."""
+"""The closed form of static metrics against automatic differentiation, and the effect of its smoothing."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def learners():
 
 
 def smoothed_distance(expert_states, learner_states, matrix, weights):
-    """The embodiment distance, written down pair by pair, with smoothed lengths."""
+    """The embodiment distance with smoothed lengths, pair by pair."""
 
     def pair(position_a, direction_a, position_b, direction_b):
         square = jnp.sum((position_a - position_b) ** 2)

@@ -1,4 +1,4 @@
-"""Metrics at Weights & Biases and MLflow, beside the files of a run: by modules that only pretend to be them."""
+"""Metrics logged to Weights & Biases and MLflow, which are replaced by fakes."""
 
 import csv
 import sys
@@ -99,13 +99,13 @@ def test_a_resumed_run_continues_its_mlflow_run(tmp_path, services):
         ("logger=comet", None, "logger: expected one of local, wandb, mlflow, got 'comet'"),
     ],
 )
-def test_a_logger_without_its_package_is_rejected(refused, monkeypatch, argument, missing, message):
+def test_a_logger_without_its_package_is_rejected(rejected, monkeypatch, argument, missing, message):
     if missing:
         monkeypatch.setitem(sys.modules, missing, None)
-    assert message in refused("train", "env=planar4dof", argument)
+    assert message in rejected("train", "env=planar4dof", argument)
 
 
-def test_mlflow_needs_a_tracking_uri(refused, services, monkeypatch):
+def test_mlflow_needs_a_tracking_uri(rejected, services, monkeypatch):
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
-    message = refused("train", "env=planar4dof", "logger=mlflow")
+    message = rejected("train", "env=planar4dof", "logger=mlflow")
     assert "expected MLFLOW_TRACKING_URI in the environment" in message

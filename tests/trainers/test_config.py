@@ -1,4 +1,4 @@
-"""What a trainer's config resolves to."""
+"""Resolved configs of trainers."""
 
 from mimic.trainers.config import PRESETS, PPOConfig
 

@@ -1,4 +1,4 @@
-"""The pose mapper: what it learns, keeps, repeats and refuses."""
+"""The pose mapper: training, resuming, loading, and bad input."""
 
 import json
 from typing import Any
@@ -52,7 +52,7 @@ def poses(mapper, count, seed=0):
 
 
 def test_it_learns(trained):
-    """A small network, a third of a million poses; the preset gets below 0.1 %."""
+    """A small network and a third of a million poses; the preset gets below 0.1 %."""
     run_dir, report = trained
     assert report.keys() >= REPORT_KEYS
     assert report["quality"]["held_out"] < 0.05

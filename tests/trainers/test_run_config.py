@@ -1,4 +1,4 @@
-"""The config of a run directory, as it is read again."""
+"""The config of a run directory, loaded again."""
 
 import pytest
 from omegaconf import OmegaConf

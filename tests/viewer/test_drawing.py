@@ -1,4 +1,4 @@
-"""What the live view draws: shapes of an arm, and numbers, heat maps and curves."""
+"""Drawings of the live view: meshes of an arm, numbers, heat maps and charts."""
 
 import mujoco
 import numpy as np
