@@ -1,4 +1,4 @@
-"""What all tests share: shapes checked at run time, compiled programs kept, both precisions."""
+"""Shared by all tests: run-time checks of shapes, the compilation cache, both precisions."""
 
 import functools
 import importlib
@@ -70,7 +70,7 @@ def interpreted(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture
 def gpu_kernels(interpreted, monkeypatch: pytest.MonkeyPatch):
-    """Batched functions take the GPU kernels that they have, interpreted on the CPU; a list of those taken."""
+    """Makes batched functions use their GPU kernels, interpreted on the CPU; returns the list of kernels used."""
     taken = []
 
     def choose(*rows, cuda, default):
@@ -83,15 +83,15 @@ def gpu_kernels(interpreted, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture
 def unchecked():
-    """Turns the shape checks off: what a user without them is told about bad input."""
+    """Turns the shape checks off, so that the error messages are those that users see."""
     jaxtyping_config.update("jaxtyping_disable", True)
     yield
     jaxtyping_config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture
-def refused(monkeypatch, capsys, tmp_path):
-    """A function that runs a command in an empty folder and returns the line that it is refused with."""
+def rejected(monkeypatch, capsys, tmp_path):
+    """A function that runs a command in an empty folder and returns the line that it is rejected with."""
 
     def run(name, *arguments):
         from mimic import cli

@@ -3,6 +3,6 @@
 import mimic
 
 
-def test_api_resolves():
+def test_every_public_name_exists():
     for name in mimic.__all__:
         assert getattr(mimic, name) is not None

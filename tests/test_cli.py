@@ -1,4 +1,4 @@
-"""What the commands refuse: one line that says what is valid, exit code 2, nothing written."""
+"""Bad input of commands: one line that names what is valid, exit code 2, nothing written."""
 
 import subprocess
 import sys
@@ -33,27 +33,27 @@ import mimic
         (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),
     ],
 )
-def test_bad_training_input(refused, arguments, message):
-    assert message in refused("train", *arguments)
+def test_bad_training_input(rejected, arguments, message):
+    assert message in rejected("train", *arguments)
 
 
-def test_bad_input_of_a_whole_process():
+def test_bad_input_ends_the_process_with_one_line():
     result = subprocess.run(
         [sys.executable, "-m", "mimic.train", "env=panda5dof"], capture_output=True, text=True, timeout=60, check=False
     )
     assert result.returncode == 2 and result.stderr.count("\n") == 1 and "unknown env" in result.stderr
 
 
-def test_a_bad_arm_file(refused, tmp_path):
+def test_a_bad_arm_file(rejected, tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text("<mujoco><worldbody><body")
-    assert "XML" in refused("train", "env=planar4dof", f"env.learner.model={path}")
+    assert "XML" in rejected("train", "env=planar4dof", f"env.learner.model={path}")
 
 
-def test_bad_run_directories(refused, tmp_path):
+def test_bad_run_directories(rejected, tmp_path):
     run_dir = tmp_path / "run"
     run_dir.mkdir()
-    assert "exists" in refused("train", f"run_dir={run_dir}")
+    assert "exists" in rejected("train", f"run_dir={run_dir}")
 
 
 @pytest.mark.parametrize(("command", "key"), [("train", "resume"), ("evaluate", "run"), ("render", "run")])
@@ -67,12 +67,12 @@ def test_bad_run_directories(refused, tmp_path):
         ("a: [\n", "cannot be read"),
     ],
 )
-def test_unreadable_run_directories(refused, tmp_path, command, key, config, message):
+def test_unreadable_run_directories(rejected, tmp_path, command, key, config, message):
     run_dir = tmp_path / "run"
     run_dir.mkdir()
     if config is not None:
         (run_dir / "config.yaml").write_text(config)
-    assert message in refused(command, f"{key}={run_dir}")
+    assert message in rejected(command, f"{key}={run_dir}")
 
 
 def test_all_commands_are_listed():

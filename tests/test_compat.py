@@ -1,4 +1,4 @@
-"""What mimic makes good in the packages that it uses."""
+"""Workarounds for the packages that mimic uses."""
 
 import copy
 import logging
@@ -12,7 +12,7 @@ from hydra.core.config_store import ConfigStore
 from mimic import compat
 
 
-def test_what_is_imported_later_runs_once_and_may_be_missing(tmp_path, monkeypatch):
+def test_lazy_modules_run_once_and_may_be_missing(tmp_path, monkeypatch):
     (tmp_path / "waiting").mkdir()
     (tmp_path / "waiting" / "__init__.py").write_text("raise SystemExit('the parent was imported')")
     (tmp_path / "waiting" / "part.py").write_text("import sys\nsys.modules['runs'].append(__name__)\nvalue = 3")
@@ -26,7 +26,7 @@ def test_what_is_imported_later_runs_once_and_may_be_missing(tmp_path, monkeypat
     assert sys.modules["runs"] == ["waiting.part"] and not {"waiting.missing", "missing"}.intersection(sys.modules)
 
 
-def test_tensorboard_does_not_bring_torch(tmp_path):
+def test_tensorboard_does_not_import_torch(tmp_path):
     (tmp_path / "torch.py").write_text("raise SystemExit('torch was imported')")
     code = "import sys\nfrom mimic import compat\ncompat.import_tensorboard().SummaryWriter"
     code += "\nassert 'torch' not in sys.modules"
@@ -34,7 +34,7 @@ def test_tensorboard_does_not_bring_torch(tmp_path):
     subprocess.run([sys.executable, "-c", code], env=environment, check=True)
 
 
-def test_hydra_shares_what_is_registered_and_copies_what_it_loads(monkeypatch):
+def test_hydra_shares_the_config_store_and_copies_loaded_configs(monkeypatch):
     monkeypatch.setattr(ConfigStore, "__deepcopy__", None, raising=False)  # to be put back
     compat.share_config_store()
     store = ConfigStore.instance()
@@ -53,7 +53,7 @@ def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
 @pytest.mark.slow
 @pytest.mark.skipif(not compat.needs_cpu_flag(), reason="this jax does not need the flag and aborts on it")
 def test_the_cpu_flag_speeds_up_kinematics(capsys):
-    """Times MJX's kinematics of 64 Pandas with and without it, each in a process of its own."""
+    """Times MJX's kinematics of 64 Pandas with and without it, in two processes."""
     code = (
         "import time, jax, jax.numpy as jnp, mujoco\nfrom mujoco import mjx\n"
         "from mimic.arms.embodiment import panda_path\n"

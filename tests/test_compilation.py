@@ -8,7 +8,7 @@ from mimic import compilation
 from mimic.compilation import Background, compiler_options
 
 
-def test_what_is_prepared_is_made_once():
+def test_background_functions_run_once():
     made = []
     lazy, started = Background(lambda: made.append("lazy")), Background(lambda: made.append("started"))
     started.start()
@@ -24,7 +24,7 @@ def test_what_is_prepared_is_made_once():
 
 @pytest.mark.parametrize(("a_process_for_each", "count"), [(False, 2), (True, 3)])
 def test_options_for_gpus_are_known_to_jaxlib(monkeypatch, a_process_for_each, count):
-    """Which takes them on CPUs too, and refuses a wrong name or value."""
+    """It accepts them on CPUs too, and rejects a wrong name or value."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(compilation, "a_process_for_each_gpu", lambda: a_process_for_each)
     options = compiler_options()
@@ -32,13 +32,13 @@ def test_options_for_gpus_are_known_to_jaxlib(monkeypatch, a_process_for_each, c
     assert jax.jit(lambda x: x + 1, compiler_options=options)(1.0) == 2.0
 
 
-def test_what_is_compiled_beside_a_training_is_compiled_with_them(monkeypatch):
+def test_compilation_in_the_background_uses_the_options(monkeypatch):
     monkeypatch.setattr(compilation, "compiler_options", lambda: {"no_option_of_xla": True})
     with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
         compilation.compiling(lambda x: x + 1, jnp.zeros(3))()
 
 
-def test_xla_flags_of_the_user_stay(monkeypatch):
+def test_xla_flags_of_the_user_are_kept(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     boolean, scheduling = compiler_options()
     monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to=/tmp --{scheduling}=LHS")
@@ -51,7 +51,7 @@ def test_xla_flags_of_the_user_stay(monkeypatch):
     ("backend", "processes", "devices", "expected"),
     [("gpu", 4, 4, True), ("gpu", 1, 4, False), ("gpu", 1, 1, False), ("gpu", 2, 8, False), ("cpu", 2, 2, False)],
 )
-def test_messages_go_beside_computation_where_each_gpu_has_a_process(
+def test_all_reduces_overlap_with_computation_where_each_gpu_has_a_process(
     monkeypatch, backend, processes, devices, expected
 ):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)

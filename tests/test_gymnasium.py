@@ -1,4 +1,4 @@
-"""The environments behind Gymnasium's interface: its own checks, and the same numbers as the brax environment."""
+"""The environments with Gymnasium's interface: its own checks, and the values of the brax environment."""
 
 import subprocess
 import sys
@@ -48,7 +48,7 @@ def test_all_environments_are_registered():
     assert isinstance(env.unwrapped, VectorEnv) and env.num_envs == 2
 
 
-def test_it_is_the_brax_environment(imitation):
+def test_it_equals_the_brax_environment(imitation):
     env = Env(imitation)
     obs, _ = env.reset(seed=3, options={"demonstration": 2})
     state = imitation.begin(imitation.start(jax.random.PRNGKey(0), 2))
@@ -63,7 +63,7 @@ def test_it_is_the_brax_environment(imitation):
         assert (terminated, truncated) == (index == 5, False)
 
 
-def test_arms_start_anew_in_the_step_that_ends_an_episode(imitation, vector):
+def test_arms_restart_in_the_step_that_ends_an_episode(imitation, vector):
     assert vector.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     obs, _ = vector.reset(seed=0)
     assert obs.shape == (5, imitation.observation_size) and vector.observation_space.contains(obs)
@@ -136,7 +136,7 @@ import torch
 from stable_baselines3 import PPO
 from mimic.gymnasium import Env
 
-torch.set_num_threads(1)  # a small network: more threads wait for each other, where cores are shared
+torch.set_num_threads(1)  # the network is small: more threads would wait for each other
 env = Env("planar4dof", demonstrations={"count": 1, "held_out": 1}, physics="fused")
 
 
@@ -160,7 +160,7 @@ assert after > 0.67 * before, (before, after)
 
 @pytest.mark.slow
 def test_stable_baselines_learns_on_it():
-    """Better than before by a third, on a fixed seed; in a process of its own, where nothing was rendered before."""
+    """Better by a third after training, for a fixed seed; in a process where nothing was rendered before."""
     pytest.importorskip("stable_baselines3")
     finished = subprocess.run([sys.executable, "-c", LEARNS], capture_output=True, text=True, check=False)
     assert finished.returncode == 0, finished.stderr[-2000:]

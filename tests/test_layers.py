@@ -1,6 +1,6 @@
-"""Imports of the package run one way: a folder uses those below it alone, and no modules import each other in a circle.
+"""Imports of the package run one way: a folder imports only from those below it, and there are no circular imports.
 
-Imports within functions, and those for type checkers alone, count like any other.
+Imports within functions and imports for type checkers count too.
 """
 
 import ast
@@ -70,7 +70,7 @@ def upward_imports(imports: Imports) -> set[tuple[str, str]]:
 
 
 def circle(imports: Imports) -> list[str]:
-    """Modules each of which the next one imports, the last being the first again; empty where there is no circle."""
+    """Modules of a circular import, the first one repeated at the end; empty where there is none."""
     try:
         graphlib.TopologicalSorter(imports).prepare()
     except graphlib.CycleError as error:

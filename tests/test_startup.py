@@ -1,4 +1,4 @@
-"""What happens before the first training step: nothing heavy is imported, compiled or computed that is not needed."""
+"""Start-up: heavy packages are imported only when they are needed."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_
     ],
     ids=["import", "help"],
 )
-def test_what_is_heavy_is_imported_when_it_is_needed(code):
+def test_heavy_packages_are_imported_late(code):
     result = subprocess.run([sys.executable, "-c", code + REPORT], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr[-2000:]
     imported = set(result.stdout.splitlines()[-1].split())
@@ -37,7 +37,7 @@ def test_pose_mappers_need_no_simulator():
 
 
 def test_training_needs_no_meshes_and_no_contacts():
-    """Of MJX and brax; what is put off is there when it is asked for."""
+    """Those of MJX and brax are imported late, when something uses them."""
     code = "import sys\nfrom mimic import compat\ncompat.import_mjx()\nfrom mimic.commands import train"
     code += "\nfrom mimic.trainers.ppo import trainer"
     code += "\nprint(*sys.modules)"

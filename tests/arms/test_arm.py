@@ -1,4 +1,4 @@
-"""The arms of the environments: what is simulated of them, and how strong they are."""
+"""Arms as the environments use them: the simulation model and the maximum torques."""
 
 import dataclasses
 
@@ -8,15 +8,15 @@ import pytest
 from mimic.arms.arm import ArmConfig, build_arm, effective_inertia, simulation_model, torque_scale
 
 
-def test_simulation_model_keeps_only_what_moves():
+def test_simulation_model_has_only_what_moves():
     model = build_arm(ArmConfig(locked=(3, 6, 7))).model
     assert (model.nq, model.nu, model.ngeom, model.nsite) == (4, 0, 0, 0)
     assert simulation_model(model, ()).nq == 0
     assert np.all(effective_inertia(model, np.zeros(4)) > 0)
 
 
-def test_the_largest_torque_takes_a_joint_to_twice_its_velocity_limit_in_a_step():
-    """Of a rod of 1 kg/m that turns about its end, with an armature of 0.02 kg m^2: in closed form."""
+def test_the_maximum_torque_takes_a_joint_to_twice_its_velocity_limit_in_a_step():
+    """Closed form for a rod of 1 kg/m that rotates about its end, with an armature of 0.02 kg m^2."""
     length, dt, action_scale = 0.5, 0.1, 1.5
     arm = build_arm(ArmConfig(model="planar", link_lengths=[length]))
     assert np.isinf(arm.embodiment.torque_limit).all()
@@ -26,8 +26,8 @@ def test_the_largest_torque_takes_a_joint_to_twice_its_velocity_limit_in_a_step(
 
 
 @pytest.mark.parametrize("locked", [(), (3, 6, 7)])
-def test_no_action_asks_for_more_than_the_torque_limit(locked):
-    """Some joints of a Panda reach it at twice the default scale, all of them at a hundred times that."""
+def test_no_action_exceeds_the_torque_limit(locked):
+    """Some joints of a Panda reach the limit at an action scale of 2, all of them at 100."""
     arm = build_arm(ArmConfig(locked=locked))
     limit = arm.embodiment.torque_limit
     unlimited = dataclasses.replace(arm, embodiment=dataclasses.replace(arm.embodiment, torque_limit=np.inf * limit))

@@ -9,7 +9,7 @@ from mimic.metric.kinematics import forward_kinematics, link_states
 from mimic.metric.similarity import centre_line
 from tests.helpers import random_arms
 
-pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
+pytestmark = pytest.mark.usefixtures("unchecked")  # the messages are those of mimic
 
 # Craig's DH table from the manufacturer's manual, and the segments that the metric compares, at the zero pose .
 DH = [  # a_{i-1} [m], d_i [m], alpha_{i-1} [rad]
@@ -88,7 +88,7 @@ def test_hardware_limits_lock_at_the_ready_pose():
     here, there = link_states(locked, locked.home), link_states(full, full.home)
     np.testing.assert_allclose(here.position, there.position, atol=1e-6)  # float32
     free = panda(locked={4: -1.0, 6: 0.5}, links="merged", limits="hardware")
-    assert free.joint_names == locked.joint_names  # angles that are given win over the ready pose
+    assert free.joint_names == locked.joint_names  # named angles override the ready pose
     assert abs(link_states(free, free.home).position - there.position[:5]).max() > 0.01
 
 
@@ -125,7 +125,7 @@ def test_segments_follow_a_joint_that_is_locked_at_an_angle():
         np.testing.assert_allclose(actual.points, expected.points, atol=1e-6)  # float32
 
 
-def test_unknown_links_are_refused(unchecked):
+def test_an_unknown_option_for_links_is_rejected(unchecked):
     with pytest.raises(ValueError, match="links: expected one of kept, merged, got 'none'"):
         panda(locked=3, links="none")  # pyright: ignore[reportArgumentType]
 
@@ -182,13 +182,13 @@ def test_planar_arm():
 @pytest.mark.parametrize(
     "lengths", [[], [1.0, 0.0], [-0.1], [1.0, np.nan], [np.inf], [[1.0, 2.0]], 1.0], ids=lambda lengths: str(lengths)
 )
-def test_planar_arm_refuses_bad_lengths(lengths):
+def test_planar_arm_rejects_bad_lengths(lengths):
     with pytest.raises(ValueError, match=r"^link_lengths: expected one or more finite lengths above 0 \[m\], got .*$"):
         planar_arm(lengths)
 
 
 @pytest.mark.parametrize("frame_at", [-0.1, 1.1, np.nan])
-def test_planar_arm_refuses_a_frame_off_the_link(frame_at):
+def test_planar_arm_rejects_a_frame_off_the_link(frame_at):
     with pytest.raises(ValueError, match=r"^frame_at: expected a fraction of the link in \[0, 1\], got "):
         planar_arm([1.0], frame_at=frame_at)
 
@@ -215,12 +215,12 @@ LOCKED = [
 
 
 @pytest.mark.parametrize(("locked", "message"), LOCKED, ids=[str(locked) for locked, _ in LOCKED])
-def test_bad_locked_joints_are_refused(locked, message):
+def test_bad_locked_joints_are_rejected(locked, message):
     with pytest.raises(ValueError, match=f"^{message}") as error:
         load_mjcf(panda_path(), locked=locked)
     assert "\n" not in str(error.value)
 
 
-def test_unknown_limits_are_refused():
+def test_unknown_limits_are_rejected():
     with pytest.raises(ValueError, match="^limits: expected one of none, hardware, got 'soft'$"):
         panda(limits="soft")  # pyright: ignore[reportArgumentType]

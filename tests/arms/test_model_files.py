@@ -1,4 +1,4 @@
-"""Arms from files: what is loaded moves and weighs as C MuJoCo says of the model as it was written."""
+"""Arms from files: kinematics and dynamics equal those of the original model in C MuJoCo."""
 
 import os
 import pathlib
@@ -32,7 +32,7 @@ OTHERS = {
 
 
 def other(name):
-    """The file of an arm that others wrote: from the installed package, or from the folder MIMIC_ARMS."""
+    """The file of a third-party arm, from the installed package or from the folder MIMIC_ARMS."""
     path, tip = OTHERS[name]
     package, _, inside = path.partition("/")
     found = find_spec(package)
@@ -45,7 +45,7 @@ def other(name):
 
 
 def largest_errors(file, original, tip, base=None):
-    """Of link states against `mj_forward`, and of the mass matrix and bias forces, over random poses and speeds."""
+    """Maximum errors of link states, and of the mass matrix and bias forces, over random poses and velocities."""
     arm = build_arm(ArmConfig(model=str(file), tip=tip, base=base))
     embodiment, simulated = arm.embodiment, mujoco.MjData(arm.model)
     qpos_at, qvel_at = original_model.addresses(original, embodiment.joint_names)
@@ -74,7 +74,7 @@ def largest_errors(file, original, tip, base=None):
 
 
 @pytest.mark.parametrize("name", OTHERS)
-def test_an_arm_that_others_wrote_moves_as_its_model_says(x64, name):
+def test_third_party_arms_move_as_in_their_models(x64, name):
     file, tip = other(name)
     # MuJoCo does not look up the meshes that a URDF names by their ROS package.
     original = read_model(file) if name.endswith("URDF") else mujoco.MjModel.from_xml_path(str(file))
@@ -96,14 +96,14 @@ def test_the_arm_of_a_scene_is_its_longest_chain(x64):
 
 @pytest.mark.parametrize("actuators", ["motor", "position", "none"])
 @pytest.mark.parametrize("tip", ["pinch", "palm", "wrist_3_link"])
-def test_an_arm_of_our_own_moves_as_its_model_says(x64, tmp_path, actuators, tip):
+def test_a_generated_arm_moves_as_in_its_model(x64, tmp_path, actuators, tip):
     file = tmp_path / "arm.xml"
     file.write_text(original_model.ur_like(actuators=actuators))
     kinematic, dynamic = largest_errors(file, mujoco.MjModel.from_xml_path(str(file)), tip)
     assert kinematic < 1e-9 and dynamic < 1e-9
 
 
-def test_a_urdf_moves_as_its_model_says(x64, tmp_path):
+def test_a_urdf_arm_moves_as_in_its_model(x64, tmp_path):
     file = tmp_path / "arm.urdf"
     file.write_text(original_model.urdf())
     spec = mujoco.MjSpec.from_file(str(file))
@@ -116,7 +116,7 @@ def test_a_urdf_moves_as_its_model_says(x64, tmp_path):
     assert arm.link_lengths[-1] == pytest.approx(0.15)
 
 
-def test_meshes_that_a_urdf_lacks_are_left_out_with_a_message(tmp_path, caplog):
+def test_missing_meshes_of_a_urdf_are_ignored_with_a_message(tmp_path, caplog):
     file = tmp_path / "arm.urdf"
     file.write_text(original_model.urdf(mesh="package://four/meshes/l.stl"))
     assert mimic.load_mjcf(file).num_joints == 4
@@ -146,12 +146,12 @@ def test_unnamed_joints_are_named_and_can_be_simulated(tmp_path):
     assert [joint.name for joint in read_spec(file).joints] == [f"joint{number}" for number in range(1, 7)]
 
 
-@pytest.mark.parametrize("kind", ["slides", "hinges", "a chain"])
+@pytest.mark.parametrize("kind", ["slides", "revolute joints", "a chain"])
 def test_the_arm_ends_before_its_hand(tmp_path, kind):
     finger = '<body name="{0}" pos="{1} 0.1 0"><joint name="{0}" axis="0 0 1"/><geom size="0.01"/>{2}</body>'
     hands = {
         "slides": original_model.GRIPPER,
-        "hinges": finger.format("l", 0.1, "") + finger.format("r", -0.1, ""),
+        "revolute joints": finger.format("l", 0.1, "") + finger.format("r", -0.1, ""),
         "a chain": finger.format("l", 0.1, finger.format("l2", 0.1, "")) + finger.format("r", -0.1, ""),
     }
     file = tmp_path / "arm.xml"
@@ -159,7 +159,7 @@ def test_the_arm_ends_before_its_hand(tmp_path, kind):
     assert mimic.load_mjcf(file).joint_names == ("pan", "lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
-def test_rotor_inertia_and_damping_are_at_least_what_is_asked_for(tmp_path):
+def test_rotor_inertia_and_damping_are_at_least_the_configured_ones(tmp_path):
     file = tmp_path / "arm.xml"
     file.write_text(original_model.ur_like(armature=0.02))
     model = build_arm(ArmConfig(model=str(file), armature=0.1, damping=0.1)).model
@@ -203,7 +203,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("case", FILES)
-def test_bad_files_are_refused(tmp_path, case):
+def test_bad_files_are_rejected(tmp_path, case):
     content, message = FILES[case]
     file = tmp_path / "arm.xml"
     file.write_text(content)

@@ -8,10 +8,10 @@ import pytest
 from mimic.arms import chain
 from mimic.arms.embodiment import load_arm, load_mjcf, panda, panda_path
 
-pytestmark = pytest.mark.usefixtures("unchecked")  # bad input must meet mimic's own messages
+pytestmark = pytest.mark.usefixtures("unchecked")  # the messages are those of mimic
 
 
-def hinge(name="", axis="0 0 1", pos="0 0 0", inner="", body=""):
+def revolute(name="", axis="0 0 1", pos="0 0 0", inner="", body=""):
     names = [f'name="{text}"' if text else "" for text in (body, name)]
     return f'<body {names[0]} pos="{pos}"><joint {names[1]} axis="{axis}"/><geom size="0.01"/>{inner}</body>'
 
@@ -22,8 +22,8 @@ def model(worldbody, rest=""):
 
 
 def toy(inner="", rest=""):
-    """Two hinges named a and b, 1 m apart along x, then whatever is inside."""
-    return model(hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B", inner=inner)), rest)
+    """Two revolute joints named a and b, 1 m apart along x, then what `inner` describes."""
+    return model(revolute("a", body="A", inner=revolute("b", pos="1 0 0", body="B", inner=inner)), rest)
 
 
 TIP = '<site name="tip" pos="0.5 0 0"/>'
@@ -75,8 +75,8 @@ def test_links_that_point_backwards_have_a_frame(tilt):
 
 def test_base_and_tip():
     gripper = '<body name="finger" pos="0.4 0 0"><joint name="f" type="slide"/><geom size="0.01"/></body>' + TIP
-    other = hinge("c", pos="0 1 0", body="C", inner='<site name="side" pos="0 1 0"/>')
-    tree = model(hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B", inner=gripper) + other))
+    other = revolute("c", pos="0 1 0", body="C", inner='<site name="side" pos="0 1 0"/>')
+    tree = model(revolute("a", body="A", inner=revolute("b", pos="1 0 0", body="B", inner=gripper) + other))
     assert load_mjcf(tree, tip="tip").link_lengths.tolist() == [1, 0.5]
     assert load_mjcf(tree, tip="B").joint_names == ("a", "b")
     assert load_mjcf(tree, tip="side").joint_names == ("a", "c")
@@ -86,13 +86,13 @@ def test_base_and_tip():
 
 
 def test_unnamed_joints_get_names():
-    arm = load_mjcf(model(hinge(inner=hinge(pos="1 0 0", inner=TIP))))
+    arm = load_mjcf(model(revolute(inner=revolute(pos="1 0 0", inner=TIP))))
     assert arm.joint_names == ("joint1", "joint2")
-    assert load_mjcf(model(hinge(inner=hinge(pos="1 0 0", inner=TIP))), locked=["joint2"]).num_joints == 1
+    assert load_mjcf(model(revolute(inner=revolute(pos="1 0 0", inner=TIP))), locked=["joint2"]).num_joints == 1
 
 
 def test_links_of_length_zero_are_merged_with_a_message(caplog):
-    wrist = hinge("c", axis="0 1 0", inner=TIP)  # same anchor as b
+    wrist = revolute("c", axis="0 1 0", inner=TIP)  # same anchor as b
     chain._warn_merged.cache_clear()
     with caplog.at_level(logging.WARNING):
         arm = load_mjcf(toy(wrist))
@@ -103,7 +103,7 @@ def test_links_of_length_zero_are_merged_with_a_message(caplog):
 def test_only_a_locked_joint_merges_links():
     site = '<site name="{}" type="capsule" size="0.01" fromto="{}"/>'
     bent = site.format("link1", "0 0 0 0.5 0 0") + site.format("link2", "0.5 0 0 1 0.2 0")  # both on one body
-    arm = model(hinge("a", inner=bent + hinge("b", pos="1 0.2 0", inner=site.format("link3", "0 0 0 0.5 0 0"))))
+    arm = model(revolute("a", inner=bent + revolute("b", pos="1 0.2 0", inner=site.format("link3", "0 0 0 0.5 0 0"))))
     assert load_mjcf(arm).link_names == ("link1", "link2", "link3")
     assert load_mjcf(arm, locked="b", links="merged").link_names == ("link1", "link2+link3")
     assert load_mjcf(arm, locked="b", links="kept").link_names == ("link1", "link2", "link3")
@@ -127,7 +127,7 @@ def test_a_torque_limit_is_that_of_the_actuator_times_its_gear(actuators, expect
 
 
 def test_a_torque_limit_of_the_joint_itself_has_no_gear():
-    arm = hinge("a", inner=TIP).replace(
+    arm = revolute("a", inner=TIP).replace(
         'axis="0 0 1"', 'axis="0 0 1" actuatorfrclimited="true" actuatorfrcrange="-6 6"'
     )
     for motor_limit, expected in ((4, 6), (2, 4)):  # of a motor with a gear of 2
@@ -151,9 +151,9 @@ def test_links_of_a_gripper_do_not_close_a_loop():
 
 # --- bad input --------------------------------------------------------------------------------------------------------
 
-BRANCH = hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B") + hinge("c", pos="0 1 0", body="C"))
+BRANCH = revolute("a", body="A", inner=revolute("b", pos="1 0 0", body="B") + revolute("c", pos="0 1 0", body="C"))
 BETWEEN = (
-    '<body name="S"><joint name="s" type="slide"/><geom size="0.01"/>' + hinge("b", body="B", inner=TIP) + "</body>"
+    '<body name="S"><joint name="s" type="slide"/><geom size="0.01"/>' + revolute("b", body="B", inner=TIP) + "</body>"
 )
 STATIC = '<body name="hand" pos="0.5 0 0"><geom size="0.01"/><site name="palm"/></body>'
 MODELS = {
@@ -170,12 +170,12 @@ MODELS = {
         "the model branches: bodies 'B' and 'C' lead to 1 revolute joints each; name one end with tip=",
     ),
     "two arms": (
-        lambda: model(hinge("a", body="A") + hinge("b", body="B")),
+        lambda: model(revolute("a", body="A") + revolute("b", body="B")),
         {},
         "the model branches: bodies 'A' and 'B'",
     ),
     "slide": (
-        lambda: model(hinge("a", body="A", inner=BETWEEN)),
+        lambda: model(revolute("a", body="A", inner=BETWEEN)),
         {},
         "expected revolute joints only; joint 's' on the chain is a slide: start distal to it with base=",
     ),
@@ -207,7 +207,7 @@ MODELS = {
     ),
     "no link": (lambda: model('<body><joint/><geom size="1"/></body>'), {}, "the arm has no link of a length above"),
     "names clash": (
-        lambda: model(hinge("joint2", inner=hinge(pos="1 0 0", inner=TIP))),
+        lambda: model(revolute("joint2", inner=revolute(pos="1 0 0", inner=TIP))),
         {},
         "two joints of the chain are called joint2; name the unnamed ones",
     ),
@@ -215,7 +215,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("case", MODELS)
-def test_bad_models_are_refused(case):
+def test_bad_models_are_rejected(case):
     make, options, message = MODELS[case]
     with pytest.raises(ValueError, match=f"^{message}") as error:
         load_mjcf(make(), **options)
@@ -223,8 +223,8 @@ def test_bad_models_are_refused(case):
 
 
 @pytest.mark.parametrize("active", [True, False])
-def test_an_active_loop_between_sites_is_refused(active):
-    arm = hinge("a", body="A", inner=hinge("b", pos="1 0 0", body="B", inner=STATIC))
+def test_an_active_loop_between_sites_is_rejected(active):
+    arm = revolute("a", body="A", inner=revolute("b", pos="1 0 0", body="B", inner=STATIC))
     weld = f'<equality><weld name="tie" site1="palm" site2="wall" active="{str(active).lower()}"/></equality>'
     tied = model('<site name="wall"/>' + arm, weld)
     if not active:
@@ -245,7 +245,7 @@ FILES = {
 
 
 @pytest.mark.parametrize("case", FILES)
-def test_bad_files_are_refused(tmp_path, case):
+def test_bad_files_are_rejected(tmp_path, case):
     content, message = FILES[case]
     path = tmp_path / "arm.xml"
     if content is not None:
@@ -255,6 +255,6 @@ def test_bad_files_are_refused(tmp_path, case):
     assert "\n" not in str(error.value)
 
 
-def test_a_directory_is_no_file(tmp_path):
+def test_a_directory_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="^no MJCF or URDF file at "):
         load_mjcf(tmp_path)

@@ -10,8 +10,8 @@ from mimic.arms.arm import ArmConfig
 from mimic.arms.rendering import ArmScene
 
 
-def test_a_graphics_library_that_is_missing_is_said_when_something_is_drawn(tmp_path):
-    """PyOpenGL fails so where there is no libEGL."""
+def test_a_missing_graphics_library_is_reported_when_something_is_drawn(tmp_path):
+    """PyOpenGL fails in this way where there is no libEGL."""
     (tmp_path / "OpenGL").mkdir()
     (tmp_path / "OpenGL" / "__init__.py").write_text("raise AttributeError('no eglQueryString')")
     code = "import mimic, mujoco.mjx; from mimic import ArmScene; ArmScene([mimic.ArmConfig()])"

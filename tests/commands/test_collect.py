@@ -146,8 +146,8 @@ def test_pose_mappers_are_collected_by_their_quality(tmp_path, capsys):
     assert "distance above the optimum" in shown and "1.00 ± 0.00 %" in shown and "training poses" in shown
 
 
-def test_bad_input(refused, tmp_path):
-    assert "expected a folder with runs in it" in refused("collect")
+def test_bad_input(rejected, tmp_path):
+    assert "expected a folder with runs in it" in rejected("collect")
 
 
 @pytest.mark.parametrize(
@@ -160,11 +160,11 @@ def test_bad_input(refused, tmp_path):
         (["{}/both", "only=sac"], "only: expected one of ppo, pose_mapper, got 'sac'"),
     ],
 )
-def test_bad_folders(refused, tmp_path, arguments, message):
+def test_bad_folders(rejected, tmp_path, arguments, message):
     (tmp_path / "file").touch()
     if arguments == ["{}"]:
         write_run(tmp_path / "stopped", [0.5], report=False)
     else:
         write_run(tmp_path / "both" / "policy", [0.5])
         write_run(tmp_path / "both" / "mapper", [0.5], trainer="pose_mapper")
-    assert message in refused("collect", *(argument.format(tmp_path) for argument in arguments))
+    assert message in rejected("collect", *(argument.format(tmp_path) for argument in arguments))

@@ -47,13 +47,13 @@ def test_the_command_records_what_the_library_does(kind, tmp_path):
         (["out=new.npz", "cuont=3"], "unknown key 'cuont'"),
     ],
 )
-def test_bad_input_of_the_command(refused, tmp_path, arguments, message):
+def test_bad_input_of_the_command(rejected, tmp_path, arguments, message):
     taken = tmp_path / "taken.npz"
     taken.write_text("")
-    assert message in refused("demonstrations", *(argument.format(taken=taken) for argument in arguments))
+    assert message in rejected("demonstrations", *(argument.format(taken=taken) for argument in arguments))
 
 
-def test_no_goal_within_the_limits_is_the_users_to_mend(tmp_path):
+def test_no_goal_within_the_limits_is_an_input_error(tmp_path):
     config = mimic.env_config("planar4dof", control_dt=0.9)
     with pytest.raises(ValueError, match="exceed its limits"):
         prepare_recording(RecordingConfig(config, count=1, out=str(tmp_path / "new.npz")))

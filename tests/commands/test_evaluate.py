@@ -1,4 +1,4 @@
-"""`python -m mimic.evaluate`: every controller on every demonstration, and what it refuses."""
+"""`python -m mimic.evaluate`: controllers on demonstrations, and what it rejects."""
 
 import csv
 import dataclasses
@@ -27,7 +27,7 @@ def run_dir(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def unseen():
-    """Motions of the expert that the run does not hold."""
+    """Motions of the expert that are not in the run."""
     config = environment()
     fresh = dataclasses.replace(config.demonstrations, seed=7)
     return training_and_held_out(dataclasses.replace(config, demonstrations=fresh))[1]
@@ -40,8 +40,8 @@ def evaluate(run_dir, out, **settings):
         return json.loads((out / "report.json").read_text()), list(csv.DictReader(file))
 
 
-def test_holding_still_has_a_gap_of_one(run_dir, tmp_path):
-    """On the physics that the run did not train with. 1e-5: float32, once from rollouts and once from the home pose."""
+def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path):
+    """With other physics than in training. 1e-5: float32, once from rollouts and once from the home pose."""
     report, rows = evaluate(run_dir, tmp_path / "new", controller="hold", physics="mjx")
     assert report["trainer"] == "hold"
     assert report["optimality_gap"] == pytest.approx({"train": 1, "held_out": 1}, abs=1e-5)
@@ -59,7 +59,7 @@ def test_holding_still_has_a_gap_of_one(run_dir, tmp_path):
 
 
 def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_path):
-    """1e-5: float32, of the same distances in another program."""
+    """1e-5: float32, the same distances from another compiled function."""
     unseen.of_length(HORIZON + 5).save(tmp_path / "unseen.npz")  # more steps than the run's demonstrations have
     given = {"demonstrations": str(tmp_path / "unseen.npz")}
     plain, rows = evaluate(run_dir, tmp_path / "plain", **given)
@@ -100,8 +100,8 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
         (["demonstrations=missing.npz"], "no file at 'missing.npz'"),
     ],
 )
-def test_bad_evaluations(refused, run_dir, arguments, message):
-    assert message in refused("evaluate", f"run={run_dir}", "compilation_cache=", *arguments)
+def test_bad_evaluations(rejected, run_dir, arguments, message):
+    assert message in rejected("evaluate", f"run={run_dir}", "compilation_cache=", *arguments)
 
 
 @pytest.mark.parametrize(
@@ -114,8 +114,8 @@ def test_bad_evaluations(refused, run_dir, arguments, message):
         ("torque_noise=nan", "randomization.torque_noise: expected at least 0, got nan"),
     ],
 )
-def test_bad_randomization(refused, override, message):
-    assert message in refused("train", "env=planar4dof", f"env.randomization.{override}")
+def test_bad_randomization(rejected, override, message):
+    assert message in rejected("train", "env=planar4dof", f"env.randomization.{override}")
 
 
 def too_fast(demonstrations):
@@ -131,32 +131,32 @@ def too_fast(demonstrations):
         (too_fast, "joint3 of demonstration 1 has a velocity of 100 rad/s at 0.4 s, but its velocity limit is"),
     ],
 )
-def test_unfit_demonstrations(refused, run_dir, unseen, tmp_path, change, message):
+def test_unfit_demonstrations(rejected, run_dir, unseen, tmp_path, change, message):
     path = tmp_path / "unfit.npz"
     change(unseen).save(path)
     arguments = [f"run={run_dir}", f"demonstrations={path}", "compilation_cache="]
-    assert message in refused("evaluate", *arguments)
+    assert message in rejected("evaluate", *arguments)
 
 
-def test_a_checkpoint_of_another_environment(refused, run_dir, tmp_path):
+def test_a_checkpoint_of_another_environment(rejected, run_dir, tmp_path):
     other = untrained_run(tmp_path / "other", learner=[0.4, 0.3, 0.3])
     shutil.rmtree(other / "checkpoints")
     shutil.copytree(run_dir / "checkpoints", other / "checkpoints")
-    error = refused("evaluate", f"run={other}", "compilation_cache=")
+    error = rejected("evaluate", f"run={other}", "compilation_cache=")
     # 12 numbers for each link seen: 3 of the learner and twice 3 of the expert, where the other learner has 2.
     assert "does not fit the config of its run" in error and "expected shape (108,), got (96,)" in error
 
 
-def test_a_damaged_checkpoint(refused, run_dir, tmp_path):
+def test_a_damaged_checkpoint(rejected, run_dir, tmp_path):
     damaged = tmp_path / "damaged"
     shutil.copytree(run_dir, damaged)
     (checkpoint,) = (damaged / "checkpoints").iterdir()
     (checkpoint / "_METADATA").write_text("not JSON")
-    assert "cannot be read" in refused("evaluate", f"run={damaged}", "compilation_cache=")
+    assert "cannot be read" in rejected("evaluate", f"run={damaged}", "compilation_cache=")
 
 
-def test_a_mapper_has_no_controllers(refused, tmp_path):
+def test_a_mapper_has_no_controllers(rejected, tmp_path):
     (tmp_path / "run" / "checkpoints" / "0").mkdir(parents=True)
     save_config(tmp_path / "run", TrainConfig(environment(), PoseMapperConfig()))
-    error = refused("evaluate", f"run={tmp_path / 'run'}", "controller=pd", "compilation_cache=")
+    error = rejected("evaluate", f"run={tmp_path / 'run'}", "controller=pd", "compilation_cache=")
     assert "expected a run of trainer=ppo, got one of pose_mapper" in error

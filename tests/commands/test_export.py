@@ -1,4 +1,4 @@
-"""`python -m mimic.export`: what other programs run gives what JAX gives, and says what its numbers mean."""
+"""`python -m mimic.export`: exported networks give the results of JAX and describe their inputs and outputs."""
 
 import json
 import sys
@@ -19,11 +19,11 @@ from mimic.trainers.run_config import save_config
 
 pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
-TOLERANCE = 1e-5  # rad, or a share of the largest torque: float32, with sums in another order
+TOLERANCE = 1e-5  # rad, or a fraction of the maximum torque: float32, sums in another order
 
 
 def policy_run(run_dir, name="panda4dof"):
-    """A run whose policy has random weights, and statistics that are not those of the start."""
+    """A run whose policy has random weights and random observation statistics."""
     env = mimic.make(name, demonstrations={"count": 1, "held_out": 1}, physics="fused")
     config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
@@ -61,7 +61,7 @@ def random_poses(arm, count, seed=0):
 
 
 @pytest.mark.parametrize("batch", [1, 33])
-def test_a_policy_in_onnx_is_the_policy(tmp_path, batch):
+def test_an_onnx_policy_equals_the_policy(tmp_path, batch):
     env, controller = policy_run(tmp_path / "run")
     path = mimic.export_run(tmp_path / "run", tmp_path / "policy.onnx")
     session = session_of(path)
@@ -74,7 +74,7 @@ def test_a_policy_in_onnx_is_the_policy(tmp_path, batch):
     np.testing.assert_allclose(torque, expected * env.torque_scale, rtol=TOLERANCE, atol=1e-4)  # N m, up to 87
 
 
-def test_the_metadata_says_what_the_numbers_are(tmp_path):
+def test_the_metadata_describes_inputs_and_outputs(tmp_path):
     env, _ = policy_run(tmp_path / "run")
     session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "policy.onnx"))
     metadata = session.get_modelmeta().custom_metadata_map
@@ -103,7 +103,7 @@ def test_the_metadata_says_what_the_numbers_are(tmp_path):
         ("panda3dof", "large", MetricConfig(translation=1.0, reduction="frobenius")),
     ],
 )
-def test_a_pose_mapper_in_onnx_is_the_mapper(tmp_path, name, preset, metric):
+def test_an_onnx_pose_mapper_equals_the_mapper(tmp_path, name, preset, metric):
     mapper = mapper_run(tmp_path / "run", name, preset, metric)
     session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "mapper.onnx"))
     poses = random_poses(mapper.expert, 200)
@@ -127,7 +127,7 @@ def test_jax_reads_its_own_format(tmp_path):
     assert json.loads((tmp_path / "mapper.jax.json").read_text())["learner_joints"][2] == "joint4"
 
 
-def test_what_cannot_be_exported_is_refused(refused, tmp_path):
+def test_bad_input_is_rejected(rejected, tmp_path):
     mapper_run(tmp_path / "run")
     taken = tmp_path / "taken.onnx"
     taken.write_text("")
@@ -147,19 +147,19 @@ def test_what_cannot_be_exported_is_refused(refused, tmp_path):
         (["out=new.onnx", run, "learner=panda9dof"], "unknown environment 'panda9dof'; valid are pair, panda3dof"),
     ]
     for arguments, message in cases:
-        assert message in refused("export", *arguments)
+        assert message in rejected("export", *arguments)
         (tmp_path / "empty").rmdir()
 
 
-def test_a_mapper_of_other_arms_than_its_config_says_is_refused(refused, tmp_path):
+def test_a_mapper_whose_arms_differ_from_its_config_is_rejected(rejected, tmp_path):
     mapper_run(tmp_path / "run")
     config = PoseMapperConfig(preset="paper", hidden_layers=[16, 16]).resolve()
     save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda3dof"), config))
-    assert "it has other arms or another network" in refused("export", f"run={tmp_path / 'run'}", "out=new.onnx")
+    assert "it has other arms or another network" in rejected("export", f"run={tmp_path / 'run'}", "out=new.onnx")
 
 
-def test_a_missing_package_is_named(refused, tmp_path, monkeypatch):
+def test_a_missing_package_is_named(rejected, tmp_path, monkeypatch):
     mapper_run(tmp_path / "run")
     monkeypatch.setitem(sys.modules, "onnx", None)
-    message = refused("export", f"run={tmp_path / 'run'}", "out=new.onnx")
+    message = rejected("export", f"run={tmp_path / 'run'}", "out=new.onnx")
     assert "format=onnx needs the package onnx: pip install 'mimic-mjx[export]'" in message

@@ -26,6 +26,6 @@ def test_figures_without_a_mapper(tmp_path):
         (FiguresConfig(out=__file__), "is a file"),
     ],
 )
-def test_bad_input_is_refused(config, message):
+def test_bad_input_is_rejected(config, message):
     with pytest.raises(ValueError, match=message):
         prepare_figures(config)

@@ -1,4 +1,4 @@
-"""A learner from a file, by the commands: inspected, trained, evaluated, shown."""
+"""`python -m mimic.inspect`, and the other commands with a learner from a file."""
 
 import json
 import re
@@ -29,7 +29,7 @@ def arm_file(tmp_path):
 
 @pytest.fixture
 def inspected(monkeypatch, capsys):
-    """A function that inspects an arm, by the command, and returns what is said."""
+    """A function that runs the command on an arm and returns its output."""
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["mimic.inspect", *map(str, arguments)])
@@ -39,7 +39,7 @@ def inspected(monkeypatch, capsys):
     return run
 
 
-def test_what_is_said_of_an_arm(inspected, arm_file, tmp_path):
+def test_an_inspection_describes_the_arm(inspected, arm_file, tmp_path):
     said = inspected(arm_file, "bound=false", f"out={tmp_path / 'out'}")
     for text in (
         "ur_like: 6 joints, 6 links",
@@ -59,7 +59,7 @@ def test_what_is_said_of_an_arm(inspected, arm_file, tmp_path):
     assert said.splitlines()[-1] == f"train it: {found['train']}"
 
 
-def test_the_command_that_is_proposed_trains_what_was_inspected(arm_file, monkeypatch):
+def test_the_suggested_command_trains_the_inspected_arm(arm_file, monkeypatch):
     learner = mimic.ArmConfig(model=str(arm_file), locked=["elbow", 6], tip="pinch", armature=0.2)
     config = InspectConfig(learner=learner, expert=mimic.ArmConfig(locked={"joint2": 0.5}), limits="hardware")
     words = shlex.split(train_command(config))
@@ -71,7 +71,7 @@ def test_the_command_that_is_proposed_trains_what_was_inspected(arm_file, monkey
     assert prepared == [expected]
 
 
-def test_an_arm_that_runs_away_is_given_rotors(inspected, tmp_path):
+def test_armature_is_suggested_for_an_arm_that_runs_away(inspected, tmp_path):
     file = tmp_path / "light.xml"
     file.write_text(original_model.ur_like(armature=0.0))
     said = inspected(file, "bound=false")
@@ -80,7 +80,7 @@ def test_an_arm_that_runs_away_is_given_rotors(inspected, tmp_path):
 
 
 @pytest.mark.slow
-def test_how_near_an_equal_arm_can_come(inspected):
+def test_an_equal_arm_reaches_the_poses_of_the_expert(inspected):
     said = inspected("panda")
     line = r"(\S+) for the best poses, (\S+) for holding the start pose; imitation can reduce it by (\d+)%"
     ((bound, hold, percent),) = re.findall(line, said)
@@ -101,13 +101,13 @@ def test_how_near_an_equal_arm_can_come(inspected):
         (["arm.xml", "tip=hand"], "tip"),
     ],
 )
-def test_bad_input_of_an_inspection(refused, arm_file, arguments, message):
-    assert message in refused("inspect", *(str(arm_file) if word == "arm.xml" else word for word in arguments))
+def test_bad_input_of_an_inspection(rejected, arm_file, arguments, message):
+    assert message in rejected("inspect", *(str(arm_file) if word == "arm.xml" else word for word in arguments))
 
 
 @pytest.mark.parametrize("role", ["expert", "learner"])
-def test_bad_arms_of_a_pair(refused, arm_file, role):
-    assert "no MJCF or URDF file" in refused("train", "env=pair", f"env.{role}=missing.xml")
+def test_bad_arms_of_a_pair(rejected, arm_file, role):
+    assert "no MJCF or URDF file" in rejected("train", "env=pair", f"env.{role}=missing.xml")
 
 
 def test_a_pair_takes_arms_by_file(arm_file):
@@ -119,7 +119,7 @@ def test_a_pair_takes_arms_by_file(arm_file):
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)  # three commands that compile, on two cores
-def test_a_learner_from_a_file_is_trained_evaluated_and_shown(arm_file, tmp_path):
+def test_a_learner_from_a_file_is_trained_evaluated_and_rendered(arm_file, tmp_path):
     run_dir = tmp_path / "run"
 
     elsewhere = tmp_path / "elsewhere"  # a run finds its arms from any folder

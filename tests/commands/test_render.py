@@ -1,4 +1,4 @@
-"""Videos of pose mappers and of retargeted motions: what they show, and what is rejected."""
+"""`python -m mimic.render` for pose mappers and retargeted motions: what videos show, and what is rejected."""
 
 import dataclasses
 from typing import Any
@@ -40,7 +40,7 @@ def mapper_run(tmp_path_factory):
 
 
 def swings(arm, count=2):
-    """Motions of an arm, each joint as a sine: angles and velocities belong together."""
+    """Sinusoidal motions of an arm, with the velocities that belong to the angles."""
     time = 0.1 * np.arange(STEPS + 1)[:, None]
     phase = np.arange(count)[:, None, None] + np.arange(arm.num_joints)
     qpos, qvel = 0.8 * np.sin(2 * time + phase), 1.6 * np.cos(2 * time + phase)
@@ -102,7 +102,7 @@ def test_each_frame_has_the_measures_of_similarity(files):
         assert clip.similarity[name][frame] == pytest.approx(float(expected), rel=1e-4)  # degrees in float32
 
 
-def test_a_frame_shows_the_moment(files):
+def test_frames_show_both_arms_and_the_time(files):
     plan = prepare_clip(RenderConfig(**files))
     clip = plan.compute()
     few = dataclasses.replace(clip, time=clip.time[:2], poses=tuple(poses[[0, -1]] for poses in clip.poses))
@@ -153,7 +153,7 @@ def test_motions_of_another_length_are_rejected(files, tmp_path):
         prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
 
 
-def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
+def test_bad_input_for_a_mapper_is_rejected(mapper_run, files):
     bad: list[tuple[dict[str, Any], str]] = [
         ({"split": "train"}, "split: has no effect with a run of trainer=pose_mapper"),
         ({"seed": -1}, "demonstration, seed: expected at least 0"),
@@ -174,5 +174,5 @@ def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
         (["run=missing", "split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
-def test_bad_input_of_the_command(refused, arguments, message):
-    assert message in refused("render", *arguments)
+def test_bad_input_of_the_command(rejected, arguments, message):
+    assert message in rejected("render", *arguments)

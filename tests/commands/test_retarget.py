@@ -66,6 +66,7 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows(with_ma
         (["demonstrations={recorded}", "learner=panda4dof", "out=new.npz"], "recorded with the joints"),
         (["demonstrations={recorded}", "learner=planar4dof", "out={recorded}"], "exists; name a new file"),
         (["demonstrations={recorded}", "learner=planar4dof", "out=no/new.npz"], "there is no folder"),
+        (["demonstrations={recorded}", "learner=planar4dof", "out=new.npz", "mapper=."], "not a run directory"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(recorded, arguments, message, tmp_path):

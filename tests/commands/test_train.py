@@ -1,4 +1,4 @@
-"""The commands, from the outside: what they write, refuse and survive."""
+"""`python -m mimic.train`: the run directory, evaluation, resuming and signals."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def command(module, *arguments, **more):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """One tiny run, whose compiles are logged."""
+    """One tiny run that logs what it compiles."""
     run_dir = tmp_path_factory.mktemp("runs") / "tiny"
     environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
     result = command("train", *TINY, f"run_dir={run_dir}", "compilation_cache=", env=environment)
@@ -58,8 +58,8 @@ def test_a_run_directory_holds_everything(finished):
     assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 4
 
 
-def test_a_run_compiles_few_programs(finished):
-    """Each takes a tenth of a second and more on a GPU."""
+def test_a_run_compiles_few_functions(finished):
+    """Each takes a tenth of a second or more on a GPU."""
     _, result = finished
     names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", result.stderr)
     for program in ("_begin", "_learn", "rollouts", "closest"):
@@ -98,7 +98,7 @@ def test_a_video_shows_the_whole_motion(finished):
     assert beyond.returncode == 2 and "expected 0 to 1, the held_out ones of the run, got 2" in beyond.stderr
 
 
-def test_resume_goes_on_from_the_last_checkpoint(finished, tmp_path):
+def test_resume_continues_from_the_last_checkpoint(finished, tmp_path):
     run_dir = shutil.copytree(finished[0], tmp_path / "run")
     result = command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
     assert result.returncode == 0, result.stderr[-2000:]

@@ -26,27 +26,27 @@ from mimic.commands.config import ViewConfig
         (["split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
-def test_bad_input(refused, arguments, message, monkeypatch):
+def test_bad_input(rejected, arguments, message, monkeypatch):
     monkeypatch.setattr(view, "is_installed", lambda: True)
-    assert message in refused("view", *arguments, *([] if "port=0" in arguments else [f"port={free_port()}"]))
+    assert message in rejected("view", *arguments, *([] if "port=0" in arguments else [f"port={free_port()}"]))
 
 
-def test_a_port_that_is_taken_is_refused(refused, monkeypatch):
+def test_a_port_that_is_taken_is_rejected(rejected, monkeypatch):
     monkeypatch.setattr(view, "is_installed", lambda: True)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert f"port: expected a free port at 127.0.0.1, got {port}" in refused("view", f"port={port}")
+        assert f"port: expected a free port at 127.0.0.1, got {port}" in rejected("view", f"port={port}")
 
 
-def test_without_viser_the_extra_is_named(refused, monkeypatch):
+def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "viser" else find(name, *more))
-    assert "pip install 'mimic-mjx[view]'" in refused("view")
+    assert "pip install 'mimic-mjx[view]'" in rejected("view")
 
 
-def test_nothing_of_the_view_but_its_page_needs_viser():
+def test_only_the_page_of_the_view_imports_viser():
     modules = ", ".join(
         f"mimic.viewer.{name}" for name in ("html", "live_session", "playback", "meshes", "follower", "history")
     )
@@ -54,7 +54,7 @@ def test_nothing_of_the_view_but_its_page_needs_viser():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-def test_arms_by_name():
+def test_arms_can_be_named_by_their_environment():
     arms = ViewConfig(expert="planar4dof", learner="planar4dof").resolve_env()
     assert len(arms.expert.link_lengths) == 7 and len(arms.learner.link_lengths) == 4
 
@@ -68,7 +68,7 @@ def free_port():
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-mjx[view]'")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_ends_it_cleanly(number):
+def test_signals_end_the_command_cleanly(number):
     command = [sys.executable, "-m", "mimic.view", "env=planar4dof", f"port={free_port()}"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None

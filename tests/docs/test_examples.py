@@ -1,4 +1,4 @@
-"""The examples run as their readers run them, and what they say is so."""
+"""The examples run from the command line, and their output is correct."""
 
 import ast
 import json
@@ -19,7 +19,7 @@ NAMES = sorted(path.stem for path in EXAMPLES.glob("[0-9]*.py"))
 CACHE = REPOSITORY / ".jax_cache"
 ENVIRONMENT = {
     **os.environ,
-    "HOME": str(CACHE),  # where the commands keep compiled programs by default
+    "HOME": str(CACHE),  # the default place of the compilation cache
     "JAX_PLATFORMS": "cpu",
     "JAX_COMPILATION_CACHE_DIR": str(CACHE),
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
@@ -29,7 +29,7 @@ patience = pytest.mark.timeout(900)
 
 @pytest.fixture
 def said(request, tmp_path):
-    """What the example of the test's mark says; it writes into the test's folder."""
+    """The output of the test's example, which writes into the test's folder."""
     name = request.param
     CACHE.mkdir(exist_ok=True)
     result = subprocess.run(
@@ -41,7 +41,7 @@ def said(request, tmp_path):
 
 
 def example(name, *marks):
-    """The parameter of a test: what an example says."""
+    """Parametrises a test with the output of an example."""
     return pytest.mark.parametrize("said", [pytest.param(name, marks=marks)], indirect=True, ids=[name])
 
 
@@ -58,7 +58,7 @@ def is_picture(path):
     return len([count for count, _ in colours if count > 20]) > 10
 
 
-def test_there_are_eight_and_the_index_has_them_all():
+def test_the_index_lists_all_eight_examples():
     index = (EXAMPLES / "README.md").read_text()
     assert [name[:2] for name in NAMES] == [f"{n:02}" for n in range(1, 9)]
     for name in NAMES:
@@ -148,8 +148,8 @@ def test_demonstrations(said, tmp_path):
         expected = 0.6 * np.sin(1.5 * tempo * times) ** 2
         np.testing.assert_allclose(waves.qpos[number_of_wave, :, 0], expected, atol=1e-3)  # splines of 0.02 s
     assert "velocities differentiated: True" in said
-    assert re.search(r"degrees.csv is refused: .* expected rad in", said)
-    assert re.search(r"clock.csv is refused: .* its velocity limit is", said)
+    assert re.search(r"degrees.csv is rejected: .* expected rad in", said)
+    assert re.search(r"clock.csv is rejected: .* its velocity limit is", said)
     assert 0 < number(r"mean kinematic bound over the first wave: (\S+)", said) < 0.5
     assert is_picture(tmp_path / "waves_and_bound.png") and is_picture(tmp_path / "waves.png")
 

@@ -1,4 +1,4 @@
-"""What the README and the pages in docs show, works: tests/helpers/pages.py says how blocks are checked and run."""
+"""Commands and code in README.md and the pages work; tests/helpers/pages.py describes how they are checked."""
 
 import re
 
@@ -75,8 +75,8 @@ def test_pages_run(page, monkeypatch, tmp_path):
     run_page(page, tmp_path)
 
 
-def test_every_page_is_read_as_it_is_written():
-    """What the reader would not recognise as a block must not go unnoticed."""
+def test_every_block_of_a_page_is_recognised():
+    """A block that the parser overlooks would not be checked."""
     page = "a\n\n    B=1 srun python -m m  # c\n    make x\n\n<!-- not run: no -->\n\n```python\n  d\n```\n"
     page += '```xml title="e.xml"\n<f/>\n```'
     assert read_blocks(page) == [
@@ -112,7 +112,7 @@ def test_pages_name_every_environment_and_only_functions_that_exist():
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
-def test_links_lead_somewhere(page):
+def test_links_resolve(page):
     for link in re.findall(r"\]\(((?!http)[^)]+)\)", page.read_text()):
         path, _, heading = link.partition("#")
         target = page.parent / path if path else page

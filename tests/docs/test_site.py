@@ -1,4 +1,4 @@
-"""The documentation site builds without a warning, is whole, and needs nothing from elsewhere."""
+"""The documentation site builds without warnings, is complete, and loads nothing from other hosts."""
 
 import os
 import re
@@ -46,14 +46,14 @@ def test_every_public_name_is_in_the_reference(site):
     assert 'title="jaxtyping.Float">Float</span>' in reference  # shapes
 
 
-def test_every_page_is_there(site):
+def test_every_page_is_built(site):
     pages, _ = site
     docs = REPOSITORY / "docs"
     written = {path.relative_to(docs).with_suffix(".html").as_posix() for path in docs.rglob("*.md")}
     assert set(pages) == written | {"404.html"}
 
 
-def test_what_pages_show_comes_along(site):
+def test_files_that_pages_use_are_in_the_site(site):
     pages, out = site
     for name, text in pages.items():
         sources = re.findall(r'<(?:img|script|link)[^>]*?(?:src|href)="([^"]+)"', text)
@@ -66,7 +66,7 @@ def test_what_pages_show_comes_along(site):
             assert ((out / name).parent / result).is_file(), (name, result)
 
 
-def test_a_link_that_leads_nowhere_stops_the_build(tmp_path):
+def test_a_broken_link_stops_the_build(tmp_path):
     (tmp_path / "docs").mkdir()
     (tmp_path / "docs" / "index.md").write_text("[lost](lost.md)")
     settings = (REPOSITORY / "mkdocs.yml").read_text()

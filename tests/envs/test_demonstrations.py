@@ -1,4 +1,4 @@
-"""Demonstrations with what they take of the arm: `python -m mimic.demonstrations`, the file, and what is refused."""
+"""Demonstrations made of others: crossovers, and other lengths."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def recorded():
     return mimic.record_demonstrations(panda(), 2)
 
 
-def test_crossovers_move_each_joint_as_a_given_one_does():
+def test_crossovers_take_each_joint_from_one_demonstration():
     given = mimic.record_demonstrations(panda(), 3)
     mixed = crossovers(given, 20, seed=4)
     assert mixed.count == 20 and mixed.torque is None  # nobody knows what holds the mixture

@@ -1,4 +1,4 @@
-"""The environment, its physics and its demonstrations."""
+"""The environment: observations, rewards, ends of episodes, and its config."""
 
 import jax
 import jax.numpy as jnp
@@ -43,13 +43,14 @@ def test_every_environment_resets_and_steps(name, limits):
 
 
 def test_reward_and_observation_follow_the_demonstration_step_by_step():
-    """Against its samples in the file: after i steps, sample i. 1e-5: float32, of a table made in double precision."""
+    """After i steps both use sample i of the demonstration. 1e-5: float32, of a table made in double precision."""
     env = mimic.make("planar4dof", preview=2, horizon=6, physics="fused", demonstrations=FEW)
     motions, which = env.demonstrations, 3
     expert = [
         mimic.link_states(env.expert, *(np.asarray(x[which, sample], np.float32) for x in (motions.qpos, motions.qvel)))
         for sample in range(7)
     ]
+    metric = env.metric.correspondence, env.metric.weights
     actions = np.random.default_rng(0).uniform(-1, 1, (6, env.action_size)).astype(np.float32)
     state, step = env.begin(env.start(jax.random.PRNGKey(0), which)), jax.jit(env.step)
     for i in range(7):
@@ -59,7 +60,7 @@ def test_reward_and_observation_follow_the_demonstration_step_by_step():
         leaves = [np.ravel(leaf) for states in shown for leaf in jax.tree.leaves(states)]
         np.testing.assert_allclose(state.obs, np.concatenate(leaves), atol=1e-5)
         assert state.done == (i == 6)
-        distances = [mimic.embodiment_distance(each, learner, env.correspondence, env.weights) for each in expert]
+        distances = [mimic.embodiment_distance(each, learner, *metric) for each in expert]
         if i > 0:
             assert state.reward == pytest.approx(-float(distances[i]), abs=1e-5)
             others = np.delete(distances, i)
@@ -77,7 +78,7 @@ def test_a_runaway_ends_the_episode_and_never_pays(planar_env):
     assert after.reward == pytest.approx(worst_rest, rel=1e-5)
 
 
-def test_hardware_limits_cost_where_they_are_near_and_beyond():
+def test_hardware_limits_are_penalised_near_and_beyond_them():
     free, limited = (
         mimic.make("panda4dof", physics="fused", demonstrations=FEW, limits=limits, limit_weight=2.0)
         for limits in ("none", "hardware")
@@ -98,7 +99,7 @@ def test_hardware_limits_cost_where_they_are_near_and_beyond():
         assert after.reward == pytest.approx(-float(costs), rel=1e-6)
 
 
-def test_training_and_held_out_are_apart():
+def test_training_and_held_out_demonstrations_differ():
     training, held_out = training_and_held_out(mimic.env_config("planar4dof", demonstrations=FEW))
     assert (training.count, held_out.count) == (6, 2)
     assert not np.isin(held_out.goals, training.goals).any()
@@ -117,11 +118,11 @@ def test_training_and_held_out_are_apart():
         ({"learner": {"locked": [9]}}, "unknown joint 9"),
     ],
 )
-def test_bad_overrides_are_refused(overrides, message):
+def test_bad_overrides_are_rejected(overrides, message):
     with pytest.raises(ValueError, match=message):
         mimic.make("panda4dof", **overrides)
 
 
-def test_unknown_environment_names_the_known():
+def test_an_unknown_environment_lists_the_valid_ones():
     with pytest.raises(ValueError, match="panda3dof, panda4dof, panda7dof, planar4dof"):
         mimic.make("panda5dof")

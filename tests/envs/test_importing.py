@@ -1,4 +1,4 @@
-"""Motions from elsewhere: tables and LocoMuJoCo's files become demonstrations, or are refused in a line."""
+"""Imported motions: tables and files of LocoMuJoCo become demonstrations or are rejected in one line."""
 
 import importlib
 import sys
@@ -112,7 +112,7 @@ def test_locomujoco_files_are_split_and_their_free_joint_is_left_out(tmp_path):
         np.testing.assert_allclose(imported.qvel[which], qvel, atol=1e-5)
 
 
-def test_joints_of_other_names_are_told(tmp_path):
+def test_joint_names_of_the_file_can_be_given(tmp_path):
     names = [f"panda_{i}" for i in "abcdefg"]
     source = archive(tmp_path / "loco.npz", joint_names=np.array(["root", *names]))
     imported, _ = mimic.import_demonstrations(source, mimic.panda(), joints=names)
@@ -139,11 +139,11 @@ NUMBERED = [f"q_{i}" for i in range(1, 8)]
         (lambda path: table(path, names=NUMBERED), ["joints=[a]"], "joints: expected 7 names"),
     ],
 )  # fmt: skip
-def test_bad_tables(refused, tmp_path, make, arguments, message):
+def test_bad_tables(rejected, tmp_path, make, arguments, message):
     path = tmp_path / "motion.csv"
     if make:
         make(path)
-    assert message in refused("demonstrations", f"source={path}", "out=new.npz", *arguments)
+    assert message in rejected("demonstrations", f"source={path}", "out=new.npz", *arguments)
 
 
 @pytest.mark.parametrize(
@@ -158,10 +158,10 @@ def test_bad_tables(refused, tmp_path, make, arguments, message):
         ({"qpos": np.zeros((3, 14), object)}, "cannot be read as an npz file of motions"),
     ],
 )
-def test_bad_archives(refused, tmp_path, changes, message):
+def test_bad_archives(rejected, tmp_path, changes, message):
     path = archive(tmp_path / "motion.npz", **changes)
-    assert message in refused("demonstrations", f"source={path}", "out=new.npz")
+    assert message in rejected("demonstrations", f"source={path}", "out=new.npz")
 
 
-def test_joints_without_a_file_are_refused(refused):
-    assert "joints: expected only with source=FILE" in refused("demonstrations", "out=new.npz", "joints=[a]")
+def test_joint_names_without_a_file_are_rejected(rejected):
+    assert "joints: expected only with source=FILE" in rejected("demonstrations", "out=new.npz", "joints=[a]")

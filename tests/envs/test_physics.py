@@ -1,4 +1,4 @@
-"""Our dynamics and both physics against C MuJoCo, in double precision, and the GPU kernel as far as a CPU can tell."""
+"""Our dynamics and both physics against C MuJoCo in double precision, and the GPU kernel, interpreted on the CPU."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from mimic.metric import fused_kernel
 from tests.helpers.lowering import gpu_program
 from tests.helpers.random_arms import SEEDS, random_arm
 
-# Double precision leaves 1e-16 of each of a few thousand operations, and bodies that are light beside others amplify
+# Double precision leaves 1e-16 of each of a few thousand operations, and bodies much lighter than others amplify
 # it: up to 1e-12 on the random arms, 1e-15 on the Panda.
 RTOL = 1e-9
 LOAD = Load(mass=1.2, damping=0.8)
@@ -85,7 +85,7 @@ def assert_near(found, expected, rtol=RTOL):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_acceleration_and_inverse_are_mujocos(x64, name):
+def test_forward_and_inverse_dynamics_equal_those_of_mujoco(x64, name):
     model = build_arm(ARMS[name]).model
     qpos, qvel, torque = random_states(model)
     qacc = mujoco_acceleration(model, qpos, qvel, torque)
@@ -95,7 +95,7 @@ def test_acceleration_and_inverse_are_mujocos(x64, name):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_random_arms_move_as_in_their_own_model(x64, seed):
-    """Against the model as it was written: this is also about `simulation_model`, its reference angles included."""
+    """Against the original model, so that `simulation_model` is tested too, with its reference angles."""
     source, model = free_arm(seed)
     np.testing.assert_array_equal(model.qpos0, source.qpos0)
     qpos, qvel, torque = random_states(source)
@@ -104,7 +104,7 @@ def test_random_arms_move_as_in_their_own_model(x64, seed):
     assert_near(ours(dynamics.inverse, model, qpos, qvel, qacc), torque)
 
 
-def test_random_arms_have_what_is_hard():
+def test_random_arms_include_the_hard_cases():
     sources = [random_arm(seed) for seed in SEEDS]
     assert any(source.body_jntnum.max() == 2 for source in sources)
     assert any(source.qpos0.any() for source in sources)
@@ -162,7 +162,7 @@ def test_load_scales_masses_inertias_and_damping(x64, name):
 
 @pytest.mark.parametrize("kind", ["mjx", "fused"])
 def test_both_physics_step_a_loaded_arm_as_mujoco_does(x64, kind):
-    """Three steps of RK4 in double precision; the same formula in another order."""
+    """Three steps of RK4 in double precision: the same formula, in another order."""
     model, timestep, substeps = build_arm(ARMS["planar"]).model, 0.01, 3
     heavier = loaded(model, LOAD)
     heavier.opt.timestep = timestep
@@ -177,8 +177,8 @@ def test_both_physics_step_a_loaded_arm_as_mujoco_does(x64, kind):
         assert_near(np.asarray(values), reference)
 
 
-def test_mjx_brings_no_empty_array_into_a_program():
-    """With one, jaxlib 0.11.2 crashes on a program for several devices; 0.10.2 and 0.12.0 do not."""
+def test_mjx_adds_no_empty_array_to_a_compiled_function():
+    """With one, jaxlib 0.11.2 crashes on a function for several devices; 0.10.2 and 0.12.0 do not."""
     model, empty = build_arm(ARMS["planar"]).model, np.zeros((0, 3), np.float32)
     state = [jnp.asarray(x[0]) for x in random_states(model)]
     programs = make_advance(model, 0.01, 3, "mjx"), lambda qpos, *_: jnp.sum(qpos[0] * empty)
@@ -188,7 +188,7 @@ def test_mjx_brings_no_empty_array_into_a_program():
 
 @pytest.fixture(scope="module")
 def planar():
-    """A small arm, which compiles quickly, and what it takes to step it: 5 states, and as many loads."""
+    """A small arm that compiles quickly, with 5 states and 5 loads."""
     model = build_arm(ARMS["planar"]).model
     states = [jnp.asarray(x, jnp.float32) for x in random_states(model, count=5)]
     loads = Load(jnp.linspace(0.8, 1.2, 5), jnp.linspace(1.5, 0.5, 5))
@@ -229,8 +229,8 @@ def test_the_kernel_lowers_without_a_gpu(planar):
     assert "triton" not in batched.lower(*states).as_text()
 
 
-def test_default_steps_keep_the_tip_where_it_belongs():
-    """1 s of random torques against RK4 at 0.5 ms: 1 mm, a thousandth of the arm's reach; 0.2 mm when written."""
+def test_default_substeps_keep_the_tip_within_1_mm():
+    """1 s of random torques against RK4 at 0.5 ms; 0.2 mm when written, a thousandth of the reach is 1 mm."""
     env = mimic.make("panda4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     arm, model, substeps, dt = env.learner, env.arm.model, env.config.substeps, env.config.control_dt
     torques = np.random.default_rng(0).uniform(-1, 1, (4, 10, model.nv)) * np.asarray(env.torque_scale)
@@ -265,8 +265,8 @@ def test_default_steps_keep_the_tip_where_it_belongs():
     assert np.linalg.norm(apart, axis=-1).max() < 1e-3
 
 
-def test_fused_and_mjx_stay_together_over_an_episode():
-    """5 s of demonstrations' torques in single precision, without feedback; 2e-6 rad when written."""
+def test_fused_and_mjx_agree_over_an_episode():
+    """5 s of recorded torques in single precision, without feedback; 2e-6 rad when written."""
     env = mimic.make("panda7dof", demonstrations={"count": 8, "held_out": 1})
     motions, dt = env.demonstrations, env.config.control_dt
     assert motions.torque is not None
@@ -292,14 +292,14 @@ DT = 0.1
 
 @pytest.fixture(scope="module")
 def panda_scale():
-    """Largest torques."""
+    """Maximum torques."""
     return np.asarray(mimic.make("panda7dof", demonstrations={"count": 1, "held_out": 1}).torque_scale)
 
 
 @pytest.mark.parametrize("load", [Load(), Load(mass=1.2, damping=3.0)])
 @pytest.mark.parametrize("physics", PHYSICS)
 def test_the_panda_moves_as_in_mujoco(panda_scale, physics, load):
-    """1 s of random torques at the default step: 1e-4 rad, what ten control steps leave of float32."""
+    """1 s of random torques at the default step. 1e-4 rad: float32 over ten control steps."""
     model = build_arm(ArmConfig()).model
     substeps = mimic.env_config("panda7dof").substeps
     model.opt.timestep = DT / substeps

@@ -1,4 +1,4 @@
-"""Learners that differ from their model: by mass, damping and noise on their torques."""
+"""Randomised learners: factors of mass and damping, and noise on torques."""
 
 import copy
 import dataclasses
@@ -36,7 +36,7 @@ def varied():
 
 
 def stepped(env, load=None, action=ACTION, steps=1, key=0):
-    """Joint state after some steps of a learner that was given a load."""
+    """Joint state of a learner with a load after some steps."""
     state = env.reset(jax.random.PRNGKey(key))
     if load is not None:
         state = state.replace(pipeline_state=state.pipeline_state.replace(load=load))
@@ -47,7 +47,7 @@ def stepped(env, load=None, action=ACTION, steps=1, key=0):
 
 
 def test_loads_differ_between_episodes_and_fill_their_range(varied):
-    """1000 draws come within 2 % of either end of the range, but for one case in 10^8."""
+    """1000 draws miss the 2 % at an end of the range in one case of 10^8."""
     loads = jax.vmap(lambda key: varied.start(key).load)(jax.random.split(jax.random.PRNGKey(0), 1000))
     for drawn, (least, largest) in zip(loads, RANGES.values(), strict=True):
         assert least <= drawn.min() < least + 0.02 * (largest - least)
@@ -55,7 +55,7 @@ def test_loads_differ_between_episodes_and_fill_their_range(varied):
     assert abs(np.corrcoef(np.stack(loads))[0, 1]) < 0.15  # more than 4 standard deviations of chance
 
 
-def test_one_range_leaves_the_other_factor_as_it_is():
+def test_randomising_one_factor_leaves_the_other_fixed():
     load = make(mass=[0.5, 2.0], damping=[1.5, 1.5]).start(jax.random.PRNGKey(0)).load
     assert load is not None and load.damping == 1.5 and 0.5 < load.mass < 2
 
@@ -79,7 +79,7 @@ def test_a_load_stays_for_an_episode_and_changes_with_the_next(varied):
 
 
 def test_equal_bounds_are_a_fixed_load(plain, varied):
-    """1e-6: the factors are constants in one program and arguments of the other, in float32."""
+    """1e-6: float32, with factors that are constants in one function and arguments of the other."""
     fixed = make(mass=[1.2, 1.2], damping=[0.5, 0.5])
     assert fixed.start(jax.random.PRNGKey(0)).load is None and plain.start(jax.random.PRNGKey(0)).load is None
     drawn = Load(jnp.float32(1.2), jnp.float32(0.5))
@@ -90,7 +90,7 @@ def test_equal_bounds_are_a_fixed_load(plain, varied):
 
 @pytest.mark.parametrize("physics", ["mjx", "fused"])
 def test_a_heavier_arm_moves_as_in_mujoco(plain, physics):
-    """1e-5 rad and rad/s: 0.1 s in float32."""
+    """1e-5 rad and rad/s: float32 over 0.1 s."""
     heavier = RandomizationConfig(mass=[1.2, 1.2], damping=[2.0, 2.0])
     config = dataclasses.replace(plain.config, physics=physics, randomization=heavier)
     env = mimic.ImitationEnv(config, plain.demonstrations)
@@ -105,7 +105,7 @@ def test_a_heavier_arm_moves_as_in_mujoco(plain, physics):
     np.testing.assert_allclose(stepped(env), [*data.qpos, *data.qvel], atol=1e-5)
 
 
-def test_noise_moves_the_arm_anew_in_each_step_and_episode(plain):
+def test_noise_differs_between_steps_and_episodes(plain):
     noisy, silent = make(torque_noise=0.2), make(torque_noise=0.0)
     np.testing.assert_array_equal(stepped(silent), stepped(plain))
     np.testing.assert_array_equal(stepped(noisy), stepped(noisy))
@@ -115,12 +115,12 @@ def test_noise_moves_the_arm_anew_in_each_step_and_episode(plain):
 
 @pytest.fixture
 def noisy(monkeypatch):
-    """An environment with noise, and an arm whose velocity becomes the torque [N m] that it was given."""
+    """An environment with noise, and physics that return the torque [N m] as velocity."""
     monkeypatch.setattr(imitation, "make_advance", lambda *_: lambda qpos, qvel, torque, load: (qpos, torque))
     return make(torque_noise=0.1)
 
 
-def test_noise_is_of_the_given_size_and_within_the_largest_torque(noisy):
+def test_noise_has_the_given_size_and_torques_stay_within_the_maximum(noisy):
     """5000 draws: their standard deviation is known to 1 %, and 5 % is five times that."""
     env = noisy
 
@@ -141,7 +141,7 @@ def test_noise_is_of_the_given_size_and_within_the_largest_torque(noisy):
 
 
 def test_noise_shares_no_key_with_the_next_episode(noisy):
-    """Folding a small number into a key gives what splitting it does."""
+    """Folding a small number into a key gives the keys that splitting it gives."""
     env = noisy
     state = env.reset(jax.random.PRNGKey(0))
     keys = jax.random.split(state.pipeline_state.key, 3)

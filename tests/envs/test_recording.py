@@ -41,8 +41,8 @@ def panda():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_torques_of_a_file_make_its_motion(kind, tmp_path):
-    """1e-9 rad: the same double precision, on another run of the simulator."""
+def test_recorded_torques_reproduce_the_motion(kind, tmp_path):
+    """1e-9 rad: double precision, in another run of the simulator."""
     mimic.record_demonstrations(panda(), 2, kind=kind).save(tmp_path / "demonstrations.npz")
     loaded = mimic.load_demonstrations(tmp_path / "demonstrations.npz")
     assert loaded.torque is not None and loaded.torque.shape == (2, 50, 7)
@@ -58,8 +58,8 @@ def test_the_torques_of_a_file_make_its_motion(kind, tmp_path):
             np.testing.assert_allclose(data.qvel, expected_qvel, rtol=0, atol=1e-8)  # rad/s, over a step of 0.1 s
 
 
-def test_a_recording_counts_the_goals_that_it_drew_anew():
-    """Below the peak speeds of PD control, some goals must be turned down."""
+def test_a_recording_counts_redrawn_goals():
+    """Velocity limits below the peaks of PD control make it reject some goals."""
     arm = panda()
     slow = dataclasses.replace(arm, embodiment=dataclasses.replace(arm.embodiment, velocity_limit=np.full(7, 1.0)))
     redrawn = []
@@ -69,8 +69,8 @@ def test_a_recording_counts_the_goals_that_it_drew_anew():
     mimic.check_effort(recorded, slow.embodiment)
 
 
-def test_what_diverges_is_no_demonstration(tmp_path, monkeypatch):
-    """Steps of 0.4 s blow up within one control step; MuJoCo would set the arm back to rest, which breaks no limit."""
+def test_a_diverging_simulation_is_rejected(tmp_path, monkeypatch):
+    """Steps of 0.4 s diverge; MuJoCo would reset the arm to rest, which breaks no limit."""
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of what diverges
     arm = panda()
     unlimited = dataclasses.replace(arm.embodiment, velocity_limit=np.full(7, np.inf))

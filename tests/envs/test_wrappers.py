@@ -1,4 +1,4 @@
-"""Episodes that begin anew while others go on."""
+"""Restarts of episodes within a batch."""
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,8 @@ import mimic
 from mimic.envs.wrappers import wrap_for_training
 
 
-def test_observations_of_fresh_episodes_fit_their_states():
-    """In a batch of which some episodes end: the wrapper puts the observations together by itself."""
+def test_observations_of_new_episodes_match_their_states():
+    """In a batch where some episodes end: the wrapper composes the observations itself."""
     env = mimic.make("planar4dof", demonstrations={"count": 3}, physics="fused")
     wrapped = wrap_for_training(env, env.config.horizon + 1)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
@@ -31,7 +31,7 @@ def planar_env():
     return mimic.make("planar4dof", demonstrations=FEW)
 
 
-def test_episodes_end_at_the_horizon_and_draw_fresh_demonstrations(planar_env):
+def test_episodes_end_at_the_horizon_and_draw_new_demonstrations(planar_env):
     env = wrap_for_training(planar_env, planar_env.config.horizon + 1)
     count, horizon = 32, planar_env.config.horizon
 

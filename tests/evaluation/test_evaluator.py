@@ -1,4 +1,4 @@
-"""What is measured of a controller on each demonstration, and controllers whose figures are known."""
+"""The metrics of a controller on each demonstration, for controllers whose metrics are known."""
 
 import copy
 import csv
@@ -28,7 +28,7 @@ LINKS = {"link_lengths": [0.6, 0.4]}
 
 @pytest.fixture(scope="module")
 def evaluator():
-    """Of an arm that imitates its equal."""
+    """For an arm that imitates an equal arm."""
     config = mimic.env_config(
         "planar4dof",
         expert=LINKS,
@@ -42,15 +42,15 @@ def evaluator():
 
 
 def rollouts(evaluator, turned=(0.0, 0.0), faster=(0.0, 0.0), distance=None):
-    """The learner at the expert's joint angles and velocities, plus something."""
+    """The learner at the expert's joint angles and velocities plus offsets."""
     given = evaluator.env.demonstrations
     qpos, qvel = (np.asarray(x[:, 1:], np.float32) for x in (given.qpos + turned, given.qvel + faster))
     distance = np.zeros(qpos.shape[:2]) if distance is None else distance
     return Rollouts(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, 0 * qpos, distance)))
 
 
-def test_no_error_where_the_learner_does_as_the_expert(evaluator):
-    """0.05 deg is what the arc cosine leaves of float32 near 1; velocities of some rad/s are rounded by 1e-6."""
+def test_errors_are_zero_where_the_learner_moves_as_the_expert(evaluator):
+    """0.05 deg: the arc cosine of float32 near 1; velocities of some rad/s are rounded by 1e-6."""
     table = evaluator.table(rollouts(evaluator))
     assert np.all(table["link_angle_error_deg"] < 0.05)
     assert np.all(table["angular_velocity_error"] < 1e-5)
@@ -58,8 +58,8 @@ def test_no_error_where_the_learner_does_as_the_expert(evaluator):
 
 
 @pytest.mark.parametrize(("by", "links"), [((0.3, 0.0), (0.3, 0.3)), ((0.0, -0.3), (0, 0.3)), ((0.3, -0.3), (0.3, 0))])
-def test_errors_are_those_of_a_known_turn(evaluator, by, links):
-    """An angle or speed at a joint moves all links beyond it. Tolerances as above."""
+def test_errors_equal_a_known_rotation(evaluator, by, links):
+    """An angle or velocity of a joint moves all distal links. Tolerances as above."""
     turned = evaluator.table(rollouts(evaluator, turned=by))
     names = evaluator.env.learner.link_names
     for name, angle in zip(names, links, strict=True):
@@ -70,7 +70,7 @@ def test_errors_are_those_of_a_known_turn(evaluator, by, links):
     assert np.all(faster["link_angle_error_deg"] < 0.05)
 
 
-def test_angles_count_by_the_share_of_each_expert_link():
+def test_angles_are_weighted_by_the_fraction_of_each_expert_link():
     """One learner link along x against expert links at 0 and at 90 degrees.
 
     By overlap W has 1 + 3/4 and 1 + 1/4, the fractions of the expert's links and of the learner's: 5/12 for the second.
@@ -99,7 +99,7 @@ def test_torques_and_limits_by_hand(evaluator):
     env.learner = env.learner.replace(
         joint_range=np.array([[-1, 1], [-2, 2]]), velocity_limit=np.array([3.0, 4.0]), torque_limit=scale / 2
     )
-    share = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, -0.5]])  # of the largest torques, over three steps
+    share = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, -0.5]])  # of the maximum torques, over three steps
     qpos = np.array([[1.0, -2.0], [1.1, 0.0], [np.nan, 0.0]])
     qvel = np.array([[3.0, -4.1], [3.1, 4.1], [0.0, -4.0]])
     count = env.demonstrations.count
@@ -115,11 +115,11 @@ def test_torques_and_limits_by_hand(evaluator):
         "torque_violations": 1,
     }
     for key, value in expected.items():
-        np.testing.assert_allclose(table[key], np.full(count, value), rtol=1e-6)  # the largest torques are in float32
+        np.testing.assert_allclose(table[key], np.full(count, value), rtol=1e-6)  # the maximum torques are in float32
 
 
 def between(evaluator, share):
-    """Distances at a share of the way from the bound to holding still, one for each demonstration: their gaps."""
+    """Rollouts with given optimality gaps, one for each demonstration."""
     bound, hold = evaluator.lower_bound, evaluator.hold_distance
     return rollouts(evaluator, distance=bound + np.asarray(share)[:, None] * (hold - bound))
 
@@ -157,7 +157,7 @@ def test_the_worst_are_named_by_their_number_in_the_split(evaluator):
 
 
 def test_similarity_of_a_turned_arm_is_in_the_report(evaluator):
-    """The second link, 0.4 of the chain, is turned by 0.5 rad: all in closed form. Tolerances of float32."""
+    """Closed form: the second link, 0.4 of the chain, is rotated by 0.5 rad. Tolerances of float32."""
     summary = evaluator.similarity_summary(rollouts(evaluator, turned=(0.0, 0.5)), "policy")
     assert list(summary) == ["policy", "nearest_poses", "copy_joints", "hand_ik", "hold_home"]  # two links are no elbow
     expected = {
@@ -175,14 +175,14 @@ def test_similarity_of_a_turned_arm_is_in_the_report(evaluator):
         assert summary["hand_ik"]["hand_position_error"][split] < 0.05  # interpolated between every fifth sample
 
 
-def test_a_gap_that_would_mean_nothing_is_not_given():
+def test_a_meaningless_gap_is_not_reported():
     distance, bound, hold = np.array([[0.2, 0.2, 0.0], [0.087, 0.075, 0.0], [0.101, 0.1, 0.0]])
     found = gaps(distance, bound, hold)
     assert np.isnan(found[[0, 2]]).all() and found[1] == pytest.approx(5.0)
     assert has_gap(0.075, 0.1) and not has_gap(0.0751, 0.1)
 
 
-def test_a_report_says_why_there_is_no_gap(evaluator, monkeypatch):
+def test_a_report_explains_a_missing_gap(evaluator, monkeypatch):
     """The bound is raised to where it saves less than a quarter of the distance of holding the start pose."""
     monkeypatch.setattr(Evaluator, "lower_bound", property(lambda evaluator: 0.9 * evaluator.hold_distance))
     ran = rollouts(evaluator, distance=2 * evaluator.hold_distance)
@@ -208,8 +208,8 @@ def test_the_table_as_a_file(evaluator, tmp_path):
 
 
 @pytest.mark.parametrize("plot", [plots.plot_quality, plots.plot_demonstrations])
-def test_pictures_show_all_and_name_the_controller(evaluator, monkeypatch, tmp_path, plot):
-    """The held-out demonstrations went worse than the training ones, whose axes come first."""
+def test_plots_show_all_values_and_name_the_controller(evaluator, monkeypatch, tmp_path, plot):
+    """The held-out demonstrations are worse than the training ones, whose axes come first."""
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     ran = between(evaluator, [0.1] * COUNT + [3.0, 2.0, 1.0, 0.0])
@@ -222,8 +222,8 @@ def test_pictures_show_all_and_name_the_controller(evaluator, monkeypatch, tmp_p
         assert all(np.all((line.get_ydata() >= low) & (line.get_ydata() <= high)) for line in axes.lines)
 
 
-def test_holding_is_what_the_gap_is_measured_against(evaluator):
-    """1e-6: float32, of the same distances in another program."""
+def test_holding_the_start_pose_is_the_reference_of_the_gap(evaluator):
+    """1e-6: float32, the same distances from another compiled function."""
     ran, frequency = run_controller(evaluator, "hold")
     np.testing.assert_allclose(ran.distance, evaluator.hold_distance, atol=1e-6)
     assert frequency == 0 and not np.asarray(ran.torque).any()
@@ -239,13 +239,13 @@ def test_exact_dynamics_track_better_than_none(evaluator):
         assert 5 * found[0][split] < found[1][split] < 0.1  # it does without the coupling of joints
 
 
-def test_controllers_that_ask_for_too_much_get_the_largest_torque(evaluator):
+def test_actions_out_of_range_get_the_maximum_torque(evaluator):
     greedy = jax.jit(lambda: evaluator.rollout(lambda state: jnp.array([5.0, -5.0])))()
     scale = np.asarray(evaluator.env.torque_scale)
     np.testing.assert_array_equal(greedy.torque, np.broadcast_to(scale * [1, -1], greedy.torque.shape))
 
 
-def test_a_learner_that_can_do_what_the_expert_does_needs_no_search(monkeypatch):
+def test_the_bound_of_an_equal_arm_needs_no_search(monkeypatch):
     monkeypatch.setattr(evaluation, "closest_motion", None)  # would fail
     config = mimic.env_config("panda7dof", demonstrations={"count": 2, "held_out": 1}, physics="fused")
     training, held_out = training_and_held_out(config)
@@ -255,7 +255,7 @@ def test_a_learner_that_can_do_what_the_expert_does_needs_no_search(monkeypatch)
 
 
 def test_no_rollout_goes_below_the_bound():
-    """Random controllers on the planar arm; 1e-4 is what the search may leave."""
+    """Random controllers on the planar arm. 1e-4: the tolerance of the search."""
     from mimic.envs.imitation import training_and_held_out
     from mimic.evaluation.evaluator import Evaluator
 
@@ -269,8 +269,8 @@ def test_no_rollout_goes_below_the_bound():
         assert np.all(np.asarray(rollout(gain).distance) > evaluator.lower_bound - 1e-4)
 
 
-def test_bound_and_holding_are_those_of_the_samples_after_each_step():
-    """In closed form: of planar arms by directions. 1e-4: what the search may leave."""
+def test_bound_and_hold_distance_belong_to_the_samples_after_each_step():
+    """Closed forms for the directions of planar arms. 1e-4: the tolerance of the search."""
     metric = {"correspondence": "overlap", "translation": 0.0, "linear_velocity": 0.0, "angular_velocity": 0.0}
     few = {"count": 1, "held_out": 1}
     config = mimic.env_config("planar4dof", demonstrations=few, horizon=12, metric=metric, physics="fused")
@@ -280,6 +280,6 @@ def test_bound_and_holding_are_those_of_the_samples_after_each_step():
     optimum = planar_optimum(env.expert, env.learner, env.demonstrations.qpos)
     np.testing.assert_allclose(evaluator.lower_bound, optimum[:, 1:], atol=1e-4)
     assert np.abs(np.diff(optimum, axis=1)).max() > 5e-3  # a bound one sample early would be noticed
-    weights, angles = np.asarray(env.correspondence), np.cumsum(env.demonstrations.qpos, axis=-1)
+    weights, angles = np.asarray(env.metric.correspondence), np.cumsum(env.demonstrations.qpos, axis=-1)
     straight = np.pi / 2 * (weights.sum() - (np.cos(angles) @ weights).sum(axis=-1)) / weights.size
     np.testing.assert_allclose(evaluator.hold_distance, straight[:, 1:], atol=1e-5)  # float32

@@ -1,4 +1,4 @@
-"""The search for the best torques: never worse than where it starts, and exact where the arm can do it all."""
+"""The search for torques: never worse than its start, and exact where learner and expert are equal."""
 
 import json
 
@@ -43,7 +43,7 @@ def evaluator():
 
 
 def descent_and_task(evaluator, chunk=4_000):
-    """Of the training demonstrations, for arms that are as their model says."""
+    """Of the training demonstrations, without randomisation."""
     env = evaluator.env
     expert = jax.tree.map(lambda table: table[:, 1:], env.expert_states)
     loads = Load(*jnp.ones((2, env.demonstrations.count)))
@@ -56,12 +56,12 @@ def random_actions(evaluator, size=0.2):
 
 
 def controller_of(action):
-    """Open loop."""
+    """A controller that plays the actions back."""
     return lambda state: action[state.pipeline_state.demonstration, state.pipeline_state.step]
 
 
 def test_an_arm_that_imitates_itself_finds_the_torques():
-    """From none. A torque is held for 0.1 s for expert and learner alike: 1e-3 of holding is rounding and kinks."""
+    """From zero torques. Both arms hold a torque for 0.1 s: 1e-3 of the hold distance is rounding and kinks."""
     evaluator = evaluator_of(LINKS, action_scale=2.0)
     still = lambda state: jnp.zeros(evaluator.env.action_size)  # noqa: E731
     best, _ = search_torques(evaluator, still, SearchConfig(iterations=30, starts=1), lambda *_: None)
@@ -79,26 +79,24 @@ def test_no_update_makes_a_sequence_worse(evaluator):
     assert np.all(np.asarray(episodes.objective) < 0.5 * np.asarray(first))
 
 
-def test_the_objective_is_what_the_environment_reports(evaluator):
-    """With the loads that the environment draws. 2e-5: float32, and five digits that are shown."""
+def test_the_objective_equals_the_distance_in_the_environment(evaluator):
+    """With the loads that the environment draws. 2e-5: float32, and the five digits of the text."""
     loaded = evaluator_of([0.5, 0.5], randomization={"mass": [0.5, 2.0], "damping": [0.5, 2.0]})
     objectives = []
     for each in (evaluator, loaded):
-        controller, said = controller_of(random_actions(each)), []
-        search_torques(
-            each, controller, SearchConfig(iterations=1, starts=1), lambda _, text, said=said: said.append(text)
-        )
+        controller, texts = controller_of(random_actions(each)), {}
+        search_torques(each, controller, SearchConfig(iterations=1, starts=1), texts.__setitem__)
         rolled_out = jax.jit(lambda each=each, controller=controller: each.rollout(controller))()
-        objectives.append(float(said[0].removeprefix("objective ")))
-        assert objectives[-1] == pytest.approx(np.mean(rolled_out.distance), abs=2e-5)
+        objectives.append(float(texts[0].removeprefix("objective ")))
+        assert objectives[-1] == pytest.approx(float(np.mean(np.asarray(rolled_out.distance))), abs=2e-5)
     assert abs(objectives[0] - objectives[1]) > 1e-3
 
 
 @pytest.mark.parametrize(("correspondence", "adaptive"), [("arc_length", False), ("soft", True)])
 def test_the_gradient_is_that_of_the_objective(correspondence, adaptive):
-    """By one action at a time, along a whole rollout, against central differences.
+    """By single actions, over a whole rollout, against central differences.
 
-    2e-3 of the largest: a float32 objective, 1e-7, over a step of 2e-3, and its third derivative.
+    2e-3 of the maximum: a float32 objective, 1e-7, over a step of 2e-3, and its third derivative.
     """
     metric = {"adaptive": adaptive, "correspondence": correspondence, "linear_velocity": 0.1, "angular_velocity": 0.1}
     evaluator = evaluator_of([0.5, 0.5], metric=metric)
@@ -139,7 +137,7 @@ def test_the_curvature_is_positive(evaluator):
 
 
 def test_a_bounded_law_is_the_minimum_between_the_bounds():
-    """Against projected gradient descent, to its end. 1e-5: float32."""
+    """Against converged projected gradient descent. 1e-5: float32."""
     keys = jax.random.split(jax.random.PRNGKey(0), 3)
     root = jax.random.normal(keys[0], (3, 3))
     matrix, gradient, mixed = root @ root.T + jnp.eye(3), 3 * jax.random.normal(keys[1], (3,)), jnp.ones((3, 2))
@@ -155,8 +153,8 @@ def test_a_bounded_law_is_the_minimum_between_the_bounds():
     np.testing.assert_array_equal(np.all(np.asarray(gain)[~at_bound] != 0, axis=1), True)
 
 
-def test_runaways_are_left_alone(evaluator):
-    """With a bound on the speed that the largest torques exceed in a step, and no torque does not."""
+def test_runaways_give_no_nan(evaluator):
+    """With a speed bound that the maximum torques exceed in one step and zero torques do not."""
     slow = evaluator_of([0.5, 0.5], speed_bound=1.0)
     descent, task = descent_and_task(slow)
     greedy = jnp.ones_like(random_actions(slow)).at[0].set(0.0)
@@ -167,7 +165,7 @@ def test_runaways_are_left_alone(evaluator):
 
 
 def test_the_report_of_a_search(tmp_path):
-    """Of an untrained policy. 1e-5: float32, of means that are made in another order."""
+    """Of an untrained policy. 1e-5: float32, means in another order."""
     run = untrained_run(tmp_path / "run")
     config = EvaluateConfig(
         str(run), out=str(tmp_path / "out"), controller="searched", search=SearchConfig(5, 5), compilation_cache=""
@@ -192,5 +190,5 @@ def test_the_report_of_a_search(tmp_path):
         ("search.starts=many", "search.starts"),
     ],
 )
-def test_bad_searches(refused, argument, message):
-    assert message in refused("evaluate", "run=anything", "controller=searched", argument)
+def test_bad_search_settings(rejected, argument, message):
+    assert message in rejected("evaluate", "run=anything", "controller=searched", argument)

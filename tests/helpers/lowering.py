@@ -1,4 +1,4 @@
-"""Programs for a GPU that is not there."""
+"""Compilation for a GPU that the machine does not have."""
 
 import contextlib
 
@@ -6,7 +6,7 @@ import jax
 
 
 def gpu_program(function, *arguments):
-    """The text of a jitted function's program for NVIDIA GPUs."""
+    """The text of a jitted function lowered for NVIDIA GPUs."""
     kind = getattr(jax.sharding, "AbstractDevice", None)  # from JAX 0.12 on Pallas asks which GPU
     there = contextlib.nullcontext()
     if kind is not None:

@@ -1,4 +1,4 @@
-"""Arms, states and every choice that the metric offers, for the tests of its values and of its gradients."""
+"""Arms, states and all options of the metric, for the tests of its values and gradients."""
 
 import functools
 
@@ -36,7 +36,7 @@ def states(arm, seed=0, dtype: DTypeLike = np.float32):
 
 
 def planar_optimum(expert, learner, qpos):
-    """Closed form of the least distance of directions, by overlap: [...] of poses [..., joints] of a planar expert.
+    """Closed form of the minimum distance of directions, by overlap: [...] for poses [..., joints] of a planar expert.
 
     Each link of the learner points along the sum of the directions that correspond to it.
     """

@@ -1,4 +1,4 @@
-"""Where C MuJoCo says that the links of an arm are in the model as it was written, and an arm of our own to load."""
+"""Link states of an original model by C MuJoCo, and generated models to load."""
 
 import mujoco
 import numpy as np
@@ -58,7 +58,7 @@ def urdf(*, mesh: str = "") -> str:
 
 
 def at_rest(model: mujoco.MjModel) -> np.ndarray:
-    """Hinges at 0, all else where the model puts it."""
+    """Revolute joints at 0, other joints where the model places them."""
     qpos = model.qpos0.copy()
     for joint in range(model.njnt):
         if model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_HINGE):
@@ -67,7 +67,7 @@ def at_rest(model: mujoco.MjModel) -> np.ndarray:
 
 
 def addresses(model: mujoco.MjModel, joint_names: tuple[str, ...]) -> tuple[list[int], list[int]]:
-    """Of joints in qpos and in qvel."""
+    """Indices of joints in qpos and in qvel."""
     joints = [model.joint(name) for name in joint_names]
     return [int(joint.qposadr[0]) for joint in joints], [int(joint.dofadr[0]) for joint in joints]
 
@@ -75,7 +75,7 @@ def addresses(model: mujoco.MjModel, joint_names: tuple[str, ...]) -> tuple[list
 def link_motion(
     model: mujoco.MjModel, data: mujoco.MjData, joint_names: tuple[str, ...], link_names: tuple[str, ...], tip: str
 ) -> dict[str, np.ndarray]:
-    """What `link_states` should give, unnormalized: from the positions and velocities of MuJoCo's bodies.
+    """The expected unnormalized `link_states`, from the positions and velocities of MuJoCo's bodies.
 
     Link number i runs from the anchor of joint i to that of the next, the last one to the tip, a site or a body.
     """

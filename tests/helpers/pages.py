@@ -98,7 +98,7 @@ def read_blocks(text: str) -> list[Block]:
 
 
 def commands(block: Block) -> list[list[str]]:
-    """The words of each command, without what stands before its program (`srun`, `NAME=value`)."""
+    """The words of each command, without a prefix (`srun`, `NAME=value`)."""
     lines = block.text.replace("\\\n", " ").splitlines()
     split = [shlex.split(line, comments=True) for line in lines]
     return [_program(words) for words in split if words]
@@ -111,12 +111,12 @@ def _program(words: list[str]) -> list[str]:
 
 
 def module(words: list[str]) -> str:
-    """What a command runs: the module of `python -m`, else the program."""
+    """The module of `python -m`, else the executable."""
     return words[2] if words[:2] == ["python", "-m"] else words[0]
 
 
 def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails unless the command is one that exists, with arguments that it takes."""
+    """Fails unless the command exists and takes the arguments."""
     program = module(words)
     if program == "make":
         for word in words[1:]:
@@ -144,7 +144,7 @@ def check(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _compose(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Makes the command's config of its arguments, of a sweep those of its runs, and does nothing with it."""
+    """Composes the command's config, or those of a sweep's runs, from its arguments, and does nothing with it."""
     composed: list[Any] = []
     prepare: Callable[[Any], cli.Work] = lambda config: composed.append(config) or (lambda: 0)  # noqa: E731
     assert hasattr(importlib.import_module(f"mimic.{name}"), "prepare")
@@ -163,7 +163,7 @@ def _compose(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -
 
 
 def _parse(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parses the benchmark's arguments, and stops there."""
+    """Parses the benchmark's arguments and stops."""
 
     class Parsed(Exception):
         pass
@@ -206,7 +206,7 @@ def _run(words: list[str], folder: pathlib.Path) -> None:
         flags = [word for word in arguments if word.startswith("-")]  # Hydra takes them before all others
         others = [word for word in arguments if word not in flags]
         arguments = [*flags, *SMALL.get(name, []), *others, *SHORT.get(name, [])]
-    home = REPOSITORY / ".jax_cache" / "home"  # where mimic keeps compiled programs
+    home = REPOSITORY / ".jax_cache" / "home"  # the default place of the compilation cache
     home.mkdir(parents=True, exist_ok=True)
     quickly_compiled = "--xla_backend_optimization_level=0"  # most of a small run is compilation
     settings = {

@@ -1,4 +1,4 @@
-"""Random serial arms as MJCF, and where C MuJoCo says that their links are and how they move."""
+"""Random serial arms as MJCF, and their link states by C MuJoCo."""
 
 import mujoco
 import numpy as np
@@ -12,25 +12,25 @@ def has_link_sites(seed: int) -> bool:
     return seed % 3 == 0
 
 
-def random_arm(seed: int, hinges: int | None = None) -> mujoco.MjModel:
-    """A serial arm of as many hinges; of 1 to 9 by the seed where None.
+def random_arm(seed: int, joints: int | None = None) -> mujoco.MjModel:
+    """A serial arm with the given number of revolute joints; 1 to 9 by the seed where None.
 
-    Random axes, anchors and body rotations, with static bodies at the root, between and behind the moving ones. Some
-    joints have a reference angle other than 0; some bodies of the arms without link sites have two hinges with one
+    Random axes, anchors and body rotations, with static bodies proximal to, between and distal to the moving ones. Some
+    joints have a reference angle other than 0; some bodies of the arms without link sites have two joints with one
     anchor, so that the link between these has length zero.
     """
     rng = np.random.default_rng(seed)
-    opened, made, hinges = [], 0, hinges or 1 + seed % 9
-    while made < hinges:
+    opened, made, joints = [], 0, joints or 1 + seed % 9
+    while made < joints:
         if rng.random() < 0.4:
             opened.append(f"<body {_pose(rng)}>")
         opened.append(f'<body {_pose(rng)}><geom size="0.02"/>')
         anchor = _text(rng.uniform(-_REACH, _REACH, 3))
-        twins = not has_link_sites(seed) and made + 2 <= hinges and rng.random() < 0.25
+        twins = not has_link_sites(seed) and made + 2 <= joints and rng.random() < 0.25
         for _ in range(2 if twins else 1):
             made += 1
             ref = rng.choice([0.0, rng.uniform(-1, 1)])
-            opened[-1] += f'<joint name="hinge{made}" pos="{anchor}" axis="{_text(rng.normal(size=3))}" ref="{ref}"/>'
+            opened[-1] += f'<joint name="joint{made}" pos="{anchor}" axis="{_text(rng.normal(size=3))}" ref="{ref}"/>'
         if has_link_sites(seed):
             site = f'<site name="link{made}" fromto="{_text(rng.uniform(-_REACH, _REACH, 6))}"/>'
             opened[-1] += site if rng.random() < 0.5 else f"<body {_pose(rng)}>{site}</body>"
@@ -45,7 +45,7 @@ def random_arm(seed: int, hinges: int | None = None) -> mujoco.MjModel:
 
 
 def posed(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray | None = None) -> mujoco.MjData:
-    """The model's state, with everything that follows from it computed by MuJoCo."""
+    """The model's state after `mj_forward`."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     data.qvel[:] = 0 if qvel is None else qvel
@@ -54,9 +54,9 @@ def posed(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray | None = Non
 
 
 def links(model: mujoco.MjModel, data: mujoco.MjData, link_names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """What `link_states` should give, unnormalized, and the links' bodies: from MuJoCo's positions and velocities.
+    """The expected unnormalized `link_states`, from MuJoCo's positions and velocities.
 
-    A link's name says which it is: "link2", or "link2+link3" for links that a locked joint has made one.
+    Links are found by name: "link2", or "link2+link3" for links that a locked joint merges.
     """
     base = int(model.body_parentid[model.jnt_bodyid[0]])
     R_base_world, origin = data.xmat[base].reshape(3, 3).T, data.xpos[base]

@@ -1,4 +1,4 @@
-"""Where the repository is that the tests belong to."""
+"""The root folder of the repository."""
 
 import pathlib
 

@@ -1,4 +1,4 @@
-"""The smallest training run that goes through everything."""
+"""Settings of the smallest training run that uses every part."""
 
 TINY = [
     "env=planar4dof",

@@ -84,7 +84,7 @@ def test_dtypes_are_kept(x64):
     [0, 0.0, 1.0, np.nan, -np.inf, np.inf, jnp.float32(2.0), [-1.0, -2.0]],
     ids=lambda xi: f"{type(xi).__name__} {xi}",
 )
-def test_soft_refuses_a_sharpness_that_is_not_negative(unchecked, xi):
+def test_soft_rejects_a_sharpness_that_is_not_negative(unchecked, xi):
     with pytest.raises(ValueError, match="^xi: expected a finite number below 0, for a soft minimum, got .*$"):
         soft_correspondence(random_distances(), xi=xi)
 
@@ -122,7 +122,7 @@ def test_overlap_by_hand(x64):
 
 @pytest.mark.parametrize("expert", ARMS)
 @pytest.mark.parametrize("learner", ARMS)
-def test_overlap_shares_out_every_link(x64, expert, learner):
+def test_overlap_distributes_every_link(x64, expert, learner):
     """With o = W / (1/l + 1/l_hat): rows of o sum to the expert's lengths, columns to the learner's."""
     arms = ARMS[expert], ARMS[learner]
     length, length_hat = (arm.link_lengths / arm.link_lengths.sum() for arm in arms)
@@ -153,7 +153,7 @@ def test_overlap_under_jit_with_the_arms_as_arguments():
 
 
 def test_merged_links_overlap_by_their_path_or_their_chord():
-    """A chord across a right angle: 2 along the path, sqrt(2) straight, beside a link of 1."""
+    """A chord across a right angle, 2 along the path and sqrt(2) straight, next to a link of 1."""
     bent = merged_by_a_right_angle()
     assert bent.link_lengths == pytest.approx([np.sqrt(2), 1.0])
     twin = planar_arm([2.0, 1.0])
@@ -184,7 +184,7 @@ def test_arc_length_of_an_arm_with_itself_counts_links_by_their_length(name):
     assert np.asarray(arc_length_correspondence(arm, arm)).mean() == pytest.approx(1, rel=1e-6)
 
 
-def test_arc_length_does_not_see_a_straight_link_cut_in_two():
+def test_arc_length_ignores_that_a_straight_link_is_cut_in_two():
     whole, cut, other = planar_arm([1.0, 2.0]), planar_arm([1.0, 0.5, 1.5]), planar_arm([1.5, 1.0, 0.5])
     angles = np.array([0.3, -0.8, 0.5], np.float32)
     states = link_states(other, angles), link_states(whole, angles[:2]), link_states(cut, np.array([0.3, -0.8, 0.0]))

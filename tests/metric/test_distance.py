@@ -36,7 +36,7 @@ from tests.helpers.metric_cases import (
 def worked_example():
     """Two arms with two links of 1 m, so L = 2. Positions and velocities by hand, divided by L.
 
-    Expert at (0, pi/2), with both joints at 1 rad/s: link 1 points along x and turns at 1 rad/s, link 2 along y at 2.
+    Expert at (0, pi/2), with both joints at 1 rad/s: link 1 points along x and rotates at 1 rad/s, link 2 along y at 2.
     Middles (1/2, 0) and (1, 1/2), velocities (0, 1/2) and (0, 1) + 2 (-1/2, 0) = (-1, 1).
     Learner stretched along x and at rest: middles (1/2, 0) and (3/2, 0).
     """
@@ -128,8 +128,8 @@ def test_arms_of_equal_shape_and_different_size_match():
         assert distance == pytest.approx(0, abs=1e-6)  # float32
 
 
-def test_turning_both_arms_together_changes_nothing(x64):
-    """Distances do not depend on the direction of the base frame: joint 1 of both arms turns everything about z."""
+def test_rotating_both_arms_changes_nothing(x64):
+    """Distances do not depend on the direction of the base frame: joint 1 of both arms rotates all links about z."""
     a, b = panda(), panda(locked=(3, 6, 7))
     rng = np.random.default_rng(0)
     (qa, va), (qb, vb) = (rng.uniform(-2, 2, (2, arm.num_joints)) for arm in (a, b))
@@ -161,7 +161,7 @@ def test_weights_of_zero_cost_nothing():
     program = jax.make_jaxpr(functools.partial(link_distances, weights=DistanceWeights(rotation=1.0)))(a, b)
     used = jax.jit(functools.partial(link_distances, weights=DistanceWeights(rotation=1.0))).lower(a, b).as_text()
     assert "sqrt" in str(program)  # the distances are written down, and
-    assert "sqrt" not in used  # XLA is not given those that nothing uses
+    assert "sqrt" not in used  # XLA drops those that are unused
     assert not link_distances(a, b, DistanceWeights(rotation=0.0)).any()
 
 
@@ -205,14 +205,14 @@ def test_float32_stays_float32_under_x64(x64, correspondence, weights):
     [np.ones((2, 3)), np.ones((3, 3)), np.ones(6), np.ones((1, 3, 2)), 1.0, lambda distances: distances.T],
     ids=lambda matrix: str(np.shape(matrix)),
 )
-def test_a_correspondence_of_another_shape_is_refused(matrix):
+def test_a_correspondence_of_another_shape_is_rejected(matrix):
     expected = r"^correspondence: expected shape \(3, 2\) \(expert links, learner links\), got \(.*\)$"
     with pytest.raises(ValueError, match=expected):
         embodiment_distance(states(EXPERT), states(LEARNER), matrix, PAPER_WEIGHTS)
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_unknown_measures_and_reductions_are_refused():
+def test_unknown_measures_and_reductions_are_rejected():
     pair = states(EXPERT), states(LEARNER)
     options = {"rotation": ("cosine, angle", "euler"), "reduction": ("mean, frobenius", "sum")}
     for option, (valid, bad) in options.items():
@@ -230,7 +230,7 @@ def test_unknown_measures_and_reductions_are_refused():
 @pytest.mark.parametrize(
     ("part", "field"), [("rotation", "direction"), ("angular_velocity", "angular_velocity")], ids=lambda x: x
 )
-def test_candidate_points_refuse_weights_on_what_they_lack(part, field):
+def test_candidate_points_reject_weights_on_what_they_lack(part, field):
     weights = dataclasses.replace(DistanceWeights(translation=1.0, rotation=0.0), **{part: 0.5})
     message = f"^weights: candidate points have no {field}, so {part} must weigh 0, got 0.5$"
     a, b = states(EXPERT), states(LEARNER)
@@ -243,7 +243,7 @@ def test_candidate_points_refuse_weights_on_what_they_lack(part, field):
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_weights_of_another_shape_are_refused():
+def test_weights_of_another_shape_are_rejected():
     expected = (
         r"^weights: expected rotation to broadcast to \(3, 2\) \(expert links, learner links\), got shape \(3, 3\)$"
     )

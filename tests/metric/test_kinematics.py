@@ -82,10 +82,10 @@ def test_random_arms_move_as_in_mujoco(dtype, seed):
     assert_moves_as_in_mujoco(arm, model, dtype)
 
 
-@pytest.mark.parametrize("locked", [{}, {"hinge1": 0.3, "hinge7": -0.5}], ids=["free", "locked"])
+@pytest.mark.parametrize("locked", [{}, {"joint1": 0.3, "joint7": -0.5}], ids=["free", "locked"])
 @pytest.mark.parametrize("seed", [3, 4])
 def test_long_arms_move_as_in_mujoco(x64, seed, locked):
-    model = random_arms.random_arm(seed, hinges=LONG + 8)
+    model = random_arms.random_arm(seed, joints=LONG + 8)
     arm = load_mjcf(model, locked=locked, links="kept")
     assert arm.num_joints == LONG + 8 - len(locked) > LONG
     assert (-1 in arm.link_joint) == bool(locked)
@@ -115,7 +115,7 @@ def test_panda_moves_as_in_mujoco(dtype, locked, links):
 def test_locked_random_arm_moves_as_in_mujoco(x64, seed, links):
     model = random_arms.random_arm(seed)
     rng = np.random.default_rng(seed)
-    locked = {f"hinge{i + 1}": rng.uniform(-3, 3) for i in rng.permutation(model.njnt)[: model.njnt // 2]}
+    locked = {f"joint{i + 1}": rng.uniform(-3, 3) for i in rng.permutation(model.njnt)[: model.njnt // 2]}
     arm = load_mjcf(model, locked=locked, links=links)
     assert arm.num_joints == model.njnt - len(locked)
     if links == "kept":
@@ -231,7 +231,7 @@ def test_float32_stays_float32_under_x64(x64, arm):
     assert link_states(arm, q32.astype(jnp.float64)).position.dtype == jnp.float64
 
 
-def test_whole_numbers_are_angles_too(unchecked):
+def test_integer_angles_are_accepted(unchecked):
     arm = planar_arm([0.4, 0.6])
     assert link_states(arm, np.array([0, 1])).position.dtype == jnp.float32  # pyright: ignore[reportArgumentType]
 
@@ -242,7 +242,7 @@ def test_annotated_shapes_are_checked_while_testing():
 
 
 @pytest.mark.parametrize("shape", [(), (6,), (8,), (7, 1), (5, 7)])
-def test_wrong_shapes_are_refused(unchecked, shape):
+def test_wrong_shapes_are_rejected(unchecked, shape):
     arm, good, bad = panda(), np.zeros(7, np.float32), np.zeros(shape, np.float32)
     for what, call in {
         "qpos": [
@@ -259,7 +259,7 @@ def test_wrong_shapes_are_refused(unchecked, shape):
             assert ("jax.vmap" in str(error.value)) == (len(shape) > 1)
 
 
-def test_the_table_of_link_states_is_what_they_are():
+def test_the_table_of_link_states_equals_link_states():
     arm = mimic.panda(locked=[3])
     qpos, qvel = np.random.default_rng(0).normal(size=(2, 3, 4, arm.num_joints))
     table = link_state_table(arm, qpos, qvel)

@@ -1,4 +1,4 @@
-"""The paper's finding on two-link arms, as numbers: which measure has one minimum, and which have more."""
+"""The paper's result for two-link arms: which measures have one minimum, and which have more."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_minima_are_counted_across_the_seam():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_bad_input_is_refused():
+def test_bad_input_is_rejected():
     with pytest.raises(ValueError, match="learner: expected 2 joints, got 3"):
         distance_landscape(ARM, planar_arm([1, 1, 1]), EXPERT_POSE, hard_correspondence, adaptive_weights)
     with pytest.raises(ValueError, match="resolution: expected at least 3"):

@@ -39,13 +39,13 @@ CASES = {
 
 @pytest.fixture
 def long_kernel(gpu_kernels, monkeypatch):
-    """`motion_distance` takes the kernel for long arms, whatever the arms; the kernels that it took."""
+    """Makes `motion_distance` use the kernel for long arms with any arms; returns the list of kernels used."""
     monkeypatch.setattr(motion_module, "LONG", 0)
     return gpu_kernels
 
 
 def schedule(arms, correspondence, weights):
-    """What the kernel crosses and compares in each step; it does not depend on the size of the arms."""
+    """The joints that the kernel crosses and the links that it compares in each step, for arms of any size."""
     matrix = np.asarray(correspondence, float)
     return long_chain_kernel.plan(arms, np.stack([np.full(matrix.shape, getattr(weights, p)) for p in PARTS]) * matrix)
 
@@ -63,7 +63,7 @@ def motions(arms, batch, dtype: DTypeLike = np.float64):
 
 
 def values_and_gradients(arms, correspondence, weights, batch):
-    """Of the composition, as the kernel gives them."""
+    """Value and gradients of the composition."""
 
     def distance(*motion):
         states = link_states(arms[0], *motion[:2]), link_states(arms[1], *motion[2:])
@@ -74,7 +74,7 @@ def values_and_gradients(arms, correspondence, weights, batch):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_kernel_computes_what_the_composition_does(x64, long_kernel, case):
+def test_the_kernel_equals_the_composition(x64, long_kernel, case):
     arms, correspondence, weights = CASES[case]
     correspondence = overlap_correspondence(*arms) if correspondence is None else correspondence
     batch = motions(arms, fused_kernel.DEFAULT.block + 1)  # the last block is partial

@@ -29,7 +29,7 @@ ALL_ARGUMENTS = (0, 1, 2, 3)
 
 
 def composed(arms, correspondence, weights, **options):
-    """What `motion_distance` stands for, of its parts."""
+    """The composition of functions that `motion_distance` equals."""
 
     def distance(*motion):
         states = link_states(arms[0], *motion[:2]), link_states(arms[1], *motion[2:])
@@ -60,7 +60,7 @@ def largest_difference(found, expected):
         pytest.param("fixed links", "all", marks=pytest.mark.slow),
     ],
 )
-def test_value_and_gradient_are_those_of_the_composition(x64, pair, weights):
+def test_value_and_gradient_equal_those_of_the_composition(x64, pair, weights):
     arms = PAIRS[pair]
     metric = overlap_correspondence(*arms), EVERY_WEIGHT[weights]
     functions = motion_distance(*arms, *metric), composed(arms, *metric)
@@ -70,7 +70,7 @@ def test_value_and_gradient_are_those_of_the_composition(x64, pair, weights):
 
 
 @pytest.mark.parametrize(("correspondence", "weights"), itertools.product(CORRESPONDENCES, WEIGHTS))
-def test_any_other_metric_is_the_composition(x64, correspondence, weights):
+def test_other_metrics_equal_the_composition(x64, correspondence, weights):
     metric, arms = (CORRESPONDENCES[correspondence], WEIGHTS[weights]), (EXPERT, LEARNER)
     sample = [x[0] for x in motions(arms)]
     several: tuple[dict, ...] = {}, {"rotation": "angle"}, {"reduction": "frobenius"}
@@ -130,7 +130,7 @@ def test_one_expert_pose_serves_a_batch_of_learners():
     ids=["planar", "panda", "long"],
 )
 def test_zero_with_finite_gradients_at_a_match(arm):
-    """Exactly, where each operation is rounded by itself; a compiled program may round the two arms differently."""
+    """Exactly without compilation; a compiled function may round the two arms differently."""
     distance = jax.value_and_grad(motion_distance(arm, arm, 2 * np.eye(arm.num_links), ALL_WEIGHTS), (2, 3))
     compiled, one = jax.jit(jax.vmap(distance)), jax.jit(distance)
     qpos, qvel, *_ = motions((arm, arm), dtype=np.float32)
@@ -146,7 +146,7 @@ def test_zero_with_finite_gradients_at_a_match(arm):
 
 
 @pytest.mark.parametrize("pair", ["planar", "long"])
-def test_dtypes_stay(x64, pair):
+def test_dtypes_are_kept(x64, pair):
     arms = PAIRS[pair]
     distance = motion_distance(*arms, overlap_correspondence(*arms))
     for dtype in (np.float32, np.float64):
@@ -158,7 +158,7 @@ def test_dtypes_stay(x64, pair):
     assert mixed.dtype == np.float64
 
 
-def test_programs_of_long_arms_do_not_grow():
+def test_compiled_functions_of_long_arms_do_not_grow():
     def operations(joints):
         arms = planar_arm(np.full(joints, 0.1)), planar_arm(np.full(joints, 0.2))
         gradient = jax.jit(jax.vmap(jax.grad(motion_distance(*arms, overlap_correspondence(*arms)), ALL_ARGUMENTS)))
@@ -168,7 +168,7 @@ def test_programs_of_long_arms_do_not_grow():
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_bad_arguments_are_refused():
+def test_bad_arguments_are_rejected():
     arms = EXPERT, LEARNER
     with pytest.raises(ValueError, match=r"^correspondence: expected shape \(3, 2\)"):
         motion_distance(*arms, np.ones((2, 3)))
@@ -180,7 +180,7 @@ def test_bad_arguments_are_refused():
         motion_distance(*arms, overlap_correspondence(*arms))(*sample[:3], jnp.zeros(3))
 
 
-def test_what_weighs_nothing_is_left_out():
+def test_parts_of_weight_zero_are_not_computed():
     arms = panda(), panda(locked=(3, 6, 7), links="merged")
     motion = [jnp.zeros(n) for n in (7, 7, 4, 4)]
 
@@ -200,7 +200,7 @@ def test_what_weighs_nothing_is_left_out():
 
 @pytest.mark.parametrize("count", [1, fused_kernel.DEFAULT.block, fused_kernel.DEFAULT.block + 1])
 @pytest.mark.usefixtures("interpreted")
-def test_the_kernel_computes_what_the_plain_program_does(count):
+def test_the_kernel_equals_the_plain_function(count):
     def program(x, y):
         return [[x[0] * y[1] + 2.0], [jnp.sin(x[1]), 0.5, y[0] - x[0]]]
 
@@ -232,7 +232,7 @@ def test_the_kernel_lowers_in_double_precision(x64, pair):
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("pair", ["panda 7->4", "random, long"])
-def test_the_gpu_computes_what_double_precision_does(pair):
+def test_the_gpu_agrees_with_double_precision(pair):
     arms = (load_mjcf(random_arm(4, 40)), load_mjcf(random_arm(7, 20))) if pair == "random, long" else PAIRS[pair]
     metric = overlap_correspondence(*arms), PAPER_WEIGHTS
     batch = motions(arms, 10_001, np.float32)

@@ -63,7 +63,7 @@ def test_an_arm_resembles_itself_exactly_and_nothing_else(links):
         assert np.all(other[name] > 0), name
 
 
-def test_what_is_measured_does_not_depend_on_how_the_metric_groups_links():
+def test_similarity_does_not_depend_on_merged_links():
     qpos, expert = random_poses(ARMS["kept"], 8), random_poses(panda(), 8, seed=1)
     kept, merged = (compare(panda(), expert, ARMS[links], qpos) for links in ("kept", "merged"))
     for name in MEASURES:
@@ -136,6 +136,6 @@ def test_gradients_are_finite_at_a_match():
     assert np.all(np.isfinite(jax.grad(total)(jnp.asarray(qpos))))
 
 
-def test_samples_are_refused_below_one(unchecked):
+def test_fewer_than_one_sample_is_rejected(unchecked):
     with pytest.raises(ValueError, match="samples: expected at least 1, got 0"):
         centre_line_table(panda(), np.zeros(7), samples=0)

@@ -22,7 +22,7 @@ def test_axis_rotation_is_the_matrix_exponential(x64, axis, angle):
 
 
 @pytest.mark.parametrize("axis", AXES)
-def test_known_components_change_the_work_and_not_the_result(x64, axis):
+def test_constant_components_do_not_change_the_result(x64, axis):
     angle = jnp.asarray(0.4)
     known = spatial.axis_rotation(axis, angle)
     traced = spatial.axis_rotation(spatial.vector(jnp.asarray(axis)), angle)
@@ -37,7 +37,7 @@ def test_known_components_change_the_work_and_not_the_result(x64, axis):
     )
 
 
-def test_known_zeros_are_not_computed():
+def test_constant_zeros_are_not_computed():
     def turn(axis):
         return jax.make_jaxpr(lambda angle: jnp.stack([*map(jnp.asarray, spatial.axis_rotation(axis, angle)[0])]))(0.3)
 
@@ -46,7 +46,7 @@ def test_known_zeros_are_not_computed():
     assert spatial.dot((0.0, 1.0, 0.0), ("unused", 2.0, "unused")) == 2.0
 
 
-def test_vector_of_a_numpy_array_is_known():
+def test_vector_of_a_numpy_array_is_constant():
     assert spatial.vector(np.array([0.0, 1.0, 2.0])) == (0.0, 1.0, 2.0)
     assert all(type(x) is float for x in spatial.vector(np.array([0.0, 1.0, 2.0])))  # np.float64 would promote float32
 
@@ -63,5 +63,5 @@ def test_norm_has_a_finite_gradient_at_and_near_the_kink(dtype, size):
         assert value == 0 and not gradient.any()
 
 
-def test_norm_of_a_known_vector():
+def test_norm_of_a_constant_vector():
     assert spatial.norm((3.0, 0.0, -4.0)) == 5.0

@@ -1,4 +1,4 @@
-"""Pictures: that they are made, that they show what they should, and what is refused."""
+"""The picture of candidate points: which poses are optimal by points and by frames."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from mimic.paper_figures import candidate_points
 from mimic.paper_figures.planar_arms import joint_points
 
 
-def test_points_and_frames_disagree_on_what_is_perfect():
+def test_candidate_points_and_frames_have_different_optima():
     expert, mirrored, parallel = candidate_points.poses().values()
     itself, same_hand, same_directions = (
         candidate_points.distances(expert, arm) for arm in (expert, mirrored, parallel)

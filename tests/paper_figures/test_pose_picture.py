@@ -1,4 +1,4 @@
-"""The picture of an expert's poses and the learner's nearest ones."""
+"""The picture of an expert's poses and the learner's closest poses."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ def env():
     return EnvConfig(expert=PLANAR, learner=dataclasses.replace(PLANAR, locked=[3]))
 
 
-def test_a_learner_that_can_do_the_pose_does_it(env, tmp_path):
+def test_a_reachable_pose_is_reached(env, tmp_path):
     expert, learner = build_arm(env.expert), build_arm(env.learner)
     qpos = np.array([[0.5, -0.9, 0.0], [0.3, 0.8, 0.9]], np.float32)  # the locked joint is at 0 in the first alone
     pairs = nearest_poses(expert, learner, env.metric, qpos)

@@ -1,4 +1,4 @@
-"""The kinematic bound is a global minimum: nothing that is tried goes below it, and known answers are met."""
+"""The kinematic bound is a global minimum: no sampled motion is below it, and closed forms are reached."""
 
 import dataclasses
 import functools
@@ -64,7 +64,7 @@ def solved(name):
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_nothing_tried_goes_below(name):
+def test_no_sampled_motion_is_below_the_bound(name):
     expert, learner = ARMS[name]
     motion, correspondence, closest = solved(name)
     tried = distances(expert, learner, motion, random_motions(learner, 10_000), correspondence, PAPER_WEIGHTS)
@@ -77,7 +77,7 @@ def test_nothing_tried_goes_below(name):
         assert jnp.all(closest.distance <= tried.min(axis=1) + BELOW)
 
 
-def test_reports_the_distance_of_the_motion_it_returns():
+def test_the_bound_is_the_distance_of_the_returned_motion():
     expert, learner = ARMS["panda 7->4"]
     motion, correspondence, closest = solved("panda 7->4")
     candidates = closest.qpos[:, None], closest.qvel[:, None]
@@ -85,14 +85,14 @@ def test_reports_the_distance_of_the_motion_it_returns():
     np.testing.assert_allclose(closest.distance, expected, rtol=1e-4, atol=1e-6)  # float32; fused in another order
 
 
-def test_an_arm_can_do_what_it_does_itself():
+def test_the_bound_of_an_arm_and_itself_is_zero():
     arm = panda()
     motion = demonstration(7)
     bound = kinematic_bound(arm, arm, *motion, overlap_correspondence(arm, arm), PAPER_WEIGHTS, starts=1, iterations=5)
     np.testing.assert_allclose(bound, 0, atol=1e-5)
 
 
-def test_two_links_against_a_grid():
+def test_the_bound_of_two_links_is_that_of_a_grid_search():
     expert, learner = planar_arm([1 / 3] * 3), planar_arm([0.5, 0.5])
     correspondence, weights = overlap_correspondence(expert, learner), DistanceWeights(translation=1.0, rotation=0.5)
     motion = demonstration(3)
@@ -113,8 +113,8 @@ def test_more_starts_change_nothing(name):
     np.testing.assert_allclose(closest.distance, more, rtol=0.005, atol=2e-5)
 
 
-def test_starts_iterations_and_seed_are_those_of_the_search():
-    """After one iteration most of the result is due to where the search starts: more starts get lower, by 3 %."""
+def test_starts_iterations_and_seed_reach_the_search():
+    """After one iteration the result depends on the initial guesses: more of them lower it by 3 %."""
     expert, learner = planar_arm([1 / 4] * 4), planar_arm([1 / 3] * 3)
     # 130 times in no order: one start is no more than one then, and times have little to take from one another.
     qpos = jnp.float32(np.random.default_rng(4).uniform(-np.pi, np.pi, (130, 4)))
@@ -129,7 +129,7 @@ def test_starts_iterations_and_seed_are_those_of_the_search():
 
 
 def searched(expert, learner, qpos, qvel, correspondence, weights, starts=64, iterations=150):
-    """[T] least distance of Adam from many random motions: a plain search that shares nothing with the bound's."""
+    """[T] minimum distance of Adam from many random motions: a search that shares no code with the bound's."""
 
     def descend(states, start):
         optimiser = optax.adam(optax.cosine_decay_schedule(0.1, iterations))
@@ -152,7 +152,7 @@ def searched(expert, learner, qpos, qvel, correspondence, weights, starts=64, it
     return jax.jit(jax.vmap(search))(qpos, qvel)
 
 
-def test_no_search_from_many_motions_goes_below_where_minima_are_many():
+def test_no_longer_search_is_below_the_bound_where_minima_are_many():
     # Sums of minima over pairs: of descents from random poses, few end in the global minimum. Five descents a time,
     # refined with those of the neighbours, miss it by more than 1e-3 at 6 of these 17 steps.
     expert, learner = ARMS["planar 7->4"]
@@ -214,7 +214,7 @@ def test_angles_stay_within_the_joint_range():
     assert np.all((closest.qpos >= lower) & (closest.qpos <= upper))
 
 
-def test_bad_input_is_named(unchecked):
+def test_bad_input_is_rejected(unchecked):
     arm = planar_arm([0.5, 0.5])
     good = jnp.zeros((3, 2))
     bound = functools.partial(

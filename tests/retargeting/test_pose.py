@@ -1,4 +1,4 @@
-"""Pose imitation finds global minima, respects limits, and makes motions that do not jump."""
+"""Retargeted poses are global minima within limits, and retargeted motions do not jump."""
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +45,7 @@ def test_planar_arms_reach_the_closed_form(name):
 
 @pytest.mark.parametrize(("metric", "tolerance"), [("directions", 1e-9), ("default", 1e-6)])
 def test_an_equal_arm_finds_the_pose_itself(metric, tolerance):
-    """Directions count by the square of their error, positions by the error itself: float32 rounds it to 1e-7."""
+    """Distances of directions are quadratic in the error, of positions linear: float32 rounds it to 1e-7."""
     arm, (correspond, weights) = panda(), METRICS[metric]
     found = imitate_pose(arm, arm, poses(arm, 32), correspond(arm, arm), weights)
     assert np.all(found.distance < tolerance) and np.all(found.converged)
@@ -54,7 +54,7 @@ def test_an_equal_arm_finds_the_pose_itself(metric, tolerance):
 @pytest.mark.parametrize("weights", [(0.5, 1.0), pytest.param((2.0, 1.0), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["panda 7->4", pytest.param("panda 7->3", marks=pytest.mark.slow), "planar 7->4"])
 def test_no_descent_of_the_distance_itself_gets_lower(name, weights, dtype):
-    """By SciPy's simplex, which knows no derivative, from where the smoothed distance has its minimum.
+    """By SciPy's simplex, without derivatives, from the minimum of the smoothed distance.
 
     The distance there is above its own minimum by a_tr SMOOTHING at most, where a link matches exactly.
     """
@@ -76,9 +76,9 @@ def test_no_descent_of_the_distance_itself_gets_lower(name, weights, dtype):
 @pytest.mark.parametrize("weights", [(0.5, 1.0), (2.0, 1.0)])
 @pytest.mark.parametrize("name", ["panda 7->4", "panda 7->3", "planar 7->4"])
 def test_the_closed_form_ends_no_higher_than_automatic_derivatives(name, weights):
-    """On the mean of 256 poses: single ones may end in another minimum, or a smoothing higher.
+    """On the mean of 256 poses: single poses may end in another minimum, or higher by the smoothing.
 
-    Weights that are a function of the distances, be it a constant one, have no closed form.
+    Weights given as a function of the distances, even a constant one, have no closed form.
     """
     expert, learner = PAIRS[name]
     qpos, matrix = poses(expert, 256), arc_length_correspondence(expert, learner)
@@ -91,7 +91,7 @@ def test_the_closed_form_ends_no_higher_than_automatic_derivatives(name, weights
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PAIRS)
 def test_the_minimum_is_global(name):
-    """Against 512 random starts with a long descent: within 1e-3, on at least 99.5 % of the poses."""
+    """Against long descents from 512 random initial guesses: within 1e-3 for at least 99.5 % of the poses."""
     expert, learner = PAIRS[name]
     qpos, correspondence = poses(expert, 400, seed=1), overlap_correspondence(expert, learner)
     found = imitate_pose(expert, learner, qpos, correspondence, DIRECTIONS)
@@ -110,7 +110,7 @@ def test_joint_limits_are_kept():
     assert held.any() and np.mean(found.converged) > 0.95
 
 
-def test_distances_are_those_of_the_poses_and_no_nearby_pose_is_nearer():
+def test_distances_belong_to_the_poses_and_no_nearby_pose_is_better():
     expert, learner = PAIRS["panda 7->4"]
     qpos = poses(expert, 8)
     for weights, correspondence, tolerance in (
@@ -132,7 +132,7 @@ def test_distances_are_those_of_the_poses_and_no_nearby_pose_is_nearer():
             assert np.all(batched(qpos, near) > found.distance - tolerance)
 
 
-def test_newton_beats_plain_descent():
+def test_newton_beats_gradient_descent():
     expert, learner = PAIRS["panda 7->4"]
     qpos, correspondence = poses(expert, 32), overlap_correspondence(expert, learner)
     newton, plain = (
@@ -143,7 +143,7 @@ def test_newton_beats_plain_descent():
     assert np.mean(plain.distance - newton.distance) < 1e-2  # the paper's way gets near
 
 
-def test_descents_that_are_given_up_are_not_missed():
+def test_dropped_initial_guesses_are_not_missed():
     expert, learner = PAIRS["planar 7->4"]
     arguments = expert, learner, poses(expert, 64), overlap_correspondence(expert, learner), DIRECTIONS
     few, every = (imitate_pose(*arguments, kept=kept) for kept in (2, None))
@@ -201,7 +201,7 @@ def test_trajectories_do_not_jump(metric, limits):
         (np.zeros(7), {"warm_start": np.zeros(7)}, r"warm_start: expected shape \[..., 4\]"),
     ],
 )
-def test_bad_input_is_refused(qpos, options, message):
+def test_bad_input_is_rejected(qpos, options, message):
     expert, learner = PAIRS["planar 7->4"]
     with pytest.raises(ValueError, match=message):
         imitate_pose(expert, learner, qpos, jnp.ones((7, 4)), DIRECTIONS, **options)

@@ -1,4 +1,4 @@
-"""Baselines for poses do what their closed forms promise, and stay within what the learner can do."""
+"""Baselines for poses reach their closed forms and stay within the limits of the learner."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_shapes_and_dtype(name):
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_bad_poses_are_refused(name):
+def test_bad_poses_are_rejected(name):
     with pytest.raises(ValueError, match=r"expected shape \[\.\.\., time, 7\]"):
         BASELINES[name](PANDA, PANDA, np.zeros(7))
     with pytest.raises(ValueError, match="finite"):
@@ -121,8 +121,8 @@ def test_the_panda_aligns_with_itself():
 
 
 @pytest.mark.parametrize("locked", [(1,), (2,), (3,), (4,), (5,), (6,), (7,), (3, 6, 7), (2, 3, 6, 7), (1, 4)])
-def test_locked_pandas_do_no_worse_than_not_moving_a_part(locked):
-    """Each part, with the joints that orient it put back to the home pose."""
+def test_aligning_a_part_is_no_worse_than_leaving_it_at_home(locked):
+    """Each part, against the pose with the joints that orient it at home."""
     learner = panda(locked=locked)
     qpos = motion(PANDA, 200)
     found = align_segments(PANDA, learner, qpos)
@@ -149,7 +149,7 @@ def test_solutions_within_the_joint_range_come_first():
 
 
 @pytest.mark.parametrize("reachable", [True, False])
-def test_subproblem_2_is_the_least_angle(reachable):
+def test_subproblem_2_minimises_the_angle(reachable):
     """Against a grid over both angles."""
     rng = np.random.default_rng(1)
     first, second, vector, goal = rng.normal(size=(4, 40, 3))
@@ -170,7 +170,7 @@ def test_subproblem_2_is_the_least_angle(reachable):
         assert np.any(best < 0.99)
 
 
-def test_subproblem_1_is_the_least_angle():
+def test_subproblem_1_minimises_the_angle():
     rng = np.random.default_rng(2)
     axis, vector, goal = rng.normal(size=(3, 40, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The closed form of the static measure against automatic differentiation, and what its smoothing costs."""
+"""The closed form of static metrics against automatic differentiation, and the effect of its smoothing."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def learners():
 
 
 def smoothed_distance(expert_states, learner_states, matrix, weights):
-    """The embodiment distance, written down pair by pair, with smoothed lengths."""
+    """The embodiment distance with smoothed lengths, pair by pair."""
 
     def pair(position_a, direction_a, position_b, direction_b):
         square = jnp.sum((position_a - position_b) ** 2)
@@ -87,7 +87,7 @@ def test_arrays_of_weights_and_a_correspondence_known_only_at_run_time():
     np.testing.assert_allclose(jnp.stack(jax.jit(value_and_gradient)(matrix, BOTH)[1]), jnp.stack(known[1]), atol=1e-12)
 
 
-def test_a_match_has_no_slope_and_a_finite_curvature(dtype):
+def test_a_match_has_zero_gradient_and_finite_curvature(dtype):
     """At the kink of the lengths. 1e-4: rounding moves a position by 1e-7 chain lengths, and SMOOTHING is 1e-3."""
     arm = panda()
     closed = pose_objective(arm, Metric(arc_length_correspondence(arm, arm), DEFAULT))
@@ -133,7 +133,7 @@ OVERLAP = overlap_correspondence(panda(), panda())
         (hard_correspondence, DIRECTIONS, "cosine", "mean", False),
     ],
 )
-def test_the_closed_form_is_for_its_measure_alone(correspondence, weights, rotation, reduction, is_closed):
+def test_only_static_metrics_have_the_closed_form(correspondence, weights, rotation, reduction, is_closed):
     arm = panda()
     objective = pose_objective(arm, Metric(correspondence, weights, rotation, reduction))
     states = link_states(arm, jnp.zeros(7))

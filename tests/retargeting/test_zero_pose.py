@@ -20,7 +20,7 @@ METRIC, DIRECTIONS = MetricConfig(), MetricConfig(correspondence="overlap", tran
 
 
 def zero_states(arm):
-    """Without a compiler: of 127 arms it would take minutes."""
+    """Without compilation, which would take minutes for 127 arms."""
     return link_state_table(arm, np.zeros(arm.num_joints), np.zeros(arm.num_joints))
 
 
@@ -45,7 +45,7 @@ def test_the_distance_is_zero_at_the_zero_pose(metric):
 
 
 def test_the_distance_is_not_zero_elsewhere():
-    """What the others claim can fail: merged links, and a joint that is bent."""
+    """The other tests can fail: with merged links, and with a bent joint."""
     expert, merged = panda(), panda(locked=(3, 6, 7), links="merged")
     weights = METRIC.make_weights()
     apart = [(zero_states(expert), zero_states(merged), arc_length_correspondence(expert, merged))]

@@ -1,4 +1,4 @@
-"""Metrics at Weights & Biases and MLflow, beside the files of a run: by modules that only pretend to be them."""
+"""Metrics logged to Weights & Biases and MLflow, which are replaced by fakes."""
 
 import csv
 import sys
@@ -66,7 +66,7 @@ def short_run(run_dir, logger):
     )
 
 
-def test_a_run_logs_what_its_own_files_hold(tmp_path, services):
+def test_loggers_get_the_metrics_of_the_files_of_a_run(tmp_path, services):
     wandb, mlflow = services
     config = short_run(tmp_path / "run", ["local", "wandb", "mlflow"])
     assert train.prepare_training(config, 0.0)() == 0
@@ -81,7 +81,7 @@ def test_a_run_logs_what_its_own_files_hold(tmp_path, services):
     assert mlflow.named("set_experiment") == [{"experiment_name": "mimic"}]
 
 
-def test_a_resumed_run_goes_on_in_the_same_mlflow_run(tmp_path, services):
+def test_a_resumed_run_continues_its_mlflow_run(tmp_path, services):
     _, mlflow = services
     for _ in range(2):
         for logger in make_loggers(["mlflow", "mlflow"], tmp_path, to_dict(short_run(tmp_path, "mlflow"))):
@@ -99,13 +99,13 @@ def test_a_resumed_run_goes_on_in_the_same_mlflow_run(tmp_path, services):
         ("logger=comet", None, "logger: expected one of local, wandb, mlflow, got 'comet'"),
     ],
 )
-def test_what_cannot_log_is_refused(refused, monkeypatch, argument, missing, message):
+def test_a_logger_without_its_package_is_rejected(rejected, monkeypatch, argument, missing, message):
     if missing:
         monkeypatch.setitem(sys.modules, missing, None)
-    assert message in refused("train", "env=planar4dof", argument)
+    assert message in rejected("train", "env=planar4dof", argument)
 
 
-def test_mlflow_must_be_told_where_to_write(refused, services, monkeypatch):
+def test_mlflow_needs_a_tracking_uri(rejected, services, monkeypatch):
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
-    message = refused("train", "env=planar4dof", "logger=mlflow")
+    message = rejected("train", "env=planar4dof", "logger=mlflow")
     assert "expected MLFLOW_TRACKING_URI in the environment" in message

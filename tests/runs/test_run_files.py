@@ -1,4 +1,4 @@
-"""What a run directory holds."""
+"""The report and the metrics file of a run directory."""
 
 import csv
 import json
@@ -15,7 +15,7 @@ def test_a_report_is_json_even_after_a_divergence(tmp_path):
 
 
 def test_metrics_of_another_version_keep_their_columns(tmp_path):
-    """A run that another version began goes on with columns of its own."""
+    """A run of another version continues with the columns of this one."""
     (tmp_path / "metrics.csv").write_text("step,old,wall_time_s\n1,0.5,2.0\n")
     log = MetricsLog(tmp_path)
     for step in (2, 3):

@@ -1,4 +1,4 @@
-"""Sweeps: which runs, where they run, what a failed one and a signal do to the others."""
+"""Sweeps: their runs and launchers, failed runs, and signals."""
 
 import json
 import os
@@ -96,21 +96,21 @@ def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
         (["-m", "hydra/launcher=submitit_local", "hydra.launcher.parallel=0"], "parallel: expected at least 1, got 0"),
     ],
 )
-def test_bad_sweeps_leave_nothing_behind(refused, arguments, message):
-    assert message in refused("train", *arguments)
+def test_bad_sweeps_write_nothing(rejected, arguments, message):
+    assert message in rejected("train", *arguments)
 
 
-def test_slurm_and_packages_that_are_not_there(refused, monkeypatch):
+def test_missing_slurm_and_packages_are_reported(rejected, monkeypatch):
     monkeypatch.setenv("PATH", "")
-    assert "expected a machine with Slurm's sbatch" in refused("train", "-m", "hydra/launcher=submitit_slurm")
+    assert "expected a machine with Slurm's sbatch" in rejected("train", "-m", "hydra/launcher=submitit_slurm")
     monkeypatch.setitem(sys.modules, "ray", None)
     os.rmdir(os.getcwd())
-    assert "needs the package ray: pip install 'mimic-mjx[ray]'" in refused("train", "-m", "hydra/launcher=ray")
+    assert "needs the package ray: pip install 'mimic-mjx[ray]'" in rejected("train", "-m", "hydra/launcher=ray")
 
 
-def test_a_folder_takes_one_sweep(refused, tmp_path):
+def test_a_folder_takes_one_sweep(rejected, tmp_path):
     (tmp_path / "sweep.json").write_text("{}")
-    assert "has a sweep already" in refused("train", "-m", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
+    assert "has a sweep already" in rejected("train", "-m", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
 
 
 @pytest.mark.parametrize("path", ["runs/a-b.c", "my runs/it's, a=b", "~/x"])
@@ -124,7 +124,7 @@ def test_any_path_is_an_override(path):
 
 @pytest.fixture
 def program(tmp_path):
-    """Makes a run of a program in place of the command."""
+    """Makes a run of a program instead of the command."""
 
     def make(text, **more):
         (tmp_path / "program.py").write_text(text)
@@ -163,7 +163,7 @@ def after_begin(folder, act):
         ("raise SystemExit(143)", 143, "stopped by SIGTERM; continue with: python -m program resume=run"),
     ],
 )
-def test_what_became_of_a_run(program, text, exit_code, reason):
+def test_the_outcome_of_a_run_is_reported(program, text, exit_code, reason):
     outcome = program(text, run_dir="run")()
     assert (outcome.exit_code, outcome.reason) == (exit_code, reason)
 
@@ -180,8 +180,8 @@ def test_sigterm_is_passed_on(program, tmp_path):
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
-def test_a_time_limit_stops_a_run_and_lets_it_go_on(program, tmp_path):
-    """As submitit does: its handler asks for what to queue again, then ends the process."""
+def test_a_time_limit_stops_a_run_that_can_be_resumed(program, tmp_path):
+    """As in submitit, whose handler asks for the job to queue again, then ends the process."""
     run = program(WAITS, run_dir="run")
     (tmp_path / "run").mkdir()
     queued = []
@@ -213,7 +213,7 @@ def test_each_slot_has_gpus_of_its_own():
 
 @pytest.fixture
 def sweep(tmp_path, monkeypatch):
-    """A function that sweeps a command over folders, whose work is a function of the folder's name; its exit code."""
+    """A function that sweeps a command over folders and returns the exit code; `work` takes a folder's name."""
     monkeypatch.chdir(tmp_path)
 
     def run(work, *folders):

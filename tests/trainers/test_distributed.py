@@ -1,4 +1,4 @@
-"""Training over several processes: one run directory, and none is left behind however it ends."""
+"""Training over several processes: one run directory, and no process left running however it ends."""
 
 import contextlib
 import json
@@ -26,7 +26,7 @@ LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with ma
 
 
 def start(tmp_path, *arguments, slurm=False):
-    """Two processes of one training, each with a processor of its own as its device."""
+    """Starts two processes of one training, each with its own CPU device."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -48,7 +48,7 @@ def start(tmp_path, *arguments, slurm=False):
 
 
 def finish(processes):
-    """Exit code and output of each; none may hang."""
+    """Exit code and output of each process; none may hang."""
     try:
         outputs = [process.communicate(timeout=280)[0] for process in processes]
     finally:
@@ -58,7 +58,7 @@ def finish(processes):
 
 
 @pytest.mark.slow
-def test_two_processes_make_one_run_that_another_number_goes_on_with(tmp_path):
+def test_two_processes_make_one_run_that_one_process_continues(tmp_path):
     (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run"))
     assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
     report = json.loads((tmp_path / "run" / "report.json").read_text())
@@ -75,14 +75,14 @@ def test_two_processes_make_one_run_that_another_number_goes_on_with(tmp_path):
 
 
 @pytest.mark.slow
-def test_slurm_tells_all_that_is_needed(tmp_path):
+def test_the_variables_of_slurm_are_enough(tmp_path):
     (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run", "trainer.evaluations=1", slurm=True))
     assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
     assert json.loads((tmp_path / "run" / "report.json").read_text())["hardware"]["processes"] == 2
 
 
 def alone(tmp_path, *arguments):
-    """One command, that starts the other process by itself."""
+    """One command that starts the other process itself."""
     command = [sys.executable, "-m", "mimic.train", *FUSED, "distributed.coordinator=local", *arguments]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     return subprocess.Popen(
@@ -98,7 +98,7 @@ def wait_for_checkpoint(tmp_path, processes):
 
 
 def started_by(process):
-    """Numbers of the other processes of the training that it started and that are there."""
+    """Ids of the running processes of the training that it started."""
     children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     told = {child: pathlib.Path(f"/proc/{child}/environ") for child in children}
     return [int(child) for child, given in told.items() if given.exists() and b"MIMIC_LOCAL" in given.read_bytes()]
@@ -137,7 +137,7 @@ def test_ctrl_c_ends_all_that_one_command_started(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("early", [False, True])
 def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path, early):
-    """Early: before they have found each other."""
+    """Early: before they are connected."""
     process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
     if not early:
         wait_for_checkpoint(tmp_path, [process])
@@ -153,7 +153,7 @@ def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path, early):
 
 
 @pytest.mark.slow
-def test_what_both_processes_refuse_is_one_line(tmp_path):
+def test_input_that_both_processes_reject_is_one_line(tmp_path):
     process = alone(tmp_path, "distributed.processes=3", "run_dir=run")
     ((code, shown),) = finish([process])
     assert code == 2 and shown.count("expected a multiple of") == 1, shown
@@ -184,7 +184,7 @@ def test_a_process_that_was_not_started_is_the_first(monkeypatch):
     assert local_process() is None
 
 
-def test_a_process_without_its_first_ends(monkeypatch):
+def test_a_process_ends_with_the_first_one(monkeypatch):
     monkeypatch.setattr(sys, "platform", "none")  # this process goes on
     monkeypatch.setenv("MIMIC_LOCAL_PROCESS", "127.0.0.1:1 2 1 1")
     monkeypatch.setattr(os, "getppid", lambda: 2)
@@ -231,7 +231,7 @@ def test_a_signal_to_one_process_stops_all_after_a_checkpoint(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_process_that_is_refused_ends_the_others(tmp_path):
+def test_a_process_with_bad_input_ends_the_others(tmp_path):
     (tmp_path / "run").mkdir()
     (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run"))
     assert first == 2 and "'run' exists" in shown
@@ -239,7 +239,7 @@ def test_a_process_that_is_refused_ends_the_others(tmp_path):
 
 
 def test_the_page_shows_settings_that_exist():
-    """Every override on it, with any value, is a key of the command."""
+    """Every override on the page is a key of the command."""
     page = (REPOSITORY / "docs" / "scaling.md").read_text()
     keys = set(re.findall(r"\b((?:trainer|distributed|env)\.\w+)=", page))
     config = run_schema("ppo")
@@ -263,17 +263,17 @@ def test_the_page_shows_settings_that_exist():
         ({"coordinator": "local", "processes": 0}, "distributed.processes: expected at least 1, got 0"),
     ],
 )
-def test_nonsense_is_refused(settings, reason):
+def test_bad_settings_are_rejected(settings, reason):
     with pytest.raises(ValueError, match=reason):
         DistributedConfig(**settings)
 
 
-def test_a_refusal_is_one_line(refused):
+def test_bad_settings_are_one_line(rejected):
     number = ["distributed.processes=2", "distributed.process=2"]
-    assert "expected 0 to 1, got 2" in refused("train", "distributed.coordinator=localhost:1", *number)
+    assert "expected 0 to 1, got 2" in rejected("train", "distributed.coordinator=localhost:1", *number)
 
 
-def test_a_sweep_in_step_is_refused(tmp_path):
+def test_a_distributed_sweep_is_rejected(tmp_path):
     alone = ["distributed.coordinator=localhost:1", "distributed.processes=1", "distributed.process=0"]
     command = [sys.executable, "-m", "mimic.train", "-m", *alone, "seed=0,1"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False, cwd=tmp_path)

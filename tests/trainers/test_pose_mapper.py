@@ -1,4 +1,4 @@
-"""The pose mapper: what it learns, keeps, repeats and refuses."""
+"""The pose mapper: training, resuming, loading, and bad input."""
 
 import json
 from typing import Any
@@ -52,7 +52,7 @@ def poses(mapper, count, seed=0):
 
 
 def test_it_learns(trained):
-    """A small network, a third of a million poses; the preset gets below 0.1 %."""
+    """A small network and a third of a million poses; the preset gets below 0.1 %."""
     run_dir, report = trained
     assert report.keys() >= REPORT_KEYS
     assert report["quality"]["held_out"] < 0.05
@@ -109,11 +109,11 @@ def test_retargeted_motions_do_not_jump(trained, tmp_path):
     assert optimised["distance"] < mapped["distance"] < optimised["distance"] + 0.05
 
 
-def test_resume_goes_on(tmp_path):
+def test_resume_continues(tmp_path):
     run_dir = tmp_path / "run"
     short = train(run_dir, epochs=4)
     config = TrainConfig(resume=str(run_dir), compilation_cache="")
-    with pytest.raises(ValueError, match="give a larger trainer.epochs"):
+    with pytest.raises(ValueError, match="increase trainer.epochs"):
         session.prepare_training(config, 0.0)
     assert session.prepare_training(config, 0.0, [f"resume={run_dir}", "trainer.epochs=8"])() == 0
     report = json.loads((run_dir / "report.json").read_text())
@@ -136,7 +136,7 @@ def test_the_paper_overfits_and_early_stopping_goes_back_to_the_best(tmp_path):
     assert max(steps) == int(best[0]) == report["training_poses"]
 
 
-def test_what_is_judged_is_not_what_is_learned(tmp_path):
+def test_evaluation_poses_are_not_training_poses(tmp_path):
     jobs = [PoseMapperTrainer(run_config(tmp_path, seed=seed)) for seed in (0, 1)]
     for job in jobs:
         seen = np.asarray(job._poses["train"])
@@ -170,7 +170,7 @@ def test_weights_decay_and_biases_do_not():
         np.testing.assert_allclose(value, expected, rtol=1e-6)  # float32
 
 
-def test_units_are_dropped_in_training_alone():
+def test_dropout_is_for_training_only():
     models = [
         make_model(env_config("planar4dof"), PoseMapperConfig(**SMALL, dropout=dropout).resolve())
         for dropout in (0.0, 0.5)
@@ -221,12 +221,12 @@ def test_bad_regularisation_is_rejected(settings, message):
     ],
 )
 @pytest.mark.usefixtures("unchecked")
-def test_bad_poses_are_refused(trained, qpos, message):
+def test_bad_poses_are_rejected(trained, qpos, message):
     with pytest.raises(ValueError, match=message):
         mimic.PoseMapper.load(trained[0])(qpos)
 
 
-def test_a_mapper_of_other_arms_or_of_no_run_is_refused(trained, tmp_path):
+def test_a_mapper_of_other_arms_or_of_no_run_is_rejected(trained, tmp_path):
     mapper = mimic.PoseMapper.load(trained[0])
     mapper.check_fits(mapper.expert, mapper.learner)
     with pytest.raises(ValueError, match="its learner is planar4"):

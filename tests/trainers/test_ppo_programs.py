@@ -1,4 +1,4 @@
-"""The programs of the training: what they collect, and what they learn from."""
+"""The compiled functions of PPO: the transitions that they collect, and the loss."""
 
 import dataclasses
 import os
@@ -25,7 +25,7 @@ _SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
 
 @pytest.fixture(scope="module")
 def one_batch():
-    """Before and after a batch, with a loss that changes nothing and tells what it was shown, as seen along `along`."""
+    """States before and after a batch; a loss without gradient records its observations, projected on `along`."""
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
     config = PPOConfig(
         num_envs=ARMS, unroll_length=1, batch_size=UNROLLS * ARMS // 2, num_minibatches=2, num_updates_per_batch=PASSES,
@@ -53,14 +53,14 @@ def one_batch():
     return before, after, shown, along
 
 
-def test_each_pass_shows_the_loss_each_transition(one_batch):
+def test_each_pass_uses_each_transition(one_batch):
     _, after, shown, along = one_batch
     assert int(after.statistics.count.lo) == UNROLLS * ARMS
     assert shown["now"] == pytest.approx(along @ after.statistics.mean, abs=1e-5)
 
 
-def test_what_is_seen_next_belongs_to_its_transition(one_batch):
-    """Of unrolls of one step, what follows the first is what the second begins with."""
+def test_the_next_observation_belongs_to_its_transition(one_batch):
+    """In unrolls of one step, the next observation of the first is the first one of the second."""
     before, after, shown, along = one_batch
     seen = UNROLLS * ARMS * after.statistics.mean - before.episodes.obs.sum(0) + after.episodes.obs.sum(0)
     assert shown["next"] == pytest.approx(along @ seen / (UNROLLS * ARMS), abs=1e-5)
@@ -76,7 +76,7 @@ def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
 
 @pytest.mark.parametrize(("time", "entropy_cost"), [(7, 0.0), (40, 0.0), (1, 0.3)])
 def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
-    """The entropy is that of a sample, whose numbers are drawn in the same order for one step alone."""
+    """The entropy is that of a sample, drawn in the same order only for unrolls of one step."""
     sizes, unrolls = (5, 3), 6
     config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), entropy_cost=entropy_cost)
     networks = training.make_networks(config, *sizes)
@@ -184,14 +184,14 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
         return jax.device_get(state.params)
 
     constant, decayed = {"entropy_cost": 0.2}, {"entropy_cost": 0.2, "final_entropy_cost": 0.0}
-    rounding = {"rtol": 1e-5, "atol": 1e-7}  # other programs, in float32
+    rounding = {"rtol": 1e-5, "atol": 1e-7}  # other compiled functions, in float32
     jax.tree.map(lambda *x: np.testing.assert_allclose(*x, **rounding), after(1, **constant), after(1, **decayed))
     policies = after(2, **constant)[1], after(2, **decayed)[1]
     apart = jax.tree.map(lambda *x: float(np.abs(x[0] - x[1]).max()), *policies)
     assert max(jax.tree.leaves(apart)) > 1e-4  # Adam moves by 1e-3 an update, whatever the gradient's size
 
 
-def test_both_programs_are_compiled_with_the_options_of_a_run(monkeypatch):
+def test_both_functions_are_compiled_with_the_options_of_a_run(monkeypatch):
     monkeypatch.setattr(programs, "compiler_options", lambda: {"no_option_of_xla": True})
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
@@ -203,8 +203,8 @@ def test_both_programs_are_compiled_with_the_options_of_a_run(monkeypatch):
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("physics", ["fused", "mjx"])
-def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):
-    """To the bit, where XLA picks the same matrix products and adds in the same order."""
+def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypatch):
+    """Bit for bit, where XLA picks the same matrix products and order of sums."""
     env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
     config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)

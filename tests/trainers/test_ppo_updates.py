@@ -1,4 +1,4 @@
-"""PPO's updates of policy and value, over devices that JAX makes of one."""
+"""PPO's updates of policy and value, over several simulated devices."""
 
 import dataclasses
 import functools
@@ -21,7 +21,7 @@ SIZES = OBSERVED, ACTIONS = 5, 2
 
 @dataclasses.dataclass
 class Case:
-    """What there is to learn from, and with what; of each array the first axis is the devices."""
+    """Data and settings of updates; the first axis of each array is the device."""
 
     config: PPOSettings
     unrolls: Unrolls
@@ -34,14 +34,14 @@ class Case:
         self.optimizer = optax.adam(0.01)
 
     def on_device(self, staggered, unroll, unrolls, order, key):
-        """By mimic: policy and value, metrics."""
+        """Policy, value and metrics by mimic."""
         policy, value = (updates.begin(params, self.optimizer) for params in self.params)
         of_run = self.networks, self.config, self.optimizer
         config = updates.UpdateConfig(*of_run, axis="devices", staggered=staggered, unroll=unroll)
         return updates.updated((policy, value), self.statistics, unrolls, order, key, config)
 
     def expected(self):
-        """One update after the other, array by array, the means over the devices by hand."""
+        """The expected result: one update after the other, with means over the devices."""
         params = list(self.params)
         states = [self.optimizer.init(network) for network in params]
         metrics = []
@@ -83,7 +83,7 @@ def case(x64):
 
 
 @pytest.mark.parametrize(("staggered", "unroll"), [(False, 1), (True, 1), (True, 2)])
-def test_updates_are_those_of_each_minibatch_in_turn(case, staggered, unroll):
+def test_updates_equal_those_of_each_minibatch_in_turn(case, staggered, unroll):
     on_all = jax.jit(jax.vmap(functools.partial(case.on_device, staggered, unroll), axis_name="devices"))
     learners, metrics = on_all(case.unrolls, case.order, case.keys)
     params, expected_metrics = case.expected()
@@ -96,8 +96,8 @@ def test_updates_are_those_of_each_minibatch_in_turn(case, staggered, unroll):
         assert set(np.ravel(learner.optimizer[0].count)) == {UPDATES}
 
 
-def test_each_message_waits_for_the_one_before(case, monkeypatch):
-    """Else NCCL could get two at once, on each GPU in an order of its own."""
+def test_each_all_reduce_waits_for_the_one_before(case, monkeypatch):
+    """Else NCCL could get two in parallel, in a different order on each GPU."""
     scan = jax.lax.scan
 
     def in_a_row(body, carry, inputs, **how):

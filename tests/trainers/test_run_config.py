@@ -1,4 +1,4 @@
-"""The config of a run directory, as it is read again."""
+"""The config of a run directory, loaded again."""
 
 import pytest
 from omegaconf import OmegaConf
@@ -17,7 +17,7 @@ from tests.helpers.run_directories import write_run
         (None, ("merged", "chord_overlap", 0.0)),
     ],
 )
-def test_a_run_from_before_links_were_kept_has_the_metric_of_its_time(tmp_path, saved, expected):
+def test_a_run_with_merged_links_keeps_its_metric(tmp_path, saved, expected):
     run_dir = write_run(tmp_path / "run", [0.1], env="panda4dof")
     content = OmegaConf.to_container(OmegaConf.load(run_dir / CONFIG))
     assert isinstance(content, dict)
@@ -27,6 +27,6 @@ def test_a_run_from_before_links_were_kept_has_the_metric_of_its_time(tmp_path, 
     assert (metric.links, metric.correspondence, metric.translation) == expected
 
 
-def test_a_run_of_today_keeps_its_metric(tmp_path):
+def test_a_new_run_keeps_its_metric(tmp_path):
     metric = load_config(write_run(tmp_path / "run", [0.1], env="panda4dof")).env.metric
     assert metric == MetricConfig() and metric.links == "kept"

@@ -1,4 +1,4 @@
-"""The live view in a headless browser: a slider moves, the learner follows, the numbers change, nothing fails."""
+"""The live view in a headless browser: sliders, playback, and no errors in the console."""
 
 import importlib.util
 import io
@@ -33,7 +33,7 @@ pytestmark = [
 
 @pytest.fixture
 def page():
-    """A page of a headless browser, and what it complained about."""
+    """A page of a headless browser, and the errors in its console."""
     from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
 
     complaints = []
@@ -49,7 +49,7 @@ def page():
 
 @pytest.fixture
 def serve():
-    """A function that starts the view with arguments and returns its address; it must end well."""
+    """A function that starts the view and returns its address; the view must end with exit code 0."""
     started = []
 
     def start(*arguments):
@@ -132,7 +132,7 @@ def test_a_slider_moves_and_the_learner_follows(page, serve, tmp_path):
 
 
 def settled(page):
-    """The distance on the page, once it has been the same for two seconds; a busy machine draws a frame a second."""
+    """The distance on the page once it has not changed for two seconds; a busy machine draws one frame a second."""
     until = time.monotonic() + LATEST / 1000
     shown, since = page.inner_text("#mimic-distance"), time.monotonic()
     while time.monotonic() - since < 2:

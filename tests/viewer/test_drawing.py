@@ -1,4 +1,4 @@
-"""What the live view draws: shapes of an arm, and numbers, heat maps and curves."""
+"""Drawings of the live view: meshes of an arm, numbers, heat maps and charts."""
 
 import mujoco
 import numpy as np
@@ -10,7 +10,7 @@ from mimic.viewer import html
 from mimic.viewer.meshes import ArmShape, places
 
 
-def test_shapes_stand_where_mujoco_puts_them():
+def test_meshes_are_placed_as_in_mujoco():
     shape = ArmShape(env_config("panda4dof").learner)
     angles = dict.fromkeys(shape.joint_names, 0.0) | {"joint2": 0.7, "joint4": -1.2}
     model = mujoco.MjModel.from_xml_path(str(mimic.arms.embodiment.panda_path()))
@@ -50,7 +50,7 @@ def test_every_kind_of_geom_has_triangles_of_its_size(tmp_path):
         np.testing.assert_allclose(np.ptp(part.vertices, axis=0), extent, rtol=0.02)  # facets of round shapes
 
 
-def test_drawings_hold_their_numbers():
+def test_drawings_contain_their_numbers():
     table = html.heat_maps(np.eye(2), np.array([[0.25, 3.0], [0, 1]]), ["link1", "<b>"], ["link1+link2", "tip"])
     assert all(text in table for text in (">1.00<", ">0.25<", ">3.00<", ">1+2<", "&lt;b&gt;")) and "<b>" not in table
     assert ">0.1235<" in html.numbers(0.12345, 0.1) and "…" in html.numbers(0.1, float("nan"))
@@ -65,7 +65,7 @@ def test_drawings_hold_their_numbers():
     assert ">0.000<" in level and ">0.005<" in level and ">0.010<" in level  # three different ones
 
 
-def test_the_chart_is_level_while_the_arms_rest(monkeypatch):
+def test_the_chart_is_flat_while_the_arms_rest(monkeypatch):
     from mimic.commands import view
     from mimic.viewer.history import History
     from mimic.viewer.live_session import Frame

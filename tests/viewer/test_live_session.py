@@ -1,4 +1,4 @@
-"""The live view without a browser: what moves, what is shown of it, and what is refused."""
+"""The session of the live view, without a browser: motion, values, and settings."""
 
 import dataclasses
 import time
@@ -27,7 +27,7 @@ def env():
 
 @pytest.fixture
 def live(env, compiled):
-    """A fresh session that shares compiled programs with the others."""
+    """A new session that shares compiled functions with the other tests."""
     session = LiveSession(env)
     session._functions = compiled
     return session
@@ -41,7 +41,7 @@ def compiled(env):
 
 
 def settle(session, seconds=6.0):
-    """The last frame before everything rests."""
+    """The last frame before the arms come to rest."""
     frame = None
     for _ in range(int(seconds / TICK)):
         after = session.advance(TICK)
@@ -74,7 +74,7 @@ def test_what_is_shown_is_the_metric(live, env):
     distance = mimic.embodiment_distance(
         expert_states, learner_states, matrix, mimic.DistanceWeights(translation=1.0, rotation=1.0)
     )
-    np.testing.assert_allclose(frame.distance, distance, atol=1e-5)  # float32 of two programs
+    np.testing.assert_allclose(frame.distance, distance, atol=1e-5)  # float32 of two functions
     np.testing.assert_allclose(frame.matrix, matrix, atol=1e-6)
     np.testing.assert_allclose((frame.matrix * frame.links).mean(), distance, atol=1e-5)
     assert frame.expert_links == expert.link_names and frame.learner_links == learner.link_names
@@ -151,11 +151,11 @@ def test_a_trained_mapper_moves_the_learner(tmp_path):
     session.compile()
     session.move(2, 0.7)
     frame = settle(session)
-    np.testing.assert_allclose(list(frame.learner.values()), mapper(session.pose), atol=1e-4)  # float32, two programs
+    np.testing.assert_allclose(list(frame.learner.values()), mapper(session.pose), atol=1e-4)  # float32, two functions
     assert frame.bound < frame.distance  # it has hardly learned anything
 
 
-def test_locking_the_last_joint_is_refused_and_undone():
+def test_locking_the_last_joint_is_rejected_and_undone():
     session = LiveSession(env_config("planar4dof"))
     before = session.settings
     session.change(locked=("joint1", "joint2", "joint3", "joint4"))
@@ -174,7 +174,7 @@ def test_settings_that_differ_only_in_weights_share_functions(env):
         Settings((), "none", 0.0, 1.0)
 
 
-def test_a_joint_goes_the_short_way_round():
+def test_a_joint_takes_the_shorter_way_around():
     arm = mimic.panda()
     pose, is_there = step_towards(arm, np.full(7, 3.1), np.full(7, -3.1), np.full(7, 0.05))
     np.testing.assert_allclose(pose, 3.15 - 2 * np.pi)
@@ -183,7 +183,7 @@ def test_a_joint_goes_the_short_way_round():
 
 
 def test_an_update_is_quick(live):
-    """Twenty a second are needed; on two CPU cores it takes 2 ms, so that the bound holds on a busy machine too."""
+    """The view needs 20 a second; two CPU cores take 2 ms for one, so that the limit holds on a busy machine too."""
     shape, seconds = ArmShape(ArmConfig()), []
     settle(live)
     for step in range(60):
