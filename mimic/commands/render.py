@@ -29,6 +29,7 @@ from mimic.evaluation.labels import similarity_texts  # noqa: E402
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760  # pixels, width of the arms' picture
 _GIF_EVERY, _GIF_SCALE = 3, 0.5
+_LEGEND_ROOM = 1.25  # of the largest distance, above which the legend stands
 
 Bounds = tuple[float, float, float, float]  # left, bottom, width, height as fractions of the frame
 
@@ -125,8 +126,11 @@ def _add_curves(figure: Figure, bounds: Bounds, clip: Clip) -> Any:
     for curve in clip.curves:
         axes.plot(clip.curve_time, curve.values, label=curve.label, **curve.style)
     now = axes.axvline(0, color="tab:red", lw=1)
-    axes.set(xlabel="time [s]", title="embodiment distance", ylim=(0, None), xlim=(0, clip.curve_time[-1]))
-    axes.legend(fontsize="small", loc="best")  # where it hides the curves least
+    top = _LEGEND_ROOM * max(float(np.nanmax(curve.values)) for curve in clip.curves)
+    axes.set(xlabel="time [s]", title="embodiment distance", ylim=(0, top), xlim=(0, clip.curve_time[-1]))
+    axes.legend(
+        fontsize=8, loc="upper center", ncols=len(clip.curves), handlelength=1.5, columnspacing=1.2, frameon=False
+    )
     axes.grid(alpha=0.3)
     return now
 
