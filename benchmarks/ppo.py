@@ -1,53 +1,56 @@
-"""Environment steps per second with learning: PPO on our environments, on a stock one, and as the paper had it.
+"""Environment steps per second with learning: PPO on our environments, on a stock one, and as in the paper.
 
     python -m benchmarks.ppo --out FILE [--env panda4dof] [--only CASE ...] [--num-envs N]
 
 PPO as `mimic.train` runs it, with the settings of the preset, on the environment with the physics `fused` and `mjx`;
 brax's own training loop on the same environment, and on the same task as brax and MuJoCo Playground environments
-usually have it: `mjx.Data` carried, brax's own wrappers. Beside them PPO of stable-baselines3 on C MuJoCo on the
-processor, where it is installed: the same networks and as many minibatches and passes, with an arm for each core. A
-training goes on for some stretches; the speed is the median of all but the first, which compiles, with the quartiles as
-spread.
+usually implement it, with `mjx.Data` carried and brax's own wrappers. PPO of stable-baselines3 runs on C MuJoCo on the
+CPU, where it is installed, with the same networks, minibatches and passes, and an arm for each core. A training is a
+number of epochs; the speed is the median of all but the first, which compiles, with the quartiles as spread.
 """
 
-import argparse
 import functools
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
-import matplotlib
+import numpy as np
+import optax
+from brax.envs.base import Env
+from brax.training.agents.ppo import train as brax_ppo
+from brax.training.agents.ppo.networks import make_ppo_networks
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-import optax  # noqa: E402
-from brax.envs.base import Env  # noqa: E402
-from brax.training.agents.ppo import train as brax_ppo  # noqa: E402
-from brax.training.agents.ppo.networks import make_ppo_networks  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.table import Table  # noqa: E402
+import mimic
+from benchmarks.common.parser import BenchmarkParser
+from benchmarks.common.record import Results, Row, failure, print_table
+from benchmarks.peers import stock
+from mimic import compat
+from mimic.envs.imitation import ImitationEnv
+from mimic.envs.wrappers import wrap_for_training
+from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo import training
+from mimic.trainers.ppo.programs import make_programs
 
-import mimic  # noqa: E402
-from benchmarks import stock  # noqa: E402
-from benchmarks.record import write_results  # noqa: E402
-from mimic import compat  # noqa: E402
-from mimic.envs.imitation import ImitationEnv  # noqa: E402
-from mimic.envs.wrappers import wrap_for_training  # noqa: E402
-from mimic.trainers.config import PPOConfig  # noqa: E402
-from mimic.trainers.ppo import training  # noqa: E402
-from mimic.trainers.ppo.programs import make_programs  # noqa: E402
+STABLE_BASELINES = "stable-baselines3, C MuJoCo"
+EPOCHS = 6  # the first compiles
+SETTINGS = (  # that brax's PPO has under the same names
+    "num_envs", "learning_rate", "entropy_cost", "discounting", "unroll_length", "batch_size", "num_minibatches",
+    "num_updates_per_batch", "reward_scaling", "clipping_epsilon", "gae_lambda", "max_grad_norm",
+)  # fmt: skip
+COLUMNS = {
+    "env": "{env}",
+    "PPO on": "{case}",
+    "env steps/s": "{steps_per_s:,.0f}",
+    "spread": "{spread:.1%}",
+    "compile [s]": "{compile_s:.1f}",
+}
 
-ON_PROCESSOR = "stable-baselines3, C MuJoCo"
-_STRETCHES = 6  # the first compiles
-
-Case = Callable[[str, PPOConfig, int], dict[str, float]]
+Case = Callable[[str, PPOConfig, int], dict[str, float]]  # environment, settings, batches of an epoch -> rates
 
 
 def rates(steps: int, seconds: Sequence[float]) -> dict[str, float]:
-    """Speed of stretches of as many steps: median and spread (quartiles) without the first, and what that compiled."""
+    """Speed of epochs of so many steps: median and spread (quartiles) without the first, and how long that compiled."""
     later = np.asarray(seconds[1:])
     low, median, high = np.quantile(steps / later, [0.25, 0.5, 0.75])
     return {
@@ -57,167 +60,108 @@ def rates(steps: int, seconds: Sequence[float]) -> dict[str, float]:
     }
 
 
-def learn(env: ImitationEnv, config: PPOConfig, batches: int) -> dict[str, float]:
-    """PPO as `mimic.train` runs it, in stretches of so many batches."""
+def settings(config: PPOConfig) -> dict[str, Any]:
+    """The settings of a resolved config that all implementations share."""
+    return {name: getattr(config, name) for name in SETTINGS}
+
+
+def training_epoch(env: ImitationEnv, config: PPOConfig, batches: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The compiled functions of `mimic.train` that begin a training, and that train for so many batches."""
     networks = training.make_networks(config, env.observation_size, env.action_size)
     schedule = optax.constant_schedule(config.learning_rate)  # type: ignore[arg-type]
-    seconds: list[float] = []
-    began = time.perf_counter()
-    begin, program = make_programs(env, config, networks, batches, schedule, None)
-    learning = begin()(0)
-    for _ in range(_STRETCHES):
-        learning, metrics = program()(learning)
-        jax.block_until_ready(metrics)
-        seconds.append(time.perf_counter() - began)
-        began = time.perf_counter()
-    return rates(batches * config.steps_per_batch, seconds)
+    return make_programs(env, config, networks, batches, schedule, None)
 
 
-def learn_by_brax(
-    env: Env, wrap: Callable[..., Env], horizon: int, config: PPOConfig, batches: int
-) -> dict[str, float]:
-    """Brax's own training loop, in stretches of so many batches."""
-    compat.mend_brax()
-    seconds: list[float] = []
-    steps = batches * config.steps_per_batch
-    began = [time.perf_counter()]
+def mimic_loop(physics: str) -> Case:
+    """PPO as `mimic.train` runs it."""
 
-    def on_stretch(*_: Any) -> None:
-        seconds.append(time.perf_counter() - began[0])
-        began[0] = time.perf_counter()
+    def case(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+        env = mimic.make(name, physics=physics)
+        times = [time.perf_counter()]
+        begin, epoch = training_epoch(env, config, batches)
+        state = begin()(0)
+        for _ in range(EPOCHS):
+            state, metrics = epoch()(state)
+            jax.block_until_ready(metrics)
+            times.append(time.perf_counter())
+        return rates(batches * config.steps_per_batch, np.diff(times).tolist())
 
-    brax_ppo.train(
-        environment=env,
-        num_timesteps=_STRETCHES * steps,
-        episode_length=horizon + 1,
-        wrap_env_fn=wrap,
-        num_eval_envs=1,
-        num_evals=_STRETCHES + 1,
-        run_evals=False,
-        normalize_observations=True,
-        progress_fn=on_stretch,
-        network_factory=_brax_networks(config),
-        **settings(config),
-    )
-    return rates(steps, seconds)
+    return case
 
 
-def settings(config: PPOConfig) -> dict[str, Any]:
-    """Of a resolved config, under brax's names."""
-    return {
-        "num_envs": config.num_envs,
-        "learning_rate": config.learning_rate,
-        "entropy_cost": config.entropy_cost,
-        "discounting": config.discounting,
-        "unroll_length": config.unroll_length,
-        "batch_size": config.batch_size,
-        "num_minibatches": config.num_minibatches,
-        "num_updates_per_batch": config.num_updates_per_batch,
-        "reward_scaling": config.reward_scaling,
-        "clipping_epsilon": config.clipping_epsilon,
-        "gae_lambda": config.gae_lambda,
-        "max_grad_norm": config.max_grad_norm,
-    }
+def brax_loop(physics: str, make: Callable[[Any], tuple[Env, Callable[..., Env]]]) -> Case:
+    """Brax's own training loop, on an environment and with the wrappers that `make` returns."""
+
+    def case(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+        compat.mend_brax()
+        imitation = mimic.make(name, physics=physics)
+        env, wrap = make(imitation)
+        hidden = tuple(config.hidden_layers or ())
+        times = [time.perf_counter()]
+        brax_ppo.train(
+            environment=env,
+            num_timesteps=EPOCHS * batches * config.steps_per_batch,
+            episode_length=imitation.config.horizon + 1,
+            wrap_env_fn=wrap,
+            num_eval_envs=1,
+            num_evals=EPOCHS + 1,
+            run_evals=False,
+            normalize_observations=True,
+            progress_fn=lambda *_: times.append(time.perf_counter()),
+            network_factory=functools.partial(
+                make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden
+            ),
+            **settings(config),
+        )
+        return rates(batches * config.steps_per_batch, np.diff(times).tolist())
+
+    return case
 
 
-def _brax_networks(config: PPOConfig) -> Callable[..., Any]:
-    hidden = tuple(config.hidden_layers or ())
-    return functools.partial(make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden)
+def stable_baselines(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+    from benchmarks.peers import baselines  # of a package that may not be installed
 
-
-def own(physics: str) -> Case:
-    return lambda name, config, batches: learn(mimic.make(name, physics=physics), config, batches)
-
-
-def in_brax_loop(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
-    env = mimic.make(name, physics="fused")
-    return learn_by_brax(env, wrap_for_training, env.config.horizon, config, batches)
-
-
-def carried(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
-    env = mimic.make(name, physics="mjx")
-    return learn_by_brax(stock.StockEnv(env), stock.wrap, env.config.horizon, config, batches)
-
-
-def one_at_a_time(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
-    from benchmarks import baselines  # needs packages that mimic does not
-
-    return rates(*baselines.learn(name, config, batches, _STRETCHES))
+    del batches  # the CPU is slow
+    return rates(*baselines.learn(name, config, 1, EPOCHS))
 
 
 CASES: dict[str, Case] = {
-    "mimic, fused": own("fused"),
-    "mimic, mjx": own("mjx"),
-    "brax's loop, fused": in_brax_loop,
-    "brax's loop, mjx.Data carried": carried,
-    ON_PROCESSOR: one_at_a_time,
+    "mimic, fused": mimic_loop("fused"),
+    "mimic, mjx": mimic_loop("mjx"),
+    "brax's loop, fused": brax_loop("fused", lambda env: (env, wrap_for_training)),
+    "brax's loop, mjx.Data carried": brax_loop("mjx", lambda env: (stock.StockEnv(env), stock.wrap)),
+    STABLE_BASELINES: stable_baselines,
 }
 
 
-def run(name: str, config: PPOConfig, cases: Sequence[str], batches: int) -> list[dict[str, Any]]:
-    """A row for each case; what cannot run is a row that says why."""
+def run(name: str, config: PPOConfig, cases: Sequence[str], batches: int) -> list[Row]:
+    """A row for each case; a case that fails is a row with the reason."""
     rows = []
     for case in cases:
-        row: dict[str, Any] = {"env": name, "case": case}
+        row: Row = {"env": name, "case": case}
         began = time.perf_counter()
         try:
-            row |= CASES[case](name, config, 1 if case == ON_PROCESSOR else batches)
-        except Exception as error:  # not installed, or out of memory: the others go on
-            row["failed"] = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"[:200]
+            row |= CASES[case](name, config, batches)
+        except Exception as error:  # not installed, or out of memory
+            row |= failure(error)
         rows.append({**row, "wall_s": round(time.perf_counter() - began, 1)})
     return rows
 
 
-def table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Speeds, and how many times as fast as the slowest."""
-    slowest = min((row["steps_per_s"] for row in rows if "failed" not in row), default=1.0)
-    shown = Table("env", "PPO on", "env steps/s", "spread", "compile [s]", "times")
-    for row in rows:
-        if "failed" in row:
-            shown.add_row(row["env"], row["case"], row["failed"][:60])
-            continue
-        rate = row["steps_per_s"]
-        figures = f"{rate:,.0f}", f"{row['spread']:.1%}", f"{row['compile_s']:.1f}", f"{rate / slowest:,.1f}"
-        shown.add_row(row["env"], row["case"], *figures)
-    return shown
-
-
-def draw(rows: Sequence[dict[str, Any]], out: Path) -> None:
-    """A bar for each case."""
-    found = [row for row in rows if "failed" not in row]
-    figure, axes = plt.subplots(figsize=(7, 1 + 0.5 * max(len(found), 1)), layout="constrained")
-    values = [row["steps_per_s"] for row in found]
-    errors = [0.5 * row["spread"] * row["steps_per_s"] for row in found]
-    bars = axes.barh([row["case"] for row in found], values, xerr=errors, color="C0")
-    axes.bar_label(bars, [f"{value:,.0f}" for value in values], padding=4, fontsize="small")
-    axes.set(xscale="log", xlabel="environment steps/s, with learning", title=rows[0]["env"])
-    axes.invert_yaxis()
-    axes.margins(x=0.15)
-    figure.savefig(out, dpi=150)
-    plt.close(figure)
-
-
 def main() -> None:
-    """Measures, shows, writes."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.ppo", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, metavar="FILE", help="file of results; the figure goes beside it")
+    parser = BenchmarkParser("ppo", __doc__)
     parser.add_argument("--env", default="panda4dof", choices=mimic.environments(), metavar="NAME")
-    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="CASE", help="; ".join(CASES))
-    parser.add_argument("--num-envs", type=int, metavar="N", help="arms at once; the preset's")
-    parser.add_argument("--batch-size", type=int, metavar="N", help="unrolls in a minibatch; the preset's")
-    parser.add_argument("--batches", type=int, metavar="N", help="between two looks at the clock")
-    parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
+    parser.add_names("--only", CASES)
+    parser.add_argument("--num-envs", type=int, metavar="N", help="parallel arms; default: of the preset")
+    parser.add_argument("--batch-size", type=int, metavar="N", help="unrolls in a minibatch; default: of the preset")
+    parser.add_argument("--batches", type=int, metavar="N", help="batches of an epoch")
     options = parser.parse_args()
     config = PPOConfig(num_envs=options.num_envs, batch_size=options.batch_size)
     config = config.resolve(jax.default_backend(), jax.device_count())
     batches = options.batches or (10 if jax.default_backend() == "gpu" else 1)
     rows = run(options.env, config, options.only, batches)
-    Console().print(table(rows))
-    if options.out:
-        write_results(
-            options.out, "ppo", options.commit, settings=settings(config), layers=config.hidden_layers, rows=rows
-        )
-        draw(rows, options.out.with_suffix(".png"))
+    print_table(rows, COLUMNS)
+    Results("ppo", options).write(settings=settings(config), layers=config.hidden_layers, rows=rows)
 
 
 if __name__ == "__main__":

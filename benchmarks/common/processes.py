@@ -1,103 +1,103 @@
-"""Many runs as processes of their own, several at once: what is done already is not done again."""
+"""Training runs and other commands as processes."""
 
-import dataclasses
+import csv
+import json
 import os
-import shutil
+import queue
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.console import Console
+from rich.progress import track
 
-from mimic.runs.checkpoints import checkpoint_steps
-from mimic.runs.files import REPORT
+from mimic.runs.files import METRICS, REPORT
 
-
-@dataclasses.dataclass(frozen=True)
-class Task:
-    """A training run, or an evaluation of one.
-
-    Attributes:
-      folder: of its results; it is done once the report is there.
-      arguments: of `python -m mimic.train`, or of `python -m mimic.evaluate`.
-      of: folder of the run that is evaluated; None for a training run.
-    """
-
-    folder: Path
-    arguments: tuple[str, ...]
-    of: Path | None = None
-
-    @property
-    def done(self) -> bool:
-        return (self.folder / REPORT).is_file()
-
-    def command(self) -> list[str]:
-        """What does it, or goes on where it was interrupted."""
-        python = [sys.executable, "-m"]
-        if self.of is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)  # what an interruption left
-            return [*python, "mimic.evaluate", f"run={self.of}", f"out={self.folder}", *self.arguments]
-        if checkpoint_steps(self.folder):
-            return [*python, "mimic.train", f"resume={self.folder}"]
-        shutil.rmtree(self.folder, ignore_errors=True)
-        return [*python, "mimic.train", f"run_dir={self.folder}", *self.arguments]
+_HELD = 3  # successive evaluations
 
 
-def run_tasks(tasks: Sequence[Task], *, jobs: int, devices: int) -> list[Task]:
-    """Runs what is not done, `jobs` at once for each device; those that failed.
+def run_process(command: Sequence[str], **options: Any) -> float:
+    """Runs a command to its end and returns its wall time [s]; exits with the end of its error output if it fails."""
+    began = time.perf_counter()
+    process = subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    if process.returncode:
+        sys.exit(f"error: {' '.join(command)} ended with {process.returncode}: {process.stderr[-2000:]}")
+    return round(time.perf_counter() - began, 1)
 
-    A failed task is named with the end of its log, and the others go on. An evaluation waits for its run.
+
+def train(
+    run_dir: Path,
+    arguments: Sequence[str],
+    cache: Path | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> dict[str, Any]:
+    """One training run in a new folder: its report, and the wall time of the process [s].
 
     Args:
-      tasks: runs before their evaluations.
-      jobs: processes on a device.
-      devices: GPUs to spread them over; 0 is the CPU.
+      run_dir: the new folder.
+      arguments: of `python -m mimic.train`.
+      cache: compilation cache; none if None.
+      environment: variables of the process; those of this one if None.
     """
-    waiting = [task for task in tasks if not task.done]
-    running: dict[Task, tuple[subprocess.Popen[bytes], int]] = {}
-    failed: list[Task] = []
-    columns = TextColumn("[bold]runs"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[now]}")
-    with Progress(*columns, TimeElapsedColumn(), disable=not sys.stdout.isatty()) as bar:
-        shown = bar.add_task("runs", total=len(tasks), completed=len(tasks) - len(waiting), now="")
-        try:
-            while waiting or running:
-                ready = [task for task in waiting if task.of is None or (task.of / REPORT).is_file()]
-                for task in sorted(ready, key=lambda task: task.of is None):  # evaluations first: they are short
-                    if len(running) < jobs * max(devices, 1):
-                        waiting.remove(task)
-                        used = [device for _, device in running.values()]
-                        device = min(range(max(devices, 1)), key=used.count)
-                        running[task] = _start(task, device if devices else None), device
-                for task, (process, _) in list(running.items()):
-                    if process.poll() is not None:
-                        del running[task]
-                        bar.advance(shown)
-                        if not task.done:
-                            failed.append(task)
-                            print(f"failed: {task.folder}: {_log(task).read_text()[-800:]}", flush=True)
-                orphans = {task for task in waiting if task.of in {one.folder for one in failed}}
-                failed += orphans
-                waiting = [task for task in waiting if task not in orphans]
-                bar.update(shown, now=", ".join(task.folder.name for task in running))
-                time.sleep(0.2)
-        finally:  # an interruption reaches the processes too; each writes a checkpoint and ends
-            for process, _ in running.values():
-                process.terminate()
-            for process, _ in running.values():
-                process.wait()
+    command = [sys.executable, "-m", "mimic.train", *arguments, f"run_dir={run_dir}"]
+    wall = run_process([*command, f"compilation_cache={cache or ''}"], env=environment)
+    report = json.loads((run_dir / REPORT).read_text())
+    report = {key: value for key, value in report.items() if key not in ("hardware", "versions")}
+    return {"arguments": list(arguments), "process_wall_s": wall, "report": report}
+
+
+def read_metrics(run_dir: Path, *columns: str) -> list[tuple[float, ...]]:
+    """Columns of a run's metrics, one row for each evaluation."""
+    with (run_dir / METRICS).open(newline="") as file:
+        return [tuple(float(row[column]) for column in columns) for row in csv.DictReader(file)]
+
+
+def time_to_goal(run_dir: Path, quality: str, goal: float) -> float | None:
+    """Time since the start of the process [s] of the first of three successive evaluations at or below a goal.
+
+    Of all that remain, if the training ends before; None if there are none such.
+    """
+    rows = read_metrics(run_dir, f"quality/{quality}", "wall_time_s")
+    times = (wall for i, (_, wall) in enumerate(rows) if all(value <= goal for value, _ in rows[i : i + _HELD]))
+    return next(times, None)
+
+
+def run_parallel(commands: Mapping[Path, Sequence[str]], *, jobs: int, devices: int) -> list[Path]:
+    """Runs commands in parallel; the logs of those that failed, whose last lines are printed.
+
+    Ctrl-C reaches the commands that run, and the others are not started.
+
+    Args:
+      commands: by their log files.
+      jobs: processes on each device.
+      devices: number of GPUs; 0 for the CPU.
+    """
+    slots: queue.Queue[int] = queue.Queue()
+    for slot in range(jobs * max(devices, 1)):
+        slots.put(slot % max(devices, 1))
+
+    def run(log: Path) -> bool:
+        device = slots.get()
+        variables = dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")  # several share a GPU
+        if devices:
+            variables["CUDA_VISIBLE_DEVICES"] = str(device)
+        with log.open("wb") as file:
+            code = subprocess.run(commands[log], stdout=file, stderr=file, env=variables, check=False).returncode
+        slots.put(device)
+        return code == 0
+
+    failed = []
+    pool = ThreadPoolExecutor(slots.qsize())
+    try:
+        logs = {pool.submit(run, log): log for log in commands}
+        for ended in track(as_completed(logs), "processes", len(logs), console=Console(stderr=True)):
+            if not ended.result():
+                failed.append(logs[ended])
+                print(f"failed: {logs[ended].stem}: {logs[ended].read_text(errors='replace')[-800:]}", flush=True)
+    finally:
+        pool.shutdown(cancel_futures=True)
     return failed
-
-
-def _start(task: Task, device: int | None) -> "subprocess.Popen[bytes]":
-    environment = dict(os.environ, XLA_PYTHON_CLIENT_PREALLOCATE="false")  # several share a card
-    if device is not None:
-        environment["CUDA_VISIBLE_DEVICES"] = str(device)
-    task.folder.parent.mkdir(parents=True, exist_ok=True)
-    with _log(task).open("wb") as log:
-        return subprocess.Popen(task.command(), stdout=log, stderr=subprocess.STDOUT, env=environment)
-
-
-def _log(task: Task) -> Path:
-    return task.folder.with_name(task.folder.name + ".log")

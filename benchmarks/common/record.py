@@ -1,76 +1,82 @@
-"""What all benchmarks share: a training run as a process of its own, and files of results that can be trusted."""
+"""Results of a benchmark: written to a file with what they were measured on, and printed as a table."""
 
-import csv
+import argparse
 import datetime
 import importlib.metadata
 import json
-import os
 import subprocess
-import sys
-import time
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 from typing import Any
 
-from mimic.runs.files import METRICS
+from rich.console import Console
+from rich.table import Table
+
+from mimic.runs.files import finite, write_atomically
 from mimic.runs.provenance import hardware, versions
 
-_HELD = 3  # evaluations on end
+WIDTH = 140  # characters of a table, also without a terminal
+Row = dict[str, Any]
 
 
-def write_results(out: Path, benchmark: str, commit: str | None, **content: Any) -> None:
-    """Replaces a file of results, with what they were made on, only when the new one is whole."""
-    results = {
-        "benchmark": benchmark,
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes"),
-        "commit": commit or commit_id(),
-        "hardware": hardware(),
-        "versions": {**versions(), "mink": importlib.metadata.version("mink")},
-        **content,
-    }
-    partial = out.with_name(out.name + ".partial")
-    partial.write_text(json.dumps(results, indent=2) + "\n")
-    os.replace(partial, out)
+class Results:
+    """The results file of a benchmark.
 
+    Args:
+      benchmark: its name.
+      options: the parsed command line.
 
-def time_to_goal(run_dir: Path, quality: str, goal: float) -> float | None:
-    """Time [s] since the process started from which a quality is at most the goal, for three evaluations on end.
-
-    For all that are left, if the training ends before; None where it never is.
+    Attributes:
+      figure: path of the figure beside the file; None without a file.
     """
-    with (run_dir / METRICS).open(newline="") as file:
-        rows = [(float(row[f"quality/{quality}"]), float(row["wall_time_s"])) for row in csv.DictReader(file)]
-    reached = (wall for i, (_, wall) in enumerate(rows) if all(value <= goal for value, _ in rows[i : i + _HELD]))
-    return next(reached, None)
+
+    def __init__(self, benchmark: str, options: argparse.Namespace):
+        self._benchmark, self._out = benchmark, options.out
+        self._commit = options.commit or commit_id()
+        self.figure = options.out and options.out.with_suffix(".png")
+
+    def write(self, **content: Any) -> None:
+        """Replaces the file, if there is one, with this content, date, commit, hardware and versions."""
+        if self._out is None:
+            return
+        results = {
+            "benchmark": self._benchmark,
+            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes"),
+            "commit": self._commit,
+            "hardware": hardware(),
+            "versions": {**versions(), "mink": importlib.metadata.version("mink")},
+            **content,
+        }
+        write_atomically(self._out, json.dumps(finite(results), indent=2) + "\n")
 
 
 def commit_id() -> str:
-    """What is checked out, where this is a git checkout."""
-    found = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-    return found.stdout.strip() if found.returncode == 0 else "unknown"
+    """The commit that is checked out; "unknown" outside a git repository."""
+    process = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    return process.stdout.strip() if process.returncode == 0 else "unknown"
 
 
-def train(
-    run_dir: Path,
-    arguments: Sequence[str],
-    cache: Path | None = None,
-    environment: Mapping[str, str] | None = None,
-) -> dict[str, Any]:
-    """One training run into a new folder: its report, and the wall time of the whole process [s].
+def failure(error: Exception) -> Row:
+    """Entry of a row for a measurement that failed."""
+    return {"failed": f"{type(error).__name__}: {str(error).split(chr(10))[0]}"[:200]}
+
+
+def print_table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, str], title: str | None = None) -> None:
+    """Prints rows as a table.
 
     Args:
-      run_dir: the new folder.
-      arguments: of `python -m mimic.train`.
-      cache: where compiled programs are kept; the run is cold where None, or where the folder is empty.
-      environment: variables of the process; this one's where None.
+      rows: the results; the reason of a row that failed is shown in its last column.
+      columns: format string of each column, filled in from the row, as in {"steps/s": "{steps_per_s:,.0f}"}.
+      title: of the table.
     """
-    command = [sys.executable, "-m", "mimic.train", *arguments, f"run_dir={run_dir}"]
-    command.append(f"compilation_cache={cache or ''}")
-    began = time.perf_counter()
-    finished = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    wall = time.perf_counter() - began
-    if finished.returncode:
-        sys.exit(f"error: {' '.join(command)} ended with {finished.returncode}: {finished.stderr[-2000:]}")
-    report = json.loads((run_dir / "report.json").read_text())
-    report = {key: value for key, value in report.items() if key not in ("hardware", "versions")}
-    return {"arguments": list(arguments), "process_wall_s": round(wall, 1), "report": report}
+    table = Table(*columns, title=title)
+    for row in rows:
+        cells = [_cell(form, row) for form in columns.values()]
+        table.add_row(*([*cells[:-1], row["failed"]] if "failed" in row else cells))
+    Console(width=WIDTH).print(table)
+
+
+def _cell(form: str, row: Mapping[str, Any]) -> str:
+    try:
+        return form.format_map(row)
+    except (LookupError, TypeError, ValueError):  # no such value, or None
+        return "-"

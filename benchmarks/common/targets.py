@@ -1,114 +1,86 @@
-"""What mimic is to reach, and what the files of results in a folder say of it."""
+"""Targets of mimic, and how far the results files of a folder reach them."""
 
 import dataclasses
 import json
+import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
-Results = dict[str, Any]  # a file of results
+Results = dict[str, Any]  # content of a results file
 _FORMS = {"": "{:,.4g}", "%": "{:.2%}", "s": "{:,.1f} s", "mm": "{:.2f} mm"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """A quantity and what it is to be.
+    """A quantity and the value to reach.
 
     Attributes:
-      quantity: for people.
-      backend: that it is measured on: "gpu" or "cpu"; any where empty.
-      benchmark: whose files say it.
-      measured: of a file; raises `LookupError` or `ValueError` where that does not hold it.
-      target: what it is to reach.
+      quantity: its label.
+      backend: "gpu" or "cpu"; either if empty.
+      benchmark: whose results files contain it.
+      value: reads it from a file; raises a `LookupError`, `TypeError` or `ValueError` if the file does not contain it.
+      target: what it must reach.
       unit: "", "%", "s" or "mm".
-      least: whether larger is better.
+      is_minimum: whether larger is better.
     """
 
     quantity: str
     backend: str
     benchmark: str
-    measured: Callable[[Results], float]
+    value: Callable[[Results], float]
     target: float
     unit: str = ""
-    least: bool = True
+    is_minimum: bool = True
 
-    def met(self, measured: float) -> bool:
-        """Whether it is reached."""
-        return measured >= self.target if self.least else measured <= self.target
+    def met(self, value: float) -> bool:
+        """Whether a value reaches the target."""
+        return value >= self.target if self.is_minimum else value <= self.target
 
     def text(self, value: float) -> str:
-        """With its unit."""
+        """A value with its unit."""
         return _FORMS[self.unit].format(value)
 
 
-def _start(what: str, beyond: str | None = None) -> Callable[[Results], float]:
-    """Seconds of a process, less those of another."""
+def rows(
+    path: str, entry: str, reduce: Callable[[Iterable[float]], float] = max, **selected: Any
+) -> Callable[[Results], float]:
+    """Reads an entry of the rows with these values, leaving out rows that failed.
 
-    def seconds(results: Results) -> float:
-        median = {row["what"]: row["median_s"] for row in results["rows"]}
-        return median[what] - (median[beyond] if beyond else 0.0)
+    Args:
+      path: of the list of rows, with dots.
+      entry: of a row, with dots; None counts as infinite, as a goal that was never reached.
+      reduce: the value of several rows.
+      selected: values of the rows.
+    """
 
-    return seconds
+    def read(results: Results) -> float:
+        chosen = [row for row in _entry(results, path) if "failed" not in row]
+        chosen = [row for row in chosen if all(row.get(key) == value for key, value in selected.items())]
+        return reduce([math.inf if (value := _entry(row, entry)) is None else value for row in chosen])
 
-
-def _rows(results: Results, key: str, **wanted: Any) -> list[dict[str, Any]]:
-    """Rows with these entries that were measured; at least one."""
-    rows = [row for row in results[key] if "failed" not in row]
-    rows = [row for row in rows if all(row.get(name) == value for name, value in wanted.items())]
-    if not rows:
-        raise LookupError(wanted)
-    return rows
-
-
-def _pairs(quantity: str) -> Callable[[Results], float]:
-    wanted = {"sweep": "batch", "method": "mimic", "quantity": quantity}
-    return lambda results: max(row["pairs_per_s"] for row in _rows(results, "results", **wanted))
+    return read
 
 
-def _physics(arms: int) -> Callable[[Results], float]:
-    wanted = {"env": "panda7dof", "group": "physics", "case": "fused", "arms": arms}
-    return lambda results: _rows(results, "rows", **wanted)[0]["steps_per_s"]
+def _entry(values: Any, path: str) -> Any:
+    for key in path.split("."):
+        values = values[key]
+    return values
 
 
-def _learning(results: Results) -> float:
-    return _rows(results, "rows", case="mimic, fused")[0]["steps_per_s"]
-
-
-def _to_goal(start: str) -> Callable[[Results], float]:
-    def measured(results: Results) -> float:
-        seconds = [row["to_goal_s"] for row in _rows(results, "runs", case="one_demonstration", start=start)]
-        return statistics.median(float("inf") if value is None else value for value in seconds)
-
-    return measured
-
-
-def _poses(results: Results) -> float:
-    return min(row["methods"]["newton"]["poses_per_second"] for row in _rows(results, "results"))
-
-
-def _mapper(results: Results) -> float:
-    """The slowest."""
-    seconds = [row["to_goal_s"] for row in _rows(results, "runs", preset="large")]
-    return max(float("inf") if value is None else value for value in seconds)
-
-
-def _weak(devices: int) -> Callable[[Results], float]:
-    wanted = {"scaling": "weak", "devices": devices}
-    return lambda results: max(row["efficiency"] for row in _rows(results, "rows", **wanted))
+def _beyond_jax(results: Results) -> float:
+    jax, mimic = (rows("rows", "median_s", what=what)(results) for what in ("import jax", "import mimic"))
+    return mimic - jax
 
 
 def _tip(results: Results) -> float:
-    candidates = _rows(results, "results", env="panda7dof")[0]
-    return _rows(candidates, "candidates", engine="fused", integrator="rk4", substeps=10)[0]["error_mm"]["end"]["p95"]
+    (environment,) = (row for row in results["results"] if row["env"] == "panda7dof")
+    return rows("candidates", "error_mm.end.p95", engine="fused", integrator="rk4", substeps=10)(environment)
 
 
-def _gap(case: str, split: str) -> Callable[[Results], float]:
-    return lambda results: statistics.fmean(run["optimality_gap"][split] for run in results["results"][case])
-
-
+_PAIRS = {"sweep": "batch", "method": "mimic"}
+_PHYSICS = {"env": "panda7dof", "group": "physics", "case": "fused"}
 _QUALITY = (
     ("7-DOF, one trajectory", "one_demonstration", "train", 0.01),
     ("7-DOF", "panda7dof", "train", 0.02),
@@ -116,65 +88,89 @@ _QUALITY = (
     ("3-DOF", "panda3dof", "train", 0.03),
     *((f"{arm[5]}-DOF, held out", arm, "held_out", 0.04) for arm in ("panda7dof", "panda4dof", "panda3dof")),
 )
+
+
+def _maximum(quantity: str, backend: str, benchmark: str, value: Any, target: float, unit: str = "s") -> Target:
+    return Target(quantity, backend, benchmark, value, target, unit, is_minimum=False)
+
+
+def _to_goal(start: str) -> Callable[[Results], float]:
+    return rows("runs", "to_goal_s", statistics.median, case="one_demonstration", start=start)
+
+
 TARGETS = (
-    Target("import of mimic beyond jax", "cpu", "startup", _start("import mimic", "import jax"), 1.5, "s", least=False),
-    Target("mimic.train --help", "cpu", "startup", _start("mimic.train --help"), 3, "s", least=False),
-    Target("kernel, pairs/s", "gpu", "kernel", _pairs("value"), 10e9),
-    Target("kernel with gradient, pairs/s", "gpu", "kernel", _pairs("gradient"), 4e9),
-    Target("physics of 8192 arms, steps/s", "gpu", "rollout", _physics(8192), 60e6),
-    Target("physics of 65536 arms, steps/s", "gpu", "rollout", _physics(65536), 100e6),
-    Target("tip after 5 s, 95 of 100", "", "physics", _tip, 1.0, "mm", least=False),
-    Target("PPO with learning, env steps/s", "gpu", "ppo", _learning, 2e6),
-    Target("to 2 % gap, cold", "gpu", "training", _to_goal("cold"), 20, "s", least=False),
-    Target("to 2 % gap, warm", "gpu", "training", _to_goal("warm"), 10, "s", least=False),
-    Target("to 2 % gap, cold", "cpu", "training", _to_goal("cold"), 180, "s", least=False),
-    Target("optimal poses/s, slowest pair", "gpu", "pose", _poses, 1e6),
-    Target("pose mapper within 2 %, slowest", "gpu", "pose_mapper", _mapper, 10, "s", least=False),
-    Target("pose mapper within 2 %, slowest", "cpu", "pose_mapper", _mapper, 60, "s", least=False),
-    Target("PPO on 8 GPUs, efficiency", "gpu", "scaling", _weak(8), 0.9, "%"),
+    _maximum("import of mimic beyond jax", "cpu", "startup", _beyond_jax, 1.5),
+    _maximum("mimic.train --help", "cpu", "startup", rows("rows", "median_s", what="mimic.train --help"), 3),
+    Target("kernel, pairs/s", "gpu", "kernel", rows("results", "pairs_per_s", quantity="value", **_PAIRS), 10e9),
+    Target(
+        "kernel with gradient, pairs/s", "gpu", "kernel",
+        rows("results", "pairs_per_s", quantity="gradient", **_PAIRS), 4e9,
+    ),
     *(
-        Target(f"gap, {name}", "", "dynamic_imitation", _gap(case, split), goal, "%", least=False)
+        Target(
+            f"physics of {arms} arms, steps/s", "gpu", "rollout", rows("rows", "steps_per_s", arms=arms, **_PHYSICS),
+            target,
+        )
+        for arms, target in ((8192, 60e6), (65536, 100e6))
+    ),
+    _maximum("tip after 5 s, 95 of 100", "", "physics", _tip, 1.0, "mm"),
+    Target("PPO with learning, env steps/s", "gpu", "ppo", rows("rows", "steps_per_s", case="mimic, fused"), 2e6),
+    _maximum("to 2 % gap, cold", "gpu", "training", _to_goal("cold"), 20),
+    _maximum("to 2 % gap, warm", "gpu", "training", _to_goal("warm"), 10),
+    _maximum("to 2 % gap, cold", "cpu", "training", _to_goal("cold"), 180),
+    Target(
+        "optimal poses/s, slowest pair", "gpu", "pose", rows("results", "methods.newton.poses_per_second", min), 1e6
+    ),
+    *(
+        _maximum("pose mapper within 2 %, slowest", backend, "pose_mapper", rows("runs", "to_goal_s", preset="large"), s)
+        for backend, s in (("gpu", 10), ("cpu", 60))
+    ),
+    Target("PPO on 8 GPUs, efficiency", "gpu", "scaling", rows("rows", "efficiency", scaling="weak", devices=8), 0.9, "%"),
+    *(
+        _maximum(
+            f"gap, {name}", "", "dynamic_imitation",
+            rows(f"results.{case}", f"optimality_gap.{split}", statistics.fmean), goal, "%",
+        )
         for name, case, split, goal in _QUALITY
     ),
-)
+)  # fmt: skip
 
 
 def read_folder(folder: Path) -> dict[Path, Results]:
-    """All files of results in a folder, the newest last; what is none of them is left out."""
-    found = {}
+    """The results files of a folder, the newest last; other files are ignored."""
+    files = {}
     for path in sorted(folder.glob("*.json")):
         try:
             results = json.loads(path.read_text())
         except ValueError:
             continue
         if isinstance(results, dict) and "benchmark" in results:
-            found[path] = results
-    return dict(sorted(found.items(), key=lambda entry: entry[1].get("date", "")))
+            files[path] = results
+    return dict(sorted(files.items(), key=lambda entry: entry[1].get("date", "")))
 
 
 def find(target: Target, files: dict[Path, Results]) -> tuple[float, Path] | None:
-    """What the newest file that holds it says, and that file."""
+    """The value in the newest file that contains it, and that file."""
     for path, results in reversed(files.items()):
         backend = results.get("hardware", {}).get("backend")
         if results["benchmark"] == target.benchmark and target.backend in ("", backend):
             try:
-                return float(target.measured(results)), path
-            except (LookupError, TypeError, ValueError):  # another case of it, or null
+                return float(target.value(results)), path
+            except (LookupError, TypeError, ValueError):  # another case of the benchmark, or null
                 continue
     return None
 
 
-def table(files: dict[Path, Results], targets: Sequence[Target] = TARGETS) -> Table:
-    """A row for each target, and which file says it; where none does, what makes one."""
-    shown = Table("quantity", "on", "measured", "target", "", "from")
+def table(files: dict[Path, Results], targets: Sequence[Target] = TARGETS) -> list[dict[str, str]]:
+    """A row for each target with the file it was read from, or with the command that measures it."""
+    shown = []
     for target in targets:
-        goal = f"{'>=' if target.least else '<='} {target.text(target.target)}"
-        found = find(target, files)
-        if found is None:
-            command = f"python -m benchmarks.run {target.benchmark}"
-            shown.add_row(target.quantity, target.backend or "any", "-", goal, "", command)
-            continue
-        measured, path = found
-        met = "met" if target.met(measured) else "missed"
-        shown.add_row(target.quantity, target.backend or "any", target.text(measured), goal, met, path.name)
+        goal = f"{'>=' if target.is_minimum else '<='} {target.text(target.target)}"
+        row = {"quantity": target.quantity, "on": target.backend or "any", "target": goal}
+        if (known := find(target, files)) is None:
+            row |= {"measured": "-", "met": "", "from": f"python -m benchmarks.run {target.benchmark}"}
+        else:
+            met = "met" if target.met(known[0]) else "missed"
+            row |= {"measured": target.text(known[0]), "met": met, "from": known[1].name}
+        shown.append(row)
     return shown

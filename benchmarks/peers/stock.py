@@ -1,10 +1,11 @@
-"""The task as brax and MuJoCo Playground environments usually have it, to compare with: `mjx.Data` is the state."""
+"""The task as brax and MuJoCo Playground environments usually implement it: `mjx.Data` is the state."""
 
 import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers import training
 from mujoco import mjx
@@ -12,17 +13,22 @@ from mujoco import mjx
 from mimic.envs.imitation import ArmState, ImitationEnv
 
 
+def model_with_substeps(env: ImitationEnv) -> mujoco.MjModel:
+    """The learner's model with the time step of the environment's substeps."""
+    model = env.arm.model.__copy__()
+    model.opt.timestep = env.config.control_dt / env.config.substeps
+    return model
+
+
 class StockEnv(Env):
     """Carries `mjx.Data` from step to step; reward, observation and torques are the imitation environment's.
 
-    Brax's own wrappers return each arm to its first state, and with that to its first demonstration.
+    Brax's own wrappers reset each arm to its first state, and so to its first demonstration.
     """
 
     def __init__(self, imitation: ImitationEnv):
         self._imitation = imitation
-        config = imitation.config
-        model = imitation.arm.model.__copy__()
-        model.opt.timestep = config.control_dt / config.substeps
+        model = model_with_substeps(imitation)
         self._model, self._blank = mjx.put_model(model), mjx.make_data(model)
 
     def reset(self, rng: jax.Array) -> State:
@@ -36,9 +42,8 @@ class StockEnv(Env):
     def step(self, state: State, action: jax.Array) -> State:
         """Holds a torque for one control step."""
         config, before = self._imitation.config, state.info["arm_state"]
-        torque = jnp.clip(action, -1.0, 1.0) * self._imitation.torque_scale
         data: Any = state.pipeline_state
-        data = data.replace(qfrc_applied=torque)
+        data = data.replace(qfrc_applied=jnp.clip(action, -1.0, 1.0) * self._imitation.torque_scale)
         data = jax.lax.fori_loop(0, config.substeps, lambda _, d: mjx.step(self._model, d), data)
         step = jnp.round(data.time / config.control_dt).astype(jnp.int32)  # the time is reset with the data
         after: ArmState = dataclasses.replace(before, qpos=data.qpos, qvel=data.qvel, step=step)
@@ -54,17 +59,14 @@ class StockEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """Of the imitation environment."""
         return self._imitation.observation_size
 
     @property
     def action_size(self) -> int:
-        """One torque for each joint."""
         return self._imitation.action_size
 
     @property
     def backend(self) -> str:
-        """What simulates."""
         return "mjx"
 
 

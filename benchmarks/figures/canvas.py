@@ -1,0 +1,17 @@
+"""matplotlib without a display, and saving of figures."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+__all__ = ["plt", "save"]
+
+
+def save(figure: Any, out: Path) -> None:
+    """Writes a figure and closes it."""
+    figure.savefig(out, dpi=150)
+    plt.close(figure)
