@@ -28,7 +28,7 @@ from benchmarks.peers import stock
 from mimic import compat
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import wrap_for_training
-from mimic.trainers.config import PPOConfig
+from mimic.trainers.config import PPOConfig, PPOSettings
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import make_programs
 
@@ -46,7 +46,7 @@ COLUMNS = {
     "compile [s]": "{compile_s:.1f}",
 }
 
-Case = Callable[[str, PPOConfig, int], dict[str, float]]  # environment, settings, batches of an epoch -> rates
+Case = Callable[[str, PPOSettings, int], dict[str, float]]  # environment, settings, batches of an epoch -> rates
 
 
 def rates(steps: int, seconds: Sequence[float]) -> dict[str, float]:
@@ -60,22 +60,22 @@ def rates(steps: int, seconds: Sequence[float]) -> dict[str, float]:
     }
 
 
-def settings(config: PPOConfig) -> dict[str, Any]:
+def settings(config: PPOSettings) -> dict[str, Any]:
     """The settings of a resolved config that all implementations share."""
     return {name: getattr(config, name) for name in SETTINGS}
 
 
-def training_epoch(env: ImitationEnv, config: PPOConfig, batches: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def training_epoch(env: ImitationEnv, config: PPOSettings, batches: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The compiled functions of `mimic.train` that begin a training, and that train for so many batches."""
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    schedule = optax.constant_schedule(config.learning_rate)  # type: ignore[arg-type]
+    schedule = optax.constant_schedule(config.learning_rate)
     return make_programs(env, config, networks, batches, schedule, None)
 
 
 def mimic_loop(physics: str) -> Case:
     """PPO as `mimic.train` runs it."""
 
-    def case(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+    def case(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
         env = mimic.make(name, physics=physics)
         times = [time.perf_counter()]
         begin, epoch = training_epoch(env, config, batches)
@@ -92,7 +92,7 @@ def mimic_loop(physics: str) -> Case:
 def brax_loop(physics: str, make: Callable[[Any], tuple[Env, Callable[..., Env]]]) -> Case:
     """Brax's own training loop, on an environment and with the wrappers that `make` returns."""
 
-    def case(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+    def case(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
         compat.mend_brax()
         imitation = mimic.make(name, physics=physics)
         env, wrap = make(imitation)
@@ -118,7 +118,7 @@ def brax_loop(physics: str, make: Callable[[Any], tuple[Env, Callable[..., Env]]
     return case
 
 
-def stable_baselines(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
+def stable_baselines(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
     from benchmarks.peers import baselines  # of a package that may not be installed
 
     del batches  # the CPU is slow
@@ -134,7 +134,7 @@ CASES: dict[str, Case] = {
 }
 
 
-def run(name: str, config: PPOConfig, cases: Sequence[str], batches: int) -> list[Row]:
+def run(name: str, config: PPOSettings, cases: Sequence[str], batches: int) -> list[Row]:
     """A row for each case; a case that fails is a row with the reason."""
     rows = []
     for case in cases:

@@ -23,7 +23,7 @@ compat.import_mjx()  # quietly; brax would import it too
 
 from brax.envs.base import State  # noqa: E402
 
-from mimic.envs.imitation import ArmState, ImitationEnv  # noqa: E402
+from mimic.envs.imitation import ArmState, ImitationEnv, arm_state  # noqa: E402
 
 RENDER_MODES = ("rgb_array",)
 
@@ -66,7 +66,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def _step_and_restart(self, state: State, action: jax.Array) -> tuple[State, jax.Array]:
         """The step with new episodes where old ones ended, and the observations before that."""
         stepped = jax.vmap(self.imitation.step)(state, action)
-        arms: ArmState = stepped.pipeline_state  # type: ignore[assignment]
+        arms = arm_state(stepped)
         fresh = jax.vmap(self.imitation.start)(arms.key)
         fresh_obs = jax.vmap(self.imitation.observe_home)(fresh)
         done = stepped.done.astype(bool)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.arms.arm import ArmConfig, build_arm, effective_inertia, simulation_model
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.simulation_model import effective_inertia, simulation_model
 from mimic.envs.config import PHYSICS
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.physics import Load, make_advance

@@ -9,7 +9,7 @@ from random_arms import random_arm
 from mimic.arms.embodiment import load_mjcf, panda, planar_arm
 from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
-from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance, rotation_distance
+from mimic.metric.distance import DistanceWeights, Metric, adaptive_weights, embodiment_distance, rotation_distance
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.closed_form import SMOOTHING
 from mimic.retargeting.pose_objective import pose_objective
@@ -41,7 +41,7 @@ def smoothed_distance(expert_states, learner_states, matrix, weights):
 def check_derivatives(learner, matrix, weights, seed=0):
     """1e-12: double precision of a few hundred operations; Hessians of smoothed lengths reach 1e3."""
     expert, rng = panda(), np.random.default_rng(seed)
-    closed = pose_objective(learner, matrix, weights, "cosine", "mean")
+    closed = pose_objective(learner, Metric(matrix, weights))
     states = link_states(expert, rng.uniform(-3, 3, 7))
     target = closed.target(states)
 
@@ -79,7 +79,7 @@ def test_arrays_of_weights_and_a_correspondence_known_only_at_run_time():
     states, qpos = link_states(expert, rng.uniform(-3, 3, 7)), rng.uniform(-3, 3, 4)
 
     def value_and_gradient(matrix, weights):
-        closed = pose_objective(learner, matrix, weights, "cosine", "mean")
+        closed = pose_objective(learner, Metric(matrix, weights))
         derivatives = closed.derivatives(closed.target(states), tuple(qpos))
         return derivatives.value, derivatives.gradient
 
@@ -90,7 +90,7 @@ def test_arrays_of_weights_and_a_correspondence_known_only_at_run_time():
 def test_a_match_has_no_slope_and_a_finite_curvature(dtype):
     """At the kink of the lengths. 1e-4: rounding moves a position by 1e-7 chain lengths, and SMOOTHING is 1e-3."""
     arm = panda()
-    closed = pose_objective(arm, arc_length_correspondence(arm, arm), DEFAULT, "cosine", "mean")
+    closed = pose_objective(arm, Metric(arc_length_correspondence(arm, arm), DEFAULT))
     for qpos in (np.zeros(7), np.linspace(-2, 2, 7)):
         angles = jnp.asarray(qpos, dtype)
         found = closed.derivatives(closed.target(link_states(arm, angles)), tuple(angles))
@@ -103,7 +103,7 @@ def test_smoothing_changes_the_distance_by_less_than_its_own_size(dtype):
     """Arc length W has entries that sum to n n_hat: the mean length is off by SMOOTHING at most; 1e-5 for float32."""
     expert, learner = panda(), panda(locked=(3, 6, 7))
     matrix = arc_length_correspondence(expert, learner)
-    closed = pose_objective(learner, matrix, DEFAULT, "cosine", "mean")
+    closed = pose_objective(learner, Metric(matrix, DEFAULT))
     qpos = np.random.default_rng(2).uniform(-3, 3, (64, 7)).astype(dtype)
 
     @jax.vmap
@@ -135,6 +135,6 @@ OVERLAP = overlap_correspondence(panda(), panda())
 )
 def test_the_closed_form_is_for_its_measure_alone(correspondence, weights, rotation, reduction, is_closed):
     arm = panda()
-    objective = pose_objective(arm, correspondence, weights, rotation, reduction)
+    objective = pose_objective(arm, Metric(correspondence, weights, rotation, reduction))
     states = link_states(arm, jnp.zeros(7))
     assert (objective.target(states) is not states) == is_closed

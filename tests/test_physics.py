@@ -9,7 +9,8 @@ from lowering import gpu_program
 from random_arms import SEEDS, random_arm
 
 import mimic
-from mimic.arms.arm import ArmConfig, build_arm, simulation_model
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.simulation_model import simulation_model
 from mimic.envs import dynamics, physics
 from mimic.envs.physics import Load, make_advance
 from mimic.metric import fused_kernel

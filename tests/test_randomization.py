@@ -11,7 +11,7 @@ import pytest
 from random_arms import SEEDS, posed, random_arm
 
 import mimic
-from mimic.arms.arm import simulation_model
+from mimic.arms.simulation_model import simulation_model
 from mimic.envs import dynamics
 from mimic.envs.config import RandomizationConfig
 from mimic.envs.physics import Load

@@ -11,7 +11,7 @@ import optax
 import pytest
 
 from mimic import compilation
-from mimic.trainers.config import PPOConfig
+from mimic.trainers.config import PPOConfig, PPOSettings
 from mimic.trainers.ppo import programs, training, updates
 from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
 
@@ -24,7 +24,7 @@ SIZES = OBSERVED, ACTIONS = 5, 2
 class Case:
     """What there is to learn from, and with what; of each array the first axis is the devices."""
 
-    config: PPOConfig
+    config: PPOSettings
     unrolls: Unrolls
     order: jax.Array
     keys: jax.Array

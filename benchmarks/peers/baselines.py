@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize  # pyri
 
 import mimic
 from benchmarks.peers.mujoco_task import MujocoTask
-from mimic.trainers.config import PPOConfig
+from mimic.trainers.config import PPOSettings
 
 STEPS = 256  # of each arm in a batch: as many arms as on a GPU, 4096, would be as many processes
 
@@ -23,7 +23,7 @@ def make_arm(name: str, seed: int) -> MujocoTask:
     return task
 
 
-def learn(name: str, config: PPOConfig, batches: int, epochs: int) -> tuple[int, list[float]]:
+def learn(name: str, config: PPOSettings, batches: int, epochs: int) -> tuple[int, list[float]]:
     """Environment steps of a training epoch of so many batches, and the seconds of each epoch."""
     arms = os.cpu_count() or 1
     makers = [functools.partial(make_arm, name, seed) for seed in range(arms)]
@@ -31,14 +31,14 @@ def learn(name: str, config: PPOConfig, batches: int, epochs: int) -> tuple[int,
     model = PPO(
         "MlpPolicy",
         VecNormalize(workers, norm_reward=False),
-        learning_rate=config.learning_rate,  # type: ignore[arg-type]
+        learning_rate=config.learning_rate,
         n_steps=STEPS,
-        batch_size=max(arms * STEPS // config.num_minibatches, 2),  # type: ignore[operator]
-        n_epochs=config.num_updates_per_batch,  # type: ignore[arg-type]
-        gamma=config.discounting,  # type: ignore[arg-type]
+        batch_size=max(arms * STEPS // config.num_minibatches, 2),
+        n_epochs=config.num_updates_per_batch,
+        gamma=config.discounting,
         gae_lambda=config.gae_lambda,
         clip_range=config.clipping_epsilon,
-        ent_coef=config.entropy_cost,  # type: ignore[arg-type]
+        ent_coef=config.entropy_cost,
         max_grad_norm=config.max_grad_norm,
         policy_kwargs={"net_arch": list(config.hidden_layers or ())},
         device="cpu",

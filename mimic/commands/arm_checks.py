@@ -3,7 +3,6 @@
 import copy
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +14,7 @@ from mimic.arms.arm import UNKNOWN_SPEED, Arm, ArmConfig, arm_spec, torque_scale
 from mimic.arms.embodiment import load_arm
 from mimic.envs.config import EnvConfig
 from mimic.envs.recording import record_demonstrations
-from mimic.metric.distance import embodiment_distance
-from mimic.metric.kinematics import LinkStates, link_state_table
+from mimic.metric.kinematics import link_state_table
 from mimic.retargeting.kinematic_bound import closest_motion
 
 _DEMONSTRATIONS, _EVERY = 2, 5  # few, and of them every fifth step: a rough value in seconds
@@ -52,23 +50,17 @@ def reachable_distance(expert: Arm, learner: Arm, config: EnvConfig) -> Reachabl
       ValueError: the expert's limits leave it no goal.
     """
     recorded = record_demonstrations(expert, _DEMONSTRATIONS, horizon=config.horizon, dt=config.control_dt)
-    pair, metric = (expert.embodiment, learner.embodiment), config.metric
-    correspondence, weights = metric.make_correspondence(*pair), metric.make_weights()
-    measure: dict[str, Any] = {"rotation": metric.rotation_measure, "reduction": metric.reduction}
+    pair = expert.embodiment, learner.embodiment
+    metric = config.metric.build(*pair)
     qpos, qvel = (
         x[:, 1::_EVERY].reshape(-1, expert.embodiment.num_joints).astype(np.float32)
         for x in (recorded.qpos, recorded.qvel)
     )
 
-    def distance(expert_states: LinkStates, learner_states: LinkStates) -> jax.Array:
-        return embodiment_distance(expert_states, learner_states, correspondence, weights, **measure)
-
     home = np.broadcast_to(np.asarray(learner.embodiment.home), (len(qpos), learner.embodiment.num_joints))
     still = link_state_table(learner.embodiment, home, np.zeros_like(home))
-    hold = jax.jit(jax.vmap(distance))(link_state_table(expert.embodiment, qpos, qvel), still)
-    found = jax.jit(lambda qpos, qvel: closest_motion(*pair, qpos, qvel, correspondence, weights, **measure))(
-        qpos, qvel
-    )
+    hold = jax.jit(jax.vmap(metric))(link_state_table(expert.embodiment, qpos, qvel), still)
+    found = jax.jit(lambda qpos, qvel: closest_motion(*pair, qpos, qvel, **metric.arguments))(qpos, qvel)
     return ReachableDistance(
         float(jnp.mean(found.distance)), float(jnp.mean(hold)), qpos[:, None], np.asarray(found.qpos)[:, None]
     )

@@ -17,14 +17,11 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
-from mimic.metric.distance import embodiment_distance, link_distances
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import PoseMapperConfig
-from mimic.trainers.make import make_trainer
+from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.pose_mapper.model import PoseMapper
-from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import load_config, policy_run
 
 FRAMES_PER_SECOND = 30
@@ -81,7 +78,7 @@ def prepare_clip(config: RenderConfig) -> Recipe:
     """
     if config.retargeted or (config.demonstrations and not config.run):
         return _of_retargeted(config)
-    if config.run and isinstance(load_config(Path(config.run).expanduser()).trainer, PoseMapperConfig):
+    if config.run and load_config(Path(config.run).expanduser()).trainer.name == "pose_mapper":
         return _of_mapper(config)
     return _of_policy(config)
 
@@ -90,14 +87,13 @@ def _of_policy(config: RenderConfig) -> Recipe:
     """A policy's rollout, with the lower bound and an arm at rest."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
     _check_unused(config, "a run of trainer=ppo", "demonstrations", "learner", "limits", "seed")
-    job = make_trainer(trained, run_dir)
-    assert isinstance(job, PPOTrainer)
-    index = demonstration_index(job.evaluator, config.split, config.demonstration)
-    _, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
+    trainer = make_ppo_trainer(trained, run_dir)
+    index = demonstration_index(trainer.evaluator, config.split, config.demonstration)
+    _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
     title = f"{trained.env.name}, {config.split.replace('_', '-')} demonstration {config.demonstration}"
 
     def make() -> Clip:
-        story = RolloutFrames(job.evaluator, job.evaluate(params), index, FRAMES_PER_SECOND)
+        story = RolloutFrames(trainer.evaluator, trainer.evaluate(params), index, FRAMES_PER_SECOND)
         curves = (
             Curve("holding the start pose", story.hold, _HOLD),
             Curve("policy", story.distance, {"color": "tab:blue"}),
@@ -154,7 +150,7 @@ def _of_retargeted(config: RenderConfig) -> Recipe:
         if not getattr(config, key):
             raise ValueError(f"{key}: expected what mimic.retarget was given or wrote, as in {key}={example}")
     env = env_config(config.learner, limits=config.limits)
-    expert, learner = _arms(env)
+    expert, learner = env.build_arms().embodiments
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
     motions = load_demonstrations(Path(config.retargeted).expanduser())
     _check_arm("demonstrations", demonstrations, expert)
@@ -178,23 +174,19 @@ def _static_clip(
     env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray, learner_qpos: np.ndarray, *, by: str
 ) -> Clip:
     """Two arms moved pose by pose: velocities do not count; with the optimal pose's distance at each frame."""
-    expert, learner = _arms(env)
-    metric = env.metric
-    correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
-    measure: Any = {"rotation": metric.rotation_measure}
-    reduced: Any = {**measure, "reduction": metric.reduction}
+    expert, learner = env.build_arms().embodiments
+    metric = env.metric.build(expert, learner)
 
     def judged(qpos: jax.Array, learner_qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         states = link_states(expert, qpos), link_states(learner, learner_qpos)
-        distances = link_distances(*states, weights, **measure)
-        matrix = correspondence(distances) if callable(correspondence) else correspondence
-        by_link = (matrix * distances).sum(axis=0) / distances.size
-        return embodiment_distance(*states, correspondence, weights, **reduced), by_link
+        distances = metric.link_distances(*states)
+        by_link = (metric.matrix(distances) * distances).sum(axis=0) / distances.size
+        return metric.reduced(distances), by_link
 
     judge = jax.jit(jax.vmap(judged))
     distance, by_link = map(np.asarray, judge(qpos, learner_qpos))
     hold = np.asarray(judge(qpos, np.broadcast_to(np.asarray(learner.home), learner_qpos.shape))[0])
-    optimum = imitate_pose(expert, learner, qpos.astype(np.float32), correspondence, weights, kept=None, **reduced)
+    optimum = imitate_pose(expert, learner, qpos.astype(np.float32), kept=None, **metric.arguments)
     curves = (
         Curve("holding the start pose", hold, _HOLD),
         Curve(by, distance, {"color": "tab:blue"}),
@@ -202,12 +194,6 @@ def _static_clip(
     )
     labels = "expert", f"learner, {by}"
     return Clip(title, labels, time, (qpos, learner_qpos), time, curves, by_link, learner.link_names)
-
-
-def _arms(env: EnvConfig) -> tuple[Embodiment, Embodiment]:
-    """The embodiments of an environment's expert and learner."""
-    expert, learner = (build_arm(arm, env.limits, env.metric.links).embodiment for arm in (env.expert, env.learner))
-    return expert, learner
 
 
 def _resampled(motions: Demonstrations, number: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,6 @@ from typing import Any
 
 from rich.console import Console
 
-from mimic import compat
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.progress import SearchProgress
 from mimic.commands.report import make_report, show_report
@@ -17,9 +16,9 @@ from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.make import make_trainer
+from mimic.trainers.make import make_ppo_trainer, make_trainer
 from mimic.trainers.run_config import load_config
-from mimic.trainers.trainer import Params, Trainer
+from mimic.trainers.trainer import Trainer
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
@@ -40,27 +39,28 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         reason = "exists; name a new folder" if out.exists() else f"there is no folder {str(out.parent)!r}"
         raise ValueError(f"out: {str(out)!r}: {reason}")
     with stopwatch.stage("build"):
-        trained, job = _job_to_evaluate(trained, run_dir, config)
-        steps, params = load_checkpoint(run_dir, job.params_template(), config.checkpoint)
+        trained, trainer = _trainer_to_evaluate(trained, run_dir, config)
+        steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
 
     def run() -> None:
         console = Console()
         with stopwatch.stage("evaluate"):
-            outcome, controller = _outcome(job, params, config, console)
-            figures = {**job.figures(outcome), **job.details(outcome, config.controller)}
-        report = make_report(trained, job, figures, stopwatch, steps, 0)
+            with SearchProgress(console, config.search.iterations) as progress:
+                outcome, controller = trainer.run_controller(config.controller, params, config.search, progress.update)
+            figures = {**trainer.figures(outcome), **trainer.details(outcome, config.controller)}
+        report = make_report(trained, trainer, figures, stopwatch, steps, 0)
         report |= {**controller, "evaluated": _conditions(trained, config)}
-        show_report(console, report, job)
+        show_report(console, report, trainer)
         if out:
             out.mkdir()
-            job.save_outcome(out, outcome, config.controller)
+            trainer.save_outcome(out, outcome, config.controller)
             write_report(out, report)
             console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
 
     return run
 
 
-def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
+def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
     """A run as it was, or with other demonstrations, physics or loads."""
     factors = {"mass": config.mass, "damping": config.damping}
     changes: dict[str, Any] = {key: [value, value] for key, value in factors.items() if value is not None}
@@ -79,11 +79,8 @@ def _job_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig
         randomization=dataclasses.replace(trained.env.randomization, **changes),
     )
     trained = dataclasses.replace(trained, env=env)
-    compat.import_mjx()
-    from mimic.trainers.ppo.trainer import PPOTrainer
-
     unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
-    return trained, PPOTrainer(trained, run_dir, unseen)
+    return trained, make_ppo_trainer(trained, run_dir, unseen)
 
 
 def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
@@ -95,23 +92,3 @@ def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
         "physics": env.physics,
         **dataclasses.asdict(env.randomization),
     }
-
-
-def _outcome(job: Trainer, params: Params, config: EvaluateConfig, console: Console) -> tuple[Any, dict[str, Any]]:
-    """What a controller did, and what the report says of the controller."""
-    if config.controller == "policy":
-        return job.evaluate(params), {}
-    from mimic.trainers.ppo.trainer import PPOTrainer
-
-    assert isinstance(job, PPOTrainer)
-    if config.controller == "searched":
-        from mimic.evaluation.searched_torques import search_torques
-
-        policy = job.controller(params)
-        with SearchProgress(console, config.search.iterations) as progress:
-            outcome, starts = search_torques(job.evaluator, policy, config.search, progress.update)
-        return outcome, {"trainer": "searched", "search": dataclasses.asdict(config.search), "starts": starts}
-    from mimic.evaluation.tracking_controllers import run_controller
-
-    outcome, frequency = run_controller(job.evaluator, config.controller)
-    return outcome, {"trainer": config.controller, "frequency_rad_s": frequency}

@@ -7,18 +7,16 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import jax
 import jax.numpy as jnp
 from rich.console import Console
 
-from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import EXPORT_FORMATS, ExportConfig
 from mimic.config import check_choice, new_file
 from mimic.envs import env_config
-from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import observation_layout, torque_scale
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_atomically
@@ -133,7 +131,7 @@ def _portable(config: ExportConfig) -> Portable:
     run_dir = Path(config.run).expanduser()
     trained = load_config(run_dir)
     steps = check_checkpoint(run_dir, config.checkpoint)
-    expert, learner = _arms(trained.env)
+    expert, learner = trained.env.build_arms().embodiments
     if config.learner:
         _check_meant_for(config.learner, expert, learner)
     common = {
@@ -146,37 +144,30 @@ def _portable(config: ExportConfig) -> Portable:
         "learner": learner.name,
         "learner_joints": list(learner.joint_names),
     }
-    if isinstance(trained.trainer, PPOConfig):
+    if trained.trainer.name == "ppo":
         return _policy(trained, run_dir, steps, common)
     return _mapper(PoseMapper.load(run_dir, steps), common)
 
 
-def _arms(env: EnvConfig) -> tuple[Embodiment, Embodiment]:
-    expert, learner = (build_arm(arm, env.limits, env.metric.links).embodiment for arm in (env.expert, env.learner))
-    return expert, learner
-
-
 def _check_meant_for(name: str, expert: Embodiment, learner: Embodiment) -> None:
-    for role, own, wanted in zip(("expert", "learner"), (expert, learner), _arms(env_config(name)), strict=True):
-        if (own.name, own.joint_names) != (wanted.name, wanted.joint_names):
+    meant = env_config(name).build_arms().embodiments
+    for role, own, other in zip(("expert", "learner"), (expert, learner), meant, strict=True):
+        if (own.name, own.joint_names) != (other.name, other.joint_names):
             raise ValueError(
-                f"learner: {name} has the {role} {wanted.name} with joints {', '.join(wanted.joint_names)}, "
+                f"learner: {name} has the {role} {other.name} with joints {', '.join(other.joint_names)}, "
                 f"but the run's is {own.name} with joints {', '.join(own.joint_names)}"
             )
 
 
 def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str, Any]) -> Portable:
-    arms = [
-        build_arm(arm, trained.env.limits, trained.env.metric.links)
-        for arm in (trained.env.expert, trained.env.learner)
-    ]
-    expert, learner = (arm.embodiment for arm in arms)
+    arms = trained.env.build_arms()
+    expert, learner = arms.embodiments
     layout = observation_layout(expert, learner, trained.env.preview)
     size = layout[-1]["stop"]
-    config: PPOConfig = trained.trainer  # type: ignore[assignment] - saved resolved: the machine does not matter
+    config = cast(PPOConfig, trained.trainer).resolve()  # saved with all values: the machine does not matter
     params = load_checkpoint(run_dir, training.params_template(config, size, learner.num_joints), steps)[1]
     controller = training.make_controller(config, size, learner.num_joints)(jax.device_get(params))
-    scale = jnp.asarray(torque_scale(arms[1], trained.env.action_scale, trained.env.control_dt))
+    scale = jnp.asarray(torque_scale(arms.learner, trained.env.action_scale, trained.env.control_dt))
 
     def function(observation: jax.Array) -> dict[str, jax.Array]:
         action = controller(SimpleNamespace(obs=observation))  # type: ignore[arg-type]

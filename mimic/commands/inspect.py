@@ -17,8 +17,9 @@ from rich.console import Console  # noqa: E402
 from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from mimic.arms.arm import Arm, ArmConfig, build_arm, effective_inertia, rated_speed, torque_scale  # noqa: E402
+from mimic.arms.arm import Arm, ArmConfig, rated_speed, torque_scale
 from mimic.arms.rendering import ArmScene  # noqa: E402
+from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.commands.arm_checks import ReachableDistance, assumptions, calmed, joint_ranges, reachable_distance, warnings  # noqa: E402
 from mimic.commands.config import InspectConfig  # noqa: E402
 from mimic.commands.progress import similarity_table  # noqa: E402
@@ -38,7 +39,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     """
     out = _new_folder(config.out)
     env = EnvConfig(name="pair", expert=config.expert, learner=config.learner, limits=config.limits)
-    expert, learner = (build_arm(arm, env.limits, env.metric.links) for arm in (env.expert, env.learner))
+    expert, learner = env.build_arms()
     joints, links = _joints(learner, config.learner, env), _links(expert, learner, env)
     notes = list(learner.notes)
     assumed, warned = list(assumptions(config.learner, learner)), list(warnings(config.learner, learner))

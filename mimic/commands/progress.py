@@ -48,7 +48,7 @@ class TrainingProgress:
 
 
 class SearchProgress:
-    """A bar over the updates of a search; without a terminal, ten lines."""
+    """A bar over the updates of a search, from its first update on; without a terminal, ten lines."""
 
     def __init__(self, console: Console, total: int):
         self._console, self._total = console, total
@@ -64,14 +64,15 @@ class SearchProgress:
         self._task = self._bar.add_task("search", total=total, status="compiling")
 
     def __enter__(self) -> "SearchProgress":
-        self._bar.start()
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self._bar.stop()
+        if self._bar.live.is_started:
+            self._bar.stop()
 
     def update(self, done: int, status: str) -> None:
         """Shows the state after an update."""
+        self._bar.start()
         self._bar.update(self._task, completed=done, status=status)
         if not self._console.is_terminal and (done % max(self._total // 10, 1) == 0 or done == self._total):
             self._console.print(f"searching {done:>4} of {self._total}  {status}", soft_wrap=True, highlight=False)
@@ -103,17 +104,17 @@ def _similarity_cell(key: str, value: float) -> str:
     return f"{value:.1f} deg" if key.endswith("_deg") else f"{value:.3f}"
 
 
-def report_table(report: Mapping[str, Any], job: Trainer) -> Table:
+def report_table(report: Mapping[str, Any], trainer: Trainer) -> Table:
     """The figures of a report, training next to held-out data."""
     table = Table(title=f"{report['env']}  {report['trainer']}  seed {report['seed']}", title_justify="left")
     table.add_column("")
     table.add_column("training", justify="right")
     table.add_column("held out", justify="right")
-    for row in job.rows(dict(report)):
+    for row in trainer.rows(dict(report)):
         table.add_row(*row)
     table.add_section()
     seconds = ", ".join(f"{name} {value:.1f}" for name, value in report["wall_time_s"].items())
     speed = f"{report['steps_per_second']:,.0f} /s" if report["steps_per_second"] else ""
-    table.add_row(job.unit.replace("_", " "), f"{report[job.unit]:,}", speed)
+    table.add_row(trainer.unit.replace("_", " "), f"{report[trainer.unit]:,}", speed)
     table.caption, table.caption_justify = f"seconds: {seconds}", "left"
     return table

@@ -12,21 +12,21 @@ from mimic.trainers.config import TrainConfig
 from mimic.trainers.trainer import Trainer
 
 
-def show_report(console: Console, report: Mapping[str, Any], job: Trainer) -> None:
+def show_report(console: Console, report: Mapping[str, Any], trainer: Trainer) -> None:
     """Prints a report as tables."""
-    console.print(report_table(report, job))
+    console.print(report_table(report, trainer))
     if "similarity" in report:
         console.print(similarity_table(report["similarity"]))
 
 
 def make_report(
-    config: TrainConfig, job: Trainer, figures: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
+    config: TrainConfig, trainer: Trainer, figures: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
 ) -> dict[str, Any]:
     """What report.json holds.
 
     Args:
       config: of the run.
-      job: of the run.
+      trainer: of the run.
       figures: of the evaluation.
       stopwatch: of the process.
       steps: that the evaluated parameters were trained for.
@@ -39,7 +39,7 @@ def make_report(
         "seed": config.seed,
         **figures,
         "wall_time_s": wall_time,
-        job.unit: steps,
+        trainer.unit: steps,
         "steps_per_second": trained / wall_time["train"] if wall_time["train"] else 0.0,
         "hardware": hardware(),
         "versions": versions(),

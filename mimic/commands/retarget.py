@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from rich.console import Console
 from rich.table import Table
 
-from mimic.arms.arm import build_arm, rated_speed
+from mimic.arms.arm import rated_speed
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import RetargetConfig
 from mimic.commands.progress import similarity_table
@@ -144,7 +144,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
         raise ValueError("demonstrations: expected a file, as in demonstrations=FILE")
     out = new_file("out", config.out)
     env = env_config(config.learner, limits=config.limits)
-    expert, learner = (build_arm(arm, env.limits, env.metric.links).embodiment for arm in (env.expert, env.learner))
+    expert, learner = env.build_arms().embodiments
     loaded = load_demonstrations(Path(config.demonstrations).expanduser())
     _check(loaded, expert)
     mapper = PoseMapper.load(Path(config.mapper).expanduser()) if config.mapper else None

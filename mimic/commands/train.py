@@ -5,7 +5,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import OmegaConf
 from rich.console import Console
@@ -62,13 +62,13 @@ def prepare_training(
     check_loggers(config.loggers)
     run_dir = resumed or (new_run_dir(config) if leads else Path())
     with stopwatch.stage("build"):
-        job = make_trainer(config, resumed)
-        restore = load_checkpoint(resumed, job.params_template()) if resumed else None
-    config = dataclasses.replace(config, trainer=job.settings)
+        trainer = make_trainer(config, resumed)
+        restore = load_checkpoint(resumed, trainer.params_template()) if resumed else None
+    config = dataclasses.replace(config, trainer=trainer.settings)
     if group and not group.first:
-        return lambda: _follow(job, restore, group)
+        return lambda: _follow(trainer, restore, group)
     noted = group.signals if group else signals or Signals()
-    return lambda: _train(config, job, run_dir, restore, stopwatch, group, noted)
+    return lambda: _train(config, trainer, run_dir, restore, stopwatch, group, noted)
 
 
 def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
@@ -84,7 +84,7 @@ def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str])
             f"got {refused[0]!r}"
         )
     merged = OmegaConf.merge(run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
-    config: TrainConfig = OmegaConf.to_object(merged)  # type: ignore[assignment]
+    config = cast(TrainConfig, OmegaConf.to_object(merged))
     total = config.trainer.total_steps
     if steps >= total:
         raise ValueError(
@@ -96,17 +96,17 @@ def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str])
     )
 
 
-def _follow(job: Trainer, restore: tuple[int, Params] | None, group: ProcessGroup) -> int:
+def _follow(trainer: Trainer, restore: tuple[int, Params] | None, group: ProcessGroup) -> int:
     """What a process does that is not the first: it trains in step, until that one ends it."""
     with noted_signals(group.signals):
-        job.follow(restore)
+        trainer.follow(restore)
         group.wait()
     return 0
 
 
 def _train(
     config: TrainConfig,
-    job: Trainer,
+    trainer: Trainer,
     run_dir: Path,
     restore: tuple[int, Params] | None,
     stopwatch: Stopwatch,
@@ -118,14 +118,14 @@ def _train(
     with noted_signals(signals):  # also while the report is made: all is done then, and a signal changes nothing
         run_dir.mkdir(parents=True, exist_ok=restore is not None)
         save_config(run_dir, config)
-        job.save_inputs(run_dir)
+        trainer.save_inputs(run_dir)
         console.print(
-            f"{job.headline} on {device} (preset {job.settings.preset})\nrun directory: {run_dir}",
+            f"{trainer.headline} on {device} (preset {trainer.settings.preset})\nrun directory: {run_dir}",
             highlight=False,
             soft_wrap=True,
         )
         try:
-            steps, params = _train_and_log(config, job, run_dir, signals, restore, stopwatch, console)
+            steps, params = _train_and_log(config, trainer, run_dir, signals, restore, stopwatch, console)
         except Interrupted as stop:
             if group:
                 group.end(stop.exit_code)
@@ -134,20 +134,20 @@ def _train(
         if group:
             group.end(0)
         with stopwatch.stage("evaluate"):
-            outcome = job.evaluate(params)
-            figures = {**job.figures(outcome), **job.details(outcome)}
+            outcome = trainer.evaluate(params)
+            figures = {**trainer.figures(outcome), **trainer.details(outcome)}
         done_before = restore[0] if restore else 0
-        report = make_report(config, job, figures, stopwatch, steps, steps - done_before)
+        report = make_report(config, trainer, figures, stopwatch, steps, steps - done_before)
         write_report(run_dir, report)
-        job.save_outcome(run_dir, outcome)
-    show_report(console, report, job)
+        trainer.save_outcome(run_dir, outcome)
+    show_report(console, report, trainer)
     console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
     return 0
 
 
 def _train_and_log(
     config: TrainConfig,
-    job: Trainer,
+    trainer: Trainer,
     run_dir: Path,
     signals: Signals,
     restore: tuple[int, Params] | None,
@@ -160,22 +160,22 @@ def _train_and_log(
         loggers = [MetricsLog(run_dir), *make_loggers(config.loggers, run_dir, to_dict(config))]
         for logger in loggers:
             stack.callback(logger.close)  # also where training is interrupted
-        progress = stack.enter_context(TrainingProgress(console, job.total_steps, done_before))
+        progress = stack.enter_context(TrainingProgress(console, trainer.total_steps, done_before))
         stack.enter_context(stopwatch.stage("train"))
 
         def on_evaluation(step: int, params: Params, metrics: Mapping[str, float]) -> bool:
             with stopwatch.stage("evaluate"):
-                figures = job.figures(job.evaluate(params))
+                figures = trainer.figures(trainer.evaluate(params))
                 if metrics:
                     row = {f"quality/{key}": value for key, value in _flat(figures).items()}
                     row |= {f"training/{key}": value for key, value in metrics.items()}
                     row["wall_time_s"] = time.perf_counter() - stopwatch.started
                     for logger in loggers:
                         logger.write(step, row)
-                progress.update(step, job.status(figures), metrics.get("sps"))
-            return job.good_enough(figures)
+                progress.update(step, trainer.status(figures), metrics.get("sps"))
+            return trainer.good_enough(figures)
 
-        return job.train(run_dir, on_evaluation, signals, restore)
+        return trainer.train(run_dir, on_evaluation, signals, restore)
 
 
 def _flat(figures: Mapping[str, Any]) -> dict[str, float]:

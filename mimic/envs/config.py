@@ -3,7 +3,7 @@
 import dataclasses
 import math
 
-from mimic.arms.arm import ArmConfig
+from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
 from mimic.config import check_choice
 from mimic.envs.recording import KINDS
@@ -112,3 +112,11 @@ class EnvConfig:
                 raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
         if not 0 <= self.limit_weight < math.inf:
             raise ValueError(f"limit_weight: expected at least 0, got {self.limit_weight}")
+
+    def build_arms(self) -> ArmPair:
+        """The arms, with the links that the metric asks for.
+
+        Raises:
+          ValueError: an arm that cannot be built.
+        """
+        return ArmPair(*(build_arm(arm, self.limits, self.metric.links) for arm in (self.expert, self.learner)))

@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,6 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.envs.physics import Load, make_advance
 from mimic.envs.recording import record_demonstrations
-from mimic.metric.distance import embodiment_distance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 
 # Of a limit, in rad or as a share of the rated speed: where nearness begins to cost, and how much further all it can.
@@ -49,6 +48,11 @@ class ArmState:
     load: Load | None = None
 
 
+def arm_state(state: State) -> ArmState:
+    """What an episode's brax state carries of the learner."""
+    return cast(ArmState, state.pipeline_state)
+
+
 class ImitationEnv(Env):
     """One learner imitating one of the demonstrations; a brax environment over MJX.
 
@@ -64,7 +68,7 @@ class ImitationEnv(Env):
     Attributes:
       expert, learner: the embodiments.
       arm: the learner with the model that simulates it.
-      correspondence, weights: of the reward.
+      metric: of the reward.
       demonstrations: what is imitated.
       expert_states: link states of the demonstrations, [demonstrations, time, links, 3] each.
       torque_scale: [joints] largest torque [N m].
@@ -75,20 +79,17 @@ class ImitationEnv(Env):
 
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
         self.config = config
-        expert, learner = (
-            build_arm(arm, config.limits, config.metric.links) for arm in (config.expert, config.learner)
-        )
-        self.expert, self.learner = expert.embodiment, learner.embodiment
-        self.weights = config.metric.make_weights()
-        self.correspondence = config.metric.make_correspondence(self.expert, self.learner)
-        self.torque_scale = jnp.asarray(torque_scale(learner, config.action_scale, config.control_dt))
-        self.arm = learner
+        arms = config.build_arms()
+        self.expert, self.learner = arms.embodiments
+        self.metric = config.metric.build(self.expert, self.learner)
+        self.arm = arms.learner
+        self.torque_scale = jnp.asarray(torque_scale(self.arm, config.action_scale, config.control_dt))
         home = np.asarray(self.learner.home)
         self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
         timestep = config.control_dt / config.substeps
-        self._advance = make_advance(learner.model, timestep, config.substeps, config.physics)
+        self._advance = make_advance(self.arm.model, timestep, config.substeps, config.physics)
         if demonstrations is None:
-            demonstrations = training_and_held_out(config, expert)[0]
+            demonstrations = training_and_held_out(config, arms.expert)[0]
         self._set_demonstrations(demonstrations)
 
     def with_demonstrations(self, demonstrations: Demonstrations) -> "ImitationEnv":
@@ -142,7 +143,7 @@ class ImitationEnv(Env):
 
     def step(self, state: State, action: Float[Array, " joints"]) -> State:
         """Holds a torque for one control step."""
-        before: ArmState = state.pipeline_state  # type: ignore[assignment]
+        before = arm_state(state)
         command = jnp.clip(action, -1.0, 1.0)
         step = before.step + 1
         randomization = self.config.randomization
@@ -181,15 +182,7 @@ class ImitationEnv(Env):
 
     def states_distance(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, ""]:
         """Embodiment distance of link states, in this environment's metric."""
-        metric = self.config.metric
-        return embodiment_distance(
-            expert_states,
-            learner_states,
-            self.correspondence,
-            self.weights,
-            rotation=metric.rotation_measure,  # type: ignore[arg-type]
-            reduction=metric.reduction,  # type: ignore[arg-type]
-        )
+        return self.metric(expert_states, learner_states)
 
     def limit_excess(self, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]) -> Float[Array, ""]:
         """How much joints are at or beyond their limits: 0 within a margin of them, 1 where all are far beyond."""
@@ -209,7 +202,7 @@ class ImitationEnv(Env):
         metric, n, n_hat = self.config.metric, self.expert.num_links, self.learner.num_links
         per_pair = np.pi * metric.rotation + 2 * metric.translation + 4 * metric.adaptive
         # No Frobenius norm is above the sum; the entries of hard and soft W sum up to n + n_hat.
-        total = n + n_hat if callable(self.correspondence) else np.asarray(self.correspondence).sum()
+        total = n + n_hat if callable(self.metric.correspondence) else np.asarray(self.metric.correspondence).sum()
         return float(per_pair * total / (n * n_hat if metric.reduction == "mean" else 1))
 
     def expert_at(self, demonstration: Array, step: Array) -> LinkStates:

@@ -8,7 +8,7 @@ from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
 from mimic import compat
-from mimic.envs.imitation import FIRST_STEP, ArmState, ImitationEnv
+from mimic.envs.imitation import FIRST_STEP, ArmState, ImitationEnv, arm_state
 
 
 class FreshEpisodeWrapper(Wrapper):
@@ -26,11 +26,11 @@ class FreshEpisodeWrapper(Wrapper):
     def reset(self, rng: jax.Array) -> State:
         """Batched reset."""
         state = self.env.reset(rng)
-        arm_state: ArmState = state.pipeline_state  # type: ignore[assignment]
-        keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(arm_state.key, FIRST_STEP)
+        arm = arm_state(state)
+        keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(arm.key, FIRST_STEP)
         steps = jax.vmap(lambda key: jax.random.randint(key, (), 0, self._imitation.config.horizon))(keys)
-        arm_state = dataclasses.replace(arm_state, step=steps)
-        return state.replace(pipeline_state=arm_state, obs=jax.vmap(self._imitation.observe_home)(arm_state))
+        arm = dataclasses.replace(arm, step=steps)
+        return state.replace(pipeline_state=arm, obs=jax.vmap(self._imitation.observe_home)(arm))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Batched step."""
@@ -39,19 +39,19 @@ class FreshEpisodeWrapper(Wrapper):
             info = {**info, "steps": jnp.where(state.done, 0, info["steps"])}
         state = state.replace(done=jnp.zeros_like(state.done), info=info)
         state = self.env.step(state, action)
-        arm_state: ArmState = state.pipeline_state  # type: ignore[assignment]
-        fresh, fresh_obs = jax.vmap(self._begin)(arm_state.key)
+        arm = arm_state(state)
+        fresh, fresh_obs = jax.vmap(self._begin)(arm.key)
         done = state.done.astype(bool)
 
         def where_done(new, old):
             return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
 
-        arm_state = jax.tree.map(where_done, fresh, arm_state)
-        return state.replace(pipeline_state=arm_state, obs=where_done(fresh_obs, state.obs))
+        arm = jax.tree.map(where_done, fresh, arm)
+        return state.replace(pipeline_state=arm, obs=where_done(fresh_obs, state.obs))
 
     def _begin(self, key: jax.Array) -> tuple[ArmState, jax.Array]:
-        arm_state = self._imitation.start(key)
-        return arm_state, self._imitation.observe_home(arm_state)
+        arm = self._imitation.start(key)
+        return arm, self._imitation.observe_home(arm)
 
 
 def fresh_episodes(env: ImitationEnv) -> Wrapper:

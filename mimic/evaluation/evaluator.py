@@ -232,19 +232,9 @@ def _references(env: ImitationEnv) -> References:
 
 def _lower_bound(env: ImitationEnv, qpos: Motions, qvel: Motions) -> tuple[np.ndarray, Motions]:
     """The kinematic bound [demonstrations, time], and the poses that have it."""
-    metric = env.config.metric
 
     def closest(qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        found = closest_motion(
-            env.expert,
-            env.learner,
-            qpos,
-            qvel,
-            env.correspondence,
-            env.weights,
-            rotation=metric.rotation_measure,  # type: ignore[arg-type]
-            reduction=metric.reduction,  # type: ignore[arg-type]
-        )
+        found = closest_motion(env.expert, env.learner, qpos, qvel, **env.metric.arguments)
         return found.distance, found.qpos
 
     # On the host's processor where JAX may use it: there the program compiles several times faster, and it runs once.

@@ -1,14 +1,11 @@
 """A policy's rollout as it is shown: resampled in time, with its distance, bound and what each link adds."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from mimic.evaluation.evaluator import Evaluator, Rollouts
-from mimic.metric.distance import link_distances
 from mimic.metric.kinematics import link_states
 
 
@@ -77,10 +74,8 @@ def _links(evaluator: Evaluator, index: int, qpos: np.ndarray, qvel: np.ndarray)
 
     def one(qpos: jax.Array, qvel: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
         learner = link_states(env.learner, qpos, qvel)
-        measure: Any = env.config.metric.rotation_measure
-        distances = link_distances(env.expert_at(jnp.asarray(index), step), learner, env.weights, rotation=measure)
-        matrix = env.correspondence(distances) if callable(env.correspondence) else jnp.asarray(env.correspondence)
-        return distances, matrix
+        distances = env.metric.link_distances(env.expert_at(jnp.asarray(index), step), learner)
+        return distances, env.metric.matrix(distances)
 
     links, matrix = jax.jit(jax.vmap(one))(qpos, qvel, jnp.arange(1, len(qpos) + 1))
     return np.asarray(links), np.asarray(matrix)

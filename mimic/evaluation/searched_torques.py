@@ -8,7 +8,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.envs.imitation import ArmState, ImitationEnv
+from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.envs.physics import Load
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
@@ -85,7 +85,7 @@ def _with_noise(env: ImitationEnv, policy: Controller, key: Array) -> Controller
     noise = jnp.repeat(_NOISE * jax.random.normal(key, shape), _NOISE_STEPS, axis=1)
 
     def controller(state: State) -> Array:
-        arm: ArmState = state.pipeline_state  # type: ignore[assignment]
+        arm = arm_state(state)
         return policy(state) + noise[arm.demonstration, arm.step]
 
     return controller
@@ -95,7 +95,7 @@ def _replay(action: Float[Array, "demonstrations time joints"]) -> Controller:
     """Open loop."""
 
     def controller(state: State) -> Array:
-        arm: ArmState = state.pipeline_state  # type: ignore[assignment]
+        arm = arm_state(state)
         return action[arm.demonstration, arm.step]
 
     return controller

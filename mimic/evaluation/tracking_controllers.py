@@ -8,9 +8,9 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import effective_inertia
+from mimic.arms.simulation_model import effective_inertia
 from mimic.envs import dynamics
-from mimic.envs.imitation import ArmState, ImitationEnv
+from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.retargeting.motions import largest_jump, optimal_motions
 
@@ -65,7 +65,7 @@ def _tracking(env: ImitationEnv, law: _Law) -> Callable[[Array], Controller]:
 
     def make(frequency: Array) -> Controller:
         def controller(state: State) -> Array:
-            arm: ArmState = state.pipeline_state  # type: ignore[assignment]
+            arm = arm_state(state)
             motion, now = arm.demonstration, arm.step
             position_error, velocity_error = qpos[motion, now] - arm.qpos, qvel[motion, now] - arm.qvel
             acceleration = (qvel[motion, now + 1] - qvel[motion, now]) / dt

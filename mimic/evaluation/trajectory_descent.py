@@ -17,7 +17,6 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.physics import Load, make_advance
 from mimic.metric.distance import PARTS, PairDistances, Weights, pair_distances
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.metric.spatial import safe_sqrt
 
 _STEPS = (1.0, 0.5, 0.2, 0.05, 0.01)  # of the full update; all are rolled out, and the best one is taken
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-6, 1e3  # added to the curvature by the action
@@ -231,13 +230,9 @@ class TrajectoryDescent:
 
     def _of_parts(self, parts: PairDistances) -> Array:
         """The embodiment distance as a function of the parts of its pair distances."""
-        env, weights = self._env, self._env.weights
-        alpha = _weights_at(weights, parts)
-        distances: Any = sum(getattr(alpha, part) * getattr(parts, part) for part in PARTS)
-        weighted = (env.correspondence(distances) if callable(env.correspondence) else env.correspondence) * distances
-        if env.config.metric.reduction == "mean":
-            return jnp.mean(weighted)
-        return safe_sqrt(jnp.sum(weighted * weighted))
+        metric = self._env.metric
+        alpha = _weights_at(metric.weights, parts)
+        return metric.reduced(sum((getattr(alpha, part) * getattr(parts, part) for part in PARTS), jnp.zeros(())))
 
 
 def _weights_at(weights: Weights, parts: PairDistances) -> Any:

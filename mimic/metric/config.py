@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,17 @@ from mimic.metric.correspondence import (
     overlap_correspondence,
     soft_correspondence,
 )
-from mimic.metric.distance import Correspondence, DistanceWeights, Weights, adaptive_weights
+from mimic.metric.distance import (
+    REDUCTIONS,
+    ROTATION_MEASURES,
+    Correspondence,
+    DistanceWeights,
+    Metric,
+    Reduction,
+    RotationMeasure,
+    Weights,
+    adaptive_weights,
+)
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")
 
@@ -51,8 +62,8 @@ class MetricConfig:
     def __post_init__(self) -> None:
         check_choice("links", self.links, LINKS)
         check_choice("correspondence", self.correspondence, CORRESPONDENCES)
-        check_choice("rotation_measure", self.rotation_measure, ("cosine", "angle"))
-        check_choice("reduction", self.reduction, ("mean", "frobenius"))
+        check_choice("rotation_measure", self.rotation_measure, ROTATION_MEASURES)
+        check_choice("reduction", self.reduction, REDUCTIONS)
         if not -math.inf < self.xi < 0:
             raise ValueError(f"xi: expected a finite number below 0 (soft minimum), got {self.xi}")
         for name in ("translation", "rotation", "linear_velocity", "angular_velocity"):
@@ -76,6 +87,12 @@ class MetricConfig:
             "soft": lambda: partial(soft_correspondence, xi=self.xi),
         }
         return made[self.correspondence]()
+
+    def build(self, expert: Embodiment, learner: Embodiment) -> Metric:
+        """The metric between two arms."""
+        correspondence = self.make_correspondence(expert, learner)
+        rotation, reduction = cast(RotationMeasure, self.rotation_measure), cast(Reduction, self.reduction)
+        return Metric(correspondence, self.make_weights(), rotation, reduction)
 
     def shares(self, expert: Embodiment, learner: Embodiment) -> Float[np.ndarray, "expert learner"]:
         """How much each expert link counts for a learner link: columns sum to 1; alike where W depends on the state."""

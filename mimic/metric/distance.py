@@ -1,5 +1,6 @@
 """How far apart two embodiments are: the link-pair kernel, its weights, and the reduction to one number."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
+from mimic.config import check_choice
 from mimic.metric import spatial
 from mimic.metric.kinematics import LinkStates
 
@@ -71,7 +73,7 @@ def rotation_distance(
     Raises:
       ValueError: an unknown measure.
     """
-    _check_choice("rotation", measure, ROTATION_MEASURES)
+    check_choice("rotation", measure, ROTATION_MEASURES)
     a, b = spatial.vector(direction_a), spatial.vector(direction_b)
     if measure == "angle":  # atan2, because the derivative of arccos is infinite at a match
         return jnp.arctan2(spatial.norm(spatial.cross(a, b)), spatial.dot(a, b))
@@ -94,7 +96,7 @@ def link_distances(
     Raises:
       ValueError: an unknown measure, or candidate points with a weight on what they lack.
     """
-    _check_choice("rotation", rotation, ROTATION_MEASURES)
+    check_choice("rotation", rotation, ROTATION_MEASURES)
     if not callable(weights):
         _check_candidate_points(expert_states, learner_states, weights)
     over_learner = jax.vmap(lambda a, b: pair_distances(a, b, rotation), in_axes=(None, 0))
@@ -106,6 +108,70 @@ def link_distances(
         weight = _weight(part, getattr(alpha, part), distances)  # a constant 0 costs nothing, in time and in NaNs
         total = spatial.plus(total, spatial.times(weight, distances))
     return jnp.broadcast_to(jnp.asarray(total, parts.translation.dtype), parts.translation.shape)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Metric:
+    """All of the embodiment distance but the link states; called with these, it is the distance.
+
+    Attributes:
+      correspondence: W [n, n_hat], or a function that makes it of the link distances, as `hard_correspondence`.
+      weights: see `link_distances`.
+      rotation: see `link_distances`.
+      reduction: "mean" of all n n_hat entries of W o D' (paper), or their "frobenius" norm.
+
+    Raises:
+      ValueError: an unknown rotation measure or reduction.
+    """
+
+    correspondence: Correspondence
+    weights: Weights
+    rotation: RotationMeasure = "cosine"
+    reduction: Reduction = "mean"
+
+    def __post_init__(self) -> None:
+        check_choice("rotation", self.rotation, ROTATION_MEASURES)
+        check_choice("reduction", self.reduction, REDUCTIONS)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The attributes, as keyword arguments of the functions that take a metric in parts."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    @property
+    def is_static(self) -> bool:
+        """Whether it is a constant W and constant weights with cosines and the mean: closed forms exist for these."""
+        constant = not callable(self.correspondence) and isinstance(self.weights, DistanceWeights)
+        return constant and self.rotation == "cosine" and self.reduction == "mean"
+
+    def __call__(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, ""]:
+        """See `embodiment_distance`."""
+        return self.reduced(self.link_distances(expert_states, learner_states))
+
+    def link_distances(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, "expert learner"]:
+        """See `link_distances`."""
+        return link_distances(expert_states, learner_states, self.weights, rotation=self.rotation)
+
+    def matrix(self, distances: Float[Array, "expert learner"]) -> Float[Array, "expert learner"]:
+        """W, for these link distances.
+
+        Raises:
+          ValueError: W of another shape.
+        """
+        matrix = self.correspondence(distances) if callable(self.correspondence) else self.correspondence
+        matrix = jnp.asarray(matrix, distances.dtype)
+        if matrix.shape != distances.shape:
+            raise ValueError(
+                f"correspondence: expected shape {distances.shape} (expert links, learner links), got {matrix.shape}"
+            )
+        return matrix
+
+    def reduced(self, distances: Float[Array, "expert learner"]) -> Float[Array, ""]:
+        """The corresponding links' distances as one number."""
+        weighted = self.matrix(distances) * distances
+        if self.reduction == "mean":
+            return jnp.mean(weighted)
+        return spatial.safe_sqrt(jnp.sum(weighted * weighted))
 
 
 def embodiment_distance(
@@ -122,25 +188,15 @@ def embodiment_distance(
     Args:
       expert_states: link states of the expert.
       learner_states: link states of the learner.
-      correspondence: W [n, n_hat], or a function that makes it of the link distances, as `hard_correspondence`.
+      correspondence: see `Metric`.
       weights: see `link_distances`.
       rotation: see `link_distances`.
-      reduction: "mean" of all n n_hat entries of W o D' (paper), or their "frobenius" norm.
+      reduction: see `Metric`.
 
     Raises:
-      ValueError: W of another shape, an unknown measure or reduction, or what `link_distances` refuses.
+      ValueError: W of another shape, an unknown measure or reduction, or what `link_distances` rejects.
     """
-    _check_choice("reduction", reduction, REDUCTIONS)
-    distances = link_distances(expert_states, learner_states, weights, rotation=rotation)
-    matrix = jnp.asarray(correspondence(distances) if callable(correspondence) else correspondence, distances.dtype)
-    if matrix.shape != distances.shape:
-        raise ValueError(
-            f"correspondence: expected shape {distances.shape} (expert links, learner links), got {matrix.shape}"
-        )
-    weighted = matrix * distances
-    if reduction == "mean":
-        return jnp.mean(weighted)
-    return spatial.safe_sqrt(jnp.sum(weighted * weighted))
+    return Metric(correspondence, weights, rotation, reduction)(expert_states, learner_states)
 
 
 def pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> PairDistances:
@@ -188,8 +244,3 @@ def _check_candidate_points(a: LinkStates, b: LinkStates, weights: DistanceWeigh
         missing = getattr(a, field) is None or getattr(b, field) is None
         if missing and not isinstance(weight, Tracer) and np.any(np.asarray(weight) != 0):
             raise ValueError(f"weights: candidate points have no {field}, so {part} must weigh 0, got {weight}")
-
-
-def _check_choice(what: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{what}: expected one of {', '.join(choices)}, got {value!r}")

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from mimic.arms.embodiment import Embodiment
-from mimic.metric.distance import Correspondence, RotationMeasure, Weights, embodiment_distance
+from mimic.metric.distance import Correspondence, Metric, RotationMeasure, Weights
 from mimic.metric.kinematics import link_states
 
 
@@ -53,12 +53,13 @@ def distance_landscape(
         raise ValueError(f"learner: expected 2 joints, got {learner.num_joints} of {learner.name}")
     if resolution < 3:
         raise ValueError(f"resolution: expected at least 3, got {resolution}")
+    metric = Metric(correspondence, weights, rotation)
     states = link_states(expert, qpos)
     angles = jnp.linspace(-jnp.pi, jnp.pi, resolution, endpoint=False)
 
     def distance(first: Array, second: Array) -> Array:
         learner_states = link_states(learner, jnp.stack([first, second]))
-        return embodiment_distance(states, learner_states, correspondence, weights, rotation=rotation)
+        return metric(states, learner_states)
 
     over_grid = jax.vmap(jax.vmap(distance, (None, 0)), (0, None))
     return Landscape(angles, jax.jit(over_grid)(angles, angles))

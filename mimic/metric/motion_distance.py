@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,10 +19,10 @@ from mimic.metric.distance import (
     PARTS,
     Correspondence,
     DistanceWeights,
+    Metric,
     Reduction,
     RotationMeasure,
     Weights,
-    embodiment_distance,
     pair_distances,
 )
 from mimic.metric.kinematics import LONG, joint_values, link_states
@@ -65,17 +65,16 @@ def motion_distance(
     Raises:
       ValueError: what `embodiment_distance` refuses.
     """
-    arms = expert, learner
+    arms, metric = (expert, learner), Metric(correspondence, weights, rotation, reduction)
 
     def composed(*motion: Array) -> Array:
         states = link_states(expert, *motion[:2]), link_states(learner, *motion[2:])
-        return embodiment_distance(*states, correspondence, weights, rotation=rotation, reduction=reduction)
+        return metric(*states)
 
     # Refuses what it does not know, for all of the ways below.
     jax.eval_shape(composed, *(jax.ShapeDtypeStruct((arm.num_joints,), jnp.float32) for arm in arms for _ in range(2)))
-    usual = rotation == "cosine" and reduction == "mean" and not callable(correspondence)
-    if usual and isinstance(weights, DistanceWeights) and _is_known((arms, correspondence, weights)):
-        factors = _factors(np.asarray(correspondence, float), weights)
+    if metric.is_static and _is_known((arms, correspondence, weights)):
+        factors = _factors(np.asarray(correspondence, float), cast(DistanceWeights, weights))
         is_long = max(expert.num_joints, learner.num_joints) > LONG
         distance = (_long if is_long else _short)([_of_length_one(arm) for arm in arms], factors)
     else:

@@ -79,9 +79,8 @@ def nearest_poses(
 ) -> PosePairs:
     """The learner's poses of least embodiment distance to poses of the expert [rad], and how alike they look."""
     pair = expert.embodiment, learner.embodiment
-    measure: Any = {"rotation": metric.rotation_measure, "reduction": metric.reduction}
-    correspondence, weights = metric.make_correspondence(*pair), metric.make_weights()
-    found = jax.jit(lambda qpos: imitate_pose(*pair, qpos, correspondence, weights, **measure))(qpos)
+    arguments = metric.build(*pair).arguments
+    found = jax.jit(lambda qpos: imitate_pose(*pair, qpos, **arguments))(qpos)
     learner_qpos = np.asarray(found.qpos)
     alike = similarity(centre_line_table(pair[0], qpos), centre_line_table(pair[1], learner_qpos))
     return PosePairs(qpos, learner_qpos, np.asarray(found.distance), alike)

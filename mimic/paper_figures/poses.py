@@ -143,8 +143,7 @@ def _mapped_and_optimal(mapper: PoseMapper, poses: np.ndarray) -> tuple[np.ndarr
     """The mapper's poses, the optimiser's, and how far the first are above the second [% of a random pose's way]."""
     metric, expert, learner = mapper.model.metric, mapper.expert, mapper.learner
     mapped = np.asarray(mapper(poses))
-    correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
-    optimal = imitate_pose(expert, learner, poses, correspondence, weights)
+    optimal = imitate_pose(expert, learner, poses, **metric.build(expert, learner).arguments)
     distance = functools.partial(_distances, mapper, poses)
     lower, upper = np.asarray(learner.joint_range).T
     chance = np.random.default_rng(0).uniform(lower, upper, (1000, learner.num_joints))

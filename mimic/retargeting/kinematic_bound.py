@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.metric.distance import Correspondence, Reduction, RotationMeasure, Weights, embodiment_distance
+from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.pose import pose_limits, shared_joints
 from mimic.retargeting.quasi_newton import Descent, bfgs
@@ -24,8 +24,6 @@ _HOP = 1.0  # standard deviation of a random step from the best motion [rad]; ea
 # Descents and hops a round, of all times together: few times have little to take from one another, but are cheap.
 _LEAST_DESCENTS, _LEAST_HOPS = 128, 32
 _VARIETY = 32  # after so many steps the random numbers recur, so that a long motion makes no large constants
-
-_Distance = Callable[[LinkStates, LinkStates], Array]
 
 
 class ClosestMotion(NamedTuple):
@@ -133,20 +131,17 @@ def closest_motion(
     if starts < 1 or iterations < 1:
         raise ValueError(f"starts, iterations: expected at least 1, got {starts} and {iterations}")
 
-    def distance(states: LinkStates, learner_states: LinkStates) -> Array:
-        return embodiment_distance(
-            states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
-        )
+    metric = Metric(correspondence, weights, rotation, reduction)
 
     def solve(qpos: Array, qvel: Array) -> ClosestMotion:
         times, rng = len(qpos), np.random.default_rng(seed)
         states = jax.vmap(lambda *motion: link_states(expert, *motion))(qpos, qvel)
         speed = jnp.maximum(jnp.abs(qvel).max(axis=1), _LEAST_SPEED)
         own_qpos, own_qvel = (shared_joints(expert, learner, values) for values in (qpos, qvel))
-        guesses = _initial_poses(distance, learner, states, own_qpos, max(starts, _LEAST_DESCENTS // times), rng)
+        guesses = _initial_poses(metric, learner, states, own_qpos, max(starts, _LEAST_DESCENTS // times), rng)
         own_speed = jnp.broadcast_to((own_qvel / speed[:, None])[:, None], guesses.shape)
         points = jnp.concatenate([guesses, own_speed], axis=-1)
-        descend = _descents(distance, learner, states, speed)
+        descend = _descents(metric, learner, states, speed)
         found = _search(descend, points, iterations, rng)
         end_qpos, end_qvel = jnp.split(found.point, 2, axis=-1)
         return ClosestMotion(end_qpos, speed[:, None] * end_qvel, found.value)
@@ -155,7 +150,7 @@ def closest_motion(
 
 
 def _initial_poses(
-    distance: _Distance,
+    metric: Metric,
     learner: Embodiment,
     states: LinkStates,
     own: Float[Array, "time joints"],
@@ -167,7 +162,7 @@ def _initial_poses(
     lower, upper = np.asarray(learner.joint_range).T
     poses = jnp.asarray(rng.uniform(lower, upper, (count, learner.num_joints)), own.dtype)
     pose_states = jax.vmap(lambda pose: link_states(learner, pose))(poses)
-    tried = jax.vmap(lambda state: jax.vmap(lambda pose: distance(state, pose))(pose_states))(states)
+    tried = jax.vmap(lambda state: jax.vmap(lambda pose: metric(state, pose))(pose_states))(states)
     orders = np.stack([rng.permutation(count) for _ in range(min(_VARIETY, times))]).reshape(
         -1, starts, count // starts
     )
@@ -178,7 +173,7 @@ def _initial_poses(
 
 
 def _descents(
-    distance: _Distance, learner: Embodiment, states: LinkStates, speed: Float[Array, " time"]
+    metric: Metric, learner: Embodiment, states: LinkStates, speed: Float[Array, " time"]
 ) -> Callable[[Array, Array, int], Descent]:
     """A function of [T, candidates, 2 joints] points and their inverse Hessians: each time's best end.
 
@@ -192,7 +187,7 @@ def _descents(
         def at_time(state: LinkStates, speed: Array, points: Array, inverses: Array) -> Descent:
             def objective(point: Array) -> Array:
                 qpos, unit_qvel = jnp.split(point, 2)
-                return distance(state, link_states(learner, qpos, speed * unit_qvel))
+                return metric(state, link_states(learner, qpos, speed * unit_qvel))
 
             descent = jax.vmap(lambda point, inverse: bfgs(objective, point, inverse, limits, iterations))
             ends = descent(points, inverses)

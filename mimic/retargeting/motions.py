@@ -19,19 +19,16 @@ def optimal_motions(
     expert: Embodiment, learner: Embodiment, qpos: Array, metric: MetricConfig, largest_jump: np.ndarray, seed: int
 ) -> PoseImitation:
     """The `imitate_trajectory` of each of an expert's motions [motions, time, joints] under a metric."""
-    correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
+    arguments = metric.build(expert, learner).arguments
 
     def one(qpos: jax.Array) -> PoseImitation:
         return imitate_trajectory(
             expert,
             learner,
             qpos,
-            correspondence,
-            weights,
             largest_jump=largest_jump,
             key=jax.random.key(seed),
-            rotation=metric.rotation_measure,  # type: ignore[arg-type]
-            reduction=metric.reduction,  # type: ignore[arg-type]
+            **arguments,
         )
 
     # One demonstration after the other: the minima that are tracked fill the processor, and memory stays small.

@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.metric.distance import Correspondence, Reduction, RotationMeasure, Weights
+from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, gradient_descent, newton
 from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
@@ -98,7 +98,7 @@ def imitate_pose(
     rough = count if kept is None else max(int(_ROUGH_SHARE * count), 1)
     key = jax.random.key(0) if key is None else key
     batch = poses.shape[:-1]
-    objective = pose_objective(learner, correspondence, weights, rotation, reduction)
+    objective = pose_objective(learner, Metric(correspondence, weights, rotation, reduction))
     limits = pose_limits(learner, poses.dtype)
     descend = newton if method == "newton" else gradient_descent
 
@@ -174,7 +174,7 @@ def imitate_trajectory(
     if starts < 0:
         raise ValueError(f"starts: expected at least 0, got {starts}")
     key = jax.random.key(0) if key is None else key
-    objective = pose_objective(learner, correspondence, weights, rotation, reduction)
+    objective = pose_objective(learner, Metric(correspondence, weights, rotation, reduction))
     limits = lower, upper = pose_limits(learner, poses.dtype)
     jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
     last = poses.shape[0] - 1

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,7 @@ from jaxtyping import Array, Bool, Int
 
 from mimic.arms.embodiment import Embodiment
 from mimic.metric import spatial
-from mimic.metric.distance import (
-    Correspondence,
-    DistanceWeights,
-    Reduction,
-    RotationMeasure,
-    Weights,
-    embodiment_distance,
-)
+from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
 from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
 from mimic.retargeting.optimizers import Derivatives, Scalars
@@ -47,36 +40,21 @@ class PoseObjective:
     rough_derivatives: Callable[[Target, Scalars], Derivatives]
 
 
-def pose_objective(
-    learner: Embodiment,
-    correspondence: Correspondence,
-    weights: Weights,
-    rotation: RotationMeasure,
-    reduction: Reduction,
-) -> PoseObjective:
-    """In closed form for the static measure, see `_static`; any other is differentiated automatically."""
-
-    def distance(expert_states: LinkStates, learner_states: LinkStates) -> Array:
-        return embodiment_distance(
-            expert_states, learner_states, correspondence, weights, rotation=rotation, reduction=reduction
-        )
-
-    static = not callable(correspondence) and rotation == "cosine" and reduction == "mean"
-    if static and isinstance(weights, DistanceWeights):
-        return _static(learner, correspondence, weights, distance)
-    return _differentiated(learner, distance)
+def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
+    """In closed form for a static metric, see `_static`; any other is differentiated automatically."""
+    return _static(learner, metric) if metric.is_static else _differentiated(learner, metric)
 
 
-def _differentiated(learner: Embodiment, distance: Callable[[LinkStates, LinkStates], Array]) -> PoseObjective:
+def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
     def derivatives(target: LinkStates, qpos: Scalars) -> Derivatives:
         def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
-            value, gradient = jax.value_and_grad(lambda q: distance(target, link_states(learner, q)))(qpos)
+            value, gradient = jax.value_and_grad(lambda q: metric(target, link_states(learner, q)))(qpos)
             return gradient, (value, gradient)
 
         hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
         return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
 
-    return PoseObjective(distance, lambda states: states, distance, derivatives, derivatives)
+    return PoseObjective(metric, lambda states: states, metric, derivatives, derivatives)
 
 
 class StaticTarget(NamedTuple):
@@ -95,16 +73,12 @@ class StaticTarget(NamedTuple):
     pulls: tuple[Pull, ...]
 
 
-def _static(
-    learner: Embodiment,
-    correspondence: Any,
-    weights: DistanceWeights,
-    distance: Callable[[LinkStates, LinkStates], Array],
-) -> PoseObjective:
+def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
     """Constant W and weights, cosines and the mean: sums of W_ij (pi/2) (1 - e_i . e^_j) and W_ij |p_i - p^_j|.
 
     Of the directions all that counts of the expert is one pull for each link of the learner, t_j = sum_i W_ij e_i.
     """
+    correspondence, weights = metric.correspondence, cast(DistanceWeights, metric.weights)
     directions, positions = (_pair_weights(correspondence, w) for w in (weights.rotation, weights.translation))
     pairs = _counting_pairs(correspondence, weights.translation)
     arm = _of_chain_length_one(learner)
@@ -135,7 +109,7 @@ def _static(
         return static_derivatives(joint_axes(arm, frames), anchors, links, target.pulls, smoothing)
 
     rough, fine = (functools.partial(derivatives, smoothing) for smoothing in (ROUGH_SMOOTHING, SMOOTHING))
-    return PoseObjective(distance, target, value, fine, rough if len(pairs) else fine)
+    return PoseObjective(metric, target, value, fine, rough if len(pairs) else fine)
 
 
 def _pair_weights(correspondence: Any, weight: Any) -> Any:

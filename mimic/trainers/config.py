@@ -65,7 +65,7 @@ class TrainerConfig:
 
     @property
     def total_steps(self) -> int:
-        """How long a resolved config trains."""
+        """How long resolved settings train."""
         raise NotImplementedError
 
 
@@ -125,11 +125,11 @@ class PPOConfig(TrainerConfig):
         check_choice("trainer.preset", self.preset, ("auto", *PRESETS))
         check_choice("trainer.name", self.name, ("ppo",))
 
-    def resolve(self, backend: str, devices: int = 1) -> "PPOConfig":
+    def resolve(self, backend: str = "cpu", devices: int = 1) -> "PPOSettings":
         """The same with every field filled in, and the preset's name.
 
         Args:
-          backend: of JAX.
+          backend: of JAX; chooses the preset where that is "auto".
           devices: that environments and batches are spread over.
 
         Raises:
@@ -139,12 +139,31 @@ class PPOConfig(TrainerConfig):
         preset = PRESETS[name]
         if self.target_gap > 0:
             preset = {**preset, "evaluations": _LOOKS * preset["evaluations"]}
-        open_fields = {key: value for key, value in preset.items() if getattr(self, key) is None}
-        resolved = dataclasses.replace(self, preset=name, **open_fields)
-        resolved._check(devices)
-        return resolved
+        settings = PPOSettings(**{**_filled_in(self, preset), "preset": name})
+        settings.check(devices)
+        return settings
 
-    def _check(self, devices: int) -> None:
+
+@dataclasses.dataclass(frozen=True)
+class PPOSettings(PPOConfig):
+    """A PPO config with every field filled in: what trains, and what a run directory keeps."""
+
+    num_timesteps: int = MISSING
+    num_envs: int = MISSING
+    unroll_length: int = MISSING
+    batch_size: int = MISSING
+    num_minibatches: int = MISSING
+    num_updates_per_batch: int = MISSING
+    learning_rate: float = MISSING
+    final_learning_rate: float = MISSING
+    discounting: float = MISSING
+    entropy_cost: float = MISSING
+    hidden_layers: list[int] = MISSING
+    crossovers: int = MISSING
+    evaluations: int = MISSING
+
+    def check(self, devices: int) -> None:
+        """Raises a ValueError for numbers out of range, or batch sizes that the devices cannot divide."""
         whole = ("num_timesteps", "num_envs", "unroll_length", "batch_size", "num_minibatches", "num_updates_per_batch")
         _check_whole(self, *whole, "evaluations")
         for key in ("learning_rate", "max_grad_norm", "reward_scaling", "clipping_epsilon"):
@@ -157,8 +176,8 @@ class PPOConfig(TrainerConfig):
             if not getattr(self, key) >= 0:
                 raise ValueError(f"trainer.{key}: expected at least 0, got {getattr(self, key)}")
         _check_layers(self.hidden_layers)
-        unrolls = self.batch_size * self.num_minibatches  # type: ignore[operator]
-        if unrolls % self.num_envs:  # type: ignore[operator]
+        unrolls = self.batch_size * self.num_minibatches
+        if unrolls % self.num_envs:
             raise ValueError(
                 f"trainer: batch_size * num_minibatches = {self.batch_size} * {self.num_minibatches} = {unrolls} "
                 f"must be a multiple of num_envs = {self.num_envs}"
@@ -172,12 +191,12 @@ class PPOConfig(TrainerConfig):
     @property
     def total_steps(self) -> int:
         """Environment steps."""
-        return self.num_timesteps  # type: ignore[return-value]
+        return self.num_timesteps
 
     @property
     def steps_per_batch(self) -> int:
         """Environment steps between two updates of the policy that collects them."""
-        return self.batch_size * self.num_minibatches * self.unroll_length  # type: ignore[operator]
+        return self.batch_size * self.num_minibatches * self.unroll_length
 
 
 MAPPER_PRESETS: dict[str, dict[str, Any]] = {
@@ -274,18 +293,37 @@ class PoseMapperConfig(TrainerConfig):
         check_choice("trainer.preset", self.preset, tuple(MAPPER_PRESETS))
         check_choice("trainer.name", self.name, ("pose_mapper",))
 
-    def resolve(self) -> "PoseMapperConfig":
+    def resolve(self) -> "PoseMapperSettings":
         """The same with every field filled in.
 
         Raises:
           ValueError: numbers out of range, or a batch size that does not divide the samples.
         """
-        preset = MAPPER_PRESETS[self.preset]
-        resolved = dataclasses.replace(self, **{key: preset[key] for key in preset if getattr(self, key) is None})
-        resolved._check()
-        return resolved
+        settings = PoseMapperSettings(**_filled_in(self, MAPPER_PRESETS[self.preset]))
+        settings.check()
+        return settings
 
-    def _check(self) -> None:
+
+@dataclasses.dataclass(frozen=True)
+class PoseMapperSettings(PoseMapperConfig):
+    """A pose mapper's config with every field filled in."""
+
+    inputs: str = MISSING
+    outputs: str = MISSING
+    heads: int = MISSING
+    hidden_layers: list[int] = MISSING
+    activation: str = MISSING
+    samples: int = MISSING
+    batch_size: int = MISSING
+    fresh: bool = MISSING
+    epochs: int = MISSING
+    learning_rate: float = MISSING
+    final_learning_rate: float = MISSING
+    patience: int = MISSING
+    evaluations: int = MISSING
+
+    def check(self) -> None:
+        """Raises a ValueError for numbers out of range, or a batch size that does not divide the samples."""
         check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
         check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
         check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
@@ -293,9 +331,9 @@ class PoseMapperConfig(TrainerConfig):
             self, "heads", "samples", "batch_size", "epochs", "evaluations", "validation_poses", "held_out_poses"
         )
         _check_layers(self.hidden_layers)
-        if not 0 < self.learning_rate < math.inf:  # type: ignore[operator]
+        if not 0 < self.learning_rate < math.inf:
             raise ValueError(f"trainer.learning_rate: expected a number above 0, got {self.learning_rate}")
-        if not 0 <= self.final_learning_rate <= 1:  # type: ignore[operator]
+        if not 0 <= self.final_learning_rate <= 1:
             raise ValueError(
                 f"trainer.final_learning_rate: expected a number in [0, 1], got {self.final_learning_rate}"
             )
@@ -303,12 +341,12 @@ class PoseMapperConfig(TrainerConfig):
             raise ValueError(f"trainer.dropout: expected a fraction in [0, 1), got {self.dropout}")
         if not 0 <= self.weight_decay < math.inf:
             raise ValueError(f"trainer.weight_decay: expected a finite number of at least 0, got {self.weight_decay}")
-        if self.patience < 0 or not self.target_quality >= 0:  # type: ignore[operator]
+        if self.patience < 0 or not self.target_quality >= 0:
             raise ValueError(
                 f"trainer: expected patience and target_quality of at least 0, got {self.patience}, "
                 f"{self.target_quality}"
             )
-        if self.samples % self.batch_size:  # type: ignore[operator]
+        if self.samples % self.batch_size:
             raise ValueError(
                 f"trainer.batch_size: expected a divisor of samples = {self.samples}, got {self.batch_size}"
             )
@@ -316,10 +354,16 @@ class PoseMapperConfig(TrainerConfig):
     @property
     def total_steps(self) -> int:
         """Poses to train on, each time anew."""
-        return self.samples * self.epochs  # type: ignore[operator]
+        return self.samples * self.epochs
 
 
 TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig, "pose_mapper": PoseMapperConfig}
+
+
+def _filled_in(config: TrainerConfig, preset: dict[str, Any]) -> dict[str, Any]:
+    """All fields; those that are None from the preset."""
+    fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return {key: preset.get(key) if value is None else value for key, value in fields.items()}
 
 
 def _check_whole(config: TrainerConfig, *keys: str) -> None:

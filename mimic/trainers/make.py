@@ -1,10 +1,16 @@
-"""The trainer of a config."""
+"""The trainer of a config, by its name."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mimic import compat
-from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from mimic.envs.demonstrations import Demonstrations
+from mimic.trainers.config import TrainConfig
 from mimic.trainers.trainer import Trainer
+
+if TYPE_CHECKING:
+    from mimic.trainers.ppo.trainer import PPOTrainer
 
 
 def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
@@ -13,11 +19,24 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
     Raises:
       ValueError: a config that cannot be trained.
     """
-    if isinstance(config.trainer, PoseMapperConfig):
-        from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
+    return _MAKERS[config.trainer.name](config, run_dir)
 
-        return PoseMapperTrainer(config, run_dir)
+
+def make_ppo_trainer(config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None) -> "PPOTrainer":
+    """That of a config with trainer=ppo; see `PPOTrainer`."""
     compat.import_mjx()
     from mimic.trainers.ppo.trainer import PPOTrainer  # brax and MJX, which take seconds to import
 
-    return PPOTrainer(config, run_dir)
+    return PPOTrainer(config, run_dir, unseen)
+
+
+def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
+    from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
+
+    return PoseMapperTrainer(config, run_dir)
+
+
+_MAKERS: dict[str, Callable[[TrainConfig, Path | None], Trainer]] = {
+    "ppo": make_ppo_trainer,
+    "pose_mapper": _make_pose_mapper_trainer,
+}

@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from mimic.config import explain, schema, to_dict
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, write_atomically
-from mimic.trainers.config import TRAINERS, PPOConfig, TrainConfig
+from mimic.trainers.config import TRAINERS, TrainConfig
 
 
 def new_run_dir(config: TrainConfig) -> Path:
@@ -79,6 +79,6 @@ def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
     run_dir = Path(run).expanduser()
     trained = load_config(run_dir)
     check_checkpoint(run_dir, checkpoint)
-    if not isinstance(trained.trainer, PPOConfig):
+    if trained.trainer.name != "ppo":
         raise ValueError(f"run: expected a run of trainer=ppo, got one of {trained.trainer.name}")
     return run_dir, trained

@@ -5,12 +5,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mimic.evaluation.config import SearchConfig
 from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainerConfig
 
 Params = Any  # pytree
 Figures = dict[str, Any]  # quality figures of a report, some by split
 OnEvaluation = Callable[[int, Params, Mapping[str, float]], bool]  # steps, metrics of the training; whether to stop
+OnUpdate = Callable[[int, str], None]
 Row = tuple[str, str, str]  # of the final table: label, on training data, on held-out data
 
 
@@ -64,6 +66,24 @@ class Trainer(abc.ABC):
     @abc.abstractmethod
     def evaluate(self, params: Params) -> Any:
         """What `figures`, `details` and `save_outcome` are made of."""
+
+    def run_controller(
+        self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate
+    ) -> tuple[Any, dict[str, Any]]:
+        """The same for a controller in the place of what was trained.
+
+        Args:
+          name: "policy" is what was trained.
+          params: of that.
+          search: how long "searched" searches.
+          on_update: called with the number of updates of a search, from 0 on, and its state as text.
+
+        Returns:
+          As `evaluate`; and what the report says of the controller.
+        """
+        del search, on_update
+        assert name == "policy", name
+        return self.evaluate(params), {}
 
     @abc.abstractmethod
     def figures(self, outcome: Any) -> Figures:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -15,11 +14,10 @@ from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.config import check_choice
 from mimic.envs.config import EnvConfig
-from mimic.metric.config import CORRESPONDENCES, MetricConfig
-from mimic.metric.distance import Correspondence, DistanceWeights, Weights, link_distances
+from mimic.metric.config import CORRESPONDENCES
+from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
-from mimic.metric.spatial import safe_sqrt
 from mimic.retargeting.pose import imitate_pose, pose_limits
 
 Mapper = Callable[[Array], Array]  # the expert's pose -> the learner's
@@ -132,30 +130,31 @@ def compile_programs(env: EnvConfig, settings: Settings, mapper: Mapper | None =
     """
     expert = build_arm(env.expert, env.limits, env.metric.links).embodiment
     arm = learner_arm(env, settings.locked)
-    learner, metric = arm.embodiment, dataclasses.replace(env.metric, correspondence=settings.correspondence)
-    correspondence = metric.make_correspondence(expert, learner)
-    choice: dict[str, Any] = {"rotation": metric.rotation_measure, "reduction": metric.reduction}
+    learner = arm.embodiment
+    chosen = dataclasses.replace(env.metric, correspondence=settings.correspondence).build(expert, learner)
 
-    def weigh(weights: Array) -> Weights:
-        if metric.adaptive:
-            return metric.make_weights()
+    def metric(weights: Array) -> Metric:
+        if env.metric.adaptive:
+            return chosen
         # A weight that is known to be 0 costs nothing: the optimiser's derivatives are then much simpler.
-        return DistanceWeights(0.0 if settings.translation == 0 else weights[0], weights[1])
+        constant = DistanceWeights(0.0 if settings.translation == 0 else weights[0], weights[1])
+        return dataclasses.replace(chosen, weights=constant)
 
     def follow(qpos: Array, present: Array, weights: Array) -> Array:
         if mapper is not None:
             return mapper(qpos)
-        options = {"warm_start": present, "iterations": _TRACKING_ITERATIONS, **choice}
-        return imitate_pose(expert, learner, qpos, correspondence, weigh(weights), **options).qpos
+        options = {"warm_start": present, "iterations": _TRACKING_ITERATIONS, **metric(weights).arguments}
+        return imitate_pose(expert, learner, qpos, **options).qpos
 
     def measure(qpos: Array, learner_qpos: Array, weights: Array) -> Measured:
         states = link_states(expert, qpos), link_states(learner, learner_qpos)
-        links = link_distances(*states, weigh(weights), rotation=choice["rotation"])
         lines = centre_line(expert, qpos), centre_line(learner, learner_qpos)
-        return measured(links, correspondence, metric, similarity(*lines))
+        weighted = metric(weights)
+        links = weighted.link_distances(*states)
+        return Measured(weighted.reduced(links), weighted.matrix(links), links, similarity(*lines))
 
     def best(qpos: Array, weights: Array) -> tuple[Array, Array]:
-        found = imitate_pose(expert, learner, qpos, correspondence, weigh(weights), **choice)
+        found = imitate_pose(expert, learner, qpos, **metric(weights).arguments)
         return found.qpos, found.distance
 
     q, q_hat = (jax.ShapeDtypeStruct((n.num_joints,), np.float32) for n in (expert, learner))
@@ -163,16 +162,6 @@ def compile_programs(env: EnvConfig, settings: Settings, mapper: Mapper | None =
     moving = Programs(arm, _compiled(follow, q, q_hat, w), _compiled(measure, q, q_hat, w), None)
     yield moving
     yield dataclasses.replace(moving, best=_compiled(best, q, w))
-
-
-def measured(
-    links: Array, correspondence: Correspondence, metric: MetricConfig, similarity: Mapping[str, Array]
-) -> Measured:
-    """What is shown of the distances of all pairs of links."""
-    matrix = jnp.asarray(correspondence(links) if callable(correspondence) else correspondence, links.dtype)
-    weighted = matrix * links
-    total = weighted.mean() if metric.reduction == "mean" else safe_sqrt(jnp.sum(weighted * weighted))
-    return Measured(total, matrix, links, similarity)
 
 
 def _compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:

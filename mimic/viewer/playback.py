@@ -14,8 +14,7 @@ from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.make import make_trainer
-from mimic.trainers.ppo.trainer import PPOTrainer
+from mimic.trainers.make import make_ppo_trainer
 from mimic.viewer import html
 from mimic.viewer.live_session import Frame
 
@@ -36,11 +35,10 @@ class Playback:
     """
 
     def __init__(self, trained: TrainConfig, run_dir: Path, checkpoint: int | None):
-        job = make_trainer(trained, run_dir)
-        assert isinstance(job, PPOTrainer)
+        trainer = make_ppo_trainer(trained, run_dir)
         self.env: EnvConfig = trained.env
-        self._job, self._evaluator = job, job.evaluator
-        self._params = load_checkpoint(run_dir, job.params_template(), checkpoint)[1]
+        self._trainer, self._evaluator = trainer, trainer.evaluator
+        self._params = load_checkpoint(run_dir, trainer.params_template(), checkpoint)[1]
         self._rollouts: Any = None
         self._locked = dict(build_arm(self.env.learner, self.env.limits).locked)
         self.story = functools.lru_cache(maxsize=16)(self._story)
@@ -48,7 +46,7 @@ class Playback:
     def run(self) -> None:
         """Runs the policy on all demonstrations, and computes their bounds."""
         with Console().status("running the policy on all demonstrations, and computing the lower bound"):
-            self._rollouts = self._job.evaluate(self._params)
+            self._rollouts = self._trainer.evaluate(self._params)
             _ = self._evaluator.lower_bound
 
     def count(self, split: str) -> int:

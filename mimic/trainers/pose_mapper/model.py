@@ -15,16 +15,15 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.compilation import on_host
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
-from mimic.metric.distance import Correspondence, embodiment_distance
+from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import pose_limits
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings
 from mimic.trainers.run_config import load_config
 
 Params = Any
@@ -64,38 +63,30 @@ class MapperModel:
     expert: Embodiment
     learner: Embodiment
     metric: MetricConfig
-    config: PoseMapperConfig
+    config: PoseMapperSettings
 
     @functools.cached_property
     def _network(self) -> _Network:
-        outputs = int(self.config.heads or 1) * self.learner.num_joints * 2
-        hidden_layers, activation = tuple(self.config.hidden_layers or ()), str(self.config.activation)
+        outputs = self.config.heads * self.learner.num_joints * 2
+        hidden_layers, activation = tuple(self.config.hidden_layers), self.config.activation
         return _Network(hidden_layers, outputs, activation, self.config.dropout)
 
     @functools.cached_property
-    def correspondence(self) -> Correspondence:
-        """W, or the function that makes it of the link distances."""
+    def built_metric(self) -> Metric:
+        """The metric between the two arms."""
         # It must not belong to the first program that asks for it, nor wait for the first work on a GPU.
         with jax.ensure_compile_time_eval(), on_host():
-            correspondence = self.metric.make_correspondence(self.expert, self.learner)
-            return correspondence if callable(correspondence) else np.asarray(correspondence)
+            metric = self.metric.build(self.expert, self.learner)
+            matrix = metric.correspondence
+            return metric if callable(matrix) else dataclasses.replace(metric, correspondence=np.asarray(matrix))
 
     @functools.cached_property
     def distance(self) -> PoseDistance:
         """Embodiment distance between a pose of the expert and one of the learner."""
-        correspondence, weights = self.correspondence, self.metric.make_weights()
-
-        def distance(qpos: Array, learner_qpos: Array) -> Array:
-            return embodiment_distance(
-                link_states(self.expert, qpos),
-                link_states(self.learner, learner_qpos),
-                correspondence,
-                weights,
-                rotation=self.metric.rotation_measure,  # type: ignore[arg-type]
-                reduction=self.metric.reduction,  # type: ignore[arg-type]
-            )
-
-        return distance
+        metric = self.built_metric
+        return lambda qpos, learner_qpos: metric(
+            link_states(self.expert, qpos), link_states(self.learner, learner_qpos)
+        )
 
     def init(self, key: Array) -> Params:
         """Random parameters."""
@@ -115,7 +106,7 @@ class MapperModel:
         training = dropout_key is not None
         rngs = {"dropout": dropout_key} if training else None
         outputs = self._network.apply(params, self._inputs(qpos), training=training, rngs=rngs)
-        outputs = jnp.reshape(outputs, (config.heads, self.learner.num_joints, 2))  # type: ignore[arg-type]
+        outputs = jnp.reshape(outputs, (config.heads, self.learner.num_joints, 2))  # type: ignore[arg-type] - flax annotates all that apply may return
         lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.learner.joint_range).T)
         within = (lower + upper) / 2 + (upper - lower) / 2 * jnp.tanh(outputs[..., 0])
         if config.outputs == "tanh":
@@ -208,14 +199,13 @@ class PoseMapper:
                 )
 
 
-def make_model(env: EnvConfig, config: PoseMapperConfig) -> MapperModel:
+def make_model(env: EnvConfig, config: PoseMapperSettings) -> MapperModel:
     """The mapper of an environment's arms and metric.
 
     Raises:
       ValueError: arms that cannot be built.
     """
-    expert, learner = (build_arm(arm, env.limits, env.metric.links).embodiment for arm in (env.expert, env.learner))
-    return MapperModel(expert, learner, env.metric, config)
+    return MapperModel(*env.build_arms().embodiments, env.metric, config)
 
 
 def check_poses(arm: Embodiment, qpos: ArrayLike) -> Array:

@@ -15,7 +15,7 @@ from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose
 from mimic.runs.signals import Signals
-from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings, TrainConfig
 from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.trainer import Figures, OnEvaluation, Params, Row, Trainer
@@ -69,13 +69,14 @@ class PoseMapperTrainer(Trainer):
     def __init__(self, config: TrainConfig, run_dir: Path | None = None):
         del run_dir
         assert isinstance(config.trainer, PoseMapperConfig)
-        self.settings: PoseMapperConfig = config.trainer.resolve()
+        self.settings: PoseMapperSettings = config.trainer.resolve()
         self._name, self._seed = config.env.name, config.seed % 2**31  # what a 32-bit integer holds
         self.total_steps = self.settings.total_steps
         self._model = model = make_model(config.env, self.settings)
-        samples = int(self.settings.samples or 0)
         kind = "fresh poses in each epoch" if self.settings.fresh else "training poses"
-        self.headline = f"{config.env.name}: {model.expert.name} to {model.learner.name}, {samples} {kind}"
+        self.headline = (
+            f"{config.env.name}: {model.expert.name} to {model.learner.name}, {self.settings.samples} {kind}"
+        )
 
     @functools.cached_property
     def _poses(self) -> dict[str, Array]:
@@ -85,7 +86,7 @@ class PoseMapperTrainer(Trainer):
     def _draw(self, seed: int) -> dict[str, Array]:
         settings, draw = self.settings, functools.partial(training.random_poses, self._model)
         return {
-            "train": draw(jax.random.fold_in(_key(_TRAINING), seed), int(settings.samples or 0)),
+            "train": draw(jax.random.fold_in(_key(_TRAINING), seed), settings.samples),
             "validation": draw(_key(_VALIDATION), settings.validation_poses),
             "held_out": draw(_key(_HELD_OUT), settings.held_out_poses),
         }
@@ -94,7 +95,7 @@ class PoseMapperTrainer(Trainer):
     def _counts(self) -> dict[str, int]:
         """Poses of each split that the mapper is judged on."""
         few, many = self.settings.validation_poses, self.settings.held_out_poses
-        return {"train": min(few, int(self.settings.samples or 0)), "validation": few, "held_out": many}
+        return {"train": min(few, self.settings.samples), "validation": few, "held_out": many}
 
     @property
     def _every_shape(self) -> jax.ShapeDtypeStruct:
@@ -122,19 +123,11 @@ class PoseMapperTrainer(Trainer):
 
     @functools.cached_property
     def _optimisation(self) -> Background[Callable[[np.ndarray], _Reference]]:
-        model, metric = self._model, self._model.metric
+        model = self._model
 
         def reference(every: Array) -> _Reference:
-            found = imitate_pose(
-                model.expert,
-                model.learner,
-                every,
-                model.correspondence,
-                metric.make_weights(),
-                kept=None,  # compiled in half of the time
-                rotation=metric.rotation_measure,  # type: ignore[arg-type]
-                reduction=metric.reduction,  # type: ignore[arg-type]
-            )
+            kept = None  # compiled in half of the time
+            found = imitate_pose(model.expert, model.learner, every, kept=kept, **model.built_metric.arguments)
             lower, upper = jnp.asarray(model.learner.joint_range, jnp.float32).T
             chance = jax.random.uniform(_key(_CHANCE), (len(every), len(lower)), minval=lower, maxval=upper)
             direction = jax.vmap(lambda q: link_states(model.expert, q).direction)(every)

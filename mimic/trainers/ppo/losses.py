@@ -14,7 +14,7 @@ from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float
 
-from mimic.trainers.config import PPOConfig
+from mimic.trainers.config import PPOSettings
 
 METRICS = ("policy_loss", "entropy", "approx_kl", "clip_fraction", "action_std")  # of the policy
 _VALUE_SHARE = 0.25  # of the squared error of the value
@@ -54,7 +54,7 @@ def value_loss(
     statistics: RunningStatisticsState,
     unrolls: Unrolls,
     networks: ppo_networks.PPONetworks,
-    config: PPOConfig,
+    config: PPOSettings,
 ) -> tuple[Array, Float[Array, "unrolls time"]]:
     """The loss of the value, and the advantages, normalised, that the policy learns from.
 
@@ -68,7 +68,7 @@ def value_loss(
     values = networks.value_network.apply(statistics, params, unrolls.observation)
     reward, goes_on = unrolls.reward[:, :-1], unrolls.goes_on[:, :-1]
     targets, advantages = jax.lax.stop_gradient(
-        compute_gae(config.reward_scaling * reward, config.discounting * goes_on, values, config.gae_lambda)  # type: ignore[operator]
+        compute_gae(config.reward_scaling * reward, config.discounting * goes_on, values, config.gae_lambda)
     )
     loss = _VALUE_SHARE * jnp.square(targets - values[:, :-1]).mean()
     return loss, (advantages - advantages.mean()) / (advantages.std() + 1e-8)
@@ -81,7 +81,7 @@ def policy_loss(
     advantages: Float[Array, "unrolls time"],
     key: Array,
     networks: ppo_networks.PPONetworks,
-    config: PPOConfig,
+    config: PPOSettings,
 ) -> tuple[Array, Float[Array, " metrics"]]:
     """The loss of the policy, entropy included, and `METRICS`.
 
@@ -101,7 +101,7 @@ def policy_loss(
     ratio, least, most = jnp.exp(log_ratio), 1 - config.clipping_epsilon, 1 + config.clipping_epsilon
     surrogate = -jnp.minimum(ratio * advantages, jnp.clip(ratio, least, most) * advantages)
     entropy = actions.entropy(logits, key)
-    loss = surrogate.mean() - config.entropy_cost * entropy.mean()  # type: ignore[operator]
+    loss = surrogate.mean() - config.entropy_cost * entropy.mean()
 
     approx_kl = ratio - 1 - log_ratio
     clipped = (ratio < least) | (ratio > most)

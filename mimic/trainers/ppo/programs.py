@@ -5,6 +5,7 @@ the other, each before it knows of the next; here all that they need is known fr
 side, with whatever else there is to compile or to import.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -24,7 +25,7 @@ from mimic.compilation import Background, a_process_for_each_gpu, compiler_optio
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import fresh_episodes
 from mimic.metric.kinematics import LinkStates
-from mimic.trainers.config import PPOConfig
+from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo import updates
 from mimic.trainers.ppo.losses import Unrolls
 
@@ -62,7 +63,7 @@ class TrainingState:
 
 def make_programs(
     env: ImitationEnv,
-    config: PPOConfig,
+    config: PPOSettings,
     networks: ppo_networks.PPONetworks,
     batches: int,
     learning_rate: optax.Schedule,
@@ -122,7 +123,7 @@ def initial_params(networks: ppo_networks.PPONetworks, observation_size: int, ke
 
 def _begin(
     env: ImitationEnv,
-    config: PPOConfig,
+    config: PPOSettings,
     networks: ppo_networks.PPONetworks,
     optimizer: optax.GradientTransformation,
     devices: int,
@@ -132,7 +133,7 @@ def _begin(
 ) -> TrainingState:
     key_networks, key_episodes, key = jax.random.split(jax.random.PRNGKey(seed), 3)
     statistics, policy, value = restored or initial_params(networks, env.observation_size, key_networks)
-    keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), config.num_envs // devices)  # type: ignore[operator]
+    keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), config.num_envs // devices)
     episodes = fresh_episodes(env.with_expert_states(expert_states)).reset(keys)
     learners = updates.begin(policy, optimizer), updates.begin(value, optimizer)
     return TrainingState(*learners, statistics, episodes, expert_states, key)  # type: ignore[arg-type]
@@ -140,7 +141,7 @@ def _begin(
 
 def _learn(
     env: ImitationEnv,
-    config: PPOConfig,
+    config: PPOSettings,
     networks: ppo_networks.PPONetworks,
     optimizer: optax.GradientTransformation,
     devices: int,
@@ -149,8 +150,8 @@ def _learn(
 ) -> tuple[TrainingState, Metrics]:
     episodes_env = fresh_episodes(env.with_expert_states(learning.expert_states))
     make_policy = ppo_networks.make_inference_fn(networks)
-    rounds = config.batch_size * config.num_minibatches // config.num_envs  # type: ignore[operator]
-    minibatch = config.batch_size // devices  # type: ignore[operator]
+    rounds = config.batch_size * config.num_minibatches // config.num_envs
+    minibatch = config.batch_size // devices
     # A GPU pauses between CUDA graphs, and none goes beyond a pass of a loop. On one GPU compiling takes what it saves.
     updates_in_a_pass = 2 if devices > 1 else 1
     how = updates.UpdateConfig(
@@ -166,11 +167,11 @@ def _learn(
             after = episodes_env.step(state, action)
             return after, Unrolls(state.obs, taken["raw_action"], taken["log_prob"], after.reward, 1 - after.done)  # type: ignore[arg-type]
 
-        keys = jax.random.split(key, config.unroll_length)  # type: ignore[arg-type]
+        keys = jax.random.split(key, config.unroll_length)
         episodes, steps = jax.lax.scan(step, learning.episodes, keys)
         last = jax.tree.map(lambda x: jnp.zeros_like(x[:1]), steps)._replace(observation=episodes.obs[None])
         steps = jax.tree.map(lambda *x: jnp.concatenate(x), steps, last)
-        return learning.replace(episodes=episodes), steps  # type: ignore[attr-defined]
+        return dataclasses.replace(learning, episodes=episodes), steps
 
     def batch(learning: TrainingState, _: None) -> tuple[TrainingState, Array]:
         """Collects unrolls, and learns from them."""
@@ -181,15 +182,15 @@ def _learn(
         learning, collected = jax.lax.scan(unroll, learning, jax.random.split(key_unroll, rounds))
         unrolls = jax.tree.map(lambda x: jnp.moveaxis(x, 2, 1).reshape(-1, x.shape[1], *x.shape[3:]), collected)
         statistics = running_statistics.update(learning.statistics, unrolls.observation[:, :-1], pmap_axis_name=_AXIS)
-        passes = jax.random.split(key_order, config.num_updates_per_batch)  # type: ignore[arg-type]
+        passes = jax.random.split(key_order, config.num_updates_per_batch)
         count = len(unrolls.observation)
         order = jax.vmap(lambda key: jax.random.permutation(key, count))(passes).reshape(-1, minibatch)
         learners = learning.policy, learning.value
         (policy, value), metrics = updates.updated(learners, statistics, unrolls, order, key_loss, how)
-        learning = learning.replace(policy=policy, value=value, statistics=statistics, key=key)  # type: ignore[attr-defined]
+        learning = dataclasses.replace(learning, policy=policy, value=value, statistics=statistics, key=key)
         return learning, metrics
 
     learning, metrics = jax.lax.scan(batch, learning, None, length=batches)
     means = dict(zip(updates.METRICS, jax.lax.pmean(metrics.mean(axis=0), _AXIS), strict=True))
-    loss = means["policy_loss"] + means["value_loss"] - config.entropy_cost * means["entropy"]  # type: ignore[operator]
+    loss = means["policy_loss"] + means["value_loss"] - config.entropy_cost * means["entropy"]
     return learning, {"loss": loss, **means}

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -11,14 +12,15 @@ from mimic.compilation import Background, compiling
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
+from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.rollout_metrics import LEAST_SPAN
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
-from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.trainers.config import PPOConfig, PPOSettings, TrainConfig
 from mimic.trainers.ppo import training as ppo
-from mimic.trainers.trainer import Figures, OnEvaluation, Params, Row, Trainer
+from mimic.trainers.trainer import Figures, OnEvaluation, OnUpdate, Params, Row, Trainer
 
 
 class PPOTrainer(Trainer):
@@ -41,7 +43,7 @@ class PPOTrainer(Trainer):
     def __init__(self, config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None):
         assert isinstance(config.trainer, PPOConfig)
         self._name, self._seed = config.env.name, config.seed
-        self.settings: PPOConfig = config.trainer.resolve(jax.default_backend(), jax.device_count())
+        self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count())
         self.total_steps = self.settings.total_steps
         env, held_out = _environment(config.env, run_dir)
         if unseen is not None:
@@ -49,7 +51,7 @@ class PPOTrainer(Trainer):
             check_effort(unseen, env.expert)
             held_out = unseen.of_length(env.demonstrations.horizon)
         self.evaluator = Evaluator(env, held_out)
-        self._env = _with_crossovers(env, self.settings.crossovers or 0, config.env.demonstrations.seed)
+        self._env = _with_crossovers(env, self.settings.crossovers, config.env.demonstrations.seed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
         self.headline = (
             f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once, "
@@ -104,6 +106,22 @@ class PPOTrainer(Trainer):
         """Each demonstration once, without exploration."""
         # From the host: each way of spreading the parameters over devices would ask for a program of its own.
         return self._program()(jax.device_get(params))
+
+    def run_controller(
+        self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate
+    ) -> tuple[Rollouts, dict[str, Any]]:
+        """See `mimic.evaluation.tracking_controllers.run_controller` and `search_torques`."""
+        if name == "policy":
+            return self.evaluate(params), {}
+        if name == "searched":
+            from mimic.evaluation.searched_torques import search_torques
+
+            outcome, starts = search_torques(self.evaluator, self.controller(params), search, on_update)
+            return outcome, {"trainer": name, "search": dataclasses.asdict(search), "starts": starts}
+        from mimic.evaluation.tracking_controllers import run_controller
+
+        outcome, frequency = run_controller(self.evaluator, name)
+        return outcome, {"trainer": name, "frequency_rad_s": frequency}
 
     def figures(self, outcome: Rollouts) -> Figures:
         """See `Evaluator.summary`."""

@@ -14,13 +14,13 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.evaluator import Controller
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.signals import Signals
-from mimic.trainers.config import PPOConfig
+from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo.programs import Params, initial_params, make_programs
 
 OnEvaluation = Callable[[int, Params, dict[str, float]], bool]  # whether that is good enough to stop
 
 
-def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
+def make_networks(config: PPOSettings, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
     """Policy and value network of a resolved config."""
     hidden = tuple(config.hidden_layers or ())
     return ppo_networks.make_ppo_networks(
@@ -32,13 +32,13 @@ def make_networks(config: PPOConfig, observation_size: int, action_size: int) ->
     )
 
 
-def params_template(config: PPOConfig, observation_size: int, action_size: int) -> Params:
+def params_template(config: PPOSettings, observation_size: int, action_size: int) -> Params:
     """Shapes of the parameters, to restore a checkpoint into."""
     networks = make_networks(config, observation_size, action_size)
     return jax.eval_shape(lambda: initial_params(networks, observation_size, jax.random.PRNGKey(0)))
 
 
-def make_controller(config: PPOConfig, observation_size: int, action_size: int) -> Callable[[Params], Controller]:
+def make_controller(config: PPOSettings, observation_size: int, action_size: int) -> Callable[[Params], Controller]:
     """The deterministic policy as a function of its parameters."""
     make_policy = ppo_networks.make_inference_fn(make_networks(config, observation_size, action_size))
 
@@ -51,7 +51,7 @@ def make_controller(config: PPOConfig, observation_size: int, action_size: int) 
 
 def train(
     env: ImitationEnv,
-    config: PPOConfig,
+    config: PPOSettings,
     run_dir: Path,
     *,
     seed: int,
@@ -96,7 +96,7 @@ def train(
     return result.step, result.params
 
 
-def follow(env: ImitationEnv, config: PPOConfig, *, seed: int, restore: tuple[int, Params] | None = None) -> None:
+def follow(env: ImitationEnv, config: PPOSettings, *, seed: int, restore: tuple[int, Params] | None = None) -> None:
     """Trains in step with the first process, where `train` runs."""
     for _ in _stretches(env, config, seed, restore, lambda: None):
         pass
@@ -118,15 +118,15 @@ class _Stretch(NamedTuple):
 
 def _stretches(
     env: ImitationEnv,
-    config: PPOConfig,
+    config: PPOSettings,
     seed: int,
     restore: tuple[int, Params] | None,
     on_compiling: Callable[[], None],
 ) -> Iterator[_Stretch]:
     """The start of a training, and the end of each of its stretches."""
     step, restored = jax.device_get(restore) if restore else (0, None)
-    left = max(config.num_timesteps - step, 1)  # type: ignore[operator]
-    evaluations = max(round(config.evaluations * left / config.num_timesteps), 1)  # type: ignore[operator]
+    left = max(config.num_timesteps - step, 1)
+    evaluations = max(round(config.evaluations * left / config.num_timesteps), 1)
     all_batches = -(-left // config.steps_per_batch)
     batches = max(round(all_batches / evaluations), 1)
     networks = make_networks(config, env.observation_size, env.action_size)
@@ -147,11 +147,11 @@ def _stretches(
         yield _Stretch(step, jax.device_get(learning.params), {**speed, **metrics})
 
 
-def _learning_rate(config: PPOConfig, done_steps: int) -> optax.Schedule:
+def _learning_rate(config: PPOSettings, done_steps: int) -> optax.Schedule:
     """A linear decay over the updates of the whole training, from those that are done."""
-    updates_per_batch = config.num_minibatches * config.num_updates_per_batch  # type: ignore[operator]
-    updates = config.num_timesteps // config.steps_per_batch * updates_per_batch  # type: ignore[operator]
+    updates_per_batch = config.num_minibatches * config.num_updates_per_batch
+    updates = config.num_timesteps // config.steps_per_batch * updates_per_batch
     done_updates = done_steps // config.steps_per_batch * updates_per_batch
-    start: float = config.learning_rate  # type: ignore[assignment]
-    schedule = optax.linear_schedule(start, start * config.final_learning_rate, updates)  # type: ignore[operator]
+    start = config.learning_rate
+    schedule = optax.linear_schedule(start, start * config.final_learning_rate, updates)
     return lambda count: schedule(count + done_updates)
