@@ -5,15 +5,14 @@
 The learner starts at home at rest; for 5 s a new random torque, uniform within the environment's torque scale, is held
 for each control step. The error is the distance of the tip, the end of the last link, from that of C MuJoCo with RK4 in
 steps of 0.1 ms, in double precision. Candidates are C MuJoCo's integrators in double precision, and the environments'
-own physics in single precision. Sequences in which a joint of the reference reaches the speed bound, at which the
-environment ends an episode as a runaway, are counted and left out. A state that is not finite has an infinite error,
-null in the file.
+own physics in single precision. Sequences in which a joint of the reference reaches the speed bound are counted and
+left out. A state that is not finite has an infinite error, null in the file.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +20,8 @@ import mujoco
 import numpy as np
 
 import mimic
-from benchmarks.common.parser import BenchmarkParser
-from benchmarks.common.record import Results, Row, print_table
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, collect, print_table
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.physics import Load, make_advance
 
@@ -31,20 +30,10 @@ STEPS = 50  # control steps of a sequence
 REFERENCE_TIMESTEP = 1e-4  # s
 SUBSTEPS, OWN_SUBSTEPS = (1, 2, 5, 10, 20, 50), (5, 10, 20)
 EVALUATIONS = {"euler": 1, "implicitfast": 1, "rk4": 4}  # of the forward dynamics, in a step
-PHYSICS = ("mjx", "fused")
-GOAL = 1.0  # mm
 QUANTILES = {"median": 0.5, "p95": 0.95, "max": 1.0}
+ERRORS = " ".join(f"error_mm[end][{name}]:.3g" for name in QUANTILES) + " error_mm[largest][max]:.3g"
 
-
-class Motion(NamedTuple):
-    """Joint states after each control step: each [sequences, steps, joints]."""
-
-    qpos: np.ndarray
-    qvel: np.ndarray
-
-    def runaways(self, bound: float) -> np.ndarray:
-        """Sequences that the environment would end, at its check after each control step."""
-        return ~np.all(np.abs(self.qvel) < bound, axis=(1, 2))
+Motion = tuple[np.ndarray, np.ndarray]  # qpos and qvel after each control step: [sequences, steps, joints]
 
 
 def random_torques(env: ImitationEnv, sequences: int) -> np.ndarray:
@@ -73,7 +62,7 @@ def mujoco_motion(env: ImitationEnv, torques: np.ndarray, integrator: str, subst
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         states = np.stack(list(pool.map(sequence, torques)))
-    return Motion(states[:, :, 0], states[:, :, 1])
+    return states[:, :, 0], states[:, :, 1]
 
 
 def own_motion(env: ImitationEnv, torques: np.ndarray, physics: str, substeps: int) -> Motion:
@@ -90,7 +79,8 @@ def own_motion(env: ImitationEnv, torques: np.ndarray, physics: str, substeps: i
         home = jnp.asarray(env.learner.home, jnp.float32)
         return jax.lax.scan(step, (home, jnp.zeros_like(home)), torques)[1]
 
-    return Motion(*(np.asarray(x, float) for x in sequence(jnp.asarray(torques, jnp.float32))))
+    qpos, qvel = sequence(jnp.asarray(torques, jnp.float32))
+    return np.asarray(qpos, float), np.asarray(qvel, float)
 
 
 def tip_positions(arm: mimic.Embodiment) -> Callable[[np.ndarray], np.ndarray]:
@@ -121,20 +111,24 @@ def quantiles(errors: np.ndarray) -> dict[str, dict[str, float]]:
 def run_env(name: str, sequences: int) -> Row:
     """All candidates on one environment."""
     env = mimic.make(name, demonstrations={"count": 1, "held_out": 1})
-    bound, tips = env.config.speed_bound, tip_positions(env.learner)
-    torques = random_torques(env, sequences)
-    reference = mujoco_motion(env, torques, "rk4", round(env.config.control_dt / REFERENCE_TIMESTEP))
-    kept = ~reference.runaways(bound)
-    reference_tips = tips(reference.qpos[kept])
+    bound, torques, tips = env.config.speed_bound, random_torques(env, sequences), tip_positions(env.learner)
+
+    def runaways(qvel: np.ndarray) -> np.ndarray:
+        """Sequences that the environment would end, at its check after each control step."""
+        return ~np.all(np.abs(qvel) < bound, axis=(1, 2))
+
+    qpos, qvel = mujoco_motion(env, torques, "rk4", round(env.config.control_dt / REFERENCE_TIMESTEP))
+    kept = ~runaways(qvel)
+    reference = tips(qpos[kept])
 
     def candidate(engine: str, integrator: str, substeps: int, motion: Motion) -> Row:
-        metres = np.linalg.norm(tips(motion.qpos[kept]) - reference_tips, axis=-1)
+        metres = np.linalg.norm(tips(motion[0][kept]) - reference, axis=-1)
+        row = {"engine": engine, "integrator": integrator, "substeps": substeps}
+        costs = {"evaluations": EVALUATIONS[integrator] * substeps}
         return {
-            "engine": engine,
-            "integrator": integrator,
-            "substeps": substeps,
-            "evaluations": EVALUATIONS[integrator] * substeps,
-            "false_runaways": int(motion.runaways(bound)[kept].sum()),
+            **row,
+            **costs,
+            "false_runaways": int(runaways(motion[1])[kept].sum()),
             "error_mm": quantiles(1e3 * metres),
         }
 
@@ -143,12 +137,11 @@ def run_env(name: str, sequences: int) -> Row:
         for integrator in EVALUATIONS
         for substeps in SUBSTEPS
     ]
-    differences = []
-    for substeps in OWN_SUBSTEPS:
-        motions = {physics: own_motion(env, torques, physics, substeps) for physics in PHYSICS}
-        candidates += [candidate(physics, "rk4", substeps, motion) for physics, motion in motions.items()]
-        difference = np.abs(motions["fused"].qpos - motions["mjx"].qpos)[kept].max(axis=-1)
-        differences.append({"substeps": substeps, "difference_rad": quantiles(difference)})
+    candidates += [
+        candidate(physics, "rk4", substeps, own_motion(env, torques, physics, substeps))
+        for substeps in OWN_SUBSTEPS
+        for physics in ("mjx", "fused")
+    ]
     return {
         "env": name,
         "action_scale": env.config.action_scale,
@@ -156,43 +149,17 @@ def run_env(name: str, sequences: int) -> Row:
         "speed_bound": bound,
         "sequences": sequences,
         "runaways": int((~kept).sum()),
-        "median_peak_speed": float(np.median(np.abs(reference.qvel[kept]).max(axis=(1, 2)))),
+        "median_peak_speed": float(np.median(np.abs(qvel[kept]).max(axis=(1, 2)))),
         "candidates": candidates,
-        "rk4_substeps_below_1mm": enough(candidates),
-        "fused_against_mjx": differences,
     }
-
-
-def enough(candidates: Sequence[Row]) -> dict[str, int | None]:
-    """The fewest of the tested RK4 steps of C MuJoCo with an error at the end below a millimetre."""
-    rk4 = [row for row in candidates if (row["engine"], row["integrator"]) == ("mujoco", "rk4")]
-    return {
-        name: next((row["substeps"] for row in rk4 if row["error_mm"]["end"][name] < GOAL), None) for name in QUANTILES
-    }
-
-
-def _columns(error: str, form: str, *names: str) -> dict[str, str]:
-    end = {name: f"{{{error}[end][{name}]:{form}}}" for name in QUANTILES}
-    return {**{name: f"{{{name}}}" for name in names}, **end, "largest": f"{{{error}[largest][max]:{form}}}"}
 
 
 def main() -> None:
-    parser = BenchmarkParser("physics", __doc__)
-    parser.add_names("--envs", mimic.environments(), ENVS)
-    parser.add_argument("--seeds", type=int, default=100, metavar="N", help="random sequences of torques")
-    options = parser.parse_args()
+    options = make_parser("physics", __doc__, envs=ENVS, seeds=100).parse_args()
     mujoco.set_mju_user_warning(lambda _: None)  # divergence is counted here; MuJoCo would also log it to a file
-    results, rows = Results("physics", options), []
-    for name in options.envs:
-        rows.append(run_env(name, options.seeds))
-        results.write(results=rows)
-    for row in rows:
-        columns = _columns("error_mm", ".3g", "engine", "integrator", "substeps", "evaluations", "false_runaways")
-        print_table(row["candidates"], columns, f"{row['env']}: error of the tip after 5 s [mm]")
-        columns = _columns("difference_rad", ".1e", "substeps")
-        print_table(row["fused_against_mjx"], columns, f"{row['env']}: joint angles after 5 s, fused to mjx [rad]")
-        print(f"{row['env']}: {row['runaways']} of {row['sequences']} sequences run away and are left out; "
-              f"RK4 steps in a control step for less than {GOAL:g} mm: {row['rk4_substeps_below_1mm']}")  # fmt: skip
+    rows = (run_env(name, options.seeds) for name in options.envs)
+    for row in collect(options, rows, "results", "env sequences runaways median_peak_speed:.1f"):
+        print_table(row["candidates"], f"engine integrator substeps evaluations false_runaways {ERRORS}", row["env"])
 
 
 if __name__ == "__main__":

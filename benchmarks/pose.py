@@ -19,17 +19,17 @@ import mujoco
 import numpy as np
 
 import mimic
-from benchmarks.common.parser import BenchmarkParser
-from benchmarks.common.record import Results, Row, print_table
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.common.timing import time_call
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.metric.config import MetricConfig
 
 METRIC = MetricConfig()
-EXHAUSTIVE: dict[str, Any] = {"starts": 512, "iterations": 60}
 CHUNK = 500  # poses of an exhaustive search in parallel
 NEAR, ROUNDING = 1e-3, 1e-6  # tolerance of the global minimum: relative, and absolute for float32
 MINK_STEPS, MINK_DT = 100, 0.1  # steps of inverse kinematics for a pose, and the time that each integrates over [s]
+COLUMNS = "pair method quality:.2% global_share:.2% distance:.4f poses_per_second:,.0f first_call_s:.1f"
 
 Solver = Callable[[np.ndarray], np.ndarray]  # expert's poses -> learner's poses
 
@@ -46,27 +46,13 @@ PAIRS = {
     "panda 7->4": (ArmConfig(), ArmConfig(locked=[3, 6, 7])),
     "panda 7->3": (ArmConfig(), ArmConfig(locked=[2, 3, 6, 7])),
 }
-COLUMNS = {
-    "pair": "{pair}",
-    "method": "{method}",
-    "quality": "{quality:.2%}",
-    "global": "{global_share:.2%}",
-    "distance": "{distance:.4f}",
-    "poses/s": "{poses_per_second:,.0f}",
-    "first call [s]": "{first_call_s:.1f}",
-}
 
 
 def imitate(expert: Arm, learner: Arm, **options: Any) -> Solver:
     """`imitate_pose`, compiled once."""
-    correspondence = METRIC.make_correspondence(expert.embodiment, learner.embodiment)
-
-    @jax.jit
-    def solve(qpos: jax.Array) -> jax.Array:
-        pair = expert.embodiment, learner.embodiment
-        return mimic.imitate_pose(*pair, qpos, correspondence, METRIC.make_weights(), **options).qpos
-
-    return lambda qpos: np.asarray(solve(jnp.asarray(qpos)))
+    pair = expert.embodiment, learner.embodiment
+    metric = METRIC.make_correspondence(*pair), METRIC.make_weights()
+    return jax.jit(lambda qpos: mimic.imitate_pose(*pair, qpos, *metric, **options).qpos)
 
 
 def with_mink(expert: Arm, learner: Arm) -> Solver:
@@ -99,33 +85,25 @@ def with_mink(expert: Arm, learner: Arm) -> Solver:
 
 def exhaustive(expert: Arm, learner: Arm) -> Solver:
     """`imitate_pose` from very many starts, with random numbers of its own."""
-    solve = imitate(expert, learner, key=jax.random.key(1), **EXHAUSTIVE)
-
-    def in_chunks(qpos: np.ndarray) -> np.ndarray:
-        chunk = min(CHUNK, len(qpos))
-        padded = np.concatenate([qpos, np.repeat(qpos[-1:], -len(qpos) % chunk, axis=0)])
-        return np.concatenate([solve(part) for part in padded.reshape(-1, chunk, qpos.shape[1])])[: len(qpos)]
-
-    return in_chunks
+    solve = imitate(expert, learner, key=jax.random.key(1), starts=512, iterations=60)
+    return jax.jit(lambda qpos: jax.lax.map(solve, qpos, batch_size=CHUNK))
 
 
 def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
     """All methods on one pair of arms."""
     expert, learner = map(build_arm, PAIRS[name])
-    correspondence = METRIC.make_correspondence(expert.embodiment, learner.embodiment)
+    metric = METRIC.build(expert.embodiment, learner.embodiment)
 
     @jax.jit
     @jax.vmap
     def distances(qpos: jax.Array, learner_qpos: jax.Array) -> jax.Array:
-        states = mimic.link_states(expert.embodiment, qpos), mimic.link_states(learner.embodiment, learner_qpos)
-        return mimic.embodiment_distance(*states, correspondence, METRIC.make_weights())
+        return metric(mimic.link_states(expert.embodiment, qpos), mimic.link_states(learner.embodiment, learner_qpos))
 
     rng = np.random.default_rng(0)
-
-    def random_poses(arm: Arm, count: int) -> np.ndarray:
-        return rng.uniform(-np.pi, np.pi, (count, arm.embodiment.num_joints)).astype(np.float32)
-
-    qpos, chance, many = random_poses(expert, poses), random_poses(learner, poses), random_poses(expert, batch)
+    qpos, chance, many = (
+        rng.uniform(-np.pi, np.pi, (count, arm.embodiment.num_joints)).astype(np.float32)
+        for arm, count in ((expert, poses), (learner, poses), (expert, batch))
+    )
     plain: dict[str, Any] = {"method": "gradient_descent"}
     solvers = {
         "newton": imitate(expert, learner),
@@ -137,13 +115,9 @@ def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
     for method, solver in solvers.items():
         judged, timed, repeats = (qpos[:mink_poses], qpos[:mink_poses], 1) if method == "mink" else (qpos, many, 5)
         timing = time_call(lambda solver=solver, timed=timed: solver(timed), repeats=repeats)
-        methods[method] = {
-            "batch": len(timed),
-            "poses_per_second": len(timed) / timing.median,
-            "spread_s": [timing.low, timing.high],
-            "first_call_s": timing.first,
-        }
         left[method] = np.asarray(distances(judged, solver(judged)))
+        methods[method] = {"batch": len(timed), "poses_per_second": len(timed) / timing.median}
+        methods[method] |= {"spread_s": [timing.low, timing.high], "first_call_s": timing.first}
     best = np.array(distances(qpos, exhaustive(expert, learner)(qpos)))
     for values in left.values():
         best[: len(values)] = np.minimum(best[: len(values)], values)
@@ -160,16 +134,11 @@ def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
 
 
 def main() -> None:
-    parser = BenchmarkParser("pose", __doc__)
-    parser.add_names("--pair", PAIRS)
-    parser.add_argument("--poses", type=int, default=1000, help="poses that quality is judged on")
-    parser.add_argument("--batch", type=int, default=1000, help="parallel poses that speed is measured on")
-    parser.add_argument("--mink-poses", type=int, default=100, help="poses for mink, one after the other")
-    options = parser.parse_args()
-    results, rows = Results("pose", options), []
+    options = make_parser("pose", __doc__, pair=PAIRS, poses=1000, batch=1000, mink_poses=100).parse_args()
+    rows = []
     for name in options.pair:
         rows.append(run_pair(name, options.poses, options.batch, options.mink_poses))
-        results.write(results=rows)
+        write_results(options, results=rows)
     shown = ({"pair": row["pair"], "method": key, **values} for row in rows for key, values in row["methods"].items())
     print_table(shown, COLUMNS)
 

@@ -18,9 +18,9 @@ import matplotlib.ticker
 import numpy as np
 
 import mimic
-from benchmarks.common.parser import BenchmarkParser
+from benchmarks.common.parser import make_parser
 from benchmarks.common.processes import read_metrics, time_to_goal, train
-from benchmarks.common.record import Results, Row, print_table
+from benchmarks.common.record import Row, collect
 from benchmarks.common.timing import time_program
 from benchmarks.figures.canvas import plt, save
 
@@ -36,32 +36,29 @@ REGULARISATION: dict[str, tuple[str, ...]] = {
     "weight decay 0.1": ("trainer.weight_decay=0.1",),
     "weight decay 1": ("trainer.weight_decay=1",),
 }
-COLUMNS = {
-    "env": "{report[env]} {report[seed]}",
-    "preset": "{preset}",
-    "regularisation": "{regularisation}",
-    "training": "{report[quality][train]:.2%}",
-    "unseen": "{report[quality][held_out]:.2%}",
-    "within 2 % [s]": "{to_goal_s:.1f}",
-    "process [s]": "{process_wall_s:.1f}",
-    "poses/s": "{poses_per_second:,.0f}",
-}
-_SPLITS = {"train": ("training poses", "--"), "held_out": ("unseen poses", "-")}
+COLUMNS = (
+    "report[env] report[seed] preset regularisation report[quality][train]:.2% report[quality][held_out]:.2% "
+    "to_goal_s:.1f process_wall_s:.1f poses_per_second:,.0f"
+)
+SPLITS = {"train": ("training poses", "--"), "held_out": ("unseen poses", "-")}
 
 
-def poses_per_second(run_dir: Path, batch: int) -> float:
-    """Speed of a trained mapper on a batch."""
-    mapper = mimic.PoseMapper.load(run_dir)
+def run(preset: str, env: str, variant: str, seed: int) -> Row:
+    """Report, curves and speed of a training."""
+    arguments = ["trainer=pose_mapper", f"trainer.preset={preset}", f"env={env}", f"seed={seed}"]
+    with tempfile.TemporaryDirectory() as folder:
+        run_dir = Path(folder) / "run"
+        result = train(run_dir, [*arguments, *REGULARISATION[variant]])
+        mapper = mimic.PoseMapper.load(run_dir)
+        metrics = np.transpose(read_metrics(run_dir, "step", *(f"quality/quality.{split}" for split in SPLITS)))
+        to_goal = time_to_goal(run_dir, "quality.held_out", GOAL)
     lower, upper = mapper.expert.joint_range.T
-    qpos = np.random.default_rng(0).uniform(lower, upper, (batch, len(lower))).astype(np.float32)
-    return batch / time_program(mapper, jax.device_put(qpos)).median
-
-
-def curves(run_dir: Path) -> dict[str, list[float]]:
-    """Quality on training and unseen poses after each evaluation."""
-    steps, *quality = zip(*read_metrics(run_dir, "step", *(f"quality/quality.{split}" for split in _SPLITS)), strict=True)
-    rounded = {split: [round(x, 6) for x in values] for split, values in zip(_SPLITS, quality, strict=True)}
-    return {"training_poses": [int(step) for step in steps], **rounded}
+    qpos = np.random.default_rng(0).uniform(lower, upper, (BATCH, len(lower))).astype(np.float32)
+    rate = BATCH / time_program(mapper, jax.device_put(qpos)).median
+    curves = {split: values.round(6).tolist() for split, values in zip(SPLITS, metrics[1:], strict=True)}
+    curves["training_poses"] = metrics[0].astype(int).tolist()
+    case = {"preset": preset, "regularisation": variant, **result, "curves": curves}
+    return {**case, "poses_per_second": rate, "to_goal_s": to_goal}
 
 
 def plot(rows: Sequence[Row], out: Path) -> None:
@@ -72,7 +69,7 @@ def plot(rows: Sequence[Row], out: Path) -> None:
     for axes, preset in zip(panels[0], presets, strict=True):
         chosen = [r for r in rows if r["preset"] == preset and r["report"]["seed"] == rows[0]["report"]["seed"]]
         for index, row in enumerate(chosen):
-            for split, (label, style) in _SPLITS.items():
+            for split, (label, style) in SPLITS.items():
                 percent = 100 * np.asarray(row["curves"][split])
                 name = f"{row['report']['env']}, {label}" if preset == presets[0] else None
                 axes.plot(row["curves"]["training_poses"], percent, style, color=f"C{index}", lw=1.2, label=name)
@@ -86,27 +83,13 @@ def plot(rows: Sequence[Row], out: Path) -> None:
 
 
 def main() -> None:
-    parser = BenchmarkParser("pose_mapper", __doc__)
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="picture of the curves")
-    parser.add_names("--preset", PRESETS)
-    parser.add_names("--env", ENVIRONMENTS)
-    parser.add_numbers("--seeds", [0, 1, 2], "of the runs")
-    parser.add_argument("--regularisation", action="store_true", help="each also with dropout and weight decay")
-    options = parser.parse_args()
-    variants = REGULARISATION if options.regularisation else {"none": ()}
-    results, rows = Results("pose_mapper", options), []
-    for preset, env, variant, seed in itertools.product(options.preset, options.env, variants, options.seeds):
-        arguments = ["trainer=pose_mapper", f"trainer.preset={preset}", f"env={env}", f"seed={seed}", *variants[variant]]
-        with tempfile.TemporaryDirectory() as folder:
-            run_dir = Path(folder) / "run"
-            row = {"preset": preset, "regularisation": variant, **train(run_dir, arguments)}
-            row |= {"curves": curves(run_dir), "poses_per_second": poses_per_second(run_dir, BATCH)}
-            row["to_goal_s"] = time_to_goal(run_dir, "quality.held_out", GOAL)
-        rows.append(row)
-        results.write(batch=BATCH, runs=rows)
+    lists = {"preset": PRESETS, "env": ENVIRONMENTS, "seeds": [0, 1, 2]}
+    options = make_parser("pose_mapper", __doc__, **lists, regularisation=False, plot=Path).parse_args()
+    variants = REGULARISATION if options.regularisation else ["none"]
+    cases = itertools.product(options.preset, options.env, variants, options.seeds)
+    rows = collect(options, (run(*case) for case in cases), "runs", COLUMNS, batch=BATCH)
     if options.plot:
         plot(rows, options.plot)
-    print_table(rows, COLUMNS)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,9 @@ from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.networks import make_ppo_networks
 
 import mimic
-from benchmarks.common.parser import BenchmarkParser
-from benchmarks.common.record import Results, Row, failure, print_table
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, collect, failure
+from benchmarks.common.timing import summary_of_rates
 from benchmarks.peers import stock
 from mimic import compat
 from mimic.envs.imitation import ImitationEnv
@@ -38,26 +39,16 @@ SETTINGS = (  # that brax's PPO has under the same names
     "num_envs", "learning_rate", "entropy_cost", "discounting", "unroll_length", "batch_size", "num_minibatches",
     "num_updates_per_batch", "reward_scaling", "clipping_epsilon", "gae_lambda", "max_grad_norm",
 )  # fmt: skip
-COLUMNS = {
-    "env": "{env}",
-    "PPO on": "{case}",
-    "env steps/s": "{steps_per_s:,.0f}",
-    "spread": "{spread:.1%}",
-    "compile [s]": "{compile_s:.1f}",
-}
+COLUMNS = "env case steps_per_s:,.0f spread:.1% compile_s:.1f"
 
 Case = Callable[[str, PPOSettings, int], dict[str, float]]  # environment, settings, batches of an epoch -> rates
 
 
-def rates(steps: int, seconds: Sequence[float]) -> dict[str, float]:
-    """Speed of epochs of so many steps: median and spread (quartiles) without the first, and how long that compiled."""
-    later = np.asarray(seconds[1:])
-    low, median, high = np.quantile(steps / later, [0.25, 0.5, 0.75])
-    return {
-        "compile_s": round(max(seconds[0] - float(np.median(later)), 0.0), 3),
-        "steps_per_s": float(median),
-        "spread": round(float((high - low) / median), 4),
-    }
+def rates(steps: int, times: Sequence[float]) -> dict[str, float]:
+    """Speed between the ends of epochs of so many steps, without the first, and how long that compiled."""
+    first, *later = np.diff(times).tolist()
+    compile_s = round(max(first - float(np.median(later)), 0.0), 3)
+    return {"compile_s": compile_s, **summary_of_rates([steps / seconds for seconds in later])}
 
 
 def settings(config: PPOSettings) -> dict[str, Any]:
@@ -65,7 +56,9 @@ def settings(config: PPOSettings) -> dict[str, Any]:
     return {name: getattr(config, name) for name in SETTINGS}
 
 
-def training_epoch(env: ImitationEnv, config: PPOSettings, batches: int) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def training_epoch(
+    env: ImitationEnv, config: PPOSettings, batches: int
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """The compiled functions of `mimic.train` that begin a training, and that train for so many batches."""
     networks = training.make_networks(config, env.observation_size, env.action_size)
     schedule = optax.constant_schedule(config.learning_rate)
@@ -84,7 +77,7 @@ def mimic_loop(physics: str) -> Case:
             state, metrics = epoch()(state)
             jax.block_until_ready(metrics)
             times.append(time.perf_counter())
-        return rates(batches * config.steps_per_batch, np.diff(times).tolist())
+        return rates(batches * config.steps_per_batch, times)
 
     return case
 
@@ -113,7 +106,7 @@ def brax_loop(physics: str, make: Callable[[Any], tuple[Env, Callable[..., Env]]
             ),
             **settings(config),
         )
-        return rates(batches * config.steps_per_batch, np.diff(times).tolist())
+        return rates(batches * config.steps_per_batch, times)
 
     return case
 
@@ -121,8 +114,8 @@ def brax_loop(physics: str, make: Callable[[Any], tuple[Env, Callable[..., Env]]
 def stable_baselines(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
     from benchmarks.peers import baselines  # of a package that may not be installed
 
-    del batches  # the CPU is slow
-    return rates(*baselines.learn(name, config, 1, EPOCHS))
+    del batches  # the CPU is slow: one
+    return rates(*baselines.learn(name, config, EPOCHS))
 
 
 CASES: dict[str, Case] = {
@@ -134,34 +127,25 @@ CASES: dict[str, Case] = {
 }
 
 
-def run(name: str, config: PPOSettings, cases: Sequence[str], batches: int) -> list[Row]:
-    """A row for each case; a case that fails is a row with the reason."""
-    rows = []
-    for case in cases:
-        row: Row = {"env": name, "case": case}
-        began = time.perf_counter()
-        try:
-            row |= CASES[case](name, config, batches)
-        except Exception as error:  # not installed, or out of memory
-            row |= failure(error)
-        rows.append({**row, "wall_s": round(time.perf_counter() - began, 1)})
-    return rows
+def run(name: str, config: PPOSettings, case: str, batches: int) -> Row:
+    """A case, or the reason why it failed."""
+    row: Row = {"env": name, "case": case}
+    began = time.perf_counter()
+    try:
+        row |= CASES[case](name, config, batches)
+    except Exception as error:  # not installed, or out of memory
+        row |= failure(error)
+    return {**row, "wall_s": round(time.perf_counter() - began, 1)}
 
 
 def main() -> None:
-    parser = BenchmarkParser("ppo", __doc__)
-    parser.add_argument("--env", default="panda4dof", choices=mimic.environments(), metavar="NAME")
-    parser.add_names("--only", CASES)
-    parser.add_argument("--num-envs", type=int, metavar="N", help="parallel arms; default: of the preset")
-    parser.add_argument("--batch-size", type=int, metavar="N", help="unrolls in a minibatch; default: of the preset")
-    parser.add_argument("--batches", type=int, metavar="N", help="batches of an epoch")
-    options = parser.parse_args()
+    numbers = {"num_envs": int, "batch_size": int, "batches": int}  # default: of the preset
+    options = make_parser("ppo", __doc__, env="panda4dof", only=CASES, **numbers).parse_args()
     config = PPOConfig(num_envs=options.num_envs, batch_size=options.batch_size)
     config = config.resolve(jax.default_backend(), jax.device_count())
     batches = options.batches or (10 if jax.default_backend() == "gpu" else 1)
-    rows = run(options.env, config, options.only, batches)
-    print_table(rows, COLUMNS)
-    Results("ppo", options).write(settings=settings(config), layers=config.hidden_layers, rows=rows)
+    rows = (run(options.env, config, case, batches) for case in options.only)
+    collect(options, rows, "rows", COLUMNS, settings=settings(config), layers=config.hidden_layers)
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import jax
 
 import mimic
-from benchmarks.common.parser import BenchmarkParser
-from benchmarks.common.record import Results, Row, print_table
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.ppo import training_epoch
 from mimic.trainers.config import PPOConfig
 
@@ -63,11 +63,11 @@ def kind(name: str) -> str:
 
 def by_name(events: Iterable[Event], naming: Callable[[str], str]) -> list[Row]:
     """Count and total time of the events of each name, the longest first."""
-    durations: dict[str, list[float]] = {}
+    rows: dict[str, Row] = {}
     for event in events:
-        durations.setdefault(naming(event.name), []).append(event.duration)
-    rows = [{"what": name, "count": len(times), "ms": sum(times) / 1e6} for name, times in durations.items()]
-    return sorted(rows, key=lambda row: -row["ms"])
+        row = rows.setdefault(naming(event.name), {"what": naming(event.name), "count": 0, "ms": 0.0})
+        row |= {"count": row["count"] + 1, "ms": row["ms"] + event.duration / 1e6}
+    return sorted(rows.values(), key=lambda row: -row["ms"])
 
 
 def busy(events: Iterable[Event]) -> float:
@@ -92,29 +92,19 @@ def profile(name: str, batches: int) -> dict[str, Any]:
             jax.block_until_ready(epoch()(state))
             wall = time.perf_counter() - began
         events = device_events(Path(folder))
-    return {
-        "env": name,
-        "batches": batches,
-        "env_steps": batches * config.steps_per_batch,
-        "wall_s": wall,
-        "busy_s": busy(events),
-        "kinds": by_name(events, kind),
-        "kernels": by_name(events, str)[:_LONGEST],
-    }
+    row = {"env": name, "batches": batches, "env_steps": batches * config.steps_per_batch, "wall_s": wall}
+    return {**row, "busy_s": busy(events), "kinds": by_name(events, kind), "kernels": by_name(events, str)[:_LONGEST]}
 
 
 def main() -> None:
-    parser = BenchmarkParser("profile", __doc__)
-    parser.add_argument("--env", default="panda4dof", choices=mimic.environments(), metavar="NAME")
-    parser.add_argument("--batches", type=int, default=10, metavar="N", help="batches of the epoch")
+    parser = make_parser("profile", __doc__, env="panda4dof", batches=10)
     options = parser.parse_args()
     if jax.default_backend() != "gpu":
         parser.error(f"expected a GPU, whose kernels the profiler records, got {jax.default_backend()}")
     content = profile(options.env, options.batches)
-    print_table(content["kinds"], {"on the device": "{what}", "count": "{count:,}", "ms": "{ms:.2f}"})
-    fraction = content["busy_s"] / content["wall_s"]
-    print(f"{content['env_steps']:,} environment steps in {content['wall_s']:.3f} s; busy {fraction:.1%}")
-    Results("profile", options).write(**content)
+    print_table(content["kinds"], "what count:, ms:.2f")
+    print_table([content], "env_steps:, wall_s:.3f busy_s:.3f")
+    write_results(options, **content)
 
 
 if __name__ == "__main__":

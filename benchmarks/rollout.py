@@ -3,15 +3,14 @@
     python -m benchmarks.rollout --out FILE [--envs panda7dof ...] [--arms 64 512 ...] [--peer-arms 512 ...]
                                 [--cases fused MJX-Warp ...]
 
-Every case makes control steps of 0.1 s under random torques, with the environment's own 10 Runge-Kutta steps of 10 ms.
-The physics of the environments, `fused` and `mjx`, is compared with a loop that carries `mjx.Data`, as is usual,
-MJX-Warp, where it is installed, and C MuJoCo's threaded rollout on the CPU. Environment steps add the reward, the
-observation and new episodes; the stock environment carries and resets `mjx.Data`, as brax environments usually do, with
-our reward. Times are medians with quartiles, without compilation.
+Every case makes control steps of 0.1 s under random torques, with the environment's own 10 Runge-Kutta steps. The
+physics of the environments, `fused` and `mjx`, is compared with a loop that carries `mjx.Data`, as is usual, MJX-Warp,
+where it is installed, and C MuJoCo's threaded rollout on the CPU. Environment steps add the reward, the observation and
+new episodes; the stock environment carries and resets `mjx.Data`, as brax environments usually do.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -21,12 +20,10 @@ import mujoco.rollout
 import numpy as np
 from brax.envs.base import Wrapper
 from mujoco import mjx
-from rich.console import Console
-from rich.progress import track
 
 import mimic
-from benchmarks.common.parser import BenchmarkParser
-from benchmarks.common.record import Results, Row, failure, print_table
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, collect, failure
 from benchmarks.common.timing import Timing, time_call, time_program
 from benchmarks.peers import stock
 from mimic.envs.imitation import ImitationEnv
@@ -37,6 +34,7 @@ ENVS = ("panda7dof", "panda4dof", "panda3dof")
 ARMS = (64, 512, 4096, 8192, 32768, 65536, 131072)
 PEER_ARMS = (512, 8192, 65536)  # for cases that are slow to compile and to run
 STEPS = 10  # control steps in a call
+COLUMNS = "env group case arms:, steps_per_s:,.0f spread:.0% compile_s:.1f bytes_per_arm:,.0f"
 
 Case = Callable[[ImitationEnv, int], Timing]
 
@@ -49,17 +47,20 @@ def random_motion(env: ImitationEnv, arms: int) -> tuple[jax.Array, jax.Array, j
     return qpos, jnp.zeros_like(qpos), 0.1 * actions * env.torque_scale
 
 
+def time_steps(step: Callable[[Any, Any], Any], state: Any, inputs: jax.Array) -> Timing:
+    """Times all control steps as one compiled loop."""
+    return time_program(lambda state, inputs: jax.lax.scan(step, state, inputs), state, inputs)
+
+
 def own_physics(physics: str) -> Case:
     """The physics of the environments, which carries joint states alone."""
 
     def case(env: ImitationEnv, arms: int) -> Timing:
         substeps = env.config.substeps
         advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
-
-        def step(state: Any, torque: jax.Array) -> Any:
-            return jax.vmap(lambda q, v, held: advance(q, v, held, Load()))(*state, torque), None
-
-        return time_program(lambda q, v, torques: jax.lax.scan(step, (q, v), torques)[0], *random_motion(env, arms))
+        step = lambda state, torques: (jax.vmap(lambda q, v, u: advance(q, v, u, Load()))(*state, torques), None)  # noqa: E731
+        qpos, qvel, torques = random_motion(env, arms)
+        return time_steps(step, (qpos, qvel), torques)
 
     return case
 
@@ -72,13 +73,13 @@ def carried_data(implementation: str) -> Case:
         mjx_model, blank = (make(model, impl=implementation) for make in (mjx.put_model, mjx.make_data))
         qpos, qvel, torques = random_motion(env, arms)
         data = jax.vmap(lambda q, v: blank.replace(qpos=q, qvel=v))(qpos, qvel)
+        substep = jax.vmap(lambda d: mjx.step(mjx_model, d))
 
-        def step(data: Any, torque: jax.Array) -> Any:
-            data = data.replace(qfrc_applied=torque)
-            substep = jax.vmap(lambda d: mjx.step(mjx_model, d))
+        def step(data: Any, torques: jax.Array) -> Any:
+            data = data.replace(qfrc_applied=torques)
             return jax.lax.fori_loop(0, env.config.substeps, lambda _, d: substep(d), data), None
 
-        return time_program(lambda d, t: jax.lax.scan(step, d, t)[0], data, torques)
+        return time_steps(step, data, torques)
 
     return case
 
@@ -95,43 +96,27 @@ def mujoco_threads(env: ImitationEnv, arms: int) -> Timing:
         return time_call(lambda: pool.rollout(model, threads, state, control, control_spec=applied))
 
 
-def environment(physics: str) -> Case:
-    """A whole environment step as PPO makes it, with new episodes."""
+def environment(make: Callable[[ImitationEnv], Wrapper]) -> Case:
+    """A whole environment step with new episodes, of an environment with wrappers for training."""
 
     def case(env: ImitationEnv, arms: int) -> Timing:
-        env = env if physics == env.config.physics else mimic.make(env.config.name, physics=physics)
-        return _steps(wrap_for_training(env, env.config.horizon + 1), env.action_size, arms)
+        wrapped = make(env)
+        state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), arms))
+        actions = jax.random.uniform(jax.random.PRNGKey(1), (STEPS, arms, env.action_size), minval=-1.0, maxval=1.0)
+
+        def step(state: Any, action: jax.Array) -> Any:
+            state = wrapped.step(state, action)
+            return state, (state.reward, jnp.sum(state.obs, axis=-1))  # uses all of the observation, and stores little
+
+        return time_steps(step, state, actions)
 
     return case
 
 
-def stock_environment(env: ImitationEnv, arms: int) -> Timing:
-    """The same task as brax environments usually implement it: `mjx.Data` is carried, and reset to its first value."""
-    return _steps(stock.wrap(stock.StockEnv(env), env.config.horizon + 1), env.action_size, arms)
-
-
-def _steps(wrapped: Wrapper, action_size: int, arms: int) -> Timing:
-    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), arms))
-    actions = jax.random.uniform(jax.random.PRNGKey(1), (STEPS, arms, action_size), minval=-1.0, maxval=1.0)
-
-    def step(state: Any, action: jax.Array) -> Any:
-        state = wrapped.step(state, action)
-        return state, (state.reward, jnp.sum(state.obs, axis=-1))  # uses all of the observation, and stores little
-
-    return time_program(lambda s, a: jax.lax.scan(step, s, a), state, actions)
-
-
-def _reward(env: ImitationEnv, state: Any) -> jax.Array:
-    return env.distance(state.qpos, state.qvel, state.demonstration, state.step)
-
-
-def _observation(env: ImitationEnv, state: Any) -> jax.Array:
-    return jnp.sum(env.observe(state))
-
-
-def _new_episode(env: ImitationEnv, state: Any) -> jax.Array:
-    fresh = env.start(state.key)
-    return jnp.sum(fresh.qpos) + fresh.demonstration + fresh.key[0]
+def _wrapped(env: ImitationEnv, physics: str) -> Wrapper:
+    """The environment as PPO trains on it."""
+    env = env if physics == env.config.physics else mimic.make(env.config.name, physics=physics)
+    return wrap_for_training(env, env.config.horizon + 1)
 
 
 def part(function: Callable[[ImitationEnv, Any], jax.Array]) -> Case:
@@ -145,9 +130,14 @@ def part(function: Callable[[ImitationEnv, Any], jax.Array]) -> Case:
             state = state.replace(qpos=state.qpos + 1e-3 * torque, step=state.step + 1)
             return state, jax.vmap(lambda arm: function(env, arm))(state)
 
-        return time_program(lambda s, t: jax.lax.scan(step, s, t), started.replace(qpos=qpos, qvel=qvel), torques)
+        return time_steps(step, started.replace(qpos=qpos, qvel=qvel), torques)
 
     return case
+
+
+def _new_episode(env: ImitationEnv, arm: Any) -> jax.Array:
+    fresh = env.start(arm.key)
+    return jnp.sum(fresh.qpos) + fresh.demonstration + fresh.key[0]
 
 
 CASES: dict[str, dict[str, Case]] = {
@@ -158,68 +148,44 @@ CASES: dict[str, dict[str, Case]] = {
         "MJX-Warp": carried_data("warp"),
         "C MuJoCo, all cores": mujoco_threads,
     },
-    "environment": {"fused": environment("fused"), "mjx": environment("mjx"), "stock": stock_environment},
-    "part": {"reward": part(_reward), "observation": part(_observation), "new episode": part(_new_episode)},
+    "environment": {
+        "fused": environment(lambda env: _wrapped(env, "fused")),
+        "mjx": environment(lambda env: _wrapped(env, "mjx")),
+        "stock": environment(lambda env: stock.wrap(stock.StockEnv(env), env.config.horizon + 1)),
+    },
+    "part": {
+        "reward": part(lambda env, arm: env.distance(arm.qpos, arm.qvel, arm.demonstration, arm.step)),
+        "observation": part(lambda env, arm: jnp.sum(env.observe(arm))),
+        "new episode": part(_new_episode),
+    },
 }
 NAMES = tuple(dict.fromkeys(case for cases in CASES.values() for case in cases))
 OWN = {("physics", "fused"), ("environment", "fused"), ("part", "reward")}  # quick to compile: for all numbers of arms
-COLUMNS = {
-    "env": "{env}",
-    "group": "{group}",
-    "case": "{case}",
-    "arms": "{arms:,}",
-    "steps/s": "{steps_per_s:,.0f}",  # Runge-Kutta steps of the physics, else environment steps
-    "spread": "{spread:.0%}",
-    "compile [s]": "{compile_s:.1f}",
-    "bytes/arm": "{bytes_per_arm:,.0f}",
-}
 
 
-def run(
-    envs: Sequence[str],
-    sizes: Sequence[int],
-    peer_sizes: Sequence[int],
-    save: Callable[[list[Row]], None],
-    names: Sequence[str] = NAMES,
-) -> list[Row]:
-    """A row for each measurement of the named cases, saved one by one; a case that fails is a row with the reason."""
-    jobs = [
-        (name, group, case, arms)
-        for name in envs
-        for group, cases in CASES.items()
-        for case in cases
-        if case in names
-        for arms in sorted({*peer_sizes, *(sizes if (group, case) in OWN else ())})
-    ]
-    environments = {name: mimic.make(name, physics="fused") for name in envs}
-    rows: list[Row] = []
-    for name, group, case, arms in track(jobs, "rollout", console=Console(stderr=True), transient=True):
-        row: Row = {"env": name, "group": group, "case": case, "arms": arms}
-        try:
-            timing = CASES[group][case](environments[name], arms)
-            steps = arms * STEPS * (environments[name].config.substeps if group == "physics" else 1)
-            row |= timing.summary()
-            row |= {"steps_per_s": steps / timing.median, "bytes_per_arm": timing.bytes / arms}
-        except Exception as error:  # a peer that is not installed or out of memory
-            row |= failure(error)
-        rows.append(row)
-        save(rows)
-    return rows
+def run(envs: Sequence[str], sizes: Sequence[int], peer_sizes: Sequence[int], names: Sequence[str]) -> Iterator[Row]:
+    """The measurements of the named cases; a case that fails is a row with the reason."""
+    for name in envs:
+        env = mimic.make(name, physics="fused")
+        for group, case in [(group, case) for group, cases in CASES.items() for case in cases if case in names]:
+            for arms in sorted({*peer_sizes, *(sizes if (group, case) in OWN else ())}):
+                row: Row = {"env": name, "group": group, "case": case, "arms": arms}
+                try:
+                    timing = CASES[group][case](env, arms)
+                    steps = arms * STEPS * (env.config.substeps if group == "physics" else 1)
+                    rates = {"steps_per_s": steps / timing.median, "bytes_per_arm": timing.bytes / arms}
+                    yield {**row, **timing.summary(), **rates}
+                except Exception as error:  # a peer that is not installed or out of memory
+                    yield {**row, **failure(error)}
 
 
 def main() -> None:
-    parser = BenchmarkParser("rollout", __doc__)
-    parser.add_names("--envs", ENVS)
-    parser.add_numbers("--arms", ARMS, "numbers of arms")
-    parser.add_numbers("--peer-arms", PEER_ARMS, "numbers of arms of the slower cases")
-    parser.add_names("--cases", NAMES)
+    lists = {"envs": ENVS, "arms": [*ARMS], "peer_arms": [*PEER_ARMS], "cases": NAMES}
+    parser = make_parser("rollout", __doc__, **lists)
     options = parser.parse_args()
-    results = Results("rollout", options)
-    save = lambda rows: results.write(control_steps=STEPS, rows=rows)  # noqa: E731
-    rows = run(options.envs, options.arms, options.peer_arms, save, options.cases)
-    if not rows:
+    rows = run(options.envs, options.arms, options.peer_arms, options.cases)
+    if not collect(options, rows, "rows", COLUMNS, control_steps=STEPS):
         parser.error("--arms, --peer-arms: expected a number of arms for the cases of --cases, got none")
-    print_table(rows, COLUMNS)
 
 
 if __name__ == "__main__":

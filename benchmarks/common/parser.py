@@ -1,31 +1,40 @@
 """The command line of every benchmark."""
 
 import argparse
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 
-class BenchmarkParser(argparse.ArgumentParser):
-    """Options that all benchmarks share, `--out` and `--commit`; each benchmark adds its own.
+def make_parser(name: str, doc: str | None, out: str = "FILE", **options: Any) -> argparse.ArgumentParser:
+    """A parser with `--out`, `--commit`, and the options of a benchmark.
 
     Args:
       name: of the benchmark.
       doc: docstring of its module; the first line is shown by `--help`.
-      out: "FILE", "DIR" where results go into a folder, which is required, or "" for no results.
+      out: "FILE", "DIR" for a folder, which is required, or "" without results.
+      options: defaults by name. False is a flag, a type an option of that type without default, a list several numbers,
+        any other collection some of its names (all by default).
     """
+    summary = (doc or "").split("\n")[0]
+    show_defaults = argparse.ArgumentDefaultsHelpFormatter
+    parser = argparse.ArgumentParser(f"python -m benchmarks.{name}", description=summary, formatter_class=show_defaults)
+    parser.set_defaults(benchmark=name)
+    if out:
+        parser.add_argument("--out", type=Path, metavar=out, required=out == "DIR", help="results, figures beside them")
+        parser.add_argument("--commit", help="commit to record, if this is not a git checkout")
+    for option, default in options.items():
+        parser.add_argument(f"--{option.replace('_', '-')}", **_arguments(default), help=" ")
+    return parser
 
-    def __init__(self, name: str, doc: str | None, out: str = "FILE"):
-        super().__init__(prog=f"python -m benchmarks.{name}", description=(doc or "").split("\n")[0])
-        if out:
-            text = "results file, figures beside it; default: print only" if out == "FILE" else "folder of results"
-            self.add_argument("--out", type=Path, metavar=out, required=out == "DIR", help=text)
-            self.add_argument("--commit", help="commit to record, if this is not a git checkout")
 
-    def add_names(self, flag: str, choices: Collection[str], default: Sequence[str] | None = None) -> None:
-        """An option that takes some of the choices; all of them by default."""
-        default = list(choices if default is None else default)
-        self.add_argument(flag, nargs="+", choices=choices, default=default, metavar="NAME", help="; ".join(choices))
-
-    def add_numbers(self, flag: str, default: Sequence[float], text: str, kind: type = int) -> None:
-        """An option that takes several numbers."""
-        self.add_argument(flag, nargs="*", type=kind, default=list(default), metavar="N", help=text)
+def _arguments(default: Any) -> dict[str, Any]:
+    if default is False:
+        return {"action": "store_true"}
+    if isinstance(default, type):
+        return {"type": default}
+    if isinstance(default, list):
+        return {"nargs": "*", "type": type(default[0]), "default": default, "metavar": "N"}
+    if isinstance(default, Collection) and not isinstance(default, str):
+        return {"nargs": "+", "choices": list(default), "default": list(default)}
+    return {"type": type(default), "default": default}

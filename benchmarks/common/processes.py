@@ -8,12 +8,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
-
-from rich.console import Console
-from rich.progress import track
 
 from mimic.runs.files import METRICS, REPORT
 
@@ -29,22 +26,17 @@ def run_process(command: Sequence[str], **options: Any) -> float:
     return round(time.perf_counter() - began, 1)
 
 
-def train(
-    run_dir: Path,
-    arguments: Sequence[str],
-    cache: Path | None = None,
-    environment: Mapping[str, str] | None = None,
-) -> dict[str, Any]:
-    """One training run in a new folder: its report, and the wall time of the process [s].
+def train(run_dir: Path, arguments: Sequence[str], cache: Path | str = "", **options: Any) -> dict[str, Any]:
+    """Report of one training run in a new folder, and wall time of its process [s].
 
     Args:
       run_dir: the new folder.
       arguments: of `python -m mimic.train`.
-      cache: compilation cache; none if None.
-      environment: variables of the process; those of this one if None.
+      cache: compilation cache; none if empty.
+      options: of `subprocess.run`.
     """
-    command = [sys.executable, "-m", "mimic.train", *arguments, f"run_dir={run_dir}"]
-    wall = run_process([*command, f"compilation_cache={cache or ''}"], env=environment)
+    paths = f"run_dir={run_dir}", f"compilation_cache={cache}"
+    wall = run_process([sys.executable, "-m", "mimic.train", *arguments, *paths], **options)
     report = json.loads((run_dir / REPORT).read_text())
     report = {key: value for key, value in report.items() if key not in ("hardware", "versions")}
     return {"arguments": list(arguments), "process_wall_s": wall, "report": report}
@@ -59,17 +51,15 @@ def read_metrics(run_dir: Path, *columns: str) -> list[tuple[float, ...]]:
 def time_to_goal(run_dir: Path, quality: str, goal: float) -> float | None:
     """Time since the start of the process [s] of the first of three successive evaluations at or below a goal.
 
-    Of all that remain, if the training ends before; None if there are none such.
+    Of all that remain, if the training ends before; None if the goal is never reached.
     """
     rows = read_metrics(run_dir, f"quality/{quality}", "wall_time_s")
     times = (wall for i, (_, wall) in enumerate(rows) if all(value <= goal for value, _ in rows[i : i + _HELD]))
     return next(times, None)
 
 
-def run_parallel(commands: Mapping[Path, Sequence[str]], *, jobs: int, devices: int) -> list[Path]:
-    """Runs commands in parallel; the logs of those that failed, whose last lines are printed.
-
-    Ctrl-C reaches the commands that run, and the others are not started.
+def run_parallel(commands: Mapping[Path, Sequence[str]], jobs: int, devices: int) -> list[Path]:
+    """Runs commands in parallel; the logs of those that failed. Ctrl-C reaches those that run and starts no others.
 
     Args:
       commands: by their log files.
@@ -88,16 +78,9 @@ def run_parallel(commands: Mapping[Path, Sequence[str]], *, jobs: int, devices: 
         with log.open("wb") as file:
             code = subprocess.run(commands[log], stdout=file, stderr=file, env=variables, check=False).returncode
         slots.put(device)
+        end = f" failed: {log.read_text(errors='replace')[-800:]}" if code else ""
+        print(f"{log.stem}{end}", flush=True)
         return code == 0
 
-    failed = []
-    pool = ThreadPoolExecutor(slots.qsize())
-    try:
-        logs = {pool.submit(run, log): log for log in commands}
-        for ended in track(as_completed(logs), "processes", len(logs), console=Console(stderr=True)):
-            if not ended.result():
-                failed.append(logs[ended])
-                print(f"failed: {logs[ended].stem}: {logs[ended].read_text(errors='replace')[-800:]}", flush=True)
-    finally:
-        pool.shutdown(cancel_futures=True)
-    return failed
+    with ThreadPoolExecutor(slots.qsize()) as pool:  # map cancels what has not started when it is interrupted
+        return [log for log, done in zip(commands, pool.map(run, commands), strict=True) if not done]

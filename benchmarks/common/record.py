@@ -1,4 +1,4 @@
-"""Results of a benchmark: written to a file with what they were measured on, and printed as a table."""
+"""Results of a benchmark: written to a file with what they were measured on, and printed as tables."""
 
 import argparse
 import datetime
@@ -18,65 +18,54 @@ WIDTH = 140  # characters of a table, also without a terminal
 Row = dict[str, Any]
 
 
-class Results:
-    """The results file of a benchmark.
-
-    Args:
-      benchmark: its name.
-      options: the parsed command line.
-
-    Attributes:
-      figure: path of the figure beside the file; None without a file.
-    """
-
-    def __init__(self, benchmark: str, options: argparse.Namespace):
-        self._benchmark, self._out = benchmark, options.out
-        self._commit = options.commit or commit_id()
-        self.figure = options.out and options.out.with_suffix(".png")
-
-    def write(self, **content: Any) -> None:
-        """Replaces the file, if there is one, with this content, date, commit, hardware and versions."""
-        if self._out is None:
-            return
-        results = {
-            "benchmark": self._benchmark,
-            "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes"),
-            "commit": self._commit,
-            "hardware": hardware(),
-            "versions": {**versions(), "mink": importlib.metadata.version("mink")},
-            **content,
-        }
-        write_atomically(self._out, json.dumps(finite(results), indent=2) + "\n")
-
-
-def commit_id() -> str:
-    """The commit that is checked out; "unknown" outside a git repository."""
+def write_results(options: argparse.Namespace, **content: Any) -> None:
+    """Replaces the file of `--out`, if any, by this content with date, commit, hardware and versions."""
+    if options.out is None:
+        return
     process = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-    return process.stdout.strip() if process.returncode == 0 else "unknown"
+    results = {
+        "benchmark": options.benchmark,
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="minutes"),
+        "commit": options.commit or process.stdout.strip() or "unknown",
+        "hardware": hardware(),
+        "versions": {**versions(), "mink": importlib.metadata.version("mink")},
+        **content,
+    }
+    write_atomically(options.out, json.dumps(finite(results), indent=2) + "\n")
+
+
+def collect(options: argparse.Namespace, rows: Iterable[Row], key: str, columns: str, **content: Any) -> list[Row]:
+    """Writes the results anew after each row, under a key beside other content, and prints the table of all rows."""
+    measured: list[Row] = []
+    for row in rows:
+        measured.append(row)
+        write_results(options, **content, **{key: measured})
+    print_table(measured, columns)
+    return measured
 
 
 def failure(error: Exception) -> Row:
     """Entry of a row for a measurement that failed."""
-    return {"failed": f"{type(error).__name__}: {str(error).split(chr(10))[0]}"[:200]}
+    return {"failed": f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"[:200]}
 
 
-def print_table(rows: Iterable[Mapping[str, Any]], columns: Mapping[str, str], title: str | None = None) -> None:
-    """Prints rows as a table.
+def print_table(rows: Iterable[Mapping[str, Any]], columns: str, title: str | None = None) -> None:
+    """Prints rows as a table; of a row that failed, the last column has the reason.
 
     Args:
-      rows: the results; the reason of a row that failed is shown in its last column.
-      columns: format string of each column, filled in from the row, as in {"steps/s": "{steps_per_s:,.0f}"}.
+      rows: the results.
+      columns: entries of a row with their formats, as in "case steps_per_s:,.0f gap[train]:.2%".
       title: of the table.
     """
-    table = Table(*columns, title=title)
+    table = Table(*(column.partition(":")[0] for column in columns.split()), title=title)
     for row in rows:
-        cells = [_cell(form, row) for form in columns.values()]
+        cells = [_cell(column, row) for column in columns.split()]
         table.add_row(*([*cells[:-1], row["failed"]] if "failed" in row else cells))
     Console(width=WIDTH).print(table)
 
 
-def _cell(form: str, row: Mapping[str, Any]) -> str:
+def _cell(column: str, row: Mapping[str, Any]) -> str:
     try:
-        return form.format_map(row)
-    except (LookupError, TypeError, ValueError):  # no such value, or None
+        return f"{{{column}}}".format_map(row)
+    except (LookupError, TypeError, ValueError):  # no such entry, or None
         return "-"

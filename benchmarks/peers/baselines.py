@@ -23,11 +23,10 @@ def make_arm(name: str, seed: int) -> MujocoTask:
     return task
 
 
-def learn(name: str, config: PPOSettings, batches: int, epochs: int) -> tuple[int, list[float]]:
-    """Environment steps of a training epoch of so many batches, and the seconds of each epoch."""
+def learn(name: str, config: PPOSettings, epochs: int) -> tuple[int, list[float]]:
+    """Environment steps of an epoch, of one batch, and the times at which the training began and each epoch ended."""
     arms = os.cpu_count() or 1
-    makers = [functools.partial(make_arm, name, seed) for seed in range(arms)]
-    workers = SubprocVecEnv(makers, start_method="spawn")
+    workers = SubprocVecEnv([functools.partial(make_arm, name, seed) for seed in range(arms)], start_method="spawn")
     model = PPO(
         "MlpPolicy",
         VecNormalize(workers, norm_reward=False),
@@ -40,16 +39,15 @@ def learn(name: str, config: PPOSettings, batches: int, epochs: int) -> tuple[in
         clip_range=config.clipping_epsilon,
         ent_coef=config.entropy_cost,
         max_grad_norm=config.max_grad_norm,
-        policy_kwargs={"net_arch": list(config.hidden_layers or ())},
+        policy_kwargs={"net_arch": list(config.hidden_layers)},
         device="cpu",
         seed=0,
     )
-    steps, seconds = batches * arms * STEPS, []
+    times = [time.perf_counter()]
     try:
         for _ in range(epochs):
-            began = time.perf_counter()
-            model.learn(steps, reset_num_timesteps=False)
-            seconds.append(time.perf_counter() - began)
+            model.learn(arms * STEPS, reset_num_timesteps=False)
+            times.append(time.perf_counter())
     finally:
         workers.close()
-    return steps, seconds
+    return arms * STEPS, times

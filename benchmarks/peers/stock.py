@@ -20,16 +20,16 @@ def model_with_substeps(env: ImitationEnv) -> mujoco.MjModel:
     return model
 
 
-class StockEnv(Env):
+class StockEnv(Wrapper):
     """Carries `mjx.Data` from step to step; reward, observation and torques are the imitation environment's.
 
     Brax's own wrappers reset each arm to its first state, and so to its first demonstration.
     """
 
     def __init__(self, imitation: ImitationEnv):
-        self._imitation = imitation
+        super().__init__(imitation)
         model = model_with_substeps(imitation)
-        self._model, self._blank = mjx.put_model(model), mjx.make_data(model)
+        self._imitation, self._model, self._blank = imitation, mjx.put_model(model), mjx.make_data(model)
 
     def reset(self, rng: jax.Array) -> State:
         """At rest in the home pose, on a random demonstration."""
@@ -56,18 +56,6 @@ class StockEnv(Env):
             metrics={**state.metrics, "distance": distance},
             info={**state.info, "arm_state": after},
         )
-
-    @property
-    def observation_size(self) -> int:
-        return self._imitation.observation_size
-
-    @property
-    def action_size(self) -> int:
-        return self._imitation.action_size
-
-    @property
-    def backend(self) -> str:
-        return "mjx"
 
 
 def wrap(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None) -> Wrapper:
