@@ -133,8 +133,9 @@ def collect(folder: Path) -> dict[str, list[Row]]:
         if "similarity" in report:
             entry["similarity"] = _rounded(report["similarity"])
         case = run_dir.parent.name
-        if case.partition("--")[0] in study_figures.CURVES and run.seed == 0:
-            entry["curves"] = _curves(run_dir / "quality.csv")
+        curves = run_dir / "quality.csv"
+        if case.partition("--")[0] in study_figures.CURVES and run.seed == 0 and curves.is_file():
+            entry["curves"] = _curves(curves)
         results[case].append(entry)
     return dict(results)
 

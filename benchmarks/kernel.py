@@ -84,15 +84,10 @@ def jax_function(method: str, arms: Arms, quantity: str) -> Callable[..., Any]:
 
 def random_motions(arms: Arms, batch: int) -> list[jax.Array]:
     """qpos in [-pi, pi] and qvel in [-2, 2] of both arms, on the device."""
+    keys = jax.random.split(jax.random.key(0), 4)
     shapes = [(batch, arm.num_joints) for arm in (arms.expert, arms.learner) for _ in range(2)]
-
-    @jax.jit
-    def draw() -> list[jax.Array]:
-        keys, bounds = jax.random.split(jax.random.key(0), 4), (np.pi, 2.0, np.pi, 2.0)
-        drawn = zip(keys, shapes, bounds, strict=True)
-        return [jax.random.uniform(key, shape, minval=-bound, maxval=bound) for key, shape, bound in drawn]
-
-    return draw()
+    drawn = zip(keys, shapes, (np.pi, 2.0, np.pi, 2.0), strict=True)
+    return [jax.random.uniform(key, shape, minval=-bound, maxval=bound) for key, shape, bound in drawn]
 
 
 @functools.cache

@@ -36,13 +36,6 @@ ERRORS = " ".join(f"error_mm[end][{name}]:.3g" for name in QUANTILES) + " error_
 Motion = tuple[np.ndarray, np.ndarray]  # qpos and qvel after each control step: [sequences, steps, joints]
 
 
-def random_torques(env: ImitationEnv, sequences: int) -> np.ndarray:
-    """Sequences of torques [sequences, steps, joints], each from a seed of its own."""
-    shape = STEPS, env.action_size
-    actions = [np.random.default_rng(seed).uniform(-1, 1, shape) for seed in range(sequences)]
-    return np.stack(actions) * np.asarray(env.torque_scale, float)
-
-
 def mujoco_motion(env: ImitationEnv, torques: np.ndarray, integrator: str, substeps: int) -> Motion:
     """C MuJoCo, in double precision."""
     model = env.arm.model.__copy__()
@@ -111,7 +104,9 @@ def quantiles(errors: np.ndarray) -> dict[str, dict[str, float]]:
 def run_env(name: str, sequences: int) -> Row:
     """All candidates on one environment."""
     env = mimic.make(name, demonstrations={"count": 1, "held_out": 1})
-    bound, torques, tips = env.config.speed_bound, random_torques(env, sequences), tip_positions(env.learner)
+    bound, scale, tips = env.config.speed_bound, np.asarray(env.torque_scale, float), tip_positions(env.learner)
+    actions = [np.random.default_rng(seed).uniform(-1, 1, (STEPS, env.action_size)) for seed in range(sequences)]
+    torques = scale * np.stack(actions)
 
     def runaways(qvel: np.ndarray) -> np.ndarray:
         """Sequences that the environment would end, at its check after each control step."""
@@ -142,16 +137,10 @@ def run_env(name: str, sequences: int) -> Row:
         for substeps in OWN_SUBSTEPS
         for physics in ("mjx", "fused")
     ]
-    return {
-        "env": name,
-        "action_scale": env.config.action_scale,
-        "torque_scale": np.asarray(env.torque_scale, float).tolist(),
-        "speed_bound": bound,
-        "sequences": sequences,
-        "runaways": int((~kept).sum()),
-        "median_peak_speed": float(np.median(np.abs(qvel[kept]).max(axis=(1, 2)))),
-        "candidates": candidates,
-    }
+    counts = {"sequences": sequences, "runaways": int((~kept).sum())}
+    peak = float(np.median(np.abs(qvel[kept]).max(axis=(1, 2))))
+    scales = {"action_scale": env.config.action_scale, "torque_scale": scale.tolist(), "speed_bound": bound}
+    return {"env": name, **scales, **counts, "median_peak_speed": peak, "candidates": candidates}
 
 
 def main() -> None:

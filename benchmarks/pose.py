@@ -26,7 +26,7 @@ from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.metric.config import MetricConfig
 
 METRIC = MetricConfig()
-CHUNK = 500  # poses of an exhaustive search in parallel
+CHUNK = 500  # poses of the longest search in parallel
 NEAR, ROUNDING = 1e-3, 1e-6  # tolerance of the global minimum: relative, and absolute for float32
 MINK_STEPS, MINK_DT = 100, 0.1  # steps of inverse kinematics for a pose, and the time that each integrates over [s]
 COLUMNS = "pair method quality:.2% global_share:.2% distance:.4f poses_per_second:,.0f first_call_s:.1f"
@@ -83,12 +83,6 @@ def with_mink(expert: Arm, learner: Arm) -> Solver:
     return solve
 
 
-def exhaustive(expert: Arm, learner: Arm) -> Solver:
-    """`imitate_pose` from very many starts, with random numbers of its own."""
-    solve = imitate(expert, learner, key=jax.random.key(1), starts=512, iterations=60)
-    return jax.jit(lambda qpos: jax.lax.map(solve, qpos, batch_size=CHUNK))
-
-
 def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
     """All methods on one pair of arms."""
     expert, learner = map(build_arm, PAIRS[name])
@@ -118,7 +112,8 @@ def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
         left[method] = np.asarray(distances(judged, solver(judged)))
         methods[method] = {"batch": len(timed), "poses_per_second": len(timed) / timing.median}
         methods[method] |= {"spread_s": [timing.low, timing.high], "first_call_s": timing.first}
-    best = np.array(distances(qpos, exhaustive(expert, learner)(qpos)))
+    search = imitate(expert, learner, key=jax.random.key(1), starts=512, iterations=60)
+    best = np.array(distances(qpos, jax.lax.map(search, qpos, batch_size=CHUNK)))
     for values in left.values():
         best[: len(values)] = np.minimum(best[: len(values)], values)
     random = float(np.mean(np.asarray(distances(qpos, chance))))

@@ -9,15 +9,14 @@ CPU, where it is installed, with the same networks, minibatches and passes, and 
 number of epochs; the speed is the median of all but the first, which compiles, with the quartiles as spread.
 """
 
-import functools
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 import optax
-from brax.envs.base import Env
 from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.networks import make_ppo_networks
 
@@ -65,50 +64,39 @@ def training_epoch(
     return make_programs(env, config, networks, batches, schedule, None)
 
 
-def mimic_loop(physics: str) -> Case:
+def mimic_loop(physics: str, name: str, config: PPOSettings, batches: int) -> dict[str, float]:
     """PPO as `mimic.train` runs it."""
-
-    def case(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
-        env = mimic.make(name, physics=physics)
-        times = [time.perf_counter()]
-        begin, epoch = training_epoch(env, config, batches)
-        state = begin()(0)
-        for _ in range(EPOCHS):
-            state, metrics = epoch()(state)
-            jax.block_until_ready(metrics)
-            times.append(time.perf_counter())
-        return rates(batches * config.steps_per_batch, times)
-
-    return case
+    times = [time.perf_counter()]
+    begin, epoch = training_epoch(mimic.make(name, physics=physics), config, batches)
+    state = begin()(0)
+    for _ in range(EPOCHS):
+        state, metrics = epoch()(state)
+        jax.block_until_ready(metrics)
+        times.append(time.perf_counter())
+    return rates(batches * config.steps_per_batch, times)
 
 
-def brax_loop(physics: str, make: Callable[[Any], tuple[Env, Callable[..., Env]]]) -> Case:
-    """Brax's own training loop, on an environment and with the wrappers that `make` returns."""
-
-    def case(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
-        compat.mend_brax()
-        imitation = mimic.make(name, physics=physics)
-        env, wrap = make(imitation)
-        hidden = tuple(config.hidden_layers or ())
-        times = [time.perf_counter()]
-        brax_ppo.train(
-            environment=env,
-            num_timesteps=EPOCHS * batches * config.steps_per_batch,
-            episode_length=imitation.config.horizon + 1,
-            wrap_env_fn=wrap,
-            num_eval_envs=1,
-            num_evals=EPOCHS + 1,
-            run_evals=False,
-            normalize_observations=True,
-            progress_fn=lambda *_: times.append(time.perf_counter()),
-            network_factory=functools.partial(
-                make_ppo_networks, policy_hidden_layer_sizes=hidden, value_hidden_layer_sizes=hidden
-            ),
-            **settings(config),
-        )
-        return rates(batches * config.steps_per_batch, times)
-
-    return case
+def brax_loop(physics: str, name: str, config: PPOSettings, batches: int) -> dict[str, float]:
+    """Brax's own training loop, on the environment, or with "stock" on the stock one."""
+    compat.mend_brax()
+    imitation = mimic.make(name, physics="mjx" if physics == "stock" else physics)
+    env, wrap = (stock.StockEnv(imitation), stock.wrap) if physics == "stock" else (imitation, wrap_for_training)
+    hidden = {f"{network}_hidden_layer_sizes": tuple(config.hidden_layers) for network in ("policy", "value")}
+    times = [time.perf_counter()]
+    brax_ppo.train(
+        environment=env,
+        num_timesteps=EPOCHS * batches * config.steps_per_batch,
+        episode_length=imitation.config.horizon + 1,
+        wrap_env_fn=wrap,
+        num_eval_envs=1,
+        num_evals=EPOCHS + 1,
+        run_evals=False,
+        normalize_observations=True,
+        progress_fn=lambda *_: times.append(time.perf_counter()),
+        network_factory=partial(make_ppo_networks, **hidden),
+        **settings(config),
+    )
+    return rates(batches * config.steps_per_batch, times)
 
 
 def stable_baselines(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
@@ -119,10 +107,10 @@ def stable_baselines(name: str, config: PPOSettings, batches: int) -> dict[str, 
 
 
 CASES: dict[str, Case] = {
-    "mimic, fused": mimic_loop("fused"),
-    "mimic, mjx": mimic_loop("mjx"),
-    "brax's loop, fused": brax_loop("fused", lambda env: (env, wrap_for_training)),
-    "brax's loop, mjx.Data carried": brax_loop("mjx", lambda env: (stock.StockEnv(env), stock.wrap)),
+    "mimic, fused": partial(mimic_loop, "fused"),
+    "mimic, mjx": partial(mimic_loop, "mjx"),
+    "brax's loop, fused": partial(brax_loop, "fused"),
+    "brax's loop, mjx.Data carried": partial(brax_loop, "stock"),
     STABLE_BASELINES: stable_baselines,
 }
 

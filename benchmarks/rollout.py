@@ -11,6 +11,7 @@ new episodes; the stock environment carries and resets `mjx.Data`, as brax envir
 
 import os
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +19,6 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
-from brax.envs.base import Wrapper
 from mujoco import mjx
 
 import mimic
@@ -52,36 +52,28 @@ def time_steps(step: Callable[[Any, Any], Any], state: Any, inputs: jax.Array) -
     return time_program(lambda state, inputs: jax.lax.scan(step, state, inputs), state, inputs)
 
 
-def own_physics(physics: str) -> Case:
+def own_physics(physics: str, env: ImitationEnv, arms: int) -> Timing:
     """The physics of the environments, which carries joint states alone."""
-
-    def case(env: ImitationEnv, arms: int) -> Timing:
-        substeps = env.config.substeps
-        advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
-        step = lambda state, torques: (jax.vmap(lambda q, v, u: advance(q, v, u, Load()))(*state, torques), None)  # noqa: E731
-        qpos, qvel, torques = random_motion(env, arms)
-        return time_steps(step, (qpos, qvel), torques)
-
-    return case
+    substeps = env.config.substeps
+    advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
+    qpos, qvel, torques = random_motion(env, arms)
+    many = jax.vmap(lambda qpos, qvel, torque: advance(qpos, qvel, torque, Load()))
+    return time_steps(lambda state, torques: (many(*state, torques), None), (qpos, qvel), torques)
 
 
-def carried_data(implementation: str) -> Case:
+def carried_data(implementation: str, env: ImitationEnv, arms: int) -> Timing:
     """`mjx.step`, from one `mjx.Data` to the next."""
+    model = stock.model_with_substeps(env)
+    mjx_model, blank = (make(model, impl=implementation) for make in (mjx.put_model, mjx.make_data))
+    qpos, qvel, torques = random_motion(env, arms)
+    data = jax.vmap(lambda q, v: blank.replace(qpos=q, qvel=v))(qpos, qvel)
+    substep = jax.vmap(lambda d: mjx.step(mjx_model, d))
 
-    def case(env: ImitationEnv, arms: int) -> Timing:
-        model = stock.model_with_substeps(env)
-        mjx_model, blank = (make(model, impl=implementation) for make in (mjx.put_model, mjx.make_data))
-        qpos, qvel, torques = random_motion(env, arms)
-        data = jax.vmap(lambda q, v: blank.replace(qpos=q, qvel=v))(qpos, qvel)
-        substep = jax.vmap(lambda d: mjx.step(mjx_model, d))
+    def step(data: Any, torques: jax.Array) -> Any:
+        data = data.replace(qfrc_applied=torques)
+        return jax.lax.fori_loop(0, env.config.substeps, lambda _, d: substep(d), data), None
 
-        def step(data: Any, torques: jax.Array) -> Any:
-            data = data.replace(qfrc_applied=torques)
-            return jax.lax.fori_loop(0, env.config.substeps, lambda _, d: substep(d), data), None
-
-        return time_steps(step, data, torques)
-
-    return case
+    return time_steps(step, data, torques)
 
 
 def mujoco_threads(env: ImitationEnv, arms: int) -> Timing:
@@ -96,68 +88,55 @@ def mujoco_threads(env: ImitationEnv, arms: int) -> Timing:
         return time_call(lambda: pool.rollout(model, threads, state, control, control_spec=applied))
 
 
-def environment(make: Callable[[ImitationEnv], Wrapper]) -> Case:
-    """A whole environment step with new episodes, of an environment with wrappers for training."""
+def environment(kind: str, env: ImitationEnv, arms: int) -> Timing:
+    """A whole environment step with new episodes, by a physics of the environments or "stock"."""
+    horizon = env.config.horizon + 1
+    if kind == "stock":
+        wrapped = stock.wrap(stock.StockEnv(env), horizon)
+    else:
+        wrapped = wrap_for_training(mimic.make(env.config.name, physics=kind), horizon)
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), arms))
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (STEPS, arms, env.action_size), minval=-1.0, maxval=1.0)
 
-    def case(env: ImitationEnv, arms: int) -> Timing:
-        wrapped = make(env)
-        state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), arms))
-        actions = jax.random.uniform(jax.random.PRNGKey(1), (STEPS, arms, env.action_size), minval=-1.0, maxval=1.0)
+    def step(state: Any, action: jax.Array) -> Any:
+        state = wrapped.step(state, action)
+        return state, (state.reward, jnp.sum(state.obs, axis=-1))  # uses all of the observation, and stores little
 
-        def step(state: Any, action: jax.Array) -> Any:
-            state = wrapped.step(state, action)
-            return state, (state.reward, jnp.sum(state.obs, axis=-1))  # uses all of the observation, and stores little
-
-        return time_steps(step, state, actions)
-
-    return case
-
-
-def _wrapped(env: ImitationEnv, physics: str) -> Wrapper:
-    """The environment as PPO trains on it."""
-    env = env if physics == env.config.physics else mimic.make(env.config.name, physics=physics)
-    return wrap_for_training(env, env.config.horizon + 1)
+    return time_steps(step, state, actions)
 
 
-def part(function: Callable[[ImitationEnv, Any], jax.Array]) -> Case:
+def part(name: str, env: ImitationEnv, arms: int) -> Timing:
     """One part of the environment step alone."""
+    qpos, qvel, torques = random_motion(env, arms)
+    started = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), arms))
 
-    def case(env: ImitationEnv, arms: int) -> Timing:
-        qpos, qvel, torques = random_motion(env, arms)
-        started = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), arms))
+    def new_episode(arm: Any) -> jax.Array:
+        fresh = env.start(arm.key)
+        return jnp.sum(fresh.qpos) + fresh.demonstration + fresh.key[0]
 
-        def step(state: Any, torque: jax.Array) -> Any:
-            state = state.replace(qpos=state.qpos + 1e-3 * torque, step=state.step + 1)
-            return state, jax.vmap(lambda arm: function(env, arm))(state)
+    functions = {
+        "reward": lambda arm: env.distance(arm.qpos, arm.qvel, arm.demonstration, arm.step),
+        "observation": lambda arm: jnp.sum(env.observe(arm)),
+        "new episode": new_episode,
+    }
 
-        return time_steps(step, started.replace(qpos=qpos, qvel=qvel), torques)
+    def step(state: Any, torque: jax.Array) -> Any:
+        state = state.replace(qpos=state.qpos + 1e-3 * torque, step=state.step + 1)
+        return state, jax.vmap(functions[name])(state)
 
-    return case
-
-
-def _new_episode(env: ImitationEnv, arm: Any) -> jax.Array:
-    fresh = env.start(arm.key)
-    return jnp.sum(fresh.qpos) + fresh.demonstration + fresh.key[0]
+    return time_steps(step, started.replace(qpos=qpos, qvel=qvel), torques)
 
 
 CASES: dict[str, dict[str, Case]] = {
     "physics": {
-        "fused": own_physics("fused"),
-        "mjx": own_physics("mjx"),
-        "mjx.Data carried": carried_data("jax"),
-        "MJX-Warp": carried_data("warp"),
+        "fused": partial(own_physics, "fused"),
+        "mjx": partial(own_physics, "mjx"),
+        "mjx.Data carried": partial(carried_data, "jax"),
+        "MJX-Warp": partial(carried_data, "warp"),
         "C MuJoCo, all cores": mujoco_threads,
     },
-    "environment": {
-        "fused": environment(lambda env: _wrapped(env, "fused")),
-        "mjx": environment(lambda env: _wrapped(env, "mjx")),
-        "stock": environment(lambda env: stock.wrap(stock.StockEnv(env), env.config.horizon + 1)),
-    },
-    "part": {
-        "reward": part(lambda env, arm: env.distance(arm.qpos, arm.qvel, arm.demonstration, arm.step)),
-        "observation": part(lambda env, arm: jnp.sum(env.observe(arm))),
-        "new episode": part(_new_episode),
-    },
+    "environment": {kind: partial(environment, kind) for kind in ("fused", "mjx", "stock")},
+    "part": {name: partial(part, name) for name in ("reward", "observation", "new episode")},
 }
 NAMES = tuple(dict.fromkeys(case for cases in CASES.values() for case in cases))
 OWN = {("physics", "fused"), ("environment", "fused"), ("part", "reward")}  # quick to compile: for all numbers of arms

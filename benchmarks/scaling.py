@@ -55,7 +55,7 @@ def measure(kind: str, devices: int, processes: int, seed: int, common: Sequence
     training = [*common, *arguments(kind, devices, of_one), f"seed={seed}", *local]
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        result = train(run_dir, training, environment=environment(devices, processes, jax.default_backend()))
+        result = train(run_dir, training, env=environment(devices, processes, jax.default_backend()))
         rates = [rate for (rate,) in read_metrics(run_dir, "training/sps")][1:]  # the first compiles
     row = {"scaling": kind, "devices": devices, "processes": processes, "seed": seed, **summary_of_rates(rates)}
     row |= {key: result["report"][key] for key in ("optimality_gap", "env_steps")}
