@@ -66,8 +66,6 @@ CASES = _cases()
 
 
 class Problem:
-    """The arms of a case with their metric."""
-
     def __init__(self, case: Case):
         self.recorded, learner = build_arm(case.expert), build_arm(case.learner, links=case.metric.links)
         self.expert, self.learner = self.recorded.embodiment, learner.embodiment
@@ -79,7 +77,6 @@ class Problem:
         return recorded.qpos[:, 1:].astype(np.float32), recorded.qvel[:, 1:].astype(np.float32)
 
     def bound(self, qpos: Any, qvel: Any, **options: Any) -> jax.Array:
-        """[count, STEPS] kinematic bound."""
         arms, options = (self.expert, self.learner), {**self.metric.arguments, **options}
         return jax.vmap(lambda qpos, qvel: mimic.kinematic_bound(*arms, qpos, qvel, **options))(qpos, qvel)
 
@@ -99,7 +96,6 @@ def adam_reference(problem: Problem, qpos: np.ndarray, qvel: np.ndarray) -> np.n
             return problem.metric(states, mimic.link_states(learner, motion[0], speed * motion[1]))
 
         def descend(start: Any, step_size: float, count: int) -> Any:
-            """The best motion, and its distance."""
             optimiser = optax.adam(optax.cosine_decay_schedule(step_size, count))
 
             def iterate(carry: Any, _: None) -> tuple[Any, None]:
@@ -124,7 +120,6 @@ def adam_reference(problem: Problem, qpos: np.ndarray, qvel: np.ndarray) -> np.n
 
 
 def missed(bound: np.ndarray, reference: np.ndarray) -> Row:
-    """How many steps are above the reference, and by how much."""
     excess = bound - reference
     absolute, relative = excess > ABSOLUTE, excess > RELATIVE * reference + ROUNDING
     counts = {"missed_absolute": int(absolute.sum()), "missed_relative": int(relative.sum())}

@@ -55,12 +55,10 @@ class Case(NamedTuple):
         return [sys.executable, "-m", "mimic.train", "-m", *self.arguments, f"seed={seeds}", *paths]
 
     def done(self, folder: Path) -> bool:
-        """Whether all its runs have a report."""
         return all((folder / self.name / str(seed) / REPORT).is_file() for seed in range(self.seeds))
 
 
 def cases(preset: str) -> list[Case]:
-    """All that is trained."""
     extent = STUDY["presets"][preset]
     return [
         Case(

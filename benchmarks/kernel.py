@@ -60,13 +60,11 @@ def panda_pair() -> Arms:
 
 
 def planar_pair(links: int) -> Arms:
-    """Two arms of different proportions."""
     rng = np.random.default_rng(links)
     return Arms(*(mimic.planar_arm(rng.uniform(0.5, 1.5, links) / links) for _ in range(2)))
 
 
 def jax_function(method: str, arms: Arms, quantity: str) -> Callable[..., Any]:
-    """The quantity of a batch by a method in JAX."""
     case = arms.expert, arms.learner, arms.correspondence, WEIGHTS
 
     def composition(*motion: jax.Array) -> jax.Array:
@@ -121,7 +119,6 @@ def torch_call(method: str, arms: Arms, quantity: str, motions: list[jax.Array])
 
 
 def run(method: str, arms: Arms, batch: int, quantity: str) -> Row:
-    """A measurement: speed, and largest error of value and gradient."""
     motions = random_motions(arms, batch)
     if method in TORCH:
         timing = time_call(*torch_call(method, arms, quantity, motions))

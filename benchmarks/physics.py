@@ -37,7 +37,6 @@ Motion = tuple[np.ndarray, np.ndarray]  # qpos and qvel after each control step:
 
 
 def mujoco_motion(env: ImitationEnv, torques: np.ndarray, integrator: str, substeps: int) -> Motion:
-    """C MuJoCo, in double precision."""
     model = env.arm.model.__copy__()
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     model.opt.timestep = env.config.control_dt / substeps
@@ -102,7 +101,6 @@ def quantiles(errors: np.ndarray) -> dict[str, dict[str, float]]:
 
 
 def run_env(name: str, sequences: int) -> Row:
-    """All candidates on one environment."""
     env = mimic.make(name, demonstrations={"count": 1, "held_out": 1})
     bound, scale, tips = env.config.speed_bound, np.asarray(env.torque_scale, float), tip_positions(env.learner)
     actions = [np.random.default_rng(seed).uniform(-1, 1, (STEPS, env.action_size)) for seed in range(sequences)]

@@ -49,7 +49,6 @@ PAIRS = {
 
 
 def imitate(expert: Arm, learner: Arm, **options: Any) -> Solver:
-    """`imitate_pose`, compiled once."""
     pair = expert.embodiment, learner.embodiment
     metric = METRIC.make_correspondence(*pair), METRIC.make_weights()
     return jax.jit(lambda qpos: mimic.imitate_pose(*pair, qpos, *metric, **options).qpos)
@@ -84,7 +83,6 @@ def with_mink(expert: Arm, learner: Arm) -> Solver:
 
 
 def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
-    """All methods on one pair of arms."""
     expert, learner = map(build_arm, PAIRS[name])
     metric = METRIC.build(expert.embodiment, learner.embodiment)
 

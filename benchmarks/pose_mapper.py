@@ -44,7 +44,6 @@ SPLITS = {"train": ("training poses", "--"), "held_out": ("unseen poses", "-")}
 
 
 def run(preset: str, env: str, variant: str, seed: int) -> Row:
-    """Report, curves and speed of a training."""
     arguments = ["trainer=pose_mapper", f"trainer.preset={preset}", f"env={env}", f"seed={seed}"]
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
@@ -62,7 +61,6 @@ def run(preset: str, env: str, variant: str, seed: int) -> Row:
 
 
 def plot(rows: Sequence[Row], out: Path) -> None:
-    """Curves of the first seed, a panel for each preset."""
     presets = list(dict.fromkeys(row["preset"] for row in rows))
     size = (2.2 + 3.6 * len(presets), 3.8)
     figure, panels = plt.subplots(1, len(presets), figsize=size, sharey=True, layout="constrained", squeeze=False)

@@ -65,7 +65,6 @@ def training_epoch(
 
 
 def mimic_loop(physics: str, name: str, config: PPOSettings, batches: int) -> dict[str, float]:
-    """PPO as `mimic.train` runs it."""
     times = [time.perf_counter()]
     begin, epoch = training_epoch(mimic.make(name, physics=physics), config, batches)
     state = begin()(0)
@@ -116,7 +115,6 @@ CASES: dict[str, Case] = {
 
 
 def run(name: str, config: PPOSettings, case: str, batches: int) -> Row:
-    """A case, or the reason why it failed."""
     row: Row = {"env": name, "case": case}
     began = time.perf_counter()
     try:

@@ -57,7 +57,6 @@ def device_events(folder: Path) -> list[Event]:
 
 
 def kind(name: str) -> str:
-    """The kind of a kernel."""
     return next(label for label, pattern in KINDS if re.search(pattern, name, re.IGNORECASE))
 
 
@@ -71,7 +70,6 @@ def by_name(events: Iterable[Event], naming: Callable[[str], str]) -> list[Row]:
 
 
 def busy(events: Iterable[Event]) -> float:
-    """Seconds in which at least one event ran."""
     total, end = 0.0, 0.0
     for event in sorted(events, key=lambda event: event.start):
         stop = event.start + event.duration
@@ -81,7 +79,6 @@ def busy(events: Iterable[Event]) -> float:
 
 
 def profile(name: str, batches: int) -> dict[str, Any]:
-    """One training epoch."""
     env = mimic.make(name, physics="fused")
     config = PPOConfig().resolve(jax.default_backend(), jax.device_count())
     begin, epoch = training_epoch(env, config, batches)

@@ -40,7 +40,6 @@ Case = Callable[[ImitationEnv, int], Timing]
 
 
 def random_motion(env: ImitationEnv, arms: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Joint states of the arms, and a torque for each control step."""
     key_qpos, key_torque = jax.random.split(jax.random.PRNGKey(0))
     qpos = env.learner.home + jax.random.uniform(key_qpos, (arms, env.action_size), minval=-1.0, maxval=1.0)
     actions = jax.random.uniform(key_torque, (STEPS, arms, env.action_size), minval=-1.0, maxval=1.0)
@@ -48,7 +47,6 @@ def random_motion(env: ImitationEnv, arms: int) -> tuple[jax.Array, jax.Array, j
 
 
 def time_steps(step: Callable[[Any, Any], Any], state: Any, inputs: jax.Array) -> Timing:
-    """Times all control steps as one compiled loop."""
     return time_program(lambda state, inputs: jax.lax.scan(step, state, inputs), state, inputs)
 
 
@@ -77,7 +75,6 @@ def carried_data(implementation: str, env: ImitationEnv, arms: int) -> Timing:
 
 
 def mujoco_threads(env: ImitationEnv, arms: int) -> Timing:
-    """C MuJoCo on all cores of the CPU."""
     model = stock.model_with_substeps(env)
     threads = [mujoco.MjData(model) for _ in range(os.cpu_count() or 1)]
     qpos, qvel, torques = (np.asarray(x, float) for x in random_motion(env, arms))
@@ -106,7 +103,6 @@ def environment(kind: str, env: ImitationEnv, arms: int) -> Timing:
 
 
 def part(name: str, env: ImitationEnv, arms: int) -> Timing:
-    """One part of the environment step alone."""
     qpos, qvel, torques = random_motion(env, arms)
     started = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), arms))
 

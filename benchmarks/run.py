@@ -30,7 +30,6 @@ def device_name(kind: str) -> str:
 
 
 def command(name: str, out: Path, backend: str, devices: int, commit: str | None) -> list[str]:
-    """The command that runs a benchmark."""
     options = {
         "scaling": ["--devices", *(str(count) for count in (1, 2, 4, 8) if count <= devices)],
         "dynamic_imitation": ["--runs", str(out.with_suffix("") / "runs")],  # what it contains is not repeated

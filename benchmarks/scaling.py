@@ -50,7 +50,6 @@ def environment(devices: int, processes: int, backend: str) -> dict[str, str]:
 
 
 def measure(kind: str, devices: int, processes: int, seed: int, common: Sequence[str], of_one: dict[str, int]) -> Row:
-    """One run."""
     local = ["distributed.coordinator=local", f"distributed.processes={processes}"] if processes > 1 else []
     training = [*common, *arguments(kind, devices, of_one), f"seed={seed}", *local]
     with tempfile.TemporaryDirectory() as folder:
@@ -98,7 +97,6 @@ def run(
 
 
 def draw(rows: Sequence[Row], title: str, out: Path) -> None:
-    """Steps per second and efficiency against the number of devices."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     for kind, each in itertools.product(KINDS, (False, True)):
         line = [r for r in rows if r["scaling"] == kind and (r["devices"] == 1 or (r["processes"] > 1) == each)]

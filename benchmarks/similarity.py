@@ -103,7 +103,6 @@ def optimal_poses(
 
 
 def run_pair(pair: Pair, demonstrations: int, random: int) -> list[Row]:
-    """All baselines and candidates on all sets of poses."""
     expert, learner = build_arm(pair.expert).embodiment, build_arm(pair.learner).embodiment
     is_full = pair.name == FULL
     count, every = (max(FULL_DEMONSTRATIONS, demonstrations), FULL_EVERY) if is_full else (demonstrations, EVERY)

@@ -47,7 +47,6 @@ COLUMNS = (
 
 
 def run_case(name: str, seed: int, starts: Sequence[str]) -> Iterator[Row]:
-    """The run from each start."""
     case = CASES[name]
     arguments = (*case.arguments, *case.on.get(jax.default_backend(), ()), f"seed={seed}")
     with tempfile.TemporaryDirectory() as folder:

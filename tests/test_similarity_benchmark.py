@@ -53,11 +53,11 @@ ROWS = [
 
 def test_lines_have_all_that_rows_have():
     rows = [{**ROWS[0], "poses": 3}, {"pair": "a to panda", "set": "pd", "failed": "no goal"}]
-    names, *lines = (line.split(";") for line in summary.to_lines(rows))
-    assert dict(zip(names, lines[0], strict=True)) | {"frechet_distance": "0.2", "frechet_distance q90": "0.4"} == dict(
-        zip(names, lines[0], strict=True)
-    )
-    assert lines[1] == ["a to panda", "pd", "0", "no goal"]
+    names, measured, failed = (line.split(";") for line in summary.to_lines(rows))
+    line = dict(zip(names, measured, strict=True))
+    assert (line["pair"], line["poses"], line["method"]) == ("panda -1", "3", "copy_joints")
+    assert (line["frechet_distance"], line["frechet_distance q90"]) == ("0.2", "0.4")
+    assert failed == ["a to panda", "pd", "0", "no goal"]
 
 
 def test_ratios_and_cases_lost():

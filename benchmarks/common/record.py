@@ -45,7 +45,6 @@ def collect(options: argparse.Namespace, rows: Iterable[Row], key: str, columns:
 
 
 def failure(error: Exception) -> Row:
-    """Entry of a row for a measurement that failed."""
     return {"failed": f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"[:200]}
 
 

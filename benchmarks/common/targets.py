@@ -31,7 +31,6 @@ class Target:
     backend: str = ""
 
     def met(self, value: float) -> bool:
-        """Whether a value reaches the target."""
         relation, target = self.target.split()[:2]
         return _RELATIONS[relation](value, float(target))
 

@@ -39,7 +39,6 @@ class Timing:
 
 
 def time_program(function: Callable[..., Any], *arguments: Any) -> Timing:
-    """Compiles a function of arrays and times its calls."""
     began = time.perf_counter()
     program = jax.jit(function).lower(*arguments).compile()
     compile_s = time.perf_counter() - began

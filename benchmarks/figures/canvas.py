@@ -12,6 +12,5 @@ __all__ = ["plt", "save"]
 
 
 def save(figure: Any, out: Path) -> None:
-    """Writes a figure and closes it."""
     figure.savefig(out, dpi=150)
     plt.close(figure)

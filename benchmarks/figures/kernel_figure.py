@@ -12,7 +12,6 @@ BYTES = 4 * (22 + 1)  # read and written for the value of a pair of Pandas: join
 
 
 def plot(results: Sequence[dict[str, Any]], limits: dict[str, float], out: Path) -> None:
-    """A panel for each sweep."""
     figure, panels = plt.subplots(1, len(LABELS), figsize=(11, 4.5), sharey=True, layout="constrained")
     rows = [row for row in results if "pairs_per_s" in row]
     colours = {method: f"C{i}" for i, method in enumerate(dict.fromkeys(row["method"] for row in rows))}

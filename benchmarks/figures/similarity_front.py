@@ -38,7 +38,6 @@ def is_lock(row: Row) -> bool:
 
 
 def is_other(row: Row) -> bool:
-    """Whether a row is of two arms of different kinematics."""
     return " to " in row["pair"]
 
 
@@ -91,7 +90,6 @@ def pareto_front(compared: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def print_tables(rows: Sequence[Row]) -> None:
-    """The comparisons: ratios and cases lost."""
     columns = " ".join(["method", *(f"{name}[{entry}]" for name in MEASURES for entry in ("ratio", "lost")), "front"])
     for title, compared in summarise(rows).items():
         front = pareto_front(compared)

@@ -24,7 +24,6 @@ def draw(results: Study, out: Path) -> None:
 
 
 def _draw_unseen(results: Study, out: Path) -> None:
-    """The paper's figure on its second simulation."""
     figure, axes = plt.subplots(figsize=(6, 3.8), layout="constrained")
     labels = "trained on one demonstration", "trained on 124"
     curves: dict[str, Any] = {}
@@ -41,7 +40,6 @@ def _draw_unseen(results: Study, out: Path) -> None:
 
 
 def _draw_controllers(results: Study, out: Path) -> None:
-    """PPO and controllers that need no learning."""
     kinds = {"": "PPO", "--computed_torque": "computed torque", "--pd": "PD"}
     figure, axes = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
     arms = [arm for arm in _ARMS if f"{arm}--pd" in results]
@@ -61,7 +59,6 @@ def _draw_controllers(results: Study, out: Path) -> None:
 
 
 def _draw_locked(results: Study, out: Path) -> None:
-    """Bound and gap for every locked joint (diagonal) and pair."""
     figure, (bounds, gaps) = plt.subplots(1, 2, figsize=(9.5, 4.2), layout="constrained")
     panels = (
         (bounds, "lower_bound", 1, "lower bound of the distance", "{:.3f}", "viridis_r"),

@@ -16,7 +16,6 @@ STEPS = 256  # of each arm in a batch: as many arms as on a GPU, 4096, would be 
 
 
 def make_arm(name: str, seed: int) -> MujocoTask:
-    """An arm, in a process of its own."""
     jax.config.update("jax_platforms", "cpu")  # before the backend starts: the arms leave the accelerator alone
     task = MujocoTask(mimic.make(name, physics="fused"))
     task.reset(seed=seed)

@@ -32,7 +32,6 @@ def torch_distance(*case: Any, device: str) -> Function:
 
 
 def free_torch_memory() -> None:
-    """Returns the GPU memory that PyTorch caches."""
     import torch  # pyright: ignore[reportMissingImports]
 
     gc.collect()

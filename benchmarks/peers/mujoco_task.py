@@ -49,7 +49,6 @@ class MujocoTask(gymnasium.Env):
         return self._advanced(step=0, demonstration=(options or {}).get("demonstration", random))[0], {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Holds a torque for one control step."""
         self._data.qfrc_applied[:] = np.clip(action, -1.0, 1.0) * self._torque_scale
         mujoco.mj_step(self._model, self._data, self._imitation.config.substeps)
         step = int(self._state.step) + 1

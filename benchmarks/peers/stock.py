@@ -32,7 +32,6 @@ class StockEnv(Wrapper):
         self._imitation, self._model, self._blank = imitation, mjx.put_model(model), mjx.make_data(model)
 
     def reset(self, rng: jax.Array) -> State:
-        """At rest in the home pose, on a random demonstration."""
         start = self._imitation.start(rng)
         data = mjx.forward(self._model, self._blank.replace(qpos=start.qpos, qvel=start.qvel))
         zero = jnp.zeros(())
@@ -40,7 +39,6 @@ class StockEnv(Wrapper):
         return State(data, self._imitation.observe(start), zero, zero, {"distance": zero}, info)  # type: ignore[arg-type]
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Holds a torque for one control step."""
         config, before = self._imitation.config, state.info["arm_state"]
         data: Any = state.pipeline_state
         data = data.replace(qfrc_applied=jnp.clip(action, -1.0, 1.0) * self._imitation.torque_scale)
@@ -59,5 +57,4 @@ class StockEnv(Wrapper):
 
 
 def wrap(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None) -> Wrapper:
-    """Brax's own wrappers."""
     return training.wrap(env, episode_length, action_repeat, randomization_fn)
