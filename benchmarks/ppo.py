@@ -30,7 +30,7 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import wrap_for_training
 from mimic.trainers.config import PPOConfig, PPOSettings
 from mimic.trainers.ppo import training
-from mimic.trainers.ppo.programs import make_programs
+from mimic.trainers.ppo.programs import compile_training
 
 STABLE_BASELINES = "stable-baselines3, C MuJoCo"
 EPOCHS = 6  # the first compiles
@@ -61,7 +61,7 @@ def training_epoch(
     """The compiled functions of `mimic.train` that begin a training, and that train for so many batches."""
     networks = training.make_networks(config, env.observation_size, env.action_size)
     schedule = optax.constant_schedule(config.learning_rate)
-    return make_programs(env, config, networks, batches, schedule, None)
+    return compile_training(env, config, networks, batches, schedule, None)
 
 
 def mimic_loop(physics: str, name: str, config: PPOSettings, batches: int) -> dict[str, float]:

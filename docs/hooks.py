@@ -1,4 +1,4 @@
-"""What mkdocs does besides: files of results that pages link to come along with the site."""
+"""Puts the files of results that pages link to into the site."""
 
 import re
 from pathlib import Path
@@ -18,5 +18,5 @@ def on_files(files: Files, *, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Turns links to the results in the repository into links to those in the site."""
-    return re.sub(rf"\]\(\.\./{RESULTS}/", "](results/", markdown)
+    """Turns links to the results in the repository into links to those in the site, from pages in folders too."""
+    return re.sub(rf"\]\(\.\./((?:\.\./)*){RESULTS}/", r"](\1results/", markdown)

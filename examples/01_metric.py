@@ -114,8 +114,8 @@ bound = mimic.kinematic_bound(
     expert, learner, expert_qpos[None], expert_qvel[None], correspondence, mimic.PAPER_WEIGHTS
 )[0]
 gap = (paper - bound) / (rest - bound)
-print(f"\nholding still: {rest:.4f}   copied angles: {paper:.4f}   lower bound: {bound:.4f}")
-print(f"optimality gap of the copied angles, 0 for the bound and 1 for holding still: {gap:.0%}")
+print(f"\nholding the start pose: {rest:.4f}   copied angles: {paper:.4f}   kinematic bound: {bound:.4f}")
+print(f"optimality gap of the copied angles, 0 for the bound and 1 for holding the start pose: {gap:.0%}")
 
 # ---- A picture -------------------------------------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ import numpy as np
 import mimic  # before JAX computes anything: on CPUs some versions of JAX need a flag, which mimic sets
 
 expert, learner = mimic.panda(), mimic.panda(locked=(3, 6, 7))
-correspondence = mimic.overlap_correspondence(expert, learner)
+correspondence = mimic.arc_length_correspondence(expert, learner)
 print(f"computing on: {jax.devices()[0].device_kind}, {jax.default_backend()}")
 
 # ---- One sample ------------------------------------------------------------------------------------------------------
@@ -69,7 +69,7 @@ print("central differences:  ", np.asarray(differences).round(4))
 # At a match the distance has a kink, like an absolute value at 0: velocities count by the norm of their difference. The
 # gradient is defined there all the same. It is 0, but for rounding, and not NaN.
 
-twin = mimic.motion_distance(expert, expert, mimic.overlap_correspondence(expert, expert), mimic.PAPER_WEIGHTS)
+twin = mimic.motion_distance(expert, expert, mimic.arc_length_correspondence(expert, expert), mimic.PAPER_WEIGHTS)
 value, slopes = jax.jit(jax.value_and_grad(twin, argnums=(2, 3)))(sample[0], sample[1], sample[0], sample[1])
 steepest = max(float(jnp.abs(slope).max()) for slope in slopes)
 print(f"two equal arms in the same motion: distance {value:.1e}, gradient {steepest:.1e}")

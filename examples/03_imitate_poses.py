@@ -25,12 +25,12 @@ out.mkdir(parents=True, exist_ok=True)
 
 # ---- The question ----------------------------------------------------------------------------------------------------
 #
-# The learner's pose of least embodiment distance to the expert's. Nothing moves, so velocities do not count; only the
-# directions of the links do, as in the environments. Example 1 is about what these words mean.
+# The learner's pose of least embodiment distance to the expert's. Nothing moves, so velocities do not count; the
+# positions and directions of the links do, equally, as in the environments. Example 1 is about what these words mean.
 
 expert, learner = mimic.panda(), mimic.panda(locked=(3, 6, 7))
-correspondence = mimic.overlap_correspondence(expert, learner)
-directions = mimic.DistanceWeights(translation=0.0, rotation=1.0)
+correspondence = mimic.arc_length_correspondence(expert, learner)
+weights = mimic.DistanceWeights(translation=1.0, rotation=1.0)
 
 lower, upper = expert.joint_range.T
 poses = np.random.default_rng(0).uniform(lower, upper, (200, expert.num_joints)).astype(np.float32)
@@ -40,7 +40,7 @@ def mean_distance(learner_poses):
     """Of the 200 poses."""
     distance = jax.vmap(
         lambda qpos, learner_qpos: mimic.embodiment_distance(
-            mimic.link_states(expert, qpos), mimic.link_states(learner, learner_qpos), correspondence, directions
+            mimic.link_states(expert, qpos), mimic.link_states(learner, learner_qpos), correspondence, weights
         )
     )
     return float(distance(poses, learner_poses).mean())
@@ -49,7 +49,7 @@ def mean_distance(learner_poses):
 # ---- Four answers ----------------------------------------------------------------------------------------------------
 #
 # A random pose is the scale. Copying the angles of the joints that both arms have is what one would try first: it is
-# half as bad, since a joint's angle means something else once its neighbours are locked. The paper descends from one
+# a third as bad, since a joint's angle means something else once its neighbours are locked. The paper descends from one
 # start with a constant step. The optimiser descends from thirteen, with a Newton method that turns round where the
 # distance is concave. `jax.jit` around it keeps the compiled program for the next poses of the same number.
 
@@ -61,13 +61,13 @@ copied_poses = poses[:, [expert.joint_names.index(name) for name in learner.join
 @jax.jit
 def descend(qpos):
     return mimic.imitate_pose(
-        expert, learner, qpos, correspondence, directions, method="gradient_descent", starts=0, iterations=300
+        expert, learner, qpos, correspondence, weights, method="gradient_descent", starts=0, iterations=300
     )
 
 
 @jax.jit
 def imitate(qpos, key):
-    return mimic.imitate_pose(expert, learner, qpos, correspondence, directions, key=key)
+    return mimic.imitate_pose(expert, learner, qpos, correspondence, weights, key=key)
 
 
 descended, found = descend(poses), imitate(poses, jax.random.key(0))

@@ -56,8 +56,7 @@ print(f"\nquality on unseen poses, 0 for the optimiser and 1 for a random pose: 
 mapper = mimic.PoseMapper.load(mapper_run)
 env = mimic.env_config("panda4dof")
 expert, learner = mapper.expert, mapper.learner
-correspondence = mimic.overlap_correspondence(expert, learner)
-weights = mimic.DistanceWeights(translation=0.0, rotation=1.0)
+correspondence, weights = env.metric.make_correspondence(expert, learner), env.metric.make_weights()
 poses = np.random.default_rng(0).uniform(-np.pi, np.pi, (2000, 7)).astype(np.float32)
 
 
@@ -104,7 +103,7 @@ distance = jax.jit(
     )
 )
 retargeted = {name: mimic.load_demonstrations(file).qpos for name, file in files.items()}
-retargeted["holding still"] = np.zeros_like(retargeted["mapper"])
+retargeted["zero pose"] = np.zeros_like(retargeted["mapper"])
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
 seconds_of_motion = motions.dt * np.arange(motions.horizon + 1)
 print()

@@ -94,14 +94,15 @@ for name, changed in broken.items():
 
 # ---- How much of it can the learner do? ------------------------------------------------------------------------------
 #
-# Before anything is trained, the lower bound tells what the learner's joints allow. Four joints against seven: what
+# Before anything is trained, the kinematic bound tells what the learner's joints allow. Four joints against seven: what
 # lies below the line is out of reach, whatever controls the arm. It is a bound for each moment by itself: a motion
 # through all of these poses need not exist.
 
 learner = mimic.panda(locked=(3, 6, 7))
-correspondence = mimic.overlap_correspondence(expert, learner)
-bound = mimic.kinematic_bound(expert, learner, waves.qpos[0], waves.qvel[0], correspondence, mimic.PAPER_WEIGHTS)
-print(f"\nmean lower bound over the first wave: {np.mean(bound):.4f}")
+metric = mimic.env_config("panda4dof").metric  # what a training would use
+correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
+bound = mimic.kinematic_bound(expert, learner, waves.qpos[0], waves.qvel[0], correspondence, weights)
+print(f"\nmean kinematic bound over the first wave: {np.mean(bound):.4f}")
 
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
 steps = waves.dt * np.arange(waves.horizon + 1)
@@ -111,7 +112,7 @@ for joint in range(3):
 axes[0].set(xlabel="time [s]", ylabel="angle [rad]", title="the table (lines), and what was taken from it")
 axes[0].legend(fontsize=8)
 axes[1].plot(steps, np.asarray(bound))
-axes[1].set(xlabel="time [s]", ylabel="embodiment distance", title="lower bound of a learner with four joints")
+axes[1].set(xlabel="time [s]", ylabel="embodiment distance", title="kinematic bound of a learner with four joints")
 axes[1].set_ylim(bottom=0)
 figure.savefig(out / "waves_and_bound.png", dpi=100)
 print(f"results: {out}")

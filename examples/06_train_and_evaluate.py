@@ -53,16 +53,16 @@ command(
 
 # ---- The report ------------------------------------------------------------------------------------------------------
 #
-# The optimality gap is the number to look at: 0 is the kinematic lower bound, the best that the learner's joints allow
-# at each moment, and 1 is doing nothing. On demonstrations that it was trained on the policy does far better than on
-# others: sixteen are few to learn from. A gap on held-out ones says more of a policy than the one that it was trained
-# for.
+# The optimality gap is the number to look at: 0 is the kinematic bound, the best that the learner's joints allow at
+# each moment, and 1 is holding the start pose. On demonstrations that it was trained on the policy does far better than
+# on others: sixteen are few to learn from. A gap on held-out ones says more of a policy than the one that it was
+# trained for.
 
 report = json.loads((run / "report.json").read_text())
 gap, distance = report["optimality_gap"], report["mean_distance"]
 print(f"\ngap: {gap['train']:.1%} on training demonstrations, {gap['held_out']:.1%} on held-out ones")
 print(f"mean distance: {distance['held_out']:.4f}, between its bound {report['lower_bound']['held_out']:.4f} "
-      f"and holding still {report['hold_distance']['held_out']:.4f}")  # fmt: skip
+      f"and holding the start pose {report['hold_distance']['held_out']:.4f}")  # fmt: skip
 with (run / "metrics.csv").open(newline="") as file:
     for row in csv.DictReader(file):
         print(f"  after {int(row['step']):7,} steps: {float(row['quality/optimality_gap.train']):.1%} on training ones")

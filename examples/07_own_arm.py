@@ -99,11 +99,12 @@ print(
     f"{gap['held_out']:.0%} on held-out ones"
 )
 
-# 0 is the lower bound, 1 is holding still. The policy knows its eight motions roughly, and next to nothing of others:
-# that takes more of them, and more steps. A gap above 1 is no failure of the arm: a policy that has not learned moves
-# about, which is worse than to stay. The command that `inspect` proposed trains on 124, for ten minutes or more on two
-# cores.
+# 0 is the kinematic bound, 1 is holding the start pose. The policy knows its eight motions roughly, and next to nothing
+# of others: that takes more of them, and more steps. A gap above 1 is no failure of the arm: a policy that has not
+# learned moves about, which is worse than to stay. The command that `inspect` proposed trains on 124, for ten minutes
+# or more on two cores.
 
-print(f"bound: {report['lower_bound']['held_out']:.3f}, holding still: {report['hold_distance']['held_out']:.3f}")
+print(f"kinematic bound: {report['lower_bound']['held_out']:.3f}, "
+      f"holding the start pose: {report['hold_distance']['held_out']:.3f}")  # fmt: skip
 print(f"to train it in earnest: {findings['train']}")
 print(f"results: {out}")

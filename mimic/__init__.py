@@ -1,4 +1,4 @@
-"""mimic: a metric between robot arms of different build, and imitation learning with it, in JAX and MJX.
+"""mimic: a metric between robot arms of different kinematics, and imitation learning with it, in JAX and MJX.
 
 The core functions are pure and take one sample; batch them with `jax.vmap`.
 """
@@ -101,19 +101,19 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name == "ImitationEnv":  # brax and MJX, which take seconds to import
+    if name == "ImitationEnv":  # imports brax and MJX, which takes seconds
         from mimic.envs.imitation import ImitationEnv
 
         return ImitationEnv
-    if name == "ArmScene":  # pictures, which few need
+    if name == "ArmScene":  # imports the renderer, which few need
         from mimic.arms.rendering import ArmScene
 
         return ArmScene
-    if name == "PoseMapper":  # checkpoints and metrics, likewise
+    if name == "PoseMapper":  # imports flax networks and checkpoints
         from mimic.trainers.pose_mapper.model import PoseMapper
 
         return PoseMapper
-    if name == "export_run":  # all of these
+    if name == "export_run":  # imports all of these
         compat.import_mjx()
         from mimic.commands.export import export_run
 

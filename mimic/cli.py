@@ -1,4 +1,4 @@
-"""How every command starts and fails: Hydra reads the config, and bad input is one line and exit code 2."""
+"""Start and error handling of every command: Hydra reads the config; bad input prints one line and exits with 2."""
 
 import contextlib
 import os
@@ -41,28 +41,32 @@ from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import TRAINERS, TrainConfig
 
 BAD_INPUT = 2
-ARM_KEYS = {  # of each command: keys that take an arm by name or file alone
+ARM_KEYS = {  # keys of each command whose value may be just the name or file of an arm
     "train": ("env.expert", "env.learner"),
     "demonstrations": ("env.expert", "env.learner"),
     "inspect": ("expert", "learner"),
 }
-FIRST_KEY = {"inspect": "learner.model", "collect": "folder"}  # of each command: the key that needs no name
-_CONFIG_ERRORS = (FrozenInstanceError, HydraException, OmegaConfBaseException)  # the first: a key added with "+"
+FIRST_KEY = {"inspect": "learner.model", "collect": "folder"}  # key of each command's positional argument
+_CONFIG_ERRORS = (
+    FrozenInstanceError,
+    HydraException,
+    OmegaConfBaseException,
+)  # FrozenInstanceError: a key added with "+"
 _BAD_INPUT = (ValueError, OSError, *_CONFIG_ERRORS)
 
 Work = Callable[[], int | None]  # returns the exit code, 0 for None
 
 
 def run(prepare: Callable[[Any], Work], config_name: str) -> None:
-    """Runs a command; exits with 2 and one line for input that it cannot take.
+    """Runs a command; for bad input it prints one line and exits with 2.
 
     Args:
-      prepare: takes the typed config and returns the work. What it raises is the user's to mend, and is shown as one
-        line; what the work raises is ours, and is shown whole.
-      config_name: in mimic/conf.
+      prepare: checks the typed config and returns the work. Errors that it raises are user errors and print one line;
+        errors of the work are bugs and keep their traceback.
+      config_name: name of the command and of its config in mimic/conf.
     """
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises, and the line below is all that is shown
-    sys.argv[1:] = [_written_out(argument, config_name) for argument in sys.argv[1:]]
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
+    sys.argv[1:] = [_expand_shorthand(argument, config_name) for argument in sys.argv[1:]]
     compat.share_config_store()
     _register_schemas()
     register_sweeper()
@@ -71,12 +75,12 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
     def command(config: DictConfig) -> Outcome:
         if is_sweep():
-            return _run_of_a_sweep(prepare, config)
+            return _sweep_run(prepare, config)
         try:
             check_launcher(HydraConfig.get().runtime.choices["hydra/launcher"])
             work = prepare(OmegaConf.to_object(config))
         except _BAD_INPUT as error:
-            _refuse(error)
+            _exit_with_error(error)
         exit_code = work()
         if exit_code:
             sys.exit(exit_code)
@@ -85,14 +89,14 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     try:
         command()
     except _CONFIG_ERRORS as error:
-        _refuse(error)
+        _exit_with_error(error)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(STOPPED_BY_SIGNAL + signal.SIGINT)
 
 
-def _run_of_a_sweep(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
-    """One run among several in this process: where it fails the others still run, but a signal ends them all."""
+def _sweep_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
+    """One run of a sweep in this process. The other runs continue after a failure, but a signal ends them all."""
     try:
         work = prepare(OmegaConf.to_object(config))
     except _BAD_INPUT as error:
@@ -109,8 +113,8 @@ def _run_of_a_sweep(prepare: Callable[[Any], Work], config: DictConfig) -> Outco
     return Outcome(exit_code, f"exit code {exit_code}" if exit_code else "")
 
 
-def _written_out(argument: str, command: str) -> str:
-    """An argument as Hydra takes it: env.learner=ARM.xml is short for env.learner.model=ARM.xml."""
+def _expand_shorthand(argument: str, command: str) -> str:
+    """Returns an argument in Hydra's syntax: env.learner=ARM.xml becomes env.learner.model=ARM.xml."""
     key, equals, value = argument.partition("=")
     if command in FIRST_KEY and not equals and not argument.startswith("-"):
         return f"{FIRST_KEY[command]}={argument}"
@@ -118,13 +122,13 @@ def _written_out(argument: str, command: str) -> str:
     return f"{key}.model={value}" if equals and is_arm else argument
 
 
-def _refuse(error: BaseException) -> NoReturn:
+def _exit_with_error(error: BaseException) -> NoReturn:
     print(f"error: {_one_line(error)}", file=sys.stderr)
     sys.exit(BAD_INPUT)
 
 
 def process_started() -> float:
-    """`time.perf_counter()` at the start of this process; where the system does not tell, what it is now."""
+    """`time.perf_counter()` at the start of this process; its present value if the system does not report it."""
     now = time.perf_counter()
     with contextlib.suppress(OSError, AttributeError, ValueError):
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])  # since boot: see proc(5)
@@ -133,24 +137,24 @@ def process_started() -> float:
 
 
 def start_backend() -> None:
-    """Lets JAX find its devices, and take their memory, while this thread goes on to import: CUDA needs seconds."""
-    threading.Thread(target=_find_devices, name="backend").start()
+    """Initialises JAX's backend in a thread while this one imports modules: CUDA takes seconds."""
+    threading.Thread(target=_initialise_backend, name="backend").start()
 
 
-def _find_devices() -> None:
+def _initialise_backend() -> None:
     import jax
 
-    with contextlib.suppress(RuntimeError):  # said by whoever asks for them next
+    with contextlib.suppress(RuntimeError):  # raised again by the next use of the backend
         jax.device_put(0).block_until_ready()
 
 
 def overrides() -> list[str]:
-    """The overrides of the command line, of the job that runs now."""
+    """The command-line overrides of the present run."""
     return list(HydraConfig.get().overrides.task)
 
 
 def is_sweep() -> bool:
-    """Whether the command line asks for several jobs."""
+    """Whether the command line starts a sweep."""
     return HydraConfig.get().mode == RunMode.MULTIRUN
 
 
@@ -172,7 +176,7 @@ def _register_schemas() -> None:
 
 
 def _one_line(error: BaseException) -> str:
-    """The innermost reason, as one line with the valid choices."""
+    """The innermost cause of an error, as one line with the valid choices."""
     causes = [error]
     while causes[-1].__cause__ is not None:
         causes.append(causes[-1].__cause__)
@@ -180,7 +184,7 @@ def _one_line(error: BaseException) -> str:
     if typed:
         return explain(typed[-1])
     if isinstance(error, FrozenInstanceError):
-        return f"a key that does not exist cannot be added: {error}"
+        return f"unknown keys cannot be added: {error}"
     message = str(error)
     choice = re.search(r"Could not find '([\w/]+)/([^'/]*)'\s+Available options in '[\w/]+':((?:\n\t\S+)*)", message)
     if choice:

@@ -1,12 +1,12 @@
-"""`python -m mimic.collect DIR`: the runs below a folder as one table and figure, with confidence intervals."""
+"""`python -m mimic.collect DIR`: collects runs in one table and plot, with confidence intervals over seeds."""
 
 from mimic import cli
 from mimic.commands.config import CollectConfig
 
 
 def prepare(config: CollectConfig) -> cli.Work:
-    """The collection that the config describes."""
-    from mimic.commands import collect  # not needed for --help
+    """Prepares a collection of runs. See `mimic.commands.collect`."""
+    from mimic.commands import collect  # slow to import, and not needed for --help
 
     return collect.prepare_collection(config)
 

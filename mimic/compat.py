@@ -1,4 +1,4 @@
-"""What other packages' versions make necessary; everything of this kind is here."""
+"""Workarounds for other packages and their versions; all of them are here."""
 
 import contextlib
 import importlib
@@ -18,10 +18,10 @@ _SLOW_CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
 
 
 def needs_cpu_flag(jaxlib_version: str | None = None) -> bool:
-    """Whether XLA's CPU backend needs its fusion emitters turned off.
+    """Whether the fusion emitters of XLA's CPU backend must be turned off.
 
-    Before jaxlib 0.11 they make batched kinematics several hundred times slower; from 0.11 on the flag is unknown to
-    XLA, which aborts on it.
+    Before jaxlib 0.11 they make batched kinematics several hundred times slower. From 0.11 on XLA does not know the
+    flag and aborts on it.
     """
     version = jaxlib_version or importlib.metadata.version("jaxlib")
     major, minor = (int(part) for part in version.split(".")[:2])
@@ -29,7 +29,7 @@ def needs_cpu_flag(jaxlib_version: str | None = None) -> bool:
 
 
 def prepare_cpu() -> None:
-    """Sets that flag where it is needed; must run before JAX starts its backend."""
+    """Turns XLA's fusion emitters off where `needs_cpu_flag`; must run before JAX starts its backend."""
     flags = os.environ.get("XLA_FLAGS", "")
     if not needs_cpu_flag() or "xla_cpu_use_fusion_emitters" in flags:
         return
@@ -42,25 +42,25 @@ def prepare_cpu() -> None:
 
 
 def import_mujoco() -> None:
-    """Imports MuJoCo also where the graphics library that MUJOCO_GL names is missing: who draws is told so then."""
-    asked_for = os.environ.get("MUJOCO_GL", "")
+    """Imports MuJoCo even if the graphics library that MUJOCO_GL names is missing; only rendering fails then."""
+    user_setting = os.environ.get("MUJOCO_GL", "")
     try:
         importlib.import_module("mujoco")
-    except (AttributeError, OSError):  # of PyOpenGL and ctypes, while they look for the library
+    except (AttributeError, OSError):  # from PyOpenGL and ctypes, if the library is missing
         os.environ["MUJOCO_GL"] = "disabled"
         try:
             package = importlib.import_module("mujoco")
         finally:
-            os.environ["MUJOCO_GL"] = asked_for
-        for name, part in list(sys.modules.items()):  # what was imported before it failed belonged to the first try
+            os.environ["MUJOCO_GL"] = user_setting
+        for name, part in list(sys.modules.items()):  # submodules of the first try are no attributes yet
             if name.startswith("mujoco.") and name.count(".") == 1:
                 setattr(package, name.partition(".")[2], part)
 
 
 def import_mjx() -> None:
-    """Imports MJX without its two lines about Warp, an optional backend that mimic does not use.
+    """Imports MJX without printing its two lines about Warp, an optional backend that mimic does not use.
 
-    MJX's meshes and brax's solver of contacts wait until something asks for them: arms have no use for them, and
+    MJX's meshes and brax's contact solver are imported at their first use: arms do not need them, and their imports
     trimesh, jaxopt and SciPy would take half of the time.
     """
     for name in ("mujoco.mjx._src.mesh", "jaxopt"):
@@ -71,17 +71,17 @@ def import_mjx() -> None:
 
 
 def _import_later(name: str) -> None:
-    """Lets a module run when something of it is first used, not when it is imported; if there is such a one."""
+    """Registers a module that is executed at the first access to an attribute; does nothing if there is no module."""
     package, *path = name.split(".")
     spec = importlib.util.find_spec(package)
-    if spec and path:  # found without its parents, which would import it
+    if spec and path:  # located by hand, because `find_spec` of a submodule imports its parents
         file = Path((spec.submodule_search_locations or [""])[0], *path).with_suffix(".py")
         spec = importlib.util.spec_from_file_location(name, file) if file.is_file() else None
     if spec is None or spec.loader is None:
         return
     module, execute = importlib.util.module_from_spec(spec), spec.loader.exec_module
 
-    def load(attribute: str) -> Any:  # PEP 562: what is asked for and is not there
+    def load(attribute: str) -> Any:  # PEP 562: called for a missing attribute
         del module.__getattr__
         execute(module)
         return getattr(module, attribute)
@@ -91,9 +91,9 @@ def _import_later(name: str) -> None:
 
 
 def import_tensorboard() -> Any:
-    """Imports tensorboardX, but not torch with it: where that is installed it takes seconds, for a type's name."""
+    """Imports tensorboardX without torch, which takes seconds where it is installed and is used only for a type."""
     if "torch" not in sys.modules:
-        sys.modules["torch"] = None  # type: ignore[assignment]  # an import fails, as where it is not installed
+        sys.modules["torch"] = None  # type: ignore[assignment]  # its import fails, as if it were not installed
     try:
         return importlib.import_module("tensorboardX")
     finally:
@@ -102,9 +102,9 @@ def import_tensorboard() -> Any:
 
 
 def share_config_store() -> None:
-    """Hydra copies all registered configs for each group that it lists: half of the time that `--help` takes.
+    """Keeps Hydra from copying all registered configs for each group that it lists, which is half the time of `--help`.
 
-    It need not, as it copies a config besides whenever it loads one.
+    The copies are unnecessary, because Hydra also copies each config that it loads.
     """
     from hydra.core.config_store import ConfigStore
 
@@ -112,10 +112,10 @@ def share_config_store() -> None:
 
 
 def computed_once(scalars: list[Any]) -> list[Any]:
-    """The scalars, to be computed before they are stacked where XLA would else compute each of them from scratch.
+    """Returns the scalars with a barrier, so that XLA computes them once before it stacks them.
 
-    On GPUs XLA may fuse a concatenation with all that leads to it, one copy of the chain for each row: small batches of
-    a 7-link arm then take a minute to compile. On CPUs it does not, and the barrier would cost time.
+    On GPUs XLA may fuse a concatenation with all of its inputs' computation, with one copy of it for each row: small
+    batches of a 7-link arm then take a minute to compile. On CPUs it does not, and the barrier would cost time.
     """
     import jax
 
@@ -123,11 +123,11 @@ def computed_once(scalars: list[Any]) -> list[Any]:
 
 
 def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
-    """Copies of a pytree on all devices, along a new first axis.
+    """Copies a pytree to all devices, along a new first axis.
 
     JAX removed its function of this name in 0.10, and brax 0.14 still calls it. This one replicates through `jax.pmap`,
-    with brax's own name for the axis, so that the result is sharded just as what brax's training epoch returns: the
-    epoch is then compiled once and not twice.
+    with brax's own name of the axis, so that the result has the sharding of what brax's training epoch returns: the
+    epoch is then compiled once instead of twice.
     """
     import jax
 
@@ -136,21 +136,21 @@ def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
 
 
 def coordination_client() -> Any:
-    """What the processes of `jax.distributed` tell each other through; JAX has no public name for it."""
+    """The key-value client of `jax.distributed`'s coordination service; JAX has no public name for it."""
     from jax._src import distributed
 
     return distributed.global_state.client
 
 
 def process_number() -> int:
-    """Of this process in `jax.distributed`, without starting the backend as `jax.process_index` would."""
+    """The number of this process in `jax.distributed`; unlike `jax.process_index`, it does not start the backend."""
     from jax._src import distributed
 
     return distributed.global_state.process_id
 
 
 def mend_brax() -> None:
-    """Gives brax's training loop the function that it calls and JAX no longer has."""
+    """Restores `jax.device_put_replicated`, which brax's training loop calls and JAX no longer has."""
     import jax
 
     if not hasattr(jax, "device_put_replicated"):

@@ -1,6 +1,6 @@
-"""Typed configs: frozen dataclasses as OmegaConf schemas, and what is wrong with a value in one line."""
+"""Typed configs: frozen dataclasses as OmegaConf schemas, checks of values, and one-line error messages."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,14 +8,14 @@ from omegaconf import DictConfig, OmegaConf
 
 
 def schema(config_class: type) -> DictConfig:
-    """A typed OmegaConf node of a frozen dataclass, with its defaults."""
+    """Returns a typed OmegaConf node of a frozen dataclass, with its defaults."""
     node = OmegaConf.structured(config_class)
     _unfreeze(node)
     return node
 
 
 def _unfreeze(node: DictConfig) -> None:
-    """OmegaConf takes the nodes of frozen dataclasses for read-only; presets and overrides must fill them in."""
+    """Makes a node writable: OmegaConf makes those of frozen dataclasses read-only, but presets set their fields."""
     OmegaConf.set_readonly(node, None)
     for key in node:
         child = node._get_node(key)
@@ -24,7 +24,7 @@ def _unfreeze(node: DictConfig) -> None:
 
 
 def explain(error: Exception) -> str:
-    """One line for a config error: what is wrong with which key, and the valid keys."""
+    """Returns a config error as one line: the key, what is wrong with it, and for an unknown key the valid keys."""
     message = " ".join(str(getattr(error, "msg", None) or error).splitlines()[0].split())
     key = getattr(error, "full_key", None) or getattr(error, "key", None)
     parent = getattr(error, "parent_node", None)
@@ -34,30 +34,54 @@ def explain(error: Exception) -> str:
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Raises a ValueError that names the choices, unless the value is one of them."""
+    """Raises a ValueError that lists the choices if the value is none of them."""
     if value not in choices:
         raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
 
 
 def new_file(name: str, path: str) -> Path:
-    """Where a command shall write a file.
+    """Returns the path of a file that a command will write.
 
     Args:
-      name: of the key.
-      path: its value.
+      name: the config key, for error messages.
+      path: the key's value.
 
     Raises:
-      ValueError: no path, one that exists, or one in no folder.
+      ValueError: the path is empty, exists, or its folder does not exist.
     """
+    return _new_path(name, path, "file")
+
+
+def new_folder(name: str, path: str) -> Path:
+    """Returns the path of a folder that a command will create and write into; see `new_file`."""
+    return _new_path(name, path, "folder")
+
+
+def _new_path(name: str, path: str, kind: str) -> Path:
     if not path:
-        raise ValueError(f"{name}: expected a file, as in {name}=FILE")
-    file = Path(path).expanduser()
-    if file.exists() or not file.parent.is_dir():
-        reason = "exists; name a new file" if file.exists() else f"there is no folder {str(file.parent)!r}"
-        raise ValueError(f"{name}: {str(file)!r}: {reason}")
-    return file
+        raise ValueError(f"{name}: expected a {kind}, as in {name}={kind.upper()}")
+    new = Path(path).expanduser()
+    check_new(name, new, f"name a new {kind}")
+    if not new.parent.is_dir():
+        raise ValueError(f"{name}: {str(new)!r}: there is no folder {str(new.parent)!r}")
+    return new
+
+
+def check_new(name: str, path: Path, advice: str) -> None:
+    """Raises a ValueError with some advice if a path exists: no output is ever overwritten."""
+    if path.exists():
+        raise ValueError(f"{name}: {str(path)!r} exists; {advice}")
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """A config as plain containers, for files."""
+    """Returns a config as dicts and lists, for files."""
     return OmegaConf.to_container(OmegaConf.structured(config), resolve=True)  # type: ignore[return-value]
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one level with dotted keys, such as optimality_gap.train. Empty mappings stay values."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        is_nested = isinstance(value, Mapping) and value
+        flat |= flatten(value, f"{prefix}{key}.") if is_nested else {f"{prefix}{key}": value}
+    return flat

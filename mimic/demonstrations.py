@@ -1,12 +1,12 @@
-"""`python -m mimic.demonstrations kind=pd count=124 out=FILE.npz`: demonstrations of an expert, with their torques."""
+"""`python -m mimic.demonstrations out=FILE.npz`: records an expert with its torques, or imports motions."""
 
 from mimic import cli
 from mimic.commands.config import RecordingConfig
 
 
 def prepare(config: RecordingConfig) -> cli.Work:
-    """The recording that the config describes."""
-    from mimic.commands import demonstrations  # not needed for --help
+    """Prepares a recording of demonstrations. See `mimic.commands.demonstrations`."""
+    from mimic.commands import demonstrations  # slow to import, and not needed for --help
 
     return demonstrations.prepare_recording(config)
 

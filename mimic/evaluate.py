@@ -1,13 +1,13 @@
-"""`python -m mimic.evaluate run=DIR`: repeats the report of a run from a checkpoint alone."""
+"""`python -m mimic.evaluate run=DIR`: evaluates a trained policy, or another controller in its place."""
 
 from mimic import cli
 from mimic.commands.config import EvaluateConfig
 
 
 def prepare(config: EvaluateConfig) -> cli.Work:
-    """The evaluation that the config describes."""
+    """Prepares an evaluation. See `mimic.commands.evaluate`."""
     cli.start_backend()
-    from mimic.commands.evaluate import prepare_evaluation  # not needed for --help
+    from mimic.commands.evaluate import prepare_evaluation  # slow to import, and not needed for --help
 
     return prepare_evaluation(config, cli.process_started())
 

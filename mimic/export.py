@@ -1,13 +1,13 @@
-"""`python -m mimic.export run=DIR out=FILE`: a trained policy or pose mapper as ONNX, or as StableHLO for JAX."""
+"""`python -m mimic.export run=DIR out=FILE`: exports a policy or pose mapper to ONNX, or to StableHLO for JAX."""
 
 from mimic import cli, compat
 from mimic.commands.config import ExportConfig
 
 
 def prepare(config: ExportConfig) -> cli.Work:
-    """The export that the config describes."""
+    """Prepares an export. See `mimic.commands.export`."""
     compat.import_mjx()
-    from mimic.commands import export  # not needed for --help
+    from mimic.commands import export  # slow to import, and not needed for --help
 
     return export.prepare_export(config)
 

@@ -1,12 +1,12 @@
-"""`python -m mimic.figures out=DIR`: figures of the metric and of static pose imitation, from our own runs."""
+"""`python -m mimic.figures out=DIR`: draws the figures of the metric and of pose retargeting."""
 
 from mimic import cli
 from mimic.commands.config import FiguresConfig
 
 
 def prepare(config: FiguresConfig) -> cli.Work:
-    """The figures that the config describes."""
-    from mimic.commands import figures  # not needed for --help
+    """Prepares the figures. See `mimic.commands.figures`."""
+    from mimic.commands import figures  # slow to import, and not needed for --help
 
     return figures.prepare_figures(config)
 

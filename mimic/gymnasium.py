@@ -1,10 +1,10 @@
-"""The environments as Gymnasium knows them: `VectorEnv`, thousands of arms at once, and `Env`, one arm.
+"""The environments for Gymnasium: `VectorEnv` simulates thousands of arms in parallel, `Env` one arm.
 
-Importing this module registers them, which is how Gymnasium finds them: `gymnasium.make("mimic/panda4dof-v0")` and
-`gymnasium.make_vec("mimic/panda4dof-v0", num_envs=512)`, or in one go `gymnasium.make("mimic.gymnasium:mimic/...")`.
+Importing this module registers them with Gymnasium, as `gymnasium.make("mimic/panda4dof-v0")` and
+`gymnasium.make_vec("mimic/panda4dof-v0", num_envs=512)`. `gymnasium.make("mimic.gymnasium:mimic/...")` needs no import.
 """
 
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import jax
@@ -19,27 +19,28 @@ from mimic.arms.rendering import ArmScene
 from mimic.config import check_choice
 from mimic.envs import environments, make
 
-compat.import_mjx()  # quietly; brax would import it too
+compat.import_mjx()  # first, and quietly: brax imports it too
 
 from brax.envs.base import State  # noqa: E402
 
-from mimic.envs.imitation import ArmState, ImitationEnv, arm_state  # noqa: E402
+from mimic.envs.imitation import ArmState, ImitationEnv  # noqa: E402
 
 RENDER_MODES = ("rgb_array",)
 
 
 class VectorEnv(gymnasium.vector.VectorEnv):
-    """Many arms at once, on the device that JAX has found; NumPy goes in and comes out.
+    """Many arms in parallel on JAX's default device; actions and observations are NumPy arrays.
 
-    Where an episode ends, the same step gives the first observation of the next one, on a newly drawn demonstration;
-    the last observation is `infos["final_obs"]` (Gymnasium's `AutoresetMode.SAME_STEP`). All ends are terminations:
-    after the horizon there is nothing to imitate. `infos` has the metrics of the environment, each [num_envs].
+    When an episode ends, the same step returns the first observation of the next episode, on a random demonstration;
+    the last observation of the ended one is `infos["final_obs"]` (Gymnasium's `AutoresetMode.SAME_STEP`). Episodes are
+    only terminated, never truncated: after the horizon there is nothing to imitate. `infos` has the metrics of the
+    environment, each [num_envs].
 
     Args:
-      env: name of an environment, or one that is made.
-      num_envs: arms at once.
+      env: name of an environment, or an `ImitationEnv`.
+      num_envs: number of arms.
       render_mode: "rgb_array", or None.
-      overrides: of a named environment, see `mimic.env_config`; `physics="fused"` is the fast one.
+      overrides: fields of a named environment's config, see `mimic.env_config`; `physics="fused"` is the fast physics.
 
     Raises:
       ValueError: an unknown name, field or render mode, or fewer than one arm.
@@ -58,30 +59,24 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         self.single_observation_space, self.single_action_space = _spaces(self.imitation)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._picture = _Picture(self.imitation)
+        self._renderer = _Renderer(self.imitation)
         self._begin = jax.jit(jax.vmap(lambda key: self.imitation.begin(self.imitation.start(key))))
         self._advance = jax.jit(self._step_and_restart)
         self._state: State | None = None
 
     def _step_and_restart(self, state: State, action: jax.Array) -> tuple[State, jax.Array]:
-        """The step with new episodes where old ones ended, and the observations before that."""
+        """States after a step, where episodes that are done have restarted, and the observations before the restart."""
         stepped = jax.vmap(self.imitation.step)(state, action)
-        arms = arm_state(stepped)
-        fresh = jax.vmap(self.imitation.start)(arms.key)
-        fresh_obs = jax.vmap(self.imitation.observe_home)(fresh)
-        done = stepped.done.astype(bool)
-
-        def where_done(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
-
-        arms = jax.tree.map(where_done, fresh, arms)
-        obs: jax.Array = stepped.obs  # type: ignore[assignment]
-        return stepped.replace(pipeline_state=arms, obs=where_done(fresh_obs, obs)), obs
+        return self.imitation.restart_done(stepped), cast(jax.Array, stepped.obs)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begins an episode in each arm, on a random demonstration."""
+        """Starts an episode of each arm, on a random demonstration.
+
+        Returns:
+          Observations [num_envs, n], and an empty dict.
+        """
         super().reset(seed=seed)
         del options
         state = self._begin(jax.random.split(_key(self.np_random), self.num_envs))
@@ -89,12 +84,18 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return np.array(state.obs), {}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Holds a torque for one control step in each arm.
+        """Advances each arm by one control step of constant torque.
+
+        Args:
+          actions: [num_envs, joints] torques in [-1, 1].
+
+        Returns:
+          Observations, rewards, terminations, truncations (all False), and infos.
 
         Raises:
-          ValueError: actions of the wrong shape, or no `reset` before.
+          ValueError: actions of the wrong shape, or `reset` was not called.
         """
-        state, last_obs = self._advance(_begun(self._state), _checked_action(actions, self.action_space))
+        state, last_obs = self._advance(_require_reset(self._state), _checked_action(actions, self.action_space))
         self._state = state
         done = np.array(state.done, bool)
         everywhere = np.ones(self.num_envs, bool)
@@ -106,25 +107,25 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return np.array(state.obs), np.array(state.reward, float), done, np.zeros_like(done), infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture of each arm beside its expert; None without a render mode."""
+        """An image of each arm next to its expert; None without a render mode."""
         if self.render_mode is None:
             return None
-        arms: ArmState = jax.device_get(_begun(self._state).pipeline_state)
-        return tuple(self._picture.of(jax.tree.map(lambda leaf, i=i: leaf[i], arms)) for i in range(self.num_envs))
+        arms: ArmState = jax.device_get(_require_reset(self._state).pipeline_state)
+        return tuple(self._renderer.of(jax.tree.map(lambda leaf, i=i: leaf[i], arms)) for i in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Gives the renderer back."""
+        """Closes the renderer."""
         del kwargs
-        self._picture.close()
+        self._renderer.close()
 
 
 class Env(gymnasium.Env):
-    """One arm. For many, `VectorEnv` is as fast as the hardware allows, and copies of this one are not.
+    """One arm. For many arms, one `VectorEnv` is far faster than copies of this class.
 
     Args:
-      env: name of an environment, or one that is made.
+      env: name of an environment, or an `ImitationEnv`.
       render_mode: "rgb_array", or None.
-      overrides: of a named environment, see `mimic.env_config`.
+      overrides: fields of a named environment's config, see `mimic.env_config`.
 
     Raises:
       ValueError: an unknown name, field or render mode.
@@ -137,67 +138,74 @@ class Env(gymnasium.Env):
         self.metadata = {**self.metadata, "render_fps": _frames_per_second(self.imitation)}
         self.render_mode = _checked_render_mode(render_mode)
         self.observation_space, self.action_space = _spaces(self.imitation)
-        self._picture = _Picture(self.imitation)
+        self._renderer = _Renderer(self.imitation)
         self._begin, self._advance = jax.jit(self._start), jax.jit(self.imitation.step)
         self._state: State | None = None
 
     def _start(self, key: jax.Array, demonstration: jax.Array) -> State:
-        key_choice, key_start = jax.random.split(key)
-        random = jax.random.randint(key_choice, (), 0, self.imitation.demonstrations.count)
-        chosen = jnp.where(demonstration < 0, random, demonstration)
-        return self.imitation.begin(self.imitation.start(key_start, chosen))
+        """Starts an episode on a demonstration, or on a random one where its index is negative."""
+        key_demonstration, key_start = jax.random.split(key)
+        random = jax.random.randint(key_demonstration, (), 0, self.imitation.demonstrations.count)
+        demonstration = jnp.where(demonstration < 0, random, demonstration)
+        return self.imitation.begin(self.imitation.start(key_start, demonstration))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begins an episode.
+        """Starts an episode.
 
         Args:
-          seed: of all randomness from here on.
-          options: `{"demonstration": i}` for a certain one; a random one otherwise.
+          seed: random seed of this and all following episodes.
+          options: `{"demonstration": i}` for demonstration i; otherwise the demonstration is random.
 
         Raises:
           ValueError: no such demonstration.
         """
         super().reset(seed=seed)
-        chosen, count = (options or {}).get("demonstration"), self.imitation.demonstrations.count
-        if chosen is not None and not 0 <= chosen < count:
-            raise ValueError(f"demonstration: expected a number from 0 to {count - 1}, got {chosen}")
-        state = self._begin(_key(self.np_random), -1 if chosen is None else int(chosen))
+        demonstration, count = (options or {}).get("demonstration"), self.imitation.demonstrations.count
+        if demonstration is not None and not 0 <= demonstration < count:
+            raise ValueError(f"demonstration: expected a number from 0 to {count - 1}, got {demonstration}")
+        state = self._begin(_key(self.np_random), -1 if demonstration is None else int(demonstration))
         self._state = state
         return np.array(state.obs), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Holds a torque for one control step.
+        """Advances the arm by one control step of constant torque.
+
+        Args:
+          action: [joints] torques in [-1, 1].
+
+        Returns:
+          Observation, reward, terminated, truncated (always False), and the metrics of the environment.
 
         Raises:
-          ValueError: an action of the wrong shape, or no `reset` before.
+          ValueError: an action of the wrong shape, or `reset` was not called.
         """
-        state = self._advance(_begun(self._state), _checked_action(action, self.action_space))
+        state = self._advance(_require_reset(self._state), _checked_action(action, self.action_space))
         self._state = state
         infos = {name: float(value) for name, value in state.metrics.items()}
         return np.array(state.obs), float(state.reward), bool(state.done), False, infos
 
     def render(self) -> np.ndarray | None:
-        """A picture of the arm beside its expert; None without a render mode."""
+        """An image of the arm next to its expert; None without a render mode."""
         if self.render_mode is None:
             return None
-        return self._picture.of(jax.device_get(_begun(self._state).pipeline_state))
+        return self._renderer.of(jax.device_get(_require_reset(self._state).pipeline_state))
 
     def close(self) -> None:
-        """Gives the renderer back."""
-        self._picture.close()
+        """Closes the renderer."""
+        self._renderer.close()
 
 
-class _Picture:
-    """Pictures of expert and learner; OpenGL is started by the first one."""
+class _Renderer:
+    """Images of expert and learner. The first image starts OpenGL."""
 
     def __init__(self, env: ImitationEnv):
         self._env = env
         self._scene: ArmScene | None = None
 
     def of(self, state: Any) -> np.ndarray:
-        """One arm beside its expert."""
+        """The learner next to its expert."""
         env = self._env
         if self._scene is None:
             self._scene = ArmScene([env.config.expert, env.config.learner], limits=env.config.limits)
@@ -214,7 +222,7 @@ def _imitation_env(env: str | ImitationEnv, overrides: dict[str, Any]) -> Imitat
     if isinstance(env, str):
         return make(env, **overrides)
     if overrides:
-        raise ValueError(f"{next(iter(overrides))}: expected the name of an environment with it, got one that is made")
+        raise ValueError(f"{next(iter(overrides))}: expected the name of an environment with it, got an ImitationEnv")
     return env
 
 
@@ -229,7 +237,7 @@ def _checked_render_mode(render_mode: str | None) -> str | None:
 
 
 def _spaces(env: ImitationEnv) -> tuple[spaces.Box, spaces.Box]:
-    """Of observations and of actions."""
+    """The observation space and the action space."""
     return (
         spaces.Box(-np.inf, np.inf, (env.observation_size,), np.float32),
         spaces.Box(-1.0, 1.0, (env.action_size,), np.float32),
@@ -240,9 +248,9 @@ def _key(random: np.random.Generator) -> jax.Array:
     return jax.random.PRNGKey(int(random.integers(2**31)))
 
 
-def _begun(state: State | None) -> State:
+def _require_reset(state: State | None) -> State:
     if state is None:
-        raise ValueError("expected reset before step and render")
+        raise ValueError("expected a call of reset before step and render")
     return state
 
 

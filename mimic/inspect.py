@@ -1,12 +1,12 @@
-"""`python -m mimic.inspect ARM.xml`: what an arm's file holds, whether it can be trained, and how near it can come."""
+"""`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and kinematic bound."""
 
 from mimic import cli
 from mimic.commands.config import InspectConfig
 
 
 def prepare(config: InspectConfig) -> cli.Work:
-    """The inspection that the config describes."""
-    from mimic.commands import inspect  # not needed for --help
+    """Prepares an inspection. See `mimic.commands.inspect`."""
+    from mimic.commands import inspect  # slow to import, and not needed for --help
 
     return inspect.prepare_inspection(config)
 

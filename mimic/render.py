@@ -1,13 +1,13 @@
-"""`python -m mimic.render run=DIR`: a video of expert and learner: a policy, a pose mapper, or retargeted motions."""
+"""`python -m mimic.render run=DIR`: renders a video of expert and learner."""
 
 from mimic import cli, compat
 from mimic.commands.config import RenderConfig
 
 
 def prepare(config: RenderConfig) -> cli.Work:
-    """The video that the config describes."""
+    """Prepares a video. See `mimic.commands.render`."""
     compat.import_mjx()
-    from mimic.commands import render  # not needed for --help
+    from mimic.commands import render  # slow to import, and not needed for --help
 
     return render.prepare_video(config)
 

@@ -1,12 +1,12 @@
-"""`python -m mimic.retarget demonstrations=FILE learner=ENV out=FILE`: an expert's motions as a learner's."""
+"""`python -m mimic.retarget demonstrations=FILE learner=ENV out=FILE`: retargets motions to another arm."""
 
 from mimic import cli
 from mimic.commands.config import RetargetConfig
 
 
 def prepare(config: RetargetConfig) -> cli.Work:
-    """The retargeting that the config describes."""
-    from mimic.commands import retarget  # not needed for --help
+    """Prepares a retargeting. See `mimic.commands.retarget`."""
+    from mimic.commands import retarget  # slow to import, and not needed for --help
 
     return retarget.prepare_retargeting(config)
 

@@ -1,4 +1,4 @@
-"""`python -m mimic.train`: trains, evaluates and reports one run."""
+"""`python -m mimic.train`: trains an arm to imitate another arm, evaluates it and writes a run directory."""
 
 import time
 
@@ -7,22 +7,22 @@ from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.distributed.process_group import join
 
-_process_started = [cli.process_started()]  # for the first job; those that follow in a sweep start when they start
+_process_started = [cli.process_started()]  # start time of the first run; later runs of a sweep start in `prepare`
 
 
 def prepare(config: TrainConfig) -> cli.Work:
-    """The run that the config describes."""
-    began = time.perf_counter()
+    """Prepares a training run. See `mimic.commands.train`."""
+    prepare_started = time.perf_counter()
     if config.distributed.coordinator and cli.is_sweep():
-        raise ValueError("distributed: expected one run, got a sweep; start each of its runs by itself")
+        raise ValueError("distributed: expected one run, got a sweep; start each of its runs as a command of its own")
     group = join(config.distributed)
     cli.start_backend()
-    from mimic.commands import train  # not needed for --help
+    from mimic.commands import train  # slow to import, and not needed for --help
 
-    started = _process_started.pop() if _process_started else began
+    started = _process_started.pop() if _process_started else prepare_started
     signals = group.signals if group else Signals()
     work = train.prepare_training(config, started, cli.overrides(), group, signals)
-    # One that came while the report was made changed nothing for this run, but a sweep ends by it.
+    # A signal during the final report does not change the exit code of this run, but it ends a sweep.
     return (lambda: work() or signals.exit_code) if cli.is_sweep() else work
 
 

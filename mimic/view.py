@@ -1,12 +1,12 @@
-"""`python -m mimic.view`: expert and learner live in the browser."""
+"""`python -m mimic.view`: shows expert and learner live in the browser."""
 
 from mimic import cli
 from mimic.commands.config import ViewConfig
 
 
 def prepare(config: ViewConfig) -> cli.Work:
-    """The viewer that the config describes."""
-    from mimic.commands import view  # not needed for --help
+    """Prepares a live view. See `mimic.commands.view`."""
+    from mimic.commands import view  # slow to import, and not needed for --help
 
     return view.prepare_view(config)
 

@@ -3,7 +3,6 @@
 import functools
 import importlib
 import importlib.util
-import pathlib
 import sys
 
 import jax
@@ -11,7 +10,7 @@ import pytest
 from jaxtyping import config as jaxtyping_config
 from jaxtyping import install_import_hook
 
-REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
+from tests.helpers.repository import REPOSITORY
 
 # Not mimic.metric.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
 CORE = (
@@ -38,7 +37,9 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_compilation_cache_dir", str(REPOSITORY / ".jax_cache"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
     if importlib.util.find_spec("beartype") is not None:
-        install_import_hook([f"mimic.{module}" for module in CORE], "typechecking.check")
+        from tests.helpers import typechecking  # here already: the hook itself imports no more than `tests`
+
+        install_import_hook([f"mimic.{module}" for module in CORE], f"{typechecking.__name__}.check")
 
     from mimic import compat  # importing mimic after the hook is in place, and before JAX starts
 
@@ -65,6 +66,19 @@ def interpreted(monkeypatch: pytest.MonkeyPatch):
     from mimic.metric import fused_kernel
 
     monkeypatch.setattr(fused_kernel.pl, "pallas_call", functools.partial(fused_kernel.pl.pallas_call, interpret=True))
+
+
+@pytest.fixture
+def gpu_kernels(interpreted, monkeypatch: pytest.MonkeyPatch):
+    """Batched functions take the GPU kernels that they have, interpreted on the CPU; a list of those taken."""
+    taken = []
+
+    def choose(*rows, cuda, default):
+        taken.append(cuda)
+        return cuda(*rows)
+
+    monkeypatch.setattr(jax.lax, "platform_dependent", choose)
+    return taken
 
 
 @pytest.fixture

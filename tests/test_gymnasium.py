@@ -122,7 +122,7 @@ def test_bad_input(imitation, vector):
         Env("panda9dof")
     with pytest.raises(ValueError, match="preview: expected the name of an environment"):
         Env(imitation, preview=2)
-    with pytest.raises(ValueError, match="expected reset before"):
+    with pytest.raises(ValueError, match="expected a call of reset before"):
         Env(imitation).step(np.zeros(4))
     with pytest.raises(ValueError, match="demonstration: expected a number from 0 to 2, got 3"):
         Env(imitation).reset(options={"demonstration": 3})

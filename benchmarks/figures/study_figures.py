@@ -32,7 +32,7 @@ def _draw_unseen(results: Study, out: Path) -> None:
         axes.plot(curves["time"], curves["mean"], color=colour, label=label)
         axes.fill_between(curves["time"], curves["low"], curves["high"], color=colour, alpha=0.2, lw=0)
     axes.plot(curves["time"], curves["hold"], ":", color="grey", label="holding the start pose")
-    title = "32 unseen demonstrations, 7 to 7 joints: the lower bound is 0"
+    title = "32 unseen demonstrations, 7 to 7 joints: kinematic bound 0"
     axes.set(xlabel="time [s]", ylabel="embodiment distance", title=title, yscale="log", ylim=(1e-5, 1))
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
@@ -61,7 +61,7 @@ def _draw_controllers(results: Study, out: Path) -> None:
 def _draw_locked(results: Study, out: Path) -> None:
     figure, (bounds, gaps) = plt.subplots(1, 2, figsize=(9.5, 4.2), layout="constrained")
     panels = (
-        (bounds, "lower_bound", 1, "lower bound of the distance", "{:.3f}", "viridis_r"),
+        (bounds, "lower_bound", 1, "kinematic bound of the distance", "{:.3f}", "viridis_r"),
         (gaps, "optimality_gap", 100, "optimality gap of PPO, unseen [%]", "{:.1f}", "magma_r"),
     )
     for axes, entry, factor, title, form, colours in panels:

@@ -1,1 +1,1 @@
-"""Arms: what is known of one, where it is read from, and the model that simulates and draws it."""
+"""Arms: embodiments, MJCF and URDF readers, and the models that simulate and draw an arm."""

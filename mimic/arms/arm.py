@@ -1,4 +1,4 @@
-"""An arm as the environments use it: its embodiment, and a lean MuJoCo model that moves exactly its free joints."""
+"""An arm for the environments: its embodiment, and a minimal MuJoCo model of exactly its free joints."""
 
 import copy
 import dataclasses
@@ -17,33 +17,32 @@ from mimic.arms.ignored_elements import ignored_elements
 from mimic.arms.model_files import VELOCITY_LIMIT, read_spec
 from mimic.arms.simulation_model import effective_inertia, simulation_model
 
-# Planar arms are ours to define: slender rods, whose joints feel about as heavy for their size as the Panda's.
+# Planar arms are slender rods; relative to their size, their joints have about the effective inertia of the Panda's.
 _PLANAR_MASS = 1.0  # kg/m
 _PLANAR_ARMATURE = 0.02  # kg m^2
 _PLANAR_DAMPING = 0.1  # N m s/rad
 _PLANAR_VELOCITY_LIMIT = 2.5  # rad/s
-_PLANAR_RADIUS, _PLANAR_COLOUR = 0.03, [0.35, 0.55, 0.85, 1.0]  # what is seen of them [m]
+_PLANAR_RADIUS, _PLANAR_COLOUR = 0.03, [0.35, 0.55, 0.85, 1.0]  # as drawn [m]
 
-# The largest torque takes a joint from rest to this multiple of its rated speed in one step.
-_OFFERED_SPEED_FACTOR = 2.0
-UNKNOWN_SPEED = np.pi  # rad/s, taken for the rated speed of joints that have none
-
+# The maximum torque accelerates a joint from rest to this multiple of its velocity limit in one step.
+_SPEED_FACTOR = 2.0
+DEFAULT_VELOCITY_LIMIT = np.pi  # rad/s, assumed for joints without a velocity limit
 
 BUILT_IN = "panda", "planar"
 
 
 @dataclasses.dataclass(frozen=True)
 class ArmConfig:
-    """Which arm.
+    """Model of an arm, and changes to it.
 
     Attributes:
       model: "panda", "planar", or the path of an MJCF or URDF file, which is made absolute.
       locked: joint names or numbers, or a mapping from these to angles [rad].
-      link_lengths: of a planar arm [m].
-      base: body that the chain starts behind (of a file).
-      tip: body or site that the chain ends at (of a file); else see `find_chain`.
-      armature: least rotor inertia of each joint, as its motor feels it [kg m^2]; many models state none.
-      damping: least damping of each joint [N m s/rad].
+      link_lengths: lengths of the links of a planar arm [m].
+      base: for a file, name of the body that carries the chain.
+      tip: for a file, name of the body or site at the end of the chain; default: see `find_chain`.
+      armature: minimum rotor inertia of each joint, at the joint [kg m^2]; many models state none.
+      damping: minimum damping of each joint [N m s/rad].
     """
 
     model: str = "panda"
@@ -60,7 +59,7 @@ class ArmConfig:
         for name in ("armature", "damping"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
-        if self.is_file:  # so that a run finds it again from any folder
+        if self.is_file:  # absolute, so that a run can be loaded from any folder
             object.__setattr__(self, "model", os.path.abspath(os.path.expanduser(self.model)))
 
     @property
@@ -75,9 +74,9 @@ class Arm:
 
     Attributes:
       embodiment: its free joints and links.
-      model: of the free joints alone.
-      locked: angle [rad] of the joints that are held, by name.
-      notes: what of its file was set aside, in words.
+      model: MuJoCo model of the free joints only.
+      locked: angle [rad] of the locked joints, by name.
+      notes: elements of its file that the model ignores, one line each.
     """
 
     embodiment: Embodiment
@@ -94,15 +93,15 @@ class ArmPair(NamedTuple):
 
     @property
     def embodiments(self) -> tuple[Embodiment, Embodiment]:
-        """Of the expert and of the learner."""
+        """The embodiments of the expert and of the learner."""
         return self.expert.embodiment, self.learner.embodiment
 
 
 def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
-    """The model of an arm as it was written, geoms and all joints included.
+    """The complete model of an arm, with geoms and all joints.
 
     Raises:
-      ValueError: no such file, or MuJoCo cannot read it.
+      ValueError: the file does not exist, or MuJoCo cannot read it.
     """
     if config.model == "planar":
         return _planar_spec(planar_arm(config.link_lengths))
@@ -111,7 +110,7 @@ def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
 
 
 def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> Arm:
-    """The arm that a config describes.
+    """Builds an arm from its config.
 
     Args:
       config: of the arm.
@@ -119,7 +118,7 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
       links: see `MetricConfig`.
 
     Raises:
-      ValueError: what `panda`, `planar_arm` and `load_mjcf` refuse.
+      ValueError: what `panda`, `planar_arm` and `load_mjcf` reject.
     """
     if config.model == "planar":
         embodiment = planar_arm(config.link_lengths)
@@ -151,30 +150,30 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
 
 
 def with_minimum_armature(arm: Arm, config: ArmConfig) -> Arm:
-    """The arm whose joints have at least the rotor inertia and the damping of a config."""
+    """The arm with at least the rotor inertia and the damping of the config in each joint."""
     model = copy.copy(arm.model)
     model.dof_armature[:] = np.maximum(model.dof_armature, config.armature)
     model.dof_damping[:] = np.maximum(model.dof_damping, config.damping)
     return dataclasses.replace(arm, model=model)
 
 
-def rated_speed(arm: Embodiment) -> Float[np.ndarray, " joints"]:
-    """Largest speed of each joint [rad/s], pi where none is known."""
-    return np.where(np.isfinite(arm.velocity_limit), arm.velocity_limit, UNKNOWN_SPEED)
+def finite_velocity_limit(arm: Embodiment) -> Float[np.ndarray, " joints"]:
+    """Maximum speed of each joint [rad/s]; pi where the model states none."""
+    return np.where(np.isfinite(arm.velocity_limit), arm.velocity_limit, DEFAULT_VELOCITY_LIMIT)
 
 
 def torque_scale(arm: Arm, action_scale: float, control_dt: float) -> Float[np.ndarray, " joints"]:
-    """Largest torque of each joint [N m]: what gets it well beyond its rated speed in one step, at most its limit.
+    """Maximum torque of each joint [N m]: exceeds its velocity limit within one step, and keeps its torque limit.
 
-    The full torque of a Panda would take its light joints to tens of rad/s within a step, where nothing can be learned.
+    The full torque of a Panda would accelerate its light joints to tens of rad/s within a step, too fast to learn.
 
     Args:
       arm: the learner.
       action_scale: see `EnvConfig`.
-      control_dt: time that a torque is held [s].
+      control_dt: duration of a torque [s].
     """
     inertia = effective_inertia(arm.model, np.asarray(arm.embodiment.home))
-    torque = action_scale * _OFFERED_SPEED_FACTOR * rated_speed(arm.embodiment) * inertia / control_dt
+    torque = action_scale * _SPEED_FACTOR * finite_velocity_limit(arm.embodiment) * inertia / control_dt
     return np.minimum(torque, arm.embodiment.torque_limit).astype(np.float32)
 
 

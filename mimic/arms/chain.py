@@ -1,4 +1,4 @@
-"""A serial chain of hinges as plain numbers, and what locking joints makes of it."""
+"""A serial chain of revolute joints as plain numbers, and the chain with some joints locked."""
 
 import dataclasses
 import functools
@@ -10,6 +10,8 @@ from typing import Literal
 
 import numpy as np
 
+from mimic.config import check_choice
+
 _log = logging.getLogger(__name__)
 SHORTEST_LINK = 1e-6  # m; below this a link has no direction
 
@@ -20,9 +22,9 @@ Locked = str | int | Iterable[str | int] | Mapping[str | int, float]
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A hinge in the zero pose, in the base frame. Units: m, rad, N m, rad/s.
+    """A revolute joint in the zero pose, in the base frame. Units: m, rad, N m, rad/s.
 
-    `home` is where the model's own start pose has it.
+    `home` is its angle in the model's own start pose.
     """
 
     name: str
@@ -44,8 +46,8 @@ class Link:
     Attributes:
       name: of the link; names of merged links are joined by "+".
       start, end: [3] [m].
-      joint: index of the last joint that moves it; -1 for a link that is fixed to the base.
-      merged: segments of the arm's centre line that were merged into this link; empty for a link that is one segment.
+      joint: index of the last joint that moves it; -1 for a link fixed to the base.
+      merged: segments of the arm's centre line that were merged into this link; empty for a link of one segment.
     """
 
     name: str
@@ -56,7 +58,7 @@ class Link:
 
     @property
     def length(self) -> float:
-        """From start to end [m]."""
+        """Distance from start to end [m]."""
         return float(np.linalg.norm(self.end - self.start))
 
     @property
@@ -76,24 +78,24 @@ class Chain:
 def resolve_locked(
     locked: Locked, joint_names: tuple[str, ...], angles: Mapping[str, float] | None = None
 ) -> dict[str, float]:
-    """Locked joints by name with their angles.
+    """Angles [rad] of the locked joints by name.
 
     Args:
       locked: joint names or numbers (1 is the first joint), or a mapping from these to angles [rad].
       joint_names: the arm's joints in order.
-      angles: angle by name for joints that `locked` gives no angle for; 0 where absent.
+      angles: default angles by name for joints that `locked` lists without one; 0 where absent.
 
     Raises:
       ValueError: an unknown or duplicate joint, an angle that is not a finite number, or no joint left.
     """
     joints = (locked,) if isinstance(locked, str | int) else locked
-    given = locked if isinstance(locked, Mapping) else None
+    mapping = locked if isinstance(locked, Mapping) else None
     result: dict[str, float] = {}
     for joint in joints:
         name = _joint_name(joint, joint_names)
         if name in result:
             raise ValueError(f"locked: joint {name!r} is named twice; name each joint once")
-        result[name] = _angle(name, given[joint] if given is not None else (angles or {}).get(name, 0.0))
+        result[name] = _angle(name, mapping[joint] if mapping is not None else (angles or {}).get(name, 0.0))
     if len(result) == len(joint_names):
         raise ValueError(f"locked: all {len(joint_names)} joints are locked; at least one must stay free")
     return result
@@ -123,36 +125,35 @@ def _angle(name: str, value: float) -> float:
 
 
 def lock(chain: Chain, locked: Mapping[str, float], links: Links = "kept") -> Chain:
-    """The chain that is left when joints are held at an angle.
+    """The chain with some joints locked at an angle.
 
     Args:
       chain: the free arm.
       locked: angle [rad] by joint name.
-      links: "kept": a locked joint removes a joint and no link; "merged": the links that it connects become one, from
-        the start of the first to the end of the last (paper: as many links as joints).
+      links: "kept": locking removes a joint and no link; "merged": the links at a locked joint become one, from the
+        start of the first to the end of the last (paper: as many links as joints).
 
     Raises:
       ValueError: an unknown value of `links`.
     """
-    if links not in LINKS:
-        raise ValueError(f"links: expected one of {', '.join(LINKS)}, got {links!r}")
-    rotation, offset = np.eye(3), np.zeros(3)  # what the locked joints so far do to all that comes after them
-    moved_by: dict[int, int] = {-1: -1}
+    check_choice("links", links, LINKS)
+    rotation, offset = np.eye(3), np.zeros(3)  # transform of all distal bodies by the locked joints so far
+    new_index: dict[int, int] = {-1: -1}  # last free joint up to each joint of the chain
     placement: dict[int, tuple[np.ndarray, np.ndarray]] = {-1: (rotation, offset)}
     joints: list[Joint] = []
     for index, joint in enumerate(chain.joints):
         axis, anchor = rotation @ joint.axis, rotation @ joint.anchor + offset
         if joint.name in locked:
-            turn = _turn(axis, locked[joint.name])
-            rotation, offset = turn @ rotation, turn @ (offset - anchor) + anchor
+            joint_rotation = _axis_rotation(axis, locked[joint.name])
+            rotation, offset = joint_rotation @ rotation, joint_rotation @ (offset - anchor) + anchor
         else:
             joints.append(dataclasses.replace(joint, axis=axis, anchor=anchor))
-        moved_by[index] = len(joints) - 1
+        new_index[index] = len(joints) - 1
         placement[index] = rotation, offset
     result: list[Link] = []
     previous_joint = None
     for link in chain.links:
-        moved = _moved(link, *placement[link.joint], moved_by[link.joint])
+        moved = _moved(link, *placement[link.joint], new_index[link.joint])
         if links == "merged" and result and result[-1].joint == moved.joint and link.joint != previous_joint:
             moved = _merged(result.pop(), moved)
         result.append(moved)
@@ -175,7 +176,7 @@ def _merged(first: Link, second: Link) -> Link:
 
 
 def drop_zero_length(links: Iterable[Link]) -> tuple[Link, ...]:
-    """Links without those of length zero, which have no direction: the next one, which starts there, stands for both.
+    """Links without those of length zero, which have no direction; the next link starts at the same point.
 
     Raises:
       ValueError: no link is left.
@@ -184,17 +185,17 @@ def drop_zero_length(links: Iterable[Link]) -> tuple[Link, ...]:
     kept = tuple(link for link in links if link.length > SHORTEST_LINK)
     dropped = [link.name for link in links if link.length <= SHORTEST_LINK]
     if dropped:
-        _warn_of_merged(", ".join(dropped))
+        _warn_merged(", ".join(dropped))
     if not kept:
         raise ValueError("the arm has no link of a length above zero")
     return kept
 
 
-@functools.cache  # an arm is built several times in a run; once is enough to be told
-def _warn_of_merged(names: str) -> None:
+@functools.cache  # warns once, though a run builds an arm several times
+def _warn_merged(names: str) -> None:
     _log.warning("links of length zero merged into the next link: %s", names)
 
 
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+def _axis_rotation(axis: np.ndarray, angle: float) -> np.ndarray:
     skew = np.cross(np.eye(3), axis)
     return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew

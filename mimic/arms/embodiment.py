@@ -1,4 +1,4 @@
-"""Embodiments: what the metric knows of an arm. Planar chains, the Panda, a serial chain of hinges from any model."""
+"""Embodiments, the kinematics that the metric uses: planar arms, the Panda, a serial chain from any MJCF or URDF."""
 
 import dataclasses
 import importlib.resources
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from mimic.arms.chain import Chain, Joint, Link, Links, Locked, lock, resolve_locked
 from mimic.arms.model_files import model_name, read_model
 from mimic.arms.mujoco_chain import read_chain
+from mimic.config import check_choice
 
 Limits = Literal["none", "hardware"]
 LIMITS = ("none", "hardware")
@@ -22,12 +23,12 @@ LIMITS = ("none", "hardware")
 
 @struct.dataclass
 class Embodiment:
-    """A serial chain of links with hinge joints, in the base frame (paper, eqs. 5-6).
+    """A serial chain of links with revolute joints, in the base frame (paper, eqs. 5-6).
 
-    A frozen pytree: the arrays are leaves, names and structure are static. The constructors make NumPy arrays in
-    float64, and functions compute in the dtype of the pose that they are given. An arm that a function closes over is
-    known while JAX traces and costs less than one that `jax.jit` is given as an argument (see
-    `mimic.metric.spatial`; up to 16 joints).
+    A frozen pytree: the arrays are leaves, names and structure are static. The constructors return NumPy arrays in
+    float64; functions compute in the dtype of the pose. Close over an arm rather than pass it as an argument of
+    `jax.jit`: its numbers are then constants while JAX traces, which saves computation (up to 16 joints; see
+    `mimic.metric.spatial`).
 
     Attributes:
       joint_axis: [num_joints, 3] unit axes in the zero pose.
@@ -35,17 +36,17 @@ class Embodiment:
       link_position: [num_links, 3] origins of the link frames in the zero pose [m].
       link_rotation: [num_links, 3, 3] link frames in the zero pose; the x-axis points along the link.
       link_lengths: [num_links] lengths [m].
-      joint_range: [num_joints, 2] least and largest angle [rad]; -pi to pi where nothing limits the joint.
-      torque_limit: [num_joints] largest torque [N m], inf where nothing limits it.
-      velocity_limit: [num_joints] rated speed [rad/s], inf where nothing limits it.
-      home: [num_joints] the pose that episodes start from [rad].
-      name: what the arm is, locked joints included.
+      joint_range: [num_joints, 2] minimum and maximum angle [rad]; -pi to pi for an unlimited joint.
+      torque_limit: [num_joints] maximum torque [N m]; inf where the model states none.
+      velocity_limit: [num_joints] maximum speed [rad/s]; inf where the model states none.
+      home: [num_joints] pose at the start of an episode [rad].
+      name: of the arm, followed by its locked joints.
       joint_names: base to tip.
       link_names: base to tip; merged links are joined by "+".
-      link_joint: index of the last joint that moves each link; -1 for a link that is fixed to the base.
+      link_joint: index of the last joint that moves each link; -1 for a link fixed to the base.
       segment_start, segment_end: [num_segments, 3] segments of the arm's centre line in the zero pose, base to tip [m];
         one for each link, more where locked joints merged links into chords.
-      segment_link: index of the link that each segment belongs to.
+      segment_link: index of the link of each segment.
     """
 
     joint_axis: Float[Any, "joints 3"]
@@ -67,12 +68,12 @@ class Embodiment:
 
     @property
     def num_joints(self) -> int:
-        """How many joints are free."""
+        """Number of free joints."""
         return len(self.joint_names)
 
     @property
     def num_links(self) -> int:
-        """How many links the metric compares."""
+        """Number of links that the metric compares."""
         return len(self.link_names)
 
     @property
@@ -82,14 +83,14 @@ class Embodiment:
 
 
 def planar_arm(link_lengths: Sequence[float] | Float[ArrayLike, " n"], *, frame_at: float = 0.5) -> Embodiment:
-    """A planar chain along x in its zero pose, with a joint about z at the start of each link (paper, eq. 6).
+    """A planar arm along x in its zero pose, with a joint about z at the start of each link (paper, eq. 6).
 
     Args:
       link_lengths: [n] lengths [m], each above 0.
-      frame_at: where a link's frame sits, as a share of its length: 0.5 is the middle (paper), 1 the end.
+      frame_at: position of a link's frame as a fraction of its length: 0.5 is the middle (paper), 1 the end.
 
     Raises:
-      ValueError: no link, or a length or `frame_at` out of range.
+      ValueError: no link, or a length or `frame_at` is out of range.
     """
     lengths = np.asarray(link_lengths, float)
     if lengths.ndim != 1 or lengths.size == 0 or not np.all(np.isfinite(lengths)) or np.any(lengths <= 0):
@@ -102,23 +103,23 @@ def planar_arm(link_lengths: Sequence[float] | Float[ArrayLike, " n"], *, frame_
 
 
 def panda_path() -> str:
-    """The MJCF file of the Panda."""
+    """Path of the Panda's MJCF file."""
     return str(importlib.resources.files("mimic") / "xml" / "panda.xml")
 
 
 def panda(*, locked: Locked = (), links: Links = "kept", limits: Limits = "none") -> Embodiment:
-    """The 7-joint Panda, or what is left of it with joints locked.
+    """The 7-joint Franka Panda, with some joints locked or none.
 
     Args:
-      locked: joint names ("joint3") or numbers (3), locked at 0, or at the ready pose under `limits="hardware"`; a
-        mapping {"joint3": angle} gives the angles [rad].
-      links: "kept": a locked joint removes no link, so that a locked arm has more links than joints; "merged": it makes
-        one link of the two that it connects, a chord from start to end (paper).
-      limits: "none" starts at the zero pose and lets every joint turn within [-pi, pi] (paper; the real arm cannot
-        reach it); "hardware" has the maker's joint ranges and starts at the ready pose.
+      locked: joint names ("joint3") or numbers (3), locked at 0, or at the ready pose with `limits="hardware"`; a
+        mapping {"joint3": angle} sets the angles [rad].
+      links: "kept": a locked joint removes no link, so a locked arm has more links than joints; "merged": the two links
+        at a locked joint become one, the chord from the start of the first to the end of the second (paper).
+      limits: "none": the home pose is the zero pose and all joint ranges are [-pi, pi] (paper; beyond the real arm's);
+        "hardware": the manufacturer's joint ranges, and the ready pose as home.
 
     Raises:
-      ValueError: an unknown or duplicate joint, all joints locked, or an unknown `limits`.
+      ValueError: an unknown or duplicate joint, all joints locked, or an unknown `links` or `limits`.
     """
     return load_arm(panda_path(), name="panda", locked=locked, links=links, limits=limits)[0]
 
@@ -131,23 +132,23 @@ def load_mjcf(
     tip: str | None = None,
     links: Links = "kept",
 ) -> Embodiment:
-    """A serial chain of hinges from any MJCF or URDF, with the joint ranges and limits that the model states.
+    """A serial chain of revolute joints from any MJCF or URDF, with the joint ranges and limits of the model.
 
-    Links are the capsule sites named link… where the model has them (`fromto` gives start and end), else the segments
-    from each joint's anchor to the next, the last one ending at `tip`. The base frame is that of the body before the
-    first hinge. A hand's joints stay where they are; where the model branches: see `find_chain` in
-    mimic.arms.kinematic_tree.
+    Capsule sites named link… are the links (`fromto` gives start and end). In a model without such sites, the links are
+    the segments from each joint's anchor to the next; the last one ends at `tip`. The base frame is that of the parent
+    of the first body with a revolute joint, unless `base` names a body. The joints of a hand are fixed. For models that
+    branch, see `find_chain` in mimic.arms.kinematic_tree.
 
     Args:
       path_or_model: an MJCF or URDF file, or a compiled model.
-      locked: as for `panda`; locked at 0 where no angle is given.
-      base: name of the body that the chain starts behind.
-      tip: name of the body or site that the chain ends at.
+      locked: as for `panda`; joints without an angle are locked at 0.
+      base: name of the body that carries the chain; the base frame is then its frame.
+      tip: name of the body or site at the end of the chain.
       links: as for `panda`.
 
     Raises:
-      ValueError: a file that is missing or no model, no hinge, a branch, a loop, a name that the model lacks, or what
-        `panda` refuses.
+      ValueError: a file that is missing or not a model, no revolute joint, a branch, a loop, a name that the model
+        lacks, or what `panda` rejects.
     """
     model = _model(path_or_model)
     chain = read_chain(model, base, tip)
@@ -165,17 +166,16 @@ def load_arm(
     links: Links = "kept",
     limits: Limits = "hardware",
 ) -> tuple[Embodiment, mujoco.MjModel, dict[str, float]]:
-    """An embodiment, the model that it was read from, and the angles [rad] of its locked joints by name.
+    """An embodiment, its source model, and the angles [rad] of its locked joints by name.
 
-    As `load_mjcf`, but joints are locked where the arm starts: see `limits` of `panda`.
+    As `load_mjcf`, but joints are locked at the home pose: see `limits` of `panda`.
     """
-    if limits not in LIMITS:
-        raise ValueError(f"limits: expected one of {', '.join(LIMITS)}, got {limits!r}")
+    check_choice("limits", limits, LIMITS)
     model = _model(path_or_model)
     chain = read_chain(model, base, tip)
     if limits == "none":
-        free = (dataclasses.replace(joint, range=(-np.pi, np.pi), home=0.0) for joint in chain.joints)
-        chain = Chain(tuple(free), chain.links)
+        unlimited = (dataclasses.replace(joint, range=(-np.pi, np.pi), home=0.0) for joint in chain.joints)
+        chain = Chain(tuple(unlimited), chain.links)
     home = {joint.name: joint.home for joint in chain.joints}
     angles = resolve_locked(locked, tuple(home), home)
     return _locked_embodiment(chain, angles, name or _name(path_or_model, model), links), model, angles
@@ -188,15 +188,15 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
       ValueError: `frame_at` is out of range.
     """
     if not 0 <= frame_at <= 1:
-        raise ValueError(f"frame_at: expected a share of the link in [0, 1], got {frame_at}")
+        raise ValueError(f"frame_at: expected a fraction of the link in [0, 1], got {frame_at}")
     joints, links = chain.joints, chain.links
     directions = [(link.end - link.start) / link.length for link in links]
     segments = [(start, end, index) for index, link in enumerate(links) for start, end in link.segments]
     return Embodiment(
-        joint_axis=_snap(np.stack([joint.axis for joint in joints])),
-        joint_anchor=_snap(np.stack([joint.anchor for joint in joints])),
-        link_position=_snap(np.stack([link.start + frame_at * (link.end - link.start) for link in links])),
-        link_rotation=_snap(np.stack([_rotation_to(direction) for direction in directions])),
+        joint_axis=snap_to_units(np.stack([joint.axis for joint in joints])),
+        joint_anchor=snap_to_units(np.stack([joint.anchor for joint in joints])),
+        link_position=snap_to_units(np.stack([link.start + frame_at * (link.end - link.start) for link in links])),
+        link_rotation=snap_to_units(np.stack([_rotation_to(direction) for direction in directions])),
         link_lengths=np.array([link.length for link in links]),
         joint_range=np.array([joint.range for joint in joints]),
         torque_limit=np.array([joint.torque_limit for joint in joints]),
@@ -213,17 +213,31 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
 
 
 def segment_arm(arm: Embodiment) -> Embodiment:
-    """The arm with a link for each segment of its centre line, whose frame is where the segment starts."""
+    """The arm with one link for each segment of its centre line, and the link frame at the start of the segment."""
     start, end = np.asarray(arm.segment_start), np.asarray(arm.segment_end)
     lengths = np.linalg.norm(end - start, axis=1)
+    directions = (end - start) / lengths[:, None]
     return dataclasses.replace(
         arm,
-        link_position=_snap(start),
-        link_rotation=_snap(np.stack([_rotation_to(way) for way in (end - start) / lengths[:, None]])),
+        link_position=snap_to_units(start),
+        link_rotation=snap_to_units(np.stack([_rotation_to(direction) for direction in directions])),
         link_lengths=lengths,
         link_names=tuple(f"segment{i + 1}" for i in range(len(lengths))),
         link_joint=tuple(arm.link_joint[link] for link in arm.segment_link),
         segment_link=tuple(range(len(lengths))),
+    )
+
+
+def in_chain_lengths(arm: Embodiment) -> Embodiment:
+    """The arm with all lengths in units of its chain length."""
+    length = arm.chain_length
+    return dataclasses.replace(
+        arm,
+        joint_anchor=arm.joint_anchor / length,
+        link_position=arm.link_position / length,
+        link_lengths=arm.link_lengths / length,
+        segment_start=arm.segment_start / length,
+        segment_end=arm.segment_end / length,
     )
 
 
@@ -239,17 +253,21 @@ def _locked_embodiment(chain: Chain, angles: dict[str, float], name: str, links:
     return from_chain(lock(chain, angles, links), name="-".join([name, *angles]))
 
 
-def _snap(values: np.ndarray) -> np.ndarray:
-    """Values that quaternions and sines left within 1e-12 of -1, 0 or 1, made exact: those cost nothing (`spatial`)."""
+def snap_to_units(values: np.ndarray) -> np.ndarray:
+    """Values within 1e-12 of -1, 0 or 1 set to these numbers exactly; others as they are.
+
+    Quaternions and sines leave such rounding errors. Exact zeros and ones cost nothing: see `mimic.metric.spatial`.
+    """
     nearest = np.clip(np.round(values), -1, 1)
     return np.where(np.abs(values - nearest) < 1e-12, nearest, values)
 
 
 def _rotation_to(direction: np.ndarray) -> np.ndarray:
-    """The smallest rotation that carries the x-axis onto a unit direction."""
+    """The smallest rotation that maps the x-axis onto a unit direction."""
     cosine, square_sine = direction[0], direction[1] ** 2 + direction[2] ** 2
-    if cosine < 0 and square_sine < 1e-24:  # opposite: half a turn about z
+    if cosine < 0 and square_sine < 1e-24:  # opposite: rotation by pi about z
         return np.diag([-1.0, -1.0, 1.0])
-    factor = 1 / (1 + cosine) if cosine > 0 else (1 - cosine) / square_sine  # equal; neither cancels where it is used
+    # Both are 1 / (1 + cosine), each where it does not suffer from cancellation.
+    factor = 1 / (1 + cosine) if cosine > 0 else (1 - cosine) / square_sine
     skew = np.cross(np.eye(3), np.cross([1.0, 0.0, 0.0], direction))
     return np.eye(3) + skew + factor * skew @ skew

@@ -1,16 +1,16 @@
-"""What of a MuJoCo model the arm leaves out, in words."""
+"""Elements of a MuJoCo model that the simulated arm ignores, in words."""
 
 import mujoco
 import numpy as np
 
 from mimic.arms.kinematic_tree import ChainIds, find_chain, joint_kind
 
-_SHOWN = 6  # names in a list, then a count
+_MAX_NAMES = 6  # in a list; the others are counted
 _AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
 
 
 def ignored_elements(model: mujoco.MjModel, base: str | None = None, tip: str | None = None) -> tuple[str, ...]:
-    """One line for each kind of thing that a model has and the simulated arm has not.
+    """One line for each kind of element that the model has and the simulated arm lacks.
 
     Args:
       model: of an arm.
@@ -18,15 +18,13 @@ def ignored_elements(model: mujoco.MjModel, base: str | None = None, tip: str | 
       tip: see `find_chain`.
 
     Raises:
-      ValueError: what `find_chain` refuses.
+      ValueError: what `find_chain` rejects.
     """
     chain_ids = find_chain(model, base, tip)
     lines = [
-        _joints(model, chain_ids.before, "before the base, held"),
-        _joints(
-            model, chain_ids.beyond, "beyond the tip, held where the model has them; what they carry stays as mass"
-        ),
-        _joints(model, chain_ids.elsewhere, "elsewhere in the model, not of this arm"),
+        _joints(model, chain_ids.proximal, "between world and base, fixed"),
+        _joints(model, chain_ids.distal, "distal to the tip, fixed; their bodies stay as mass"),
+        _joints(model, chain_ids.other, "elsewhere in the model, not part of this arm"),
         _actuators(model, chain_ids),
         _counted({"equality constraints": model.neq, "tendons": model.ntendon, "keyframes": model.nkey}),
         _springs(model, chain_ids),
@@ -37,33 +35,33 @@ def ignored_elements(model: mujoco.MjModel, base: str | None = None, tip: str | 
 
 def _joints(model: mujoco.MjModel, joints: tuple[int, ...], where: str) -> str:
     names = [f"{model.joint(joint).name} ({joint_kind(model, joint)})" for joint in joints]
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return f"joints {where}: {', '.join(names[:_SHOWN])}{more}" if names else ""
+    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return f"joints {where}: {', '.join(names[:_MAX_NAMES])}{more}" if names else ""
 
 
 def _actuators(model: mujoco.MjModel, chain_ids: ChainIds) -> str:
-    """Each joint gets a torque motor; of the model's own actuators only the limits count."""
+    """Each joint gets a torque motor; only the limits of the model's own actuators are used."""
     if not model.nu:
-        return f"the model has no actuators: torque motors are added to its {len(chain_ids.joints)} hinges"
+        return f"the model has no actuators: torque motors are added to its {len(chain_ids.joints)} joints"
     affine = model.actuator_biastype == _AFFINE
     on_position = affine & (model.actuator_biasprm[:, 1] != 0)
     on_speed = affine & ~on_position & (model.actuator_biasprm[:, 2] != 0)
     kinds = {"on position": int(np.sum(on_position)), "on speed": int(np.sum(on_speed))}
     servos = ", ".join(f"{count} servos {kind}" for kind, count in kinds.items() if count)
-    return f"{model.nu} actuators{f' ({servos})' if servos else ''}: torque motors with their limits take their place"
+    return f"{model.nu} actuators{f' ({servos})' if servos else ''}: replaced by torque motors with their limits"
 
 
-def _counted(things: dict[str, int]) -> str:
-    found = [f"{count} {name}" for name, count in things.items() if count]
-    return f"{', '.join(found)}: left out" if found else ""
+def _counted(elements: dict[str, int]) -> str:
+    present = [f"{count} {name}" for name, count in elements.items() if count]
+    return f"{', '.join(present)}: ignored" if present else ""
 
 
 def _springs(model: mujoco.MjModel, chain_ids: ChainIds) -> str:
     joints = list(chain_ids.joints)
     dofs = model.jnt_dofadr[joints]
-    names = {
+    is_present = {
         "springs": np.any(model.jnt_stiffness[joints] != 0),
         "dry friction": np.any(model.dof_frictionloss[dofs] != 0),
     }
-    found = [name for name, present in names.items() if present]
-    return f"{' and '.join(found)} of the joints: left out; damping and armature are kept" if found else ""
+    present = [name for name in is_present if is_present[name]]
+    return f"{' and '.join(present)} of the joints: ignored; damping and armature are kept" if present else ""

@@ -1,4 +1,4 @@
-"""Reads MJCF and URDF files with care: what cannot be meant is refused in one line before MuJoCo sees it."""
+"""Reads MJCF and URDF files, and rejects unsafe ones with a one-line error before MuJoCo parses them."""
 
 import functools
 import logging
@@ -10,12 +10,12 @@ from xml.etree import ElementTree
 
 import mujoco
 
-VELOCITY_LIMIT = "velocity_limit"  # the custom numeric that holds the rated speed of each joint [rad/s]
-LARGEST_FILE = 32 * 2**20  # bytes of XML; the largest models of robots that we know have 1 MiB
-_UNNAMED_MODEL = "MuJoCo Model"  # what MuJoCo calls a model that has no name
+VELOCITY_LIMIT = "velocity_limit"  # custom numeric with the velocity limit of each joint [rad/s]
+MAX_FILE_SIZE = 32 * 2**20  # bytes of XML; the largest robot models known to us have 1 MiB
+_UNNAMED_MODEL = "MuJoCo Model"  # MuJoCo's name of a model without one
 
 _log = logging.getLogger(__name__)
-# By their text, since MuJoCo's own reader takes what a strict XML parser would not, such as "--" in a comment.
+# Regular expressions, since MuJoCo's own reader accepts text that a strict XML parser rejects: "--" in a comment.
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _DOCTYPE = re.compile(r"<!\s*(DOCTYPE|ENTITY)", re.IGNORECASE)
 _ROOT = re.compile(r"<\s*(robot|mujoco)\b")
@@ -29,12 +29,12 @@ _MESH_FORMATS = (".stl", ".obj", ".msh")
 def read_spec(path: str | os.PathLike[str]) -> mujoco.MjSpec:
     """An MJCF or URDF file as a MuJoCo spec that compiles, in which every joint and body has a name.
 
-    A URDF keeps the names of its fixed links and its rated speeds; meshes that cannot be found are left out of it,
-    since its inertias are given without them.
+    A URDF keeps the names of its fixed links and its velocity limits. Its missing meshes are left out, since the file
+    states the inertias itself.
 
     Raises:
-      ValueError: no such file, one that is too large, has entities or includes a file outside of its folder, or that
-        MuJoCo cannot read.
+      ValueError: the file does not exist, is too large, has entities, includes a file outside its folder, or MuJoCo
+        cannot read it.
     """
     return _read(path)[0]
 
@@ -43,13 +43,13 @@ def read_model(path: str | os.PathLike[str]) -> mujoco.MjModel:
     """The compiled model of `read_spec`.
 
     Raises:
-      ValueError: what `read_spec` refuses.
+      ValueError: what `read_spec` rejects.
     """
     return _read(path)[1]
 
 
 def model_name(model: mujoco.MjModel, path: str | os.PathLike[str] | None = None) -> str:
-    """The name that a model gives itself, else that of its file."""
+    """The model's own name; the name of its file where it has none."""
     name = model.names[: model.names.index(b"\0")].decode()
     return Path(path).stem if path is not None and name in ("", _UNNAMED_MODEL) else name
 
@@ -63,7 +63,7 @@ def _read(path: str | os.PathLike[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
     try:
         spec = mujoco.MjSpec.from_file(os.fspath(path))
         if _is_urdf(file):
-            _keep_what_urdf_says(spec, file)
+            _restore_urdf_data(spec, file)
         model = spec.compile()
         if _name_unnamed(spec):
             model = spec.compile()
@@ -75,26 +75,26 @@ def _read(path: str | os.PathLike[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
 def _reason(shown: str, message: str) -> str:
     unopened = _UNOPENED.search(message)
     if unopened:
-        return f"{shown} needs the file {unopened.group(1)!r}, which is not there; expected all its files beside it"
+        return f"{shown} needs the file {unopened.group(1)!r}, which does not exist; expected all its files next to it"
     if _MASSLESS in message:
-        return f"{shown} has a moving body without inertia; expected an <inertial>, or geoms to tell it from: {message}"
-    return f"{shown} is no MJCF or URDF model that MuJoCo reads: {message}"
+        return f"{shown} has a moving body without inertia; expected an <inertial>, or geoms with mass: {message}"
+    return f"{shown} is not an MJCF or URDF model that MuJoCo can read: {message}"
 
 
 def _check_text(file: Path) -> None:
-    """Refuses what no arm needs: huge files, entities, and includes that lead out of the folder of the model."""
+    """Rejects huge files, entities, and includes that lead out of the folder of the model; no arm needs them."""
     folder = file.resolve().parent
-    pending, seen = [file.resolve()], set()
+    pending, checked = [file.resolve()], set()
     while pending:
         part = pending.pop()
-        if part in seen:
+        if part in checked:
             continue
-        seen.add(part)
+        checked.add(part)
         size = part.stat().st_size
-        if size > LARGEST_FILE:
+        if size > MAX_FILE_SIZE:
             raise ValueError(
                 f"{str(part)!r} has {size / 2**20:.0f} MiB; "
-                f"expected a model of at most {LARGEST_FILE // 2**20} MiB of XML"
+                f"expected a model of at most {MAX_FILE_SIZE // 2**20} MiB of XML"
             )
         text = _COMMENT.sub("", part.read_text(errors="replace"))
         if _DOCTYPE.search(text):
@@ -103,15 +103,15 @@ def _check_text(file: Path) -> None:
 
 
 def _included(names: list[str], part: Path, folder: Path) -> Iterator[Path]:
-    """The files that a part of a model includes; what is not there is MuJoCo's to report."""
+    """The files that a part of a model includes; MuJoCo reports those that do not exist."""
     for name in names:
-        found = (folder / name).resolve()
-        if not found.is_relative_to(folder):
+        included = (folder / name).resolve()
+        if not included.is_relative_to(folder):
             raise ValueError(
-                f"{str(part)!r} includes {name!r}, which is outside of its folder; expected files in {str(folder)!r}"
+                f"{str(part)!r} includes {name!r}, which is outside its folder; expected files in {str(folder)!r}"
             )
-        if found.is_file():
-            yield found
+        if included.is_file():
+            yield included
 
 
 def _is_urdf(file: Path) -> bool:
@@ -119,8 +119,8 @@ def _is_urdf(file: Path) -> bool:
     return root is not None and root.group(1) == "robot"
 
 
-def _keep_what_urdf_says(spec: mujoco.MjSpec, file: Path) -> None:
-    """Names of fixed links, rated speeds, and meshes where they are, which MuJoCo does not take from a URDF."""
+def _restore_urdf_data(spec: mujoco.MjSpec, file: Path) -> None:
+    """Names of fixed links, velocity limits, and paths of meshes, which MuJoCo drops from a URDF."""
     spec.compiler.fusestatic = False
     _find_meshes(spec, file)
     spec.compile()  # numbers the joints
@@ -138,25 +138,25 @@ def _keep_what_urdf_says(spec: mujoco.MjSpec, file: Path) -> None:
 def _find_meshes(spec: mujoco.MjSpec, file: Path) -> None:
     folder, missing = file.resolve().parent, []
     for mesh in list(spec.meshes):
-        found = _find_mesh(mesh.file, folder / spec.meshdir, folder)
-        if found is not None:
-            mesh.file = str(found)
+        path = _find_mesh(mesh.file, folder / spec.meshdir, folder)
+        if path is not None:
+            mesh.file = str(path)
             continue
         missing.append(mesh.file)
         for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
             spec.delete(geom)
         spec.delete(mesh)
     if missing:
-        _warn_of_missing(file, len(missing), missing[0])
+        _warn_missing_meshes(file, len(missing), missing[0])
 
 
-@functools.cache  # a model is read several times in a run; once is enough to be told
-def _warn_of_missing(file: Path, count: int, first: str) -> None:
-    _log.warning("%s: left out %d meshes that cannot be read, the first %s", file, count, first)
+@functools.cache  # warns once, though a run reads a model several times
+def _warn_missing_meshes(file: Path, count: int, first: str) -> None:
+    _log.warning("%s: ignored %d meshes that cannot be read, the first %s", file, count, first)
 
 
 def _find_mesh(name: str, *folders: Path) -> Path | None:
-    """A mesh beside the model, or of a package that the model lies in."""
+    """Path of a mesh, relative to the model or within a ROS package around it."""
     package = _PACKAGE.match(name)
     if package:
         inside, rest = package.groups()
@@ -164,24 +164,24 @@ def _find_mesh(name: str, *folders: Path) -> Path | None:
         candidates = [parent / inside / rest for parent in parents] + [parent / rest for parent in parents]
     else:
         candidates = [folder / name.removeprefix("file://") for folder in folders]
-    found = (path for path in candidates if path.is_file() and path.suffix.lower() in _MESH_FORMATS)
-    return next(found, None)
+    meshes = (path for path in candidates if path.is_file() and path.suffix.lower() in _MESH_FORMATS)
+    return next(meshes, None)
 
 
 def _name_unnamed(spec: mujoco.MjSpec) -> bool:
-    """Names joints and bodies that have no name by their number, joint1 the first; whether there were any."""
+    """Names joints and bodies without a name by their number, from joint1 on; returns whether there were any."""
     unnamed = False
     for items, kind in ((spec.joints, "joint"), (spec.bodies[1:], "body")):
-        taken = {item.name for item in items}
+        names = {item.name for item in items}
         for number, item in enumerate(sorted(items, key=lambda item: item.id), start=1):
             if not item.name:
-                item.name = _free_name(f"{kind}{number}", taken)
-                taken.add(item.name)
+                item.name = _unique_name(f"{kind}{number}", names)
+                names.add(item.name)
                 unnamed = True
     return unnamed
 
 
-def _free_name(name: str, taken: set[str]) -> str:
-    while name in taken:
+def _unique_name(name: str, names: set[str]) -> str:
+    while name in names:
         name += "_"
     return name

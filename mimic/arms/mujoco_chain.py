@@ -1,4 +1,4 @@
-"""Reads the serial chain of hinges out of a MuJoCo model."""
+"""Reads a serial chain of revolute joints from a MuJoCo model."""
 
 from collections.abc import Callable
 
@@ -6,22 +6,22 @@ import mujoco
 import numpy as np
 
 from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
-from mimic.arms.kinematic_tree import ChainIds, ancestors, body_id, find_chain, is_hinge, tip_body
+from mimic.arms.kinematic_tree import ChainIds, ancestors, body_id, find_chain, is_revolute, tip_body
 from mimic.arms.model_files import VELOCITY_LIMIT
 
-START_POSES = "ready", "home"  # keyframes that hold a model's own start pose, the first that it has
+START_POSES = "ready", "home"  # keyframes with the start pose of a model, in order of preference
 
-# As ints: MuJoCo's enums equal an integer of NumPy's in one order of the operands and not in the other.
+# As ints: a MuJoCo enum equals a NumPy integer in one order of the operands and not in the other.
 _CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 _ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _NO_BIAS = int(mujoco.mjtBias.mjBIAS_NONE)
 
 
 def read_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None = None) -> Chain:
-    """The serial chain of hinges of a model, from body `base` to body or site `tip`.
+    """The serial chain of revolute joints of a model, from body `base` to body or site `tip`.
 
     Raises:
-      ValueError: no hinge, a joint of another kind, a branch, a loop, or a name that the model lacks.
+      ValueError: no revolute joint, a joint of another kind, a branch, a loop, or a name that the model lacks.
     """
     chain_ids = find_chain(model, base, tip)
     path = chain_ids.bodies
@@ -34,41 +34,43 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None =
     def in_base(point: np.ndarray) -> np.ndarray:
         return R_base_world @ (point - origin)
 
-    velocity_limits = _velocity_limits(model)
-    key = _start_pose(model)
     joints: list[Joint] = []
     links: list[Link] = []
     for body in path:
         for joint_id in (joint for joint in chain_ids.joints if model.jnt_bodyid[joint] == body):
-            joint = model.joint(joint_id)
-            limited = bool(model.jnt_limited[joint_id])
-            low, high = map(float, model.jnt_range[joint_id]) if limited else (-np.pi, np.pi)
-            start = float(model.key_qpos[key, model.jnt_qposadr[joint_id]]) if key >= 0 else 0.0
-            joints.append(
-                Joint(
-                    name=joint.name or f"joint{len(joints) + 1}",
-                    axis=R_base_world @ data.xaxis[joint_id],
-                    anchor=in_base(data.xanchor[joint_id]),
-                    range=(low, high),
-                    torque_limit=_torque_limit(model, joint_id),
-                    velocity_limit=velocity_limits.get(joint_id, np.inf),
-                    home=float(np.clip(start, low, high)) if limited else start,
-                )
-            )
+            axis, anchor = R_base_world @ data.xaxis[joint_id], in_base(data.xanchor[joint_id])
+            joints.append(_joint(model, joint_id, axis, anchor, f"joint{len(joints) + 1}"))
         links += _site_links(model, data, body, len(joints) - 1, in_base)
     names = [joint.name for joint in joints]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"two joints of the chain are called {', '.join(twice)}; name the unnamed ones in the MJCF")
+    duplicates = sorted({name for name in names if names.count(name) > 1})
+    if duplicates:
+        raise ValueError(f"two joints of the chain are called {', '.join(duplicates)}; name the unnamed ones in MJCF")
     if not links:
         links = _anchor_links(joints, in_base(_tip_point(model, data, chain_ids, tip)))
     return Chain(tuple(joints), drop_zero_length(links))
 
 
+def _joint(model: mujoco.MjModel, joint_id: int, axis: np.ndarray, anchor: np.ndarray, default_name: str) -> Joint:
+    """A joint of the model, with axis and anchor in the base frame; home from the keyframe with the start pose."""
+    key = _start_keyframe(model)
+    limited = bool(model.jnt_limited[joint_id])
+    low, high = map(float, model.jnt_range[joint_id]) if limited else (-np.pi, np.pi)
+    start = float(model.key_qpos[key, model.jnt_qposadr[joint_id]]) if key >= 0 else 0.0
+    return Joint(
+        name=model.joint(joint_id).name or default_name,
+        axis=axis,
+        anchor=anchor,
+        range=(low, high),
+        torque_limit=_torque_limit(model, joint_id),
+        velocity_limit=_velocity_limits(model).get(joint_id, np.inf),
+        home=float(np.clip(start, low, high)) if limited else start,
+    )
+
+
 def _site_links(
     model: mujoco.MjModel, data: mujoco.MjData, body: int, joint: int, in_base: Callable[[np.ndarray], np.ndarray]
 ) -> list[Link]:
-    """Links that the model marks itself: capsule sites named link…, start and end as in their `fromto`."""
+    """Links that the model marks itself, as capsule sites named link…; start and end as in their `fromto`."""
     links = []
     for site in (s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == body):
         name = model.site(site).name
@@ -85,18 +87,18 @@ def _anchor_links(joints: list[Joint], tip: np.ndarray) -> list[Link]:
 
 
 def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, chain_ids: ChainIds, tip: str | None) -> np.ndarray:
-    """Where the last link ends.
+    """End of the last link.
 
-    The named tip, else the farthest of the sites and bodies that the last body carries, else of its geoms' ends,
-    else its centre of mass.
+    The named tip; else the farthest site or body distal to the last joint; else the farthest end of a geom; else the
+    centre of mass of the last body.
     """
     if tip is not None:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
         return data.site_xpos[site] if site >= 0 else data.xpos[tip_body(model, tip)]
     last = chain_ids.bodies[-1]
-    carried = [body for body in range(1, model.nbody) if last in ancestors(model, body)]
-    points = [data.site_xpos[site] for site in range(model.nsite) if model.site_bodyid[site] in carried]
-    points += [data.xpos[body] for body in carried if body != last]
+    subtree = [body for body in range(1, model.nbody) if last in ancestors(model, body)]
+    points = [data.site_xpos[site] for site in range(model.nsite) if model.site_bodyid[site] in subtree]
+    points += [data.xpos[body] for body in subtree if body != last]
     anchor = data.xanchor[chain_ids.joints[-1]]
 
     def distance(point: np.ndarray) -> float:
@@ -106,7 +108,7 @@ def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, chain_ids: ChainIds, 
         return max(map(distance, points), default=0.0) <= SHORTEST_LINK
 
     if is_at_anchor():
-        points += _geom_ends(model, data, carried)
+        points += _geom_ends(model, data, subtree)
     if is_at_anchor():
         points = [data.xipos[last]]
     return max(points, key=distance)
@@ -122,15 +124,15 @@ def _geom_ends(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) ->
 
 
 def zero_pose(model: mujoco.MjModel) -> np.ndarray:
-    """All hinges at 0, and joints of other kinds where the model puts them."""
+    """The model's pose [nq] with revolute joints at 0, and joints of other kinds as in `qpos0`."""
     qpos = np.array(model.qpos0)
-    hinges = [joint for joint in range(model.njnt) if is_hinge(model, joint)]
-    qpos[model.jnt_qposadr[hinges]] = 0
+    revolute = [joint for joint in range(model.njnt) if is_revolute(model, joint)]
+    qpos[model.jnt_qposadr[revolute]] = 0
     return qpos
 
 
-def _start_pose(model: mujoco.MjModel) -> int:
-    """Which keyframe holds it; -1 where none does."""
+def _start_keyframe(model: mujoco.MjModel) -> int:
+    """Id of the keyframe with the start pose; -1 where there is none."""
     keys = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name) for name in START_POSES)
     return next((key for key in keys if key >= 0), -1)
 
@@ -152,6 +154,6 @@ def _torque_limit(model: mujoco.MjModel, joint_id: int) -> float:
 
 
 def _velocity_limits(model: mujoco.MjModel) -> dict[int, float]:
-    """Rated speeds from the model's custom numeric of that name, one for each joint."""
+    """Velocity limits [rad/s] by joint id, from the model's custom numeric of that name."""
     numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, VELOCITY_LIMIT)
     return dict(enumerate(map(float, model.numeric(numeric).data))) if numeric >= 0 else {}

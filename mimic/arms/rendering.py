@@ -1,4 +1,4 @@
-"""Pictures of arms, by MuJoCo's renderer; with EGL where there is no display."""
+"""Images of arms by MuJoCo's renderer, with EGL where there is no display."""
 
 import dataclasses
 import os
@@ -14,43 +14,43 @@ from jaxtyping import Float, UInt8
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.visual_model import visual_spec
 
-SPACING, FLAT_SPACING = 0.9, 1.5  # chain lengths between two arms; flat ones are seen from above, and reach aside
+SPACING, FLAT_SPACING = 0.9, 1.5  # chain lengths between two arms; planar ones are seen from above, and reach sideways
 LOCKED = (0.85, 0.12, 0.10, 1.0)
 _FLOOR, _GRID = (0.94, 0.95, 0.96), (0.88, 0.89, 0.91)
-MARK = 0.05, 0.019  # radius and half width of a locked joint's disc, as shares of the chain length
+MARK = 0.05, 0.019  # radius and half width of a locked joint's disc, as fractions of the chain length
 
 
 class ArmScene:
-    """Arms side by side, each in a pose of its own; locked joints are red. Use it in a `with` statement.
+    """Renders several arms next to each other, each in its own pose; locked joints are red. Use in a `with` statement.
 
     Args:
       arms: from left to right.
-      limits: see `EnvConfig`; says where locked joints are held.
-      width: of a picture [pixels].
-      height: of a picture [pixels].
+      limits: see `EnvConfig`; sets the default angles of locked joints.
+      width: of an image [pixels].
+      height: of an image [pixels].
 
     Raises:
-      ValueError: an arm that cannot be built, or no OpenGL to render with.
+      ValueError: an arm cannot be built, or no OpenGL library works.
     """
 
     def __init__(self, arms: Sequence[ArmConfig], *, limits: str = "none", width: int = 640, height: int = 480):
-        built = [build_arm(arm, limits) for arm in arms]
-        free = [build_arm(dataclasses.replace(arm, locked=()), limits).embodiment for arm in arms]
-        reach = max(float(arm.chain_length) for arm in free)  # whatever is locked, arms look their size
+        built_arms = [build_arm(arm, limits) for arm in arms]
+        unlocked = [build_arm(dataclasses.replace(arm, locked=()), limits).embodiment for arm in arms]
+        reach = max(float(arm.chain_length) for arm in unlocked)  # the scale does not depend on locked joints
         is_flat = all(arm.model == "planar" for arm in arms)
-        apart = reach * (-FLAT_SPACING if is_flat else SPACING)  # along y, which points left where x points up
+        spacing = reach * (-FLAT_SPACING if is_flat else SPACING)  # along y, which points left where x points up
         spec = _empty_room(width, height)
         self._joints: list[list[str]] = []
         self._locked: dict[str, float] = {}
         highest = 0.0
-        for index, (config, arm) in enumerate(zip(arms, built, strict=True)):
+        for index, (config, arm) in enumerate(zip(arms, built_arms, strict=True)):
             prefix = f"arm{index}-"
             source, base = visual_spec(config)
             highest = max(highest, float(base[2]))
-            _share_options(source, spec)
+            _copy_options(source, spec)
             for name in arm.locked:
-                _mark_locked(source, name, float(free[index].chain_length))
-            place = [0.0, (index - 0.5 * (len(arms) - 1)) * apart, 0.0] - base * [1, 1, 0]
+                _mark_locked(source, name, float(unlocked[index].chain_length))
+            place = [0.0, (index - 0.5 * (len(arms) - 1)) * spacing, 0.0] - base * [1, 1, 0]
             spec.attach(source, prefix=prefix, frame=spec.worldbody.add_frame(pos=place))
             self._joints.append([prefix + name for name in arm.embodiment.joint_names])
             self._locked |= {prefix + name: angle for name, angle in arm.locked.items()}
@@ -63,7 +63,7 @@ class ArmScene:
         self._renderer = _renderer(self._model, width, height)
 
     def image(self, poses: Sequence[Float[np.ndarray, " joints"]]) -> UInt8[np.ndarray, "height width 3"]:
-        """The arms in their poses [rad]."""
+        """Renders the arms in these poses [rad]."""
         for name, angle in self._locked.items():
             self._data.joint(name).qpos[0] = angle
         for names, pose in zip(self._joints, poses, strict=True):
@@ -75,7 +75,7 @@ class ArmScene:
         return self._renderer.render()
 
     def flattened(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Points as the camera sees them from afar: to its right and upwards, in their own units."""
+        """Orthographic projection of points onto the image plane: right and up, in the units of the points."""
         azimuth, elevation = np.radians([self._camera.azimuth, self._camera.elevation])
         forward = np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -97,7 +97,7 @@ def _empty_room(width: int, height: int) -> mujoco.MjSpec:
     visual.quality.shadowsize, visual.quality.offsamples = 2048, 4
     visual.headlight.ambient, visual.headlight.diffuse = [0.45] * 3, [0.25] * 3
     visual.headlight.specular = [0.1] * 3
-    visual.map.shadowclip = 3.0  # m; what lies beyond it gets specks
+    visual.map.shadowclip = 3.0  # m; shadows beyond it are speckled
     visual.rgba.haze = [*_FLOOR, 1]
     spec.add_texture(
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
@@ -118,15 +118,15 @@ def _empty_room(width: int, height: int) -> mujoco.MjSpec:
     return spec
 
 
-def _share_options(source: mujoco.MjSpec, room: mujoco.MjSpec) -> None:
-    """Physics options do not matter to a picture, but where two models differ in them MuJoCo warns."""
+def _copy_options(source: mujoco.MjSpec, room: mujoco.MjSpec) -> None:
+    """Copies the physics options: they do not affect an image, but MuJoCo warns where two models differ in them."""
     for name in dir(room.option):
         if not name.startswith("_"):
             setattr(source.option, name, getattr(room.option, name))
 
 
 def _mark_locked(spec: mujoco.MjSpec, joint_name: str, chain_length: float) -> None:
-    """A red disc about the joint's axis."""
+    """Adds a red disc around the joint's axis."""
     joint = spec.joint(joint_name)
     axis = np.asarray(joint.axis) / np.linalg.norm(joint.axis)
     radius, half_width = MARK[0] * chain_length, MARK[1] * chain_length
@@ -142,16 +142,16 @@ def _renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer
         if _is_headless():
             from mujoco.egl import GLContext
 
-            # MuJoCo settles on a window system when it is imported, which nobody can be asked to know beforehand.
+            # MuJoCo chooses a window system at import, before a user can know that EGL is needed.
             sys.modules[mujoco.Renderer.__module__].gl_context.GLContext = GLContext
         return mujoco.Renderer(model, height, width)
     except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(
-            "rendering: no OpenGL library that works; expected EGL (Debian, Ubuntu: libegl1), or MUJOCO_GL=osmesa with "
+            "rendering: no OpenGL library works; expected EGL (Debian, Ubuntu: libegl1), or MUJOCO_GL=osmesa with "
             f"libosmesa6: {' '.join(str(error).split())}"
         ) from error
 
 
 def _is_headless() -> bool:
-    asked_for = any(os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"))
-    return platform.system() == "Linux" and not asked_for
+    has_display = any(os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"))
+    return platform.system() == "Linux" and not has_display

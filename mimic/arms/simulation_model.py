@@ -1,4 +1,4 @@
-"""The lean MuJoCo model that simulates an arm: bodies, inertias and the free joints, nothing else."""
+"""The minimal MuJoCo model that simulates an arm: bodies, inertias and the free joints, nothing else."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,55 +16,63 @@ def simulation_model(
 ) -> mujoco.MjModel:
     """The bodies, inertias and named joints of a model and nothing else.
 
-    No geoms, actuators, constraints, contacts or gravity. Bodies that no remaining joint moves are fused into their
+    No geoms, actuators, constraints, contacts or gravity. Bodies without a remaining joint are fused into their
     parents.
 
     Args:
       source: any model.
-      joint_names: hinges to keep.
-      locked: angle [rad] of joints that are removed, by name; other joints are removed at their zero.
+      joint_names: revolute joints to keep.
+      locked: angle [rad] of removed joints, by name; other removed joints stay at angle 0.
     """
-    locked = locked or {}
-    spec = mujoco.MjSpec()
-    spec.compiler.fusestatic = True
-    spec.compiler.autolimits = False
-    spec.compiler.degree = False  # the reference angles below are in radians
-    spec.option.disableflags = int(_IGNORED)
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    locked, spec = locked or {}, _empty_spec()
     bodies = {0: spec.worldbody}
     for body_id in range(1, source.nbody):
         body = source.body(body_id)
         position, quaternion = np.array(body.pos), np.array(body.quat)
         joint_ids = range(source.body_jntadr[body_id], source.body_jntadr[body_id] + source.body_jntnum[body_id])
-        kept = []  # hinges with their anchors and axes
+        kept = []  # revolute joints with their anchors and axes
         for joint in map(source.joint, joint_ids):
             if joint.name in joint_names:
                 kept.append((joint, joint.pos, joint.axis))
-            elif joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE:  # a removed joint turns its body for good
+            elif joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE:  # a removed joint rotates its body permanently
                 angle = locked.get(joint.name, 0.0) - float(source.qpos0[joint.qposadr[0]])
-                position, quaternion = _turned(position, quaternion, joint, angle)
-                kept = [(other, *_turned_back(*line, joint, angle)) for other, *line in kept]
-        bare = bodies[int(source.body_parentid[body_id])].add_body(pos=position, quat=quaternion)
-        bodies[body_id] = bare
+                position, quaternion = _rotated_pose(position, quaternion, joint, angle)
+                kept = [(other, *_rotated_back(*line, joint, angle)) for other, *line in kept]
+        target = bodies[int(source.body_parentid[body_id])].add_body(pos=position, quat=quaternion)
+        bodies[body_id] = target
         if source.body_mass[body_id] > 0:
-            bare.explicitinertial = True
-            bare.mass, bare.ipos, bare.iquat = float(body.mass[0]), body.ipos, body.iquat
-            bare.inertia = body.inertia
+            target.explicitinertial = True
+            target.mass, target.ipos, target.iquat = float(body.mass[0]), body.ipos, body.iquat
+            target.inertia = body.inertia
         for joint, anchor, axis in kept:
-            bare.add_joint(
-                name=joint.name,
-                type=mujoco.mjtJoint.mjJNT_HINGE,
-                axis=axis,
-                pos=anchor,
-                ref=float(source.qpos0[joint.qposadr[0]]),
-                armature=float(joint.armature[0]),
-                damping=float(joint.damping[0]),
-            )
+            _add_joint(target, joint, anchor, axis, reference=float(source.qpos0[joint.qposadr[0]]))
     return spec.compile()
 
 
+def _empty_spec() -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.compiler.fusestatic = True
+    spec.compiler.autolimits = False
+    spec.compiler.degree = False  # the reference angles of the joints are in radians
+    spec.option.disableflags = int(_IGNORED)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    return spec
+
+
+def _add_joint(body: mujoco.MjsBody, joint: Any, anchor: np.ndarray, axis: np.ndarray, reference: float) -> None:
+    body.add_joint(
+        name=joint.name,
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=axis,
+        pos=anchor,
+        ref=reference,
+        armature=float(joint.armature[0]),
+        damping=float(joint.damping[0]),
+    )
+
+
 def effective_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Inertia [kg m^2] that each joint feels while the others are free, 1 / (M^-1)_ii: [joints]."""
+    """Effective inertia [kg m^2] of each joint while the others are free, 1 / (M^-1)_ii: [joints]."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
@@ -73,20 +81,25 @@ def effective_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     return 1 / np.diag(inverse)
 
 
-def _turned(position: np.ndarray, quaternion: np.ndarray, joint: Any, angle: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a body in its parent after a turn about one of its hinges."""
-    turn, turned, before, after = np.zeros(4), np.zeros(4), np.zeros(3), np.zeros(3)
-    mujoco.mju_axisAngle2Quat(turn, joint.axis, angle)
-    mujoco.mju_mulQuat(turned, quaternion, turn)
-    mujoco.mju_rotVecQuat(before, joint.pos, quaternion)
-    mujoco.mju_rotVecQuat(after, joint.pos, turned)
-    return position + before - after, turned
+def _rotated_pose(
+    position: np.ndarray, quaternion: np.ndarray, joint: Any, angle: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of a body in its parent after a rotation about one of its joints."""
+    rotation, rotated, old_anchor, new_anchor = np.zeros(4), np.zeros(4), np.zeros(3), np.zeros(3)
+    mujoco.mju_axisAngle2Quat(rotation, joint.axis, angle)
+    mujoco.mju_mulQuat(rotated, quaternion, rotation)
+    mujoco.mju_rotVecQuat(old_anchor, joint.pos, quaternion)
+    mujoco.mju_rotVecQuat(new_anchor, joint.pos, rotated)
+    return position + old_anchor - new_anchor, rotated
 
 
-def _turned_back(anchor: np.ndarray, axis: np.ndarray, joint: Any, angle: float) -> tuple[np.ndarray, np.ndarray]:
-    """Anchor and axis, in the frame of their body, of a hinge that does not feel a turn about a later one in it."""
-    back, lever, turned = np.zeros(4), np.zeros(3), np.zeros(3)
-    mujoco.mju_axisAngle2Quat(back, joint.axis, -angle)
-    mujoco.mju_rotVecQuat(lever, anchor - joint.pos, back)
-    mujoco.mju_rotVecQuat(turned, axis, back)
-    return joint.pos + lever, turned
+def _rotated_back(anchor: np.ndarray, axis: np.ndarray, joint: Any, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Anchor and axis, in the rotated frame of the body, of a joint that precedes a removed one in the same body.
+
+    The removed joint does not move it, so it is rotated back by the removed joint's angle.
+    """
+    inverse, offset, rotated_axis = np.zeros(4), np.zeros(3), np.zeros(3)
+    mujoco.mju_axisAngle2Quat(inverse, joint.axis, -angle)
+    mujoco.mju_rotVecQuat(offset, anchor - joint.pos, inverse)
+    mujoco.mju_rotVecQuat(rotated_axis, axis, inverse)
+    return joint.pos + offset, rotated_axis

@@ -1,4 +1,4 @@
-"""An arm's model made ready for a picture: alone, with its base in the middle, and something to see."""
+"""An arm's model prepared for rendering: without its scene, and with shapes to draw."""
 
 import mujoco
 import numpy as np
@@ -7,15 +7,15 @@ from mimic.arms.arm import ArmConfig, arm_spec
 from mimic.arms.kinematic_tree import ChainIds, ancestors, find_chain
 from mimic.arms.mujoco_chain import zero_pose
 
-_THICKNESS, _COLOUR = 0.03, (0.55, 0.62, 0.70, 1.0)  # of links that the model gives no shape; share of the chain length
-_ABOUT = ("keys", "equalities", "actuators", "sensors", "tendons", "excludes", "pairs", "lights", "cameras")
+_THICKNESS, _COLOUR = 0.03, (0.55, 0.62, 0.70, 1.0)  # of links without geoms; fraction of the chain length
+_SCENE_ELEMENTS = ("keys", "equalities", "actuators", "sensors", "tendons", "excludes", "pairs", "lights", "cameras")
 
 
 def visual_spec(config: ArmConfig) -> tuple[mujoco.MjSpec, np.ndarray]:
-    """The model of an arm without the scene around it, and where its base is [m].
+    """The model of an arm without the scene around it, and the position of its base [m].
 
     Raises:
-      ValueError: what `arm_spec` and `find_chain` refuse.
+      ValueError: what `arm_spec` and `find_chain` reject.
     """
     spec = arm_spec(config)
     model = spec.compile()
@@ -31,8 +31,8 @@ def visual_spec(config: ArmConfig) -> tuple[mujoco.MjSpec, np.ndarray]:
 
 
 def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, chain_ids: ChainIds) -> None:
-    """Leaves the root body that the arm is in."""
-    for kind in _ABOUT:
+    """Removes everything but the root body of the arm."""
+    for kind in _SCENE_ELEMENTS:
         for item in list(getattr(spec, kind)):
             spec.delete(item)
     root = model.body(ancestors(model, chain_ids.bodies[0])[-2]).name
@@ -40,19 +40,19 @@ def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, chain_ids: ChainId
         spec.delete(item)
     for body in [body for body in spec.worldbody.bodies if body.name != root]:
         spec.delete(body)
-    shown = [geom for geom in spec.geoms if not (geom.contype or geom.conaffinity)]
-    if shown:  # the model has shapes to look at, so that those to collide with are hidden
+    visual = [geom for geom in spec.geoms if not (geom.contype or geom.conaffinity)]
+    if visual:  # the model has visual geoms, so its collision geoms are hidden
         for geom in spec.geoms:
-            if geom not in shown:
+            if geom not in visual:
                 geom.material, geom.rgba = "", [0, 0, 0, 0]
 
 
 def _draw_links(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec, chain_ids: ChainIds) -> None:
-    """Capsules from each joint to the next, for models without any shape."""
+    """Capsules from each joint to the next, for models without any geom."""
     points = [data.xanchor[joint] for joint in chain_ids.joints]
-    carried = [body for body in range(model.nbody) if chain_ids.bodies[-1] in ancestors(model, body)]
+    distal = [body for body in range(model.nbody) if chain_ids.bodies[-1] in ancestors(model, body)]
     points.append(
-        max((data.xpos[body] for body in carried), key=lambda point: float(np.linalg.norm(point - points[-1])))
+        max((data.xpos[body] for body in distal), key=lambda point: float(np.linalg.norm(point - points[-1])))
     )
     lengths = [float(np.linalg.norm(end - start)) for start, end in zip(points[:-1], points[1:], strict=True)]
     for joint, start, end, length in zip(chain_ids.joints, points[:-1], points[1:], lengths, strict=True):

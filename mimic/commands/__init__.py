@@ -1,1 +1,1 @@
-"""What each command does: mimic/NAME.py starts mimic/commands/NAME.py."""
+"""The commands: mimic/NAME.py starts mimic/commands/NAME.py."""

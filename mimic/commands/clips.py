@@ -1,7 +1,7 @@
-"""What a video shows, as plain numbers; made of a policy's rollout, a pose mapper, or retargeted motions."""
+"""Content of a video as arrays: a policy's rollout, the poses of a pose mapper, or retargeted motions."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.envs.recording import record_demonstrations
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
 from mimic.metric.kinematics import link_states
+from mimic.metric.similarity import centre_line_table, similarity
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_ppo_trainer
@@ -29,7 +30,7 @@ _HOLD, _OPTIMUM = {"linestyle": ":", "color": "grey"}, {"linestyle": "--", "colo
 
 
 class Curve(NamedTuple):
-    """A line over time: its name, its values [samples], and how matplotlib draws it."""
+    """A curve over time: its label, its values, and its matplotlib style."""
 
     label: str
     values: Float[np.ndarray, " samples"]
@@ -38,17 +39,18 @@ class Curve(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Clip:
-    """What a video shows.
+    """Content of a video.
 
     Attributes:
-      title: of it all.
-      labels: of the arms, left to right.
-      time: [frames] [s].
-      poses: of each arm, [frames, joints] [rad].
-      curve_time: [samples] of the curves and the bars [s].
-      curves: embodiment distances.
-      bars: [samples, links] what each link of the learner adds to the distance.
-      bar_names: of these links.
+      title: title of the video.
+      labels: names of the arms, left to right.
+      time: time of each frame [s].
+      poses: joint positions of each arm, [frames, joints] [rad].
+      curve_time: time of each sample of the curves and the bars [s].
+      curves: embodiment distances over time.
+      bars: contribution of each link of the learner to the distance, [samples, links].
+      bar_names: names of these links.
+      similarity: measures of `mimic.metric.similarity` of the poses, each of shape [frames].
     """
 
     title: str
@@ -59,32 +61,39 @@ class Clip:
     curves: tuple[Curve, ...]
     bars: Float[np.ndarray, "samples links"]
     bar_names: tuple[str, ...]
+    similarity: Mapping[str, Float[np.ndarray, " frames"]]
 
 
-class Recipe(NamedTuple):
-    """A clip that can be made: of whose arms, where its video goes unless told, and what makes it, which takes time."""
+class ClipPlan(NamedTuple):
+    """A clip to compute.
+
+    Attributes:
+      env: environment that defines the arms.
+      out: default file of the video; None where there is none.
+      compute: computes the clip, which takes time.
+    """
 
     env: EnvConfig
     out: Path | None
-    make: Callable[[], Clip]
+    compute: Callable[[], Clip]
 
 
-def prepare_clip(config: RenderConfig) -> Recipe:
-    """The clip that a config asks for.
+def prepare_clip(config: RenderConfig) -> ClipPlan:
+    """Checks the config of a video and returns its clip, which is not computed yet.
 
     Raises:
-      ValueError: no run directory, no such checkpoint or demonstration, files that do not fit, or keys that do not go
-        together.
+      ValueError: the run directory, the checkpoint or the demonstration does not exist, files belong to other arms, or
+        the keys exclude each other.
     """
     if config.retargeted or (config.demonstrations and not config.run):
-        return _of_retargeted(config)
+        return _retargeted_clip(config)
     if config.run and load_config(Path(config.run).expanduser()).trainer.name == "pose_mapper":
-        return _of_mapper(config)
-    return _of_policy(config)
+        return _mapper_clip(config)
+    return _policy_clip(config)
 
 
-def _of_policy(config: RenderConfig) -> Recipe:
-    """A policy's rollout, with the lower bound and an arm at rest."""
+def _policy_clip(config: RenderConfig) -> ClipPlan:
+    """A policy's rollout, with the kinematic bound and the distance of holding the start pose."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
     _check_unused(config, "a run of trainer=ppo", "demonstrations", "learner", "limits", "seed")
     trainer = make_ppo_trainer(trained, run_dir)
@@ -92,22 +101,24 @@ def _of_policy(config: RenderConfig) -> Recipe:
     _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
     title = f"{trained.env.name}, {config.split.replace('_', '-')} demonstration {config.demonstration}"
 
-    def make() -> Clip:
-        story = RolloutFrames(trainer.evaluator, trainer.evaluate(params), index, FRAMES_PER_SECOND)
+    def compute() -> Clip:
+        rollout = RolloutFrames(trainer.evaluator, trainer.evaluate(params), index, FRAMES_PER_SECOND)
         curves = (
-            Curve("holding the start pose", story.hold, _HOLD),
-            Curve("policy", story.distance, {"color": "tab:blue"}),
-            Curve("lower bound", story.bound, _OPTIMUM),
+            Curve("holding the start pose", rollout.hold, _HOLD),
+            Curve("policy", rollout.distance, {"color": "tab:blue"}),
+            Curve("kinematic bound", rollout.bound, _OPTIMUM),
         )
-        steps = story.dt * np.arange(1, len(story.distance) + 1)
-        poses = story.expert, story.learner
-        return Clip(title, ("expert", "learner"), story.time, poses, steps, curves, story.by_link, story.link_names)
+        steps = rollout.dt * np.arange(1, len(rollout.distance) + 1)
+        poses = rollout.expert, rollout.learner
+        measures = _similarity((trainer.evaluator.env.expert, trainer.evaluator.env.learner), poses)
+        bars = rollout.by_link, rollout.link_names
+        return Clip(title, ("expert", "learner"), rollout.time, poses, steps, curves, *bars, measures)
 
-    return Recipe(trained.env, run_dir / "videos" / f"{config.split}-{config.demonstration}.mp4", make)
+    return ClipPlan(trained.env, run_dir / "videos" / f"{config.split}-{config.demonstration}.mp4", compute)
 
 
-def _of_mapper(config: RenderConfig) -> Recipe:
-    """An expert on its way through a demonstration, and the pose that a mapper makes of it at each frame."""
+def _mapper_clip(config: RenderConfig) -> ClipPlan:
+    """A demonstration of the expert, and the pose of the pose mapper at each frame."""
     _check_unused(config, "a run of trainer=pose_mapper", "split", "learner", "limits")
     run_dir = Path(config.run).expanduser()
     env = load_config(run_dir).env
@@ -124,8 +135,8 @@ def _of_mapper(config: RenderConfig) -> Recipe:
         demonstrations = None
         name = f"{env.demonstrations.kind}-seed{config.seed}-{config.demonstration}"
 
-    def make() -> Clip:
-        shown = demonstrations or record_demonstrations(
+    def compute() -> Clip:
+        motions = demonstrations or record_demonstrations(
             build_arm(env.expert, env.limits),
             config.demonstration + 1,
             kind=env.demonstrations.kind,
@@ -134,58 +145,58 @@ def _of_mapper(config: RenderConfig) -> Recipe:
             dt=env.control_dt,
             substeps=env.substeps,
         )
-        time, qpos = _resampled(shown, config.demonstration)
-        qpos = np.clip(qpos, *pose_limits(mapper.expert, float))  # a cubic may lead a little beyond its samples
+        time, qpos = _resampled(motions, config.demonstration)
+        qpos = np.clip(qpos, *pose_limits(mapper.expert, float))  # cubic interpolation may exceed its samples slightly
         learner_qpos = np.asarray(mapper(qpos.astype(np.float32)))
         title = f"{env.name}, demonstration {config.demonstration}"
         return _static_clip(env, title, time, qpos, learner_qpos, by="pose mapper")
 
-    return Recipe(env, run_dir / "videos" / f"{name}.mp4", make)
+    return ClipPlan(env, run_dir / "videos" / f"{name}.mp4", compute)
 
 
-def _of_retargeted(config: RenderConfig) -> Recipe:
-    """An expert's demonstration, and the learner's motion that `mimic.retarget` made of it."""
+def _retargeted_clip(config: RenderConfig) -> ClipPlan:
+    """A demonstration of the expert, and the learner's motion that `mimic.retarget` computed from it."""
     _check_unused(config, "retargeted=FILE", "run", "checkpoint", "split", "seed")
     for key, example in (("demonstrations", "EXPERT.npz"), ("retargeted", "LEARNER.npz"), ("learner", "panda4dof")):
         if not getattr(config, key):
-            raise ValueError(f"{key}: expected what mimic.retarget was given or wrote, as in {key}={example}")
+            raise ValueError(f"{key}: expected with retargeted=FILE, as in {key}={example}")
     env = env_config(config.learner, limits=config.limits)
     expert, learner = env.build_arms().embodiments
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
     motions = load_demonstrations(Path(config.retargeted).expanduser())
     _check_arm("demonstrations", demonstrations, expert)
     _check_arm("retargeted", motions, learner)
-    sizes = [(part.count, part.horizon, part.dt) for part in (demonstrations, motions)]
+    sizes = [(arm_motions.count, arm_motions.horizon, arm_motions.dt) for arm_motions in (demonstrations, motions)]
     if sizes[0] != sizes[1]:
         expected, got = ("{} motions of {} steps of {} s".format(*size) for size in sizes)
-        raise ValueError(f"retargeted: expected {expected}, as the demonstrations, got {got}")
+        raise ValueError(f"retargeted: expected {expected}, as in demonstrations, got {got}")
     _check_number(config.demonstration, demonstrations)
 
-    def make() -> Clip:
+    def compute() -> Clip:
         time, qpos = _resampled(demonstrations, config.demonstration)
         _, learner_qpos = _resampled(motions, config.demonstration)
         title = f"{env.name}, demonstration {config.demonstration}"
         return _static_clip(env, title, time, qpos, learner_qpos, by="retargeted")
 
-    return Recipe(env, None, make)
+    return ClipPlan(env, None, compute)
 
 
 def _static_clip(
     env: EnvConfig, title: str, time: np.ndarray, qpos: np.ndarray, learner_qpos: np.ndarray, *, by: str
 ) -> Clip:
-    """Two arms moved pose by pose: velocities do not count; with the optimal pose's distance at each frame."""
+    """A clip of static poses, whose velocities are ignored, with the distance of the optimal pose at each frame."""
     expert, learner = env.build_arms().embodiments
     metric = env.metric.build(expert, learner)
 
-    def judged(qpos: jax.Array, learner_qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def evaluate(qpos: jax.Array, learner_qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         states = link_states(expert, qpos), link_states(learner, learner_qpos)
         distances = metric.link_distances(*states)
         by_link = (metric.matrix(distances) * distances).sum(axis=0) / distances.size
         return metric.reduced(distances), by_link
 
-    judge = jax.jit(jax.vmap(judged))
-    distance, by_link = map(np.asarray, judge(qpos, learner_qpos))
-    hold = np.asarray(judge(qpos, np.broadcast_to(np.asarray(learner.home), learner_qpos.shape))[0])
+    evaluate_batch = jax.jit(jax.vmap(evaluate))
+    distance, by_link = map(np.asarray, evaluate_batch(qpos, learner_qpos))
+    hold = np.asarray(evaluate_batch(qpos, np.broadcast_to(np.asarray(learner.home), learner_qpos.shape))[0])
     optimum = imitate_pose(expert, learner, qpos.astype(np.float32), kept=None, **metric.arguments)
     curves = (
         Curve("holding the start pose", hold, _HOLD),
@@ -193,11 +204,18 @@ def _static_clip(
         Curve("optimal poses", np.asarray(optimum.distance), _OPTIMUM),
     )
     labels = "expert", f"learner, {by}"
-    return Clip(title, labels, time, (qpos, learner_qpos), time, curves, by_link, learner.link_names)
+    poses = qpos, learner_qpos
+    measures = _similarity((expert, learner), poses)
+    return Clip(title, labels, time, poses, time, curves, by_link, learner.link_names, measures)
+
+
+def _similarity(arms: tuple[Embodiment, Embodiment], poses: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
+    """Similarity measures of two arms at each frame."""
+    return similarity(*(centre_line_table(arm, qpos) for arm, qpos in zip(arms, poses, strict=True)))
 
 
 def _resampled(motions: Demonstrations, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and angles of the frames of one motion."""
+    """Times and joint positions of one motion, at the frames of the video."""
     time = np.arange(0, motions.horizon * motions.dt + 1e-9, 1 / FRAMES_PER_SECOND)
     return time, interpolate(motions.qpos[number], motions.qvel[number], motions.dt, time)
 
@@ -212,12 +230,12 @@ def _check_arm(key: str, motions: Demonstrations, arm: Embodiment) -> None:
 
 def _check_number(number: int, motions: Demonstrations) -> None:
     if not 0 <= number < motions.count:
-        raise ValueError(f"demonstration: expected 0 to {motions.count - 1}, those of the file, got {number}")
+        raise ValueError(f"demonstration: expected an index of the file from 0 to {motions.count - 1}, got {number}")
 
 
-def _check_unused(config: RenderConfig, what: str, *keys: str) -> None:
-    """Rejects keys that mean nothing for what is shown."""
+def _check_unused(config: RenderConfig, source: str, *keys: str) -> None:
+    """Rejects keys that have no effect with this source of motions."""
     defaults = RenderConfig()
     for key in keys:
         if getattr(config, key) != getattr(defaults, key):
-            raise ValueError(f"{key}: does not go with {what}; leave it out, got {getattr(config, key)!r}")
+            raise ValueError(f"{key}: has no effect with {source}; expected none, got {getattr(config, key)!r}")

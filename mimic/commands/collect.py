@@ -1,4 +1,4 @@
-"""What `python -m mimic.collect` does: finds the runs, and writes and shows what they say together."""
+"""`python -m mimic.collect`: collects the runs in a folder in a table, a plot and a JSON file."""
 
 import csv
 import dataclasses
@@ -16,18 +16,26 @@ from rich.table import Table
 from mimic.commands.config import CollectConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import REPORT, write_atomically
-from mimic.sweeps.finished_runs import FIGURES, Figure, FinishedRun, LeftOut, find_runs
-from mimic.sweeps.seed_groups import CONFIDENCE, HOW, Interval, SeedGroup, drop_repeated, group_runs, telling_keys
+from mimic.sweeps.finished_runs import QUALITY_METRICS, FinishedRun, LeftOut, QualityMetric, find_runs
+from mimic.sweeps.seed_groups import (
+    CONFIDENCE,
+    METHOD,
+    Interval,
+    SeedGroup,
+    distinguishing_keys,
+    drop_repeated,
+    group_runs,
+)
 
 NAME = "collected"
 SOME_LEFT_OUT = 1
 
 
 def prepare_collection(config: CollectConfig) -> Callable[[], int]:
-    """What writes the collection and shows it; returns 0, or 1 where runs were left out.
+    """Reads the runs in a folder. The returned function writes the collection and returns 1 if runs were left out.
 
     Raises:
-      ValueError: no folder, no finished runs in it, runs of several trainers, or an `out` that is a file.
+      ValueError: the folder does not exist or has no finished runs, the runs have several trainers, or `out` is a file.
     """
     if not config.folder:
         raise ValueError("expected a folder with runs in it, as in python -m mimic.collect runs")
@@ -40,34 +48,34 @@ def prepare_collection(config: CollectConfig) -> Callable[[], int]:
     finished, left_out = find_runs(folder)
     finished = [run for run in finished if config.only in ("", run.trainer)]
     if not finished:
-        wanted = f" of trainer={config.only}" if config.only else ""
-        why = f"; {len(left_out)} without: {left_out[0].name}: {left_out[0].reason}" if left_out else ""
-        raise ValueError(f"{str(folder)!r}: expected runs{wanted} with a {REPORT}, found none{why}")
+        trainer = f" of trainer={config.only}" if config.only else ""
+        reason = f"; {len(left_out)} without: {left_out[0].name}: {left_out[0].reason}" if left_out else ""
+        raise ValueError(f"{str(folder)!r}: expected runs{trainer} with a {REPORT}, found none{reason}")
     trainers = sorted({run.trainer for run in finished})
     if len(trainers) > 1:
         raise ValueError(
-            f"{str(folder)!r}: the runs are of {' and '.join(trainers)}, which have no figure in common; "
-            f"choose by only={trainers[0]}"
+            f"{str(folder)!r}: the runs are of {' and '.join(trainers)}, which have no metric in common; "
+            f"choose with only={trainers[0]}"
         )
     finished, repeated = drop_repeated(finished)
-    return lambda: _collect(finished, [*left_out, *repeated], out, FIGURES[trainers[0]])
+    return lambda: _collect(finished, [*left_out, *repeated], out, QUALITY_METRICS[trainers[0]])
 
 
-def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path, figure: Figure) -> int:
-    from mimic.sweeps.plot import plot_collected  # matplotlib, a second
+def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path, metric: QualityMetric) -> int:
+    from mimic.sweeps.plot import plot_collected  # imports matplotlib, which takes a second
 
     groups = group_runs(finished)
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(out / f"{NAME}.csv", _csv(groups))
-    content = json.dumps(_summary(groups, left_out, figure), indent=2, default=str)
+    content = json.dumps(_summary(groups, left_out, metric), indent=2, default=str)
     write_atomically(out / f"{NAME}.json", content + "\n")
-    plot_collected(groups, figure, out / f"{NAME}.png")
+    plot_collected(groups, metric, out / f"{NAME}.png")
     console = Console()
-    console.print(_table(groups, figure))
+    console.print(_table(groups, metric))
     versions = Counter(run.version for run in finished)
     if len(versions) > 1:
-        named = ", ".join(f"{version} ({count})" for version, count in sorted(versions.items()))
-        print(f"note: the runs are of several versions of mimic: {named}", file=sys.stderr)
+        counts = ", ".join(f"{version} ({count})" for version, count in sorted(versions.items()))
+        print(f"note: the runs are of several versions of mimic: {counts}", file=sys.stderr)
     for run in left_out:
         print(f"left out: {run.name}: {run.reason}", file=sys.stderr)
     console.print(f"results: {out}/{NAME}.csv, .json, .png", soft_wrap=True, highlight=False)
@@ -75,7 +83,7 @@ def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: 
 
 
 def _csv(groups: Sequence[SeedGroup]) -> str:
-    """One row a run: what differs between the groups, then the numbers of its report."""
+    """A table with one row per run: settings that differ between the groups, then the numbers of its report."""
     numbers = list(dict.fromkeys(key for group in groups for run in group.runs for key in run.numbers))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -87,11 +95,11 @@ def _csv(groups: Sequence[SeedGroup]) -> str:
     return text.getvalue()
 
 
-def _summary(groups: Sequence[SeedGroup], left_out: Sequence[LeftOut], figure: Figure) -> dict[str, Any]:
+def _summary(groups: Sequence[SeedGroup], left_out: Sequence[LeftOut], metric: QualityMetric) -> dict[str, Any]:
     return {
-        "how": HOW,
+        "how": METHOD,
         "confidence": CONFIDENCE,
-        "figure": figure.key,
+        "figure": metric.key,
         "groups": [
             {
                 "label": group.label,
@@ -110,19 +118,19 @@ def _shared_numbers(group: SeedGroup) -> list[str]:
     return [key for key in group.runs[0].numbers if all(key in run.numbers for run in group.runs)]
 
 
-def _table(groups: Sequence[SeedGroup], figure: Figure) -> Table:
-    keys = telling_keys(groups)
-    table = Table(title=figure.label, title_justify="left")
+def _table(groups: Sequence[SeedGroup], metric: QualityMetric) -> Table:
+    keys = distinguishing_keys(groups)
+    table = Table(title=metric.label, title_justify="left")
     for key in keys:
         table.add_column(key, overflow="fold")
-    for name in ("seeds", "training", "held out", figure.unit.replace("_", " ")):
+    for name in ("seeds", "training", "held out", metric.unit.replace("_", " ")):
         table.add_column(name, justify="right", no_wrap=True)
     for group in groups:
         table.add_row(
             *(str(group.settings[key]) for key in keys),
             str(len(group.runs)),
-            *(percent(group.interval(f"{figure.key}.{split}")) for split in SPLITS),
-            f"{group.interval(figure.unit).mean:,.0f}",
+            *(percent(group.interval(f"{metric.key}.{split}")) for split in SPLITS),
+            f"{group.interval(metric.unit).mean:,.0f}",
         )
     table.caption = "mean ± half of its 95 % confidence interval (Student's t over seeds)"
     table.caption_justify = "left"
@@ -130,6 +138,6 @@ def _table(groups: Sequence[SeedGroup], figure: Figure) -> Table:
 
 
 def percent(interval: Interval) -> str:
-    """Mean, and half of the interval where there is one."""
+    """Mean and half of the confidence interval in percent; only the mean for a single number."""
     text = f"{100 * interval.mean:.2f}"
     return f"{text} %" if interval.high is None else f"{text} ± {100 * (interval.high - interval.mean):.2f} %"

@@ -1,6 +1,6 @@
-"""What each command is told beside the config of training, which is in mimic/trainers/config.py.
+"""Configs of the commands; the config of a training is in mimic/trainers/config.py.
 
-Imports configs alone: `--help` stays quick.
+This module imports other configs only, so that `--help` stays fast.
 """
 
 import dataclasses
@@ -23,19 +23,18 @@ _LAST_PORT = 65535
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateConfig:
-    """An evaluation of a trained policy, or of another controller in its place.
+    """Config of an evaluation of a trained policy, or of another controller in its place.
 
     Attributes:
-      run: the run directory.
-      checkpoint: environment steps of the checkpoint; the last one where None.
-      controller: "policy", what a user would do without it (see `run_controller`), or "searched" (see
-        `search_torques`).
-      search: how long "searched" searches.
-      demonstrations: file of demonstrations to evaluate on in place of the held-out ones.
-      physics: see `EnvConfig`; the run's where empty.
-      mass, damping, torque_noise: how the arm differs from its model, see `RandomizationConfig`; as in training where
-        None.
-      out: new folder for report, table and plots; the report is printed only where empty.
+      run: run directory.
+      checkpoint: environment steps of the checkpoint. Default None: the last checkpoint.
+      controller: "policy"; a baseline controller (see `run_controller`); or "searched" (see `search_torques`).
+      search: number of updates and of initial guesses for "searched".
+      demonstrations: file of demonstrations that replace the held-out ones.
+      physics: see `EnvConfig`. Default "": that of the run.
+      mass, damping, torque_noise: deviation of the arm from its model, see `RandomizationConfig`. Default None: as in
+        training.
+      out: new folder for report, table and plots. Default "": the report is printed only.
       compilation_cache: see `TrainConfig`.
     """
 
@@ -59,13 +58,14 @@ class EvaluateConfig:
 
 @dataclasses.dataclass(frozen=True)
 class FiguresConfig:
-    """The figures of static pose imitation.
+    """Config of the figures of the metric and of pose retargeting.
 
     Attributes:
       out: folder for the figures.
-      only: names of some of them; all where empty.
-      runs: folder of the mappers' run directories, one for each environment; `runs` within `out` where empty.
-      seed: of mappers that must be trained.
+      only: names of the figures to draw. Default []: all.
+      runs: folder with one run directory of a pose mapper for each environment. Default "": the folder `runs` in
+        `out`.
+      seed: seed of the pose mappers that have to be trained.
       compilation_cache: see `TrainConfig`.
     """
 
@@ -78,20 +78,21 @@ class FiguresConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RenderConfig:
-    """A video of a trained policy, of a pose mapper, or of retargeted motions.
+    """Config of a video of a trained policy, of a pose mapper, or of retargeted motions.
 
     Attributes:
-      run: the run directory of a policy or a pose mapper.
-      checkpoint: steps of the checkpoint; the last one where None.
+      run: run directory of a policy or a pose mapper.
+      checkpoint: steps of the checkpoint. Default None: the last checkpoint.
       split: "held_out" or "train": demonstrations of a policy's run.
-      demonstration: which one of these, of those in a file, or of those that are recorded for a pose mapper, from 0.
-      demonstrations: file of the expert's; for a pose mapper they are recorded, as its environment says, where empty.
-      seed: of the recorded ones.
-      retargeted: file of the learner's motions that `mimic.retarget` made of `demonstrations`.
-      learner: name of the environment that these were retargeted for.
-      limits: see `EnvConfig`; those that they were retargeted with.
-      out: the file; a name in DIR/videos of the run directory where empty.
-      gif: whether to make a GIF too.
+      demonstration: index from 0 into the split, into the file, or into the demonstrations recorded for a pose mapper.
+      demonstrations: file of the expert's demonstrations. Default "": for a pose mapper, they are recorded with the
+        settings of its environment.
+      seed: seed of the recorded demonstrations.
+      retargeted: file of the learner's motions that `mimic.retarget` computed from `demonstrations`.
+      learner: name of the environment that `retargeted` was computed for.
+      limits: the `limits` that `retargeted` was computed with, see `EnvConfig`.
+      out: video file. Default "": a file in the folder `videos` of the run directory.
+      gif: whether to write a GIF as well.
       compilation_cache: see `TrainConfig`.
     """
 
@@ -109,19 +110,19 @@ class RenderConfig:
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
-        check_choice("split", self.split, ("held_out", "train"))
+        check_choice("split", self.split, SPLITS)
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportConfig:
-    """A trained policy or pose mapper as a file for other programs.
+    """Config of an export of a trained policy or pose mapper to a file.
 
     Attributes:
-      run: the run directory.
-      out: the file; must not exist.
+      run: run directory.
+      out: exported file; must not exist.
       format: "onnx" or "jax".
-      learner: name of the environment whose arms it is meant for; any where empty.
-      checkpoint: steps of the checkpoint; the last one where None.
+      learner: name of the environment that the run's arms must equal. Default "": not checked.
+      checkpoint: steps of the checkpoint. Default None: the last checkpoint.
     """
 
     run: str = ""
@@ -136,12 +137,12 @@ class ExportConfig:
 
 @dataclasses.dataclass(frozen=True)
 class CollectConfig:
-    """A collection of runs.
+    """Config of a collection of runs.
 
     Attributes:
-      folder: that they lie in, at any depth.
-      out: folder for table, figure and numbers; `folder` where empty.
-      only: trainer whose runs alone are collected; where empty all runs must be of the same.
+      folder: folder that contains the run directories, at any depth.
+      out: folder for the table, the plot and the JSON file. Default "": `folder`.
+      only: name of a trainer: only its runs are collected. Default "": all runs must have the same trainer.
     """
 
     folder: str = ""
@@ -155,16 +156,16 @@ class CollectConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RecordingConfig:
-    """A recording of demonstrations to a file.
+    """Config of a recording of demonstrations.
 
     Attributes:
-      env: the environment whose expert is recorded, in its time steps.
-      kind, count, seed: see `DemonstrationConfig`; those of the environment where None.
-      limits: see `EnvConfig`; those of the environment where None.
-      source: file of motions to read instead of recording: see `import_demonstrations`.
-      joints: what that file calls the expert's joints, base to tip; by the expert's own names where empty.
-      out: the file, which ends in .npz; must not exist.
-      plot: picture of what was recorded; `out` with .png instead where empty. Must not exist.
+      env: environment whose expert is recorded, with its control step.
+      kind, count, seed: see `DemonstrationConfig`. Default None: those of the environment.
+      limits: see `EnvConfig`. Default None: those of the environment.
+      source: file of motions to import instead of recording, see `import_demonstrations`.
+      joints: names of the expert's joints in `source`, base to tip. Default []: the expert's own names.
+      out: .npz file of the demonstrations; must not exist.
+      plot: .png, .pdf or .svg file of the plot; must not exist. Default "": `out` with the suffix .png.
     """
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
@@ -178,27 +179,27 @@ class RecordingConfig:
     plot: str = ""
 
     def resolve(self) -> EnvConfig:
-        """The environment with what is given here.
+        """Returns the environment with the values set in this config.
 
         Raises:
-          ValueError: a value that it cannot have.
+          ValueError: a value is invalid.
         """
-        wanted = {name: getattr(self, name) for name in ("kind", "count", "seed")}
-        demonstrations = dataclasses.replace(self.env.demonstrations, **_given(wanted))
-        return dataclasses.replace(self.env, demonstrations=demonstrations, **_given({"limits": self.limits}))
+        settings = {name: getattr(self, name) for name in ("kind", "count", "seed")}
+        demonstrations = dataclasses.replace(self.env.demonstrations, **_without_none(settings))
+        return dataclasses.replace(self.env, demonstrations=demonstrations, **_without_none({"limits": self.limits}))
 
 
 @dataclasses.dataclass(frozen=True)
 class InspectConfig:
-    """A look at a learner before it is trained.
+    """Config of an inspection of a learner before training.
 
     Attributes:
-      learner: the arm in question.
-      expert: what it shall imitate.
+      learner: arm to inspect.
+      expert: arm that it should imitate.
       limits: see `EnvConfig`.
-      bound: whether to say how near the learner can come, which takes a minute.
-      out: new folder for a picture of both arms with their correspondence, one of poses of the expert with the
-        learner's nearest ones (where `bound`), and for what was found as JSON.
+      bound: whether to compute the kinematic bound of the distance, which takes a minute.
+      out: new folder for a picture of both arms with their correspondence, a picture of expert poses with the
+        learner's nearest poses (only with `bound`), and a JSON file of all results.
     """
 
     learner: ArmConfig = dataclasses.field(default_factory=ArmConfig)
@@ -213,15 +214,15 @@ class InspectConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RetargetConfig:
-    """A retargeting of demonstrations.
+    """Config of a retargeting of demonstrations.
 
     Attributes:
-      demonstrations: file of the expert's.
-      learner: name of the environment whose arms and metric count.
-      mapper: run directory of a pose mapper of that environment, which is used instead of the optimiser.
+      demonstrations: file of the expert's demonstrations.
+      learner: name of the environment that defines the arms and the metric.
+      mapper: run directory of a pose mapper of that environment, used instead of the optimiser.
       limits: see `EnvConfig`.
-      out: file of the learner's; must not exist.
-      seed: of the random poses that minima are searched from.
+      out: file of the learner's motions; must not exist.
+      seed: seed of the random initial poses of the optimiser.
     """
 
     demonstrations: str = ""
@@ -234,17 +235,17 @@ class RetargetConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ViewConfig:
-    """A live view of two arms.
+    """Config of a live view of two arms.
 
     Attributes:
-      env: the arms and the metric.
-      expert, learner: arms in place of the environment's: "panda", the name of an environment, or an MJCF file.
-      mapper: run directory of a pose mapper that moves the learner, instead of the optimiser; brings its own arms.
-      run: run directory of a policy to play; brings its own arms and demonstrations.
-      checkpoint: of the policy or the mapper; the last one where None.
-      split: "held_out" or "train", the demonstrations of the run that are shown first.
-      host: address to serve at; 0.0.0.0 is every address of this machine.
-      port: to serve at.
+      env: environment that defines the arms and the metric.
+      expert, learner: replace the arms of the environment: "panda", the name of an environment, or an MJCF file.
+      mapper: run directory of a pose mapper that moves the learner instead of the optimiser. Its arms are used.
+      run: run directory of a policy to play. Its arms and demonstrations are used.
+      checkpoint: steps of the checkpoint of the policy or the mapper. Default None: the last checkpoint.
+      split: "held_out" or "train": demonstrations of the run to show first.
+      host: address of the server; 0.0.0.0 is every address of this machine.
+      port: port of the server.
       compilation_cache: see `TrainConfig`.
     """
 
@@ -266,19 +267,19 @@ class ViewConfig:
         if self.run and self.mapper:
             raise ValueError(f"run, mapper: expected one of them, got {self.run!r} and {self.mapper!r}")
         if (self.run or self.mapper) and (self.expert or self.learner):
-            raise ValueError("expert, learner: a run brings its own arms; expected neither beside run= or mapper=")
+            raise ValueError("expert, learner: expected neither with run= or mapper=, whose arms are used")
 
     def resolve_env(self) -> EnvConfig:
-        """The environment with the arms that are named here.
+        """Returns the environment with the arms named in `expert` and `learner`.
 
         Raises:
-          ValueError: an arm that does not exist.
+          ValueError: an arm does not exist.
         """
-        given = {role: _arm(role, name) for role in ("expert", "learner") if (name := getattr(self, role))}
-        return dataclasses.replace(self.env, **given)
+        arms = {role: _arm(role, name) for role in ("expert", "learner") if (name := getattr(self, role))}
+        return dataclasses.replace(self.env, **arms)
 
 
-def _given(values: dict[str, Any]) -> dict[str, Any]:
+def _without_none(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 

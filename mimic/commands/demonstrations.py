@@ -1,4 +1,4 @@
-"""What `python -m mimic.demonstrations` does: records an expert or reads motions, plots them, says what they take."""
+"""`python -m mimic.demonstrations`: records an expert or imports motions, and compares them with the arm's limits."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +12,7 @@ from rich.table import Table
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import RecordingConfig
-from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_share
+from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_fraction
 from mimic.config import new_file
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort
@@ -23,12 +23,12 @@ _PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
-    """Records, and gives what writes and shows the result.
+    """Checks the config and records or imports the demonstrations; the returned function writes and plots them.
 
-    Only the recording tells whether the arm's limits leave a goal, so that it comes before the work.
+    Recording is part of the check: only the recording shows whether the arm's limits permit any goal.
 
     Raises:
-      ValueError: files that exist or have no folder, an arm that cannot be built, or limits that leave no goal.
+      ValueError: a file exists or its folder does not, the arm is invalid, or its limits permit no goal.
     """
     out, plot = _files(config)
     env, console = config.resolve(), Console()
@@ -36,18 +36,18 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
     if config.source:
         return _prepare_import(config, env, arm, out, plot)
     if config.joints:
-        raise ValueError("joints: expected only with source=FILE, whose joints they are")
-    recorded, redrawn = _record(arm, env, console)
-    check_effort(recorded, arm.embodiment)  # what the recorder promises, of what is written
+        raise ValueError("joints: expected only with source=FILE, as the names of its joints")
+    demonstrations, redrawn = _record(arm, env, console)
+    check_effort(demonstrations, arm.embodiment)  # of the exact arrays to be written
 
     def run() -> None:
-        recorded.save(out)
-        wanted = env.demonstrations
-        title = f"{arm.embodiment.name}, {wanted.kind} demonstrations: {wanted.count}, seed {wanted.seed}"
-        plot_demonstrations(recorded, arm.embodiment, plot, title=title)
-        console.print(_table(recorded, arm.embodiment))
-        console.print(_verdict(recorded, arm.embodiment), soft_wrap=True, highlight=False)
-        console.print(f"goals drawn anew because a limit was broken: {redrawn}", highlight=False)
+        demonstrations.save(out)
+        recording = env.demonstrations
+        title = f"{arm.embodiment.name}, {recording.kind} demonstrations: {recording.count}, seed {recording.seed}"
+        plot_demonstrations(demonstrations, arm.embodiment, plot, title=title)
+        console.print(_table(demonstrations, arm.embodiment))
+        console.print(_limits_line(arm.embodiment), soft_wrap=True, highlight=False)
+        console.print(f"goals redrawn because a limit was exceeded: {redrawn}", highlight=False)
         console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
@@ -55,9 +55,9 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
 
 
 def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path, plot: Path) -> Callable[[], None]:
-    """Reads motions, and gives what writes and shows them."""
-    if given := [key for key in ("kind", "count", "seed") if getattr(config, key) is not None]:
-        raise ValueError(f"{given[0]}: expected none with source=FILE, whose motions are taken as they are")
+    """Imports motions; the returned function writes and plots them."""
+    if unused := [key for key in ("kind", "count", "seed") if getattr(config, key) is not None]:
+        raise ValueError(f"{unused[0]}: expected none with source=FILE, whose motions are not recorded")
     source = Path(config.source).expanduser()
     imported, differentiated = import_demonstrations(
         source, arm.embodiment, dt=env.control_dt, horizon=env.horizon, joints=config.joints
@@ -68,10 +68,12 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
         imported.save(out)
         plot_demonstrations(imported, arm.embodiment, plot, title=f"{arm.embodiment.name}, {source.name}")
         console.print(_table(imported, arm.embodiment))
-        said = "differentiated, since the file has none" if differentiated else "as in the file"
+        velocities = "differentiated, since the file has none" if differentiated else "from the file"
         length = f"{imported.horizon} steps of {imported.dt:g} s"
-        console.print(f"{source.name}: {imported.count} demonstrations, {length}; velocities: {said}", soft_wrap=True)
-        console.print(f"all stay within the rated speeds of {arm.embodiment.name}; torques are not known")
+        console.print(
+            f"{source.name}: {imported.count} demonstrations, {length}; velocities: {velocities}", soft_wrap=True
+        )
+        console.print(f"all stay within the velocity limits of {arm.embodiment.name}; torques are unknown")
         console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
@@ -79,7 +81,7 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
 
 
 def _files(config: RecordingConfig) -> tuple[Path, Path]:
-    """The files of the demonstrations and of their plot."""
+    """The new files of the demonstrations and of their plot."""
     out = new_file("out", config.out)
     if out.suffix != ".npz":
         raise ValueError(f"out: expected a file that ends in .npz, got {str(out)!r}")
@@ -90,56 +92,59 @@ def _files(config: RecordingConfig) -> tuple[Path, Path]:
 
 
 def _record(arm: Arm, env: EnvConfig, console: Console) -> tuple[Demonstrations, int]:
-    """The demonstrations, and how many goals were drawn anew; with a bar on a terminal."""
-    wanted, redrawn = env.demonstrations, 0
+    """Demonstrations, and the number of goals that were redrawn. Shows a progress bar on a terminal."""
+    config, redrawn = env.demonstrations, 0
     columns = TextColumn("[bold]recording"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("record", total=wanted.count)
+        task = bar.add_task("record", total=config.count)
 
-        def count_up(redrawn_for_it: int) -> None:
+        def on_recorded(redrawn_goals: int) -> None:
             nonlocal redrawn
-            redrawn += redrawn_for_it
+            redrawn += redrawn_goals
             bar.advance(task)
 
-        recorded = record_demonstrations(
+        demonstrations = record_demonstrations(
             arm,
-            wanted.count,
-            kind=wanted.kind,
-            seed=wanted.seed,
+            config.count,
+            kind=config.kind,
+            seed=config.seed,
             horizon=env.horizon,
             dt=env.control_dt,
             substeps=env.substeps,
-            on_recorded=count_up,
+            on_recorded=on_recorded,
         )
-    return recorded, redrawn
+    return demonstrations, redrawn
 
 
-def _table(recorded: Demonstrations, arm: Embodiment) -> Table:
-    title = f"{arm.name}, demonstrations: {recorded.count} of {recorded.horizon * recorded.dt:g} s"
-    table = Table(title=title, title_justify="left", caption="in brackets: share of the limit", caption_justify="left")
+def _table(demonstrations: Demonstrations, arm: Embodiment) -> Table:
+    title = f"{arm.name}, demonstrations: {demonstrations.count} of {demonstrations.horizon * demonstrations.dt:g} s"
+    table = Table(
+        title=title, title_justify="left", caption="in brackets: fraction of the limit", caption_justify="left"
+    )
     table.add_column("joint")
-    for header in ("angles\n[rad]", "peak speed\n[rad/s]", "peak torque\n[N m]", "RMS torque\n[N m]"):
-        table.add_column(escape(header), justify="right")  # a unit in brackets is no style
-    torque = np.full((1, 1, arm.num_joints), np.nan) if recorded.torque is None else recorded.torque
-    least, most = recorded.qpos.min(axis=(0, 1)), recorded.qpos.max(axis=(0, 1))
+    for header in ("angles\n[rad]", "peak velocity\n[rad/s]", "peak torque\n[N m]", "RMS torque\n[N m]"):
+        table.add_column(escape(header), justify="right")  # a unit in brackets is not a style
+    torque = np.full((1, 1, arm.num_joints), np.nan) if demonstrations.torque is None else demonstrations.torque
+    lowest, highest = demonstrations.qpos.min(axis=(0, 1)), demonstrations.qpos.max(axis=(0, 1))
+    range_fraction = (highest - lowest) / np.ptp(arm.joint_range, axis=1)
     rms_torque = np.sqrt(np.mean(torque**2, axis=(0, 1)))
     for joint, name in enumerate(arm.joint_names):
         table.add_row(
             name,
-            f"{least[joint]:.2f} to {most[joint]:.2f} ({(most - least)[joint] / np.ptp(arm.joint_range[joint]):.0%})",
-            with_share(peak(recorded.qvel)[joint], arm.velocity_limit[joint]),
-            with_share(peak(torque)[joint], arm.torque_limit[joint]),
-            with_share(rms_torque[joint], arm.torque_limit[joint]),
+            f"{lowest[joint]:.2f} to {highest[joint]:.2f} ({range_fraction[joint]:.0%})",
+            with_fraction(peak(demonstrations.qvel)[joint], arm.velocity_limit[joint]),
+            with_fraction(peak(torque)[joint], arm.torque_limit[joint]),
+            with_fraction(rms_torque[joint], arm.torque_limit[joint]),
         )
     return table
 
 
-def _verdict(recorded: Demonstrations, arm: Embodiment) -> str:
-    """In words, what `check_effort` has found."""
-    limits = {"torque limits": arm.torque_limit, "rated speeds": arm.velocity_limit}
-    kept = [name for name, limit in limits.items() if np.isfinite(limit).any()]
-    missing = [name for name in limits if name not in kept]
-    if not kept:
-        return f"{arm.name} has no torque limits and no rated speeds to stay within"
-    lacking = f", which has no {missing[0]}" if missing else ""
-    return f"all stay within the {' and '.join(kept)} of {arm.name}{lacking}"
+def _limits_line(arm: Embodiment) -> str:
+    """The limits that `check_effort` has checked, as a sentence."""
+    limits = {"torque limits": arm.torque_limit, "velocity limits": arm.velocity_limit}
+    checked = [name for name, limit in limits.items() if np.isfinite(limit).any()]
+    unknown = [name for name in limits if name not in checked]
+    if not checked:
+        return f"{arm.name} has no torque limits and no velocity limits"
+    note = f", which has no {unknown[0]}" if unknown else ""
+    return f"all stay within the {' and '.join(checked)} of {arm.name}{note}"

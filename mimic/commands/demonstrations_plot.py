@@ -1,4 +1,4 @@
-"""Picture of a set of demonstrations: angles, speeds and torques of each joint, and where the hand goes."""
+"""Plot of demonstrations: angle, velocity and torque of each joint, and the path of the hand."""
 
 from pathlib import Path
 from typing import Any
@@ -17,19 +17,19 @@ from mimic.arms.embodiment import Embodiment  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations  # noqa: E402
 from mimic.metric.kinematics import forward_kinematics  # noqa: E402
 
-_COLOURS = {"angle": "tab:blue", "speed": "tab:green", "torque": "tab:purple", "hand": "tab:orange"}
+_COLOURS = {"angle": "tab:blue", "velocity": "tab:green", "torque": "tab:purple", "hand": "tab:orange"}
 _LIMIT: dict[str, Any] = {"color": "tab:red", "lw": 0.8, "ls": "--"}
 _PANEL, _HAND_WIDTH, _HEIGHT = 1.7, 3.4, 6.8  # inches
-_FLAT = 1e-6  # m, of a path that lies in the horizontal plane
+_FLAT = 1e-6  # m, height range below which a path counts as horizontal
 
 
 def peak(values: Float[np.ndarray, "demonstrations time joints"]) -> Float[np.ndarray, " joints"]:
-    """The largest magnitude of each joint."""
+    """Maximum magnitude of each joint."""
     return np.abs(values).max(axis=(0, 1))
 
 
-def with_share(value: float, limit: float) -> str:
-    """A value, and its share of a limit where there is one; a dash where nobody knows it."""
+def with_fraction(value: float, limit: float) -> str:
+    """Text of a value and its fraction of a finite limit; a dash for NaN."""
     if np.isnan(value):
         return "-"
     return f"{value:.2f} ({value / limit:.0%})" if np.isfinite(limit) else f"{value:.2f}"
@@ -38,34 +38,36 @@ def with_share(value: float, limit: float) -> str:
 def hand_paths(
     arm: Embodiment, qpos: Float[np.ndarray, "demonstrations samples joints"]
 ) -> Float[np.ndarray, "demonstrations samples 3"]:
-    """Where the end of the last link is, in the base frame [m]."""
+    """Position of the end of the last link in the base frame [m]."""
 
     def end(qpos: jax.Array) -> jax.Array:
         frames = forward_kinematics(arm, qpos)
-        return frames.position[-1] + frames.rotation[-1, :, 0] * arm.link_lengths[-1] / 2  # frames sit in the middle
+        return (
+            frames.position[-1] + frames.rotation[-1, :, 0] * arm.link_lengths[-1] / 2
+        )  # a frame is in the middle of its link
 
     return np.asarray(jax.jit(jax.vmap(jax.vmap(end)))(jnp.asarray(qpos, jnp.float32)))
 
 
 def plot_demonstrations(demonstrations: Demonstrations, arm: Embodiment, out: Path, *, title: str) -> None:
-    """Small multiples over time, a column for each joint, beside the hand's paths in two views; limits are dashed.
+    """Plots one column of time series for each joint, and the hand's paths in two views; limits are dashed.
 
     Args:
-      demonstrations: of the arm; a row for their torques where these are known.
-      arm: whose limits count.
-      out: the picture.
-      title: what these demonstrations are.
+      demonstrations: demonstrations of the arm. Their torques get a row if they are known.
+      arm: arm whose limits are drawn.
+      out: file of the plot.
+      title: title of the plot.
     """
     joints = arm.num_joints
     figure = plt.figure(figsize=(_PANEL * joints + _HAND_WIDTH, _HEIGHT), layout="constrained")
-    parts: Any = figure.subfigures(1, 2, width_ratios=(_PANEL * joints, _HAND_WIDTH))
-    left, right = parts
+    subfigures: Any = figure.subfigures(1, 2, width_ratios=(_PANEL * joints, _HAND_WIDTH))
+    left, right = subfigures
     figure.suptitle(f"{title} (limits dashed)")
-    known = demonstrations.torque is not None
-    rows = left.subplots(2 + known, joints, sharex=True, squeeze=False)
+    has_torque = demonstrations.torque is not None
+    rows = left.subplots(2 + has_torque, joints, sharex=True, squeeze=False)
     _plot_angles(rows[0], demonstrations, arm)
-    _plot_speeds(rows[1], demonstrations, arm)
-    if known:
+    _plot_velocities(rows[1], demonstrations, arm)
+    if has_torque:
         _plot_torques(rows[2], demonstrations, arm)
     for axes in rows.flat:
         axes.grid(alpha=0.3)
@@ -79,36 +81,36 @@ def plot_demonstrations(demonstrations: Demonstrations, arm: Embodiment, out: Pa
 
 def _plot_angles(row: Any, demonstrations: Demonstrations, arm: Embodiment) -> None:
     lower, upper = np.asarray(arm.joint_range).T
-    room = 0.05 * (upper.max() - lower.min())
+    margin = 0.05 * (upper.max() - lower.min())
     for joint, axes in enumerate(row):
         _plot_lines(axes, _times(demonstrations), demonstrations.qpos[..., joint], "angle")
         _plot_limits(axes, (lower[joint], upper[joint]))
-        axes.set(ylim=(lower.min() - room, upper.max() + room), title=arm.joint_names[joint])
+        axes.set(ylim=(lower.min() - margin, upper.max() + margin), title=arm.joint_names[joint])
     _label_row(row, "angle [rad]")
 
 
-def _plot_speeds(row: Any, demonstrations: Demonstrations, arm: Embodiment) -> None:
-    rated, fastest = np.asarray(arm.velocity_limit), peak(demonstrations.qvel)
-    shown = 1.3 * max(fastest.max(), rated[np.isfinite(rated)].max(initial=0))  # with room for the note
+def _plot_velocities(row: Any, demonstrations: Demonstrations, arm: Embodiment) -> None:
+    limit, maximum = np.asarray(arm.velocity_limit), peak(demonstrations.qvel)
+    height = 1.3 * max(maximum.max(), limit[np.isfinite(limit)].max(initial=0))  # with space for the note
     for joint, axes in enumerate(row):
-        _plot_lines(axes, _times(demonstrations), demonstrations.qvel[..., joint], "speed")
-        _plot_limits(axes, (-rated[joint], rated[joint]))
-        _note(axes, fastest[joint], rated[joint])
-        axes.set_ylim(-shown, shown)
+        _plot_lines(axes, _times(demonstrations), demonstrations.qvel[..., joint], "velocity")
+        _plot_limits(axes, (-limit[joint], limit[joint]))
+        _note(axes, maximum[joint], limit[joint])
+        axes.set_ylim(-height, height)
     _label_row(row, "velocity [rad/s]")
 
 
 def _plot_torques(row: Any, demonstrations: Demonstrations, arm: Embodiment) -> None:
     assert demonstrations.torque is not None
-    limit, largest = np.asarray(arm.torque_limit), peak(demonstrations.torque)
-    held = np.repeat(demonstrations.torque, 2, axis=1)  # a stair: one value from each sample to the next
+    limit, maximum = np.asarray(arm.torque_limit), peak(demonstrations.torque)
+    steps = np.repeat(demonstrations.torque, 2, axis=1)  # constant from each sample to the next
     time = np.repeat(_times(demonstrations), 2)[1:-1]
     for joint, axes in enumerate(row):
-        _plot_lines(axes, time, held[..., joint], "torque")
-        _note(axes, largest[joint], limit[joint])
-        shown = 1.4 * largest[joint] or 1.0  # the limit is often ten times as far
-        axes.set_ylim(-shown, shown)
-        if limit[joint] <= shown:
+        _plot_lines(axes, time, steps[..., joint], "torque")
+        _note(axes, maximum[joint], limit[joint])
+        height = 1.4 * maximum[joint] or 1.0  # the limit is often ten times as large
+        axes.set_ylim(-height, height)
+        if limit[joint] <= height:
             _plot_limits(axes, (-limit[joint], limit[joint]))
     row[0].set_ylabel("torque [N m]")
 
@@ -116,11 +118,13 @@ def _plot_torques(row: Any, demonstrations: Demonstrations, arm: Embodiment) -> 
 def _plot_hand(figure: Any, paths: Float[np.ndarray, "demonstrations samples 3"]) -> None:
     flat = np.ptp(paths[..., 2]) < _FLAT
     views = [("from above", 0, 1)] if flat else [("from above", 0, 1), ("from the side", 0, 2)]
-    for axes, (view, across, up) in zip(figure.subplots(len(views), 1, squeeze=False).flat, views, strict=True):
-        _add_lines(axes, paths[..., across], paths[..., up], "hand")
-        axes.plot(paths[:, -1, across], paths[:, -1, up], "o", color=_COLOURS["hand"], ms=2.5, label="end")
-        axes.plot(*paths[0, 0, [across, up]], "ks", ms=5, label="start")
-        axes.set(xlabel="x [m]", ylabel=f"{'xyz'[up]} [m]", title=f"hand, {view}")
+    for axes, (view, horizontal, vertical) in zip(
+        figure.subplots(len(views), 1, squeeze=False).flat, views, strict=True
+    ):
+        _add_lines(axes, paths[..., horizontal], paths[..., vertical], "hand")
+        axes.plot(paths[:, -1, horizontal], paths[:, -1, vertical], "o", color=_COLOURS["hand"], ms=2.5, label="end")
+        axes.plot(*paths[0, 0, [horizontal, vertical]], "ks", ms=5, label="start")
+        axes.set(xlabel="x [m]", ylabel=f"{'xyz'[vertical]} [m]", title=f"hand, {view}")
         axes.set_aspect("equal", adjustable="datalim")
         axes.locator_params(nbins=5)
         axes.grid(alpha=0.3)
@@ -132,18 +136,18 @@ def _times(demonstrations: Demonstrations) -> Float[np.ndarray, " samples"]:
 
 
 def _opacity(lines: np.ndarray) -> float:
-    """Of one line among many: a few are to be told apart, of many the density is to be seen."""
+    """Opacity of each line: a few lines stay distinct, many lines show their density."""
     return float(np.clip(40 / len(lines), 0.35, 0.9))
 
 
-def _plot_lines(axes: Any, time: np.ndarray, values: Float[np.ndarray, "demonstrations time"], what: str) -> None:
-    _add_lines(axes, np.broadcast_to(time, values.shape), values, what)
+def _plot_lines(axes: Any, time: np.ndarray, values: Float[np.ndarray, "demonstrations time"], quantity: str) -> None:
+    _add_lines(axes, np.broadcast_to(time, values.shape), values, quantity)
 
 
-def _add_lines(axes: Any, across: np.ndarray, up: np.ndarray, what: str) -> None:
-    """Thin lines [lines, points], as one artist: hundreds of artists take seconds to draw."""
-    style = {"color": _COLOURS[what], "lw": 0.6, "alpha": _opacity(up)}
-    axes.add_collection(LineCollection(list(np.stack([across, up], axis=-1)), **style))
+def _add_lines(axes: Any, horizontal: np.ndarray, vertical: np.ndarray, quantity: str) -> None:
+    """Draws thin lines [lines, points] as one artist: hundreds of artists take seconds."""
+    style = {"color": _COLOURS[quantity], "lw": 0.6, "alpha": _opacity(vertical)}
+    axes.add_collection(LineCollection(list(np.stack([horizontal, vertical], axis=-1)), **style))
     axes.autoscale_view()
 
 
@@ -154,13 +158,13 @@ def _plot_limits(axes: Any, limits: tuple[float, float]) -> None:
 
 
 def _note(axes: Any, value: float, limit: float) -> None:
-    """The peak and its limit, at the top of a panel."""
+    """Writes the peak and its limit at the top of a panel."""
     note = f"peak {value:.2f}" + (f" of {limit:.4g}" if np.isfinite(limit) else "")
     axes.text(0.5, 0.97, note, transform=axes.transAxes, ha="center", va="top", fontsize="x-small")
 
 
 def _label_row(row: Any, label: str) -> None:
-    """One scale for all joints, said once."""
+    """Labels the scale, which all joints of a row share, at the first panel."""
     row[0].set_ylabel(label)
     for axes in row[1:]:
         axes.tick_params(labelleft=False)

@@ -1,4 +1,4 @@
-"""`python -m mimic.evaluate`: repeats the report of a run from a checkpoint alone, or for another controller."""
+"""`python -m mimic.evaluate`: evaluates a run from a checkpoint, or another controller in place of its policy."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from mimic.commands.config import EvaluateConfig
 from mimic.commands.progress import SearchProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
+from mimic.config import new_folder
 from mimic.envs.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
@@ -22,22 +23,20 @@ from mimic.trainers.trainer import Trainer
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
-    """An evaluation of a run from a checkpoint alone, ready to start.
+    """Checks the config of an evaluation and restores the run from its checkpoint.
 
     Raises:
-      ValueError: no run directory, no such checkpoint, an `out` that exists, or what only a policy can be asked for.
+      ValueError: the run directory or the checkpoint is missing, `out` exists, or the options need a policy and the
+        run has none.
     """
     stopwatch = Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
     if not config.run:
         raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
-    trained = load_config(run_dir)  # saved resolved: the machine does not matter
+    trained = load_config(run_dir)  # saved with all values resolved, so that they do not depend on this machine
     check_checkpoint(run_dir, config.checkpoint)
-    out = Path(config.out).expanduser() if config.out else None
-    if out and (out.exists() or not out.parent.is_dir()):
-        reason = "exists; name a new folder" if out.exists() else f"there is no folder {str(out.parent)!r}"
-        raise ValueError(f"out: {str(out)!r}: {reason}")
+    out = new_folder("out", config.out) if config.out else None
     with stopwatch.stage("build"):
         trained, trainer = _trainer_to_evaluate(trained, run_dir, config)
         steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
@@ -47,8 +46,8 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         with stopwatch.stage("evaluate"):
             with SearchProgress(console, config.search.iterations) as progress:
                 outcome, controller = trainer.run_controller(config.controller, params, config.search, progress.update)
-            figures = {**trainer.figures(outcome), **trainer.details(outcome, config.controller)}
-        report = make_report(trained, trainer, figures, stopwatch, steps, 0)
+            metrics = {**trainer.metrics(outcome), **trainer.details(outcome, config.controller)}
+        report = make_report(trained, trainer, metrics, stopwatch, steps, 0)
         report |= {**controller, "evaluated": _conditions(trained, config)}
         show_report(console, report, trainer)
         if out:
@@ -62,7 +61,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
 
 
 def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateConfig) -> tuple[TrainConfig, Trainer]:
-    """A run as it was, or with other demonstrations, physics or loads."""
+    """The trainer of a run, with the demonstrations, the physics and the arm parameters of the evaluation."""
     factors = {"mass": config.mass, "damping": config.damping}
     changes: dict[str, Any] = {key: [value, value] for key, value in factors.items() if value is not None}
     if config.torque_noise is not None:
@@ -85,7 +84,7 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
 
 
 def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
-    """What an evaluation was made under."""
+    """The conditions of an evaluation, for its report."""
     env = trained.env
     return {
         "run": config.run,

@@ -1,4 +1,4 @@
-"""What `python -m mimic.export` does: a trained policy or pose mapper as a file that runs without mimic."""
+"""`python -m mimic.export`: writes a trained policy or pose mapper to a file that runs without mimic."""
 
 import dataclasses
 import importlib
@@ -26,20 +26,20 @@ from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo import training
 from mimic.trainers.run_config import load_config
 
-_NEEDS = {"onnx": "onnx", "jax": "flatbuffers"}  # the package that each format is written with
+_PACKAGES = {"onnx": "onnx", "jax": "flatbuffers"}  # the package that writes each format
 _JAX_PLATFORMS = ("cpu", "cuda")
 
 
 @dataclasses.dataclass(frozen=True)
-class Portable:
-    """What is exported.
+class ExportedFunction:
+    """A function to export.
 
     Attributes:
-      function: of one float32 vector; gives a vector for each output, by name.
+      function: maps one float32 vector to the named output vectors.
       kind: "policy" or "pose_mapper".
-      input_name: of its input.
-      input_size: length of its input.
-      metadata: what the numbers mean.
+      input_name: name of the input.
+      input_size: length of the input.
+      metadata: meaning and units of inputs and outputs.
     """
 
     function: Callable[[jax.Array], dict[str, jax.Array]]
@@ -57,60 +57,60 @@ def export_run(
     learner: str = "",
     checkpoint: int | None = None,
 ) -> Path:
-    """Writes the policy or the pose mapper of a run as a file that other programs can run, without mimic.
+    """Writes the policy or the pose mapper of a run to a file that other programs can run without mimic.
 
-    A policy takes `observation` [batch, observations] and gives `action` [batch, joints] in [-1, 1], without
-    exploration, and `torque` [N m]. A pose mapper takes `expert_qpos` [batch, joints] and gives `learner_qpos`, in rad.
-    What turns observations and poses into inputs of the network, and its outputs into actions and poses, is inside.
+    A policy maps `observation` [batch, observations] to `action` [batch, joints] in [-1, 1], without exploration, and
+    to `torque` [N m]. A pose mapper maps `expert_qpos` [batch, joints] to `learner_qpos` [batch, learner_joints], both
+    in rad. The file includes the normalisation of inputs and the scaling of outputs.
 
     Args:
-      run: the run directory.
-      out: the file; must not exist.
-      format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a file beside it that ends in .json.
-      learner: name of the environment whose arms it is meant for; any where empty.
-      checkpoint: steps of the checkpoint; the last one where None.
+      run: run directory.
+      out: exported file; must not exist.
+      format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json".
+      learner: name of the environment that the run's arms must equal. Default "": not checked.
+      checkpoint: steps of the checkpoint. Default None: the last checkpoint.
 
     Returns:
-      The file.
+      Path of the file.
 
     Raises:
-      ValueError: no such run or checkpoint, a run of other arms, a file that cannot be written, an unknown format, or
-        a package that the format needs and that is not installed.
+      ValueError: the run or the checkpoint does not exist, the run has other arms, the file cannot be written, the
+        format is unknown, or a package that it needs is not installed.
     """
     config = ExportConfig(os.fspath(run), os.fspath(out), format, learner, checkpoint)
-    _write(_portable(config), _file(config), format)
+    _write(_exported_function(config), _file(config), format)
     return Path(out).expanduser()
 
 
 def prepare_export(config: ExportConfig) -> Callable[[], None]:
-    """An export, ready to be written.
+    """Checks the config of an export and restores the run.
 
     Raises:
       ValueError: see `export_run`.
     """
     out = _file(config)
-    portable = _portable(config)
+    exported = _exported_function(config)
 
     def run() -> None:
-        _write(portable, out, config.format)
+        _write(exported, out, config.format)
         console = Console()
-        made = f"{portable.kind.replace('_', ' ')} of {portable.metadata['env']}"
-        outputs = ", ".join(portable.metadata["outputs"])
-        console.print(f"{made}: {portable.input_name} [batch, {portable.input_size}] -> {outputs}", markup=False)
+        title = f"{exported.kind.replace('_', ' ')} of {exported.metadata['env']}"
+        outputs = ", ".join(exported.metadata["outputs"])
+        console.print(f"{title}: {exported.input_name} [batch, {exported.input_size}] -> {outputs}", markup=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
 
 
 def _file(config: ExportConfig) -> Path:
-    """Where it goes."""
+    """The new file of the export."""
     check_choice("format", config.format, EXPORT_FORMATS)
     out = new_file("out", config.out)
     if config.format == "jax":
-        new_file("out", str(_beside(out)))
+        new_file("out", str(_metadata_file(out)))
     if not os.access(out.parent, os.W_OK):
         raise ValueError(f"out: {str(out)!r}: the folder cannot be written to")
-    package = _NEEDS[config.format]
+    package = _PACKAGES[config.format]
     try:
         importlib.import_module(package)
     except ImportError as error:
@@ -120,12 +120,13 @@ def _file(config: ExportConfig) -> Path:
     return out
 
 
-def _beside(out: Path) -> Path:
+def _metadata_file(out: Path) -> Path:
+    """The file of the metadata, for the format "jax"."""
     return out.with_name(out.name + ".json")
 
 
-def _portable(config: ExportConfig) -> Portable:
-    """The network of a run as a function."""
+def _exported_function(config: ExportConfig) -> ExportedFunction:
+    """The function of a run's network."""
     if not config.run:
         raise ValueError("run: expected the run directory to export, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
@@ -133,7 +134,7 @@ def _portable(config: ExportConfig) -> Portable:
     steps = check_checkpoint(run_dir, config.checkpoint)
     expert, learner = trained.env.build_arms().embodiments
     if config.learner:
-        _check_meant_for(config.learner, expert, learner)
+        _check_arms(config.learner, expert, learner)
     common = {
         "mimic_version": versions()["mimic-mjx"],
         "env": trained.env.name,
@@ -149,22 +150,23 @@ def _portable(config: ExportConfig) -> Portable:
     return _mapper(PoseMapper.load(run_dir, steps), common)
 
 
-def _check_meant_for(name: str, expert: Embodiment, learner: Embodiment) -> None:
-    meant = env_config(name).build_arms().embodiments
-    for role, own, other in zip(("expert", "learner"), (expert, learner), meant, strict=True):
-        if (own.name, own.joint_names) != (other.name, other.joint_names):
+def _check_arms(name: str, expert: Embodiment, learner: Embodiment) -> None:
+    """Raises a `ValueError` unless the arms of a run are those of an environment."""
+    required_arms = env_config(name).build_arms().embodiments
+    for role, arm, required in zip(("expert", "learner"), (expert, learner), required_arms, strict=True):
+        if (arm.name, arm.joint_names) != (required.name, required.joint_names):
             raise ValueError(
-                f"learner: {name} has the {role} {other.name} with joints {', '.join(other.joint_names)}, "
-                f"but the run's is {own.name} with joints {', '.join(own.joint_names)}"
+                f"learner: {name} has the {role} {required.name} with joints {', '.join(required.joint_names)}, "
+                f"but the run's is {arm.name} with joints {', '.join(arm.joint_names)}"
             )
 
 
-def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str, Any]) -> Portable:
+def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str, Any]) -> ExportedFunction:
     arms = trained.env.build_arms()
     expert, learner = arms.embodiments
     layout = observation_layout(expert, learner, trained.env.preview)
     size = layout[-1]["stop"]
-    config = cast(PPOConfig, trained.trainer).resolve()  # saved with all values: the machine does not matter
+    config = cast(PPOConfig, trained.trainer).resolve()  # saved with all values resolved
     params = load_checkpoint(run_dir, training.params_template(config, size, learner.num_joints), steps)[1]
     controller = training.make_controller(config, size, learner.num_joints)(jax.device_get(params))
     scale = jnp.asarray(torque_scale(arms.learner, trained.env.action_scale, trained.env.control_dt))
@@ -177,17 +179,17 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str
         **common,
         "inputs": {"observation": "see observation_layout"},
         "outputs": {
-            "action": "share of the largest torque of each joint, in [-1, 1]",
-            "torque": "N m, beside what carries the arm's weight; to be held for control_dt",
+            "action": "fraction of the maximum torque of each joint, in [-1, 1]",
+            "torque": "N m, in addition to gravity compensation; constant for control_dt",
         },
         "observation_layout": layout,
         "torque_scale": [float(torque) for torque in scale],
         "control_dt": trained.env.control_dt,
     }
-    return Portable(function, "policy", "observation", size, metadata)
+    return ExportedFunction(function, "policy", "observation", size, metadata)
 
 
-def _mapper(mapper: PoseMapper, common: Mapping[str, Any]) -> Portable:
+def _mapper(mapper: PoseMapper, common: Mapping[str, Any]) -> ExportedFunction:
     params = jax.device_get(mapper.params)
 
     def function(qpos: jax.Array) -> dict[str, jax.Array]:
@@ -200,40 +202,40 @@ def _mapper(mapper: PoseMapper, common: Mapping[str, Any]) -> Portable:
         "expert_range": _range(mapper.expert),
         "learner_range": _range(mapper.learner),
     }
-    return Portable(function, "pose_mapper", "expert_qpos", mapper.expert.num_joints, metadata)
+    return ExportedFunction(function, "pose_mapper", "expert_qpos", mapper.expert.num_joints, metadata)
 
 
 def _range(arm: Embodiment) -> Sequence[Sequence[float]]:
     return [[float(bound) for bound in bounds] for bounds in arm.joint_range]
 
 
-def _write(portable: Portable, out: Path, format: str) -> None:
-    written = {"onnx": _onnx_bytes, "jax": _jax_bytes}[format](portable)
+def _write(exported: ExportedFunction, out: Path, format: str) -> None:
+    content = {"onnx": _onnx_bytes, "jax": _jax_bytes}[format](exported)
     partial = out.with_name(out.name + ".partial")
-    partial.write_bytes(written)
+    partial.write_bytes(content)
     if format == "jax":
-        write_atomically(_beside(out), json.dumps(portable.metadata, indent=2) + "\n")
+        write_atomically(_metadata_file(out), json.dumps(exported.metadata, indent=2) + "\n")
     os.replace(partial, out)
 
 
-def _onnx_bytes(portable: Portable) -> bytes:
-    from mimic.commands.onnx_graph import to_onnx  # of an extra
+def _onnx_bytes(exported: ExportedFunction) -> bytes:
+    from mimic.commands.onnx_graph import to_onnx  # needs the extra "export"
 
-    texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in portable.metadata.items()}
+    texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in exported.metadata.items()}
     model = to_onnx(
-        portable.function,
-        name=portable.kind,
-        input_name=portable.input_name,
-        input_size=portable.input_size,
+        exported.function,
+        name=exported.kind,
+        input_name=exported.input_name,
+        input_size=exported.input_size,
         metadata=texts,
     )
     return model.SerializeToString()
 
 
-def _jax_bytes(portable: Portable) -> bytes:
-    from jax import export  # no attribute of jax until it is imported
+def _jax_bytes(exported: ExportedFunction) -> bytes:
+    from jax import export  # jax.export must be imported explicitly
 
     (batch,) = export.symbolic_shape("batch")
-    shape = jax.ShapeDtypeStruct((batch, portable.input_size), jnp.float32)
-    exported = export.export(jax.jit(jax.vmap(portable.function)), platforms=_JAX_PLATFORMS)(shape)
-    return bytes(exported.serialize())
+    shape = jax.ShapeDtypeStruct((batch, exported.input_size), jnp.float32)
+    serializable = export.export(jax.jit(jax.vmap(exported.function)), platforms=_JAX_PLATFORMS)(shape)
+    return bytes(serializable.serialize())

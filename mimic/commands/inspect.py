@@ -1,10 +1,10 @@
-"""What `python -m mimic.inspect` does: says what an arm's file holds, and what would come of training it."""
+"""`python -m mimic.inspect`: shows the joints, links and limits of an arm, and how closely it can imitate."""
 
 import dataclasses
 import json
 import os
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,40 +17,57 @@ from rich.console import Console  # noqa: E402
 from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from mimic.arms.arm import Arm, ArmConfig, rated_speed, torque_scale
+from mimic.arms.arm import Arm, ArmConfig, finite_velocity_limit, torque_scale
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.arms.simulation_model import effective_inertia  # noqa: E402
-from mimic.commands.arm_checks import ReachableDistance, assumptions, calmed, joint_ranges, reachable_distance, warnings  # noqa: E402
+from mimic.commands import arm_checks  # noqa: E402
 from mimic.commands.config import InspectConfig  # noqa: E402
 from mimic.commands.progress import similarity_table  # noqa: E402
-from mimic.envs.config import EnvConfig
+from mimic.config import new_folder  # noqa: E402
+from mimic.envs.config import EnvConfig  # noqa: E402
+from mimic.envs.demonstrations import Demonstrations  # noqa: E402
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
-from mimic.paper_figures.pose_picture import PosePairs, nearest_poses, readable_poses, save_poses  # noqa: E402
+from mimic.paper_figures.pose_picture import nearest_poses, readable_poses, save_poses  # noqa: E402
 
-_PICTURE, _POSES, _FINDINGS = "arms.png", "poses.png", "inspection.json"
+_PICTURE, _POSES, _RESULTS = "arms.png", "poses.png", "inspection.json"
 _SCENE = 800, 640  # pixels
 
 
+@dataclasses.dataclass(frozen=True)
+class Inspection:
+    """Results of an inspection.
+
+    Attributes:
+      joints, links: tables of the learner's joints and links, one entry for each row.
+      ignored: elements of the model that are ignored.
+      assumed: values that the model lacks.
+      warnings: reasons why the learner may imitate badly.
+      reachable: distance that the learner can reach; None without `bound`.
+      similarity: similarity of the nearest poses; None without `bound`.
+      command: command that trains the learner.
+    """
+
+    joints: list[dict[str, Any]]
+    links: list[dict[str, Any]]
+    ignored: list[str]
+    assumed: list[str]
+    warnings: list[str]
+    reachable: arm_checks.ReachableDistance | None
+    similarity: Mapping[str, Any] | None
+    command: str
+
+
 def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
-    """What inspects an arm.
+    """Checks the config of an inspection and builds both arms.
 
     Raises:
-      ValueError: an arm that cannot be trained, no OpenGL for the picture, or an `out` that exists.
+      ValueError: an arm cannot be trained, the expert's limits permit no goal, `out` exists, or OpenGL is not available
+        for the pictures.
     """
-    out = _new_folder(config.out)
+    out = new_folder("out", config.out) if config.out else None
     env = EnvConfig(name="pair", expert=config.expert, learner=config.learner, limits=config.limits)
     expert, learner = env.build_arms()
-    joints, links = _joints(learner, config.learner, env), _links(expert, learner, env)
-    notes = list(learner.notes)
-    assumed, warned = list(assumptions(config.learner, learner)), list(warnings(config.learner, learner))
-    calm, why = calmed(config.learner, learner, env)
-    warned += [why] if why else []
-    command = train_command(dataclasses.replace(config, learner=calm))
-    near = reachable_distance(expert, learner, env) if config.bound else None
-    alike = near and pose_similarity(
-        expert.embodiment, learner.embodiment, near.expert_qpos, {"nearest_poses": near.nearest_qpos}
-    )
-    pairs = out and near and _pose_pairs(expert, learner, env, near)
+    demonstrations = arm_checks.sample_demonstrations(expert, env) if config.bound else None
     scene = (
         ArmScene([config.expert, config.learner], limits=config.limits, width=_SCENE[0], height=_SCENE[1])
         if out
@@ -59,51 +76,81 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
 
     def run() -> None:
         console = Console()
-        console.print(_headline(expert, learner), highlight=False, soft_wrap=True)
-        console.print(_table(f"joints of {learner.embodiment.name}", joints))
-        console.print(_table("links, and the expert's links that they are compared with", links))
-        for title, lines in (("set aside", notes), ("assumed", assumed), ("mind", warned)):
-            for line in lines:
-                console.print(f"{title}: {escape(line)}", highlight=False, soft_wrap=True)
-        if near is not None and alike is not None:
-            console.print(_distance_line(near.bound, near.hold, expert), highlight=False, soft_wrap=True)
-            console.print(similarity_table(alike))
+        inspection = _inspect(config, env, expert, learner, demonstrations)
+        _print(console, inspection, expert, learner)
         if out and scene:
             out.mkdir()
             with scene:
-                _save_picture(
-                    out / _PICTURE, scene.image([expert.embodiment.home, learner.embodiment.home]), expert, learner, env
-                )
-            if pairs:
-                save_poses(out / _POSES, expert, learner, env, pairs)
-            findings = {
-                "arm": learner.embodiment.name,
-                "expert": expert.embodiment.name,
-                "joints": joints,
-                "links": links,
-                "set_aside": notes,
-                "assumed": assumed,
-                "mind": warned,
-                "bound": near and near.bound,
-                "hold": near and near.hold,
-                "similarity": alike,
-                "poses": pairs.as_json() if pairs else None,
-                "train": command,
-            }
-            (out / _FINDINGS).write_text(json.dumps(findings, indent=2) + "\n")
+                image = scene.image([expert.embodiment.home, learner.embodiment.home])
+            _save_picture(out / _PICTURE, image, expert, learner, env)
+            _write(out, inspection, expert, learner, env)
             console.print(f"results: {out}", soft_wrap=True, highlight=False)
-        console.print(f"train it: {command}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"train it: {inspection.command}", soft_wrap=True, highlight=False, markup=False)
 
     return run
 
 
-def _pose_pairs(expert: Arm, learner: Arm, env: EnvConfig, near: ReachableDistance) -> PosePairs:
-    poses = readable_poses(env.expert, expert, near.expert_qpos[:, 0])
-    return nearest_poses(expert, learner, env.metric, poses)
+def _inspect(
+    config: InspectConfig, env: EnvConfig, expert: Arm, learner: Arm, demonstrations: Demonstrations | None
+) -> Inspection:
+    """Inspects the learner; computes its reachable distance on the demonstrations, if there are any."""
+    stable_config, reason = arm_checks.stabilised(config.learner, learner, env)
+    reachable = similarity = None
+    if demonstrations is not None:
+        reachable = arm_checks.reachable_distance(expert, learner, env, demonstrations)
+        nearest = {"nearest_poses": reachable.nearest_qpos}
+        similarity = pose_similarity(expert.embodiment, learner.embodiment, reachable.expert_qpos, nearest)
+    return Inspection(
+        joints=_joints(learner, config.learner, env),
+        links=_links(expert, learner, env),
+        ignored=list(learner.notes),
+        assumed=list(arm_checks.assumptions(config.learner, learner)),
+        warnings=[*arm_checks.warnings(config.learner, learner), *([reason] if reason else [])],
+        reachable=reachable,
+        similarity=similarity,
+        command=train_command(dataclasses.replace(config, learner=stable_config)),
+    )
+
+
+def _print(console: Console, inspection: Inspection, expert: Arm, learner: Arm) -> None:
+    console.print(_headline(expert, learner), highlight=False, soft_wrap=True)
+    console.print(_table(f"joints of {learner.embodiment.name}", inspection.joints))
+    console.print(_table("links, and the expert links that they are compared with", inspection.links))
+    notes = {"ignored": inspection.ignored, "assumed": inspection.assumed, "warning": inspection.warnings}
+    for label, lines in notes.items():
+        for line in lines:
+            console.print(f"{label}: {escape(line)}", highlight=False, soft_wrap=True)
+    if inspection.reachable is not None and inspection.similarity is not None:
+        console.print(_distance_line(inspection.reachable, expert), highlight=False, soft_wrap=True)
+        console.print(similarity_table(inspection.similarity))
+
+
+def _write(out: Path, inspection: Inspection, expert: Arm, learner: Arm, env: EnvConfig) -> None:
+    """Writes the results as JSON, and a picture of the nearest poses of some poses of the expert."""
+    pairs, reachable = None, inspection.reachable
+    if reachable is not None:
+        poses = readable_poses(env.expert, expert, reachable.expert_qpos[:, 0])
+        pairs = nearest_poses(expert, learner, env.metric, poses)
+        save_poses(out / _POSES, expert, learner, env, pairs)
+    results = {
+        "arm": learner.embodiment.name,
+        "expert": expert.embodiment.name,
+        "joints": inspection.joints,
+        "links": inspection.links,
+        "set_aside": inspection.ignored,
+        "assumed": inspection.assumed,
+        "mind": inspection.warnings,
+        "bound": reachable and reachable.bound,
+        "hold": reachable and reachable.hold,
+        "similarity": inspection.similarity,
+        "poses": pairs and pairs.as_json(),
+        "train": inspection.command,
+    }
+    (out / _RESULTS).write_text(json.dumps(results, indent=2) + "\n")
 
 
 def train_command(config: InspectConfig) -> str:
-    """The command that trains what was inspected."""
+    """The command that trains the inspected learner."""
     words = ["python -m mimic.train env=pair"]
     words += [word for role in ("expert", "learner") for word in _arm_words(f"env.{role}", getattr(config, role))]
     if config.limits != "none":
@@ -112,8 +159,8 @@ def train_command(config: InspectConfig) -> str:
 
 
 def _arm_words(key: str, arm: ArmConfig) -> list[str]:
-    near = os.path.relpath(arm.model) if arm.is_file else arm.model
-    words = [f"{key}={arm.model if near.startswith('..') else near}"]
+    path = os.path.relpath(arm.model) if arm.is_file else arm.model
+    words = [f"{key}={arm.model if path.startswith('..') else path}"]
     words += [
         f"{key}.{name}={value}" for name in ("base", "tip", "armature", "damping") if (value := getattr(arm, name))
     ]
@@ -124,21 +171,11 @@ def _arm_words(key: str, arm: ArmConfig) -> list[str]:
     return [shlex.quote(word) if "{" in word else word for word in (word.replace("'", "") for word in words)]
 
 
-def _new_folder(path: str) -> Path | None:
-    if not path:
-        return None
-    folder = Path(path).expanduser()
-    if folder.exists() or not folder.parent.is_dir():
-        reason = "exists; name a new folder" if folder.exists() else f"there is no folder {str(folder.parent)!r}"
-        raise ValueError(f"out: {str(folder)!r}: {reason}")
-    return folder
-
-
 def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]:
     embodiment = arm.embodiment
     columns = {
-        "range": joint_ranges(config, arm).tolist(),
-        "rated speed": rated_speed(embodiment).tolist(),
+        "range": arm_checks.joint_ranges(config, arm).tolist(),
+        "rated speed": finite_velocity_limit(embodiment).tolist(),
         "speed is assumed": (~np.isfinite(embodiment.velocity_limit)).tolist(),
         "torque limit": [float(x) if np.isfinite(x) else None for x in embodiment.torque_limit],
         "torque offered": torque_scale(arm, env.action_scale, env.control_dt).tolist(),
@@ -152,26 +189,26 @@ def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]
 
 
 def _links(expert: Arm, learner: Arm, env: EnvConfig) -> list[dict[str, Any]]:
-    arm, shares = learner.embodiment, env.metric.shares(expert.embodiment, learner.embodiment)
+    arm, fractions = learner.embodiment, env.metric.link_fractions(expert.embodiment, learner.embodiment)
     return [
         {
             "link": name,
             "length": float(arm.link_lengths[index]),
             "moved by": arm.joint_names[arm.link_joint[index]] if arm.link_joint[index] >= 0 else "nothing",
             "compared with": {
-                other: float(share)
-                for other, share in zip(expert.embodiment.link_names, shares[:, index], strict=True)
-                if share > 0
+                expert_link: float(fraction)
+                for expert_link, fraction in zip(expert.embodiment.link_names, fractions[:, index], strict=True)
+                if fraction > 0
             },
         }
         for index, name in enumerate(arm.link_names)
     ]
 
 
-_HEADERS = {
-    "range": "range\n[rad]", "rated speed": "rated speed\n[rad/s]", "torque limit": "torque limit\n[N m]",
-    "torque offered": "torque offered\n[N m]", "inertia": "inertia\n[kg m^2]", "length": "length\n[m]",
-    "held at": "held at\n[rad]",
+_HEADERS = {  # of the tables, by the keys of inspection.json
+    "range": "range\n[rad]", "rated speed": "velocity limit\n[rad/s]", "torque limit": "torque limit\n[N m]",
+    "torque offered": "action torque\n[N m]", "inertia": "inertia\n[kg m^2]", "length": "length\n[m]",
+    "held at": "locked at\n[rad]",
 }  # fmt: skip
 
 
@@ -179,7 +216,7 @@ def _table(title: str, rows: list[dict[str, Any]]) -> Table:
     hidden = {"speed is assumed"} | {key for key in ("held at",) if all(row.get(key) is None for row in rows)}
     keys = [key for key in rows[0] if key not in hidden]
     table = Table(title=title, title_justify="left")
-    for key in keys:  # names as they are, whatever the width
+    for key in keys:  # names are never wrapped
         table.add_column(escape(_HEADERS.get(key, key)), no_wrap=key in ("joint", "link", "moved by"))
     for row in rows:
         assumed = {"rated speed"} if row.get("speed is assumed") else set()
@@ -191,41 +228,44 @@ def _text(value: Any) -> str:
     if value is None:
         return "-"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {share:.0%}" for name, share in value.items())
+        return ", ".join(f"{name} {fraction:.0%}" for name, fraction in value.items())
     if isinstance(value, list):
         return " to ".join(f"{x:.2f}" for x in value)
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def _headline(expert: Arm, learner: Arm) -> str:
-    arm, other = learner.embodiment, expert.embodiment
+    arm, expert_arm = learner.embodiment, expert.embodiment
     return (
         f"{arm.name}: {arm.num_joints} joints, {arm.num_links} links, {arm.chain_length:.3f} m along them, "
-        f"{learner.model.body_mass.sum():.2f} kg that move; expert {other.name}: "
-        f"{other.num_joints} joints, {other.num_links} links, {other.chain_length:.3f} m"
+        f"{learner.model.body_mass.sum():.2f} kg of moving mass; expert {expert_arm.name}: "
+        f"{expert_arm.num_joints} joints, {expert_arm.num_links} links, {expert_arm.chain_length:.3f} m"
     )
 
 
-def _distance_line(bound: float, hold: float, expert: Arm) -> str:
+def _distance_line(reachable: arm_checks.ReachableDistance, expert: Arm) -> str:
+    bound, hold = reachable.bound, reachable.hold
     return (
-        f"on random demonstrations of {expert.embodiment.name}, distance of the best poses: {bound:.3f}, of holding "
-        f"the start pose: {hold:.3f}; {1 - bound / hold:.0%} of it can be imitated"
+        f"distance on random demonstrations of {expert.embodiment.name}: {bound:.3f} for the best poses, {hold:.3f} "
+        f"for holding the start pose; imitation can reduce it by {1 - bound / hold:.0%}"
     )
 
 
 def _save_picture(path: Path, image: np.ndarray, expert: Arm, learner: Arm, env: EnvConfig) -> None:
-    """Both arms in their start poses beside how much each link of one counts for each of the other."""
+    """Draws both arms in their start poses, and the correspondence of their links as a matrix of fractions."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 5.6), width_ratios=(1.35, 1), layout="constrained")
     left.imshow(image)
     left.axis("off")
     left.set_title(f"{expert.embodiment.name} (expert), {learner.embodiment.name} (learner)")
-    shares = env.metric.shares(expert.embodiment, learner.embodiment)
-    right.imshow(shares, cmap="Blues", vmin=0, vmax=1)
-    for (row, column), share in np.ndenumerate(shares):
-        if share > 0.005:
-            right.text(column, row, f"{share:.0%}", ha="center", va="center", color="white" if share > 0.6 else "black")
-    right.set_xticks(range(shares.shape[1]), learner.embodiment.link_names, rotation=30, ha="right")
-    right.set_yticks(range(shares.shape[0]), expert.embodiment.link_names)
+    fractions = env.metric.link_fractions(expert.embodiment, learner.embodiment)
+    right.imshow(fractions, cmap="Blues", vmin=0, vmax=1)
+    for (row, column), fraction in np.ndenumerate(fractions):
+        if fraction > 0.005:
+            right.text(
+                column, row, f"{fraction:.0%}", ha="center", va="center", color="white" if fraction > 0.6 else "black"
+            )
+    right.set_xticks(range(fractions.shape[1]), learner.embodiment.link_names, rotation=30, ha="right")
+    right.set_yticks(range(fractions.shape[0]), expert.embodiment.link_names)
     right.set(xlabel="learner", ylabel="expert", title="which expert links a learner link is compared with")
     figure.savefig(path, dpi=100)
     plt.close(figure)

@@ -1,7 +1,7 @@
-"""JAX functions as ONNX graphs: the operations of a traced function, one by one, with a batch axis in front.
+"""Conversion of JAX functions to ONNX graphs: each operation of a traced function, with a leading batch axis.
 
-What is exported is what JAX runs, so that there is no second definition of a network to keep in step. Only operations
-that the exported functions use are known.
+The graph is converted from what JAX runs, so that no second definition of a network must be kept consistent. Only the
+operations that the exported functions use are supported.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-OPSET, IR_VERSION = 18, 8  # of 2022: reductions take their axes as inputs; runtimes since then can read it
+OPSET, IR_VERSION = 18, 8  # of 2022: reductions take axes as inputs; supported by all runtimes since then
 _UNARY = {
     "abs": "Abs", "cos": "Cos", "exp": "Exp", "log": "Log", "logistic": "Sigmoid", "neg": "Neg", "not": "Not",
     "round": "Round", "sign": "Sign", "sin": "Sin", "sqrt": "Sqrt", "tanh": "Tanh",
@@ -24,17 +24,17 @@ _BINARY = {
     "le": "LessOrEqual", "lt": "Less", "max": "Max", "min": "Min", "mul": "Mul", "or": "Or", "pow": "Pow", "sub": "Sub",
 }  # fmt: skip
 _REDUCTIONS = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax", "reduce_min": "ReduceMin"}
-_TINY = np.float32(1e-30)  # in place of a divisor of 0, whose quotient has the same arc tangent
+_TINY = np.float32(1e-30)  # replaces a divisor of 0: the quotient has the same arc tangent
 
 
 class Tensor(NamedTuple):
-    """A value of the graph: its name there, and its shape in one sample."""
+    """A value of the graph: its name, and its shape without the batch axis."""
 
     name: str
     shape: tuple[int, ...]
 
 
-Value = Tensor | np.ndarray  # arrays are the same for all samples
+Value = Tensor | np.ndarray  # arrays are constant over the batch
 
 
 def to_onnx(
@@ -45,26 +45,26 @@ def to_onnx(
     input_size: int,
     metadata: Mapping[str, str],
 ) -> onnx.ModelProto:
-    """A function of one float32 vector as an ONNX model of a batch of any size.
+    """Converts a function of one float32 vector to an ONNX model with any batch size.
 
     Args:
-      function: gives a vector for each output, by name.
-      name: of the graph.
-      input_name: of the input, [batch, input_size].
+      function: maps a vector to the named output vectors.
+      name: name of the graph.
+      input_name: name of the input [batch, input_size].
       input_size: length of the vector.
-      metadata: for the model's `metadata_props`.
+      metadata: `metadata_props` of the model.
 
     Raises:
-      NotImplementedError: an operation that this module does not know.
+      NotImplementedError: the function uses an unsupported operation.
     """
     traced, shapes = jax.make_jaxpr(function, return_shape=True)(jnp.zeros(input_size, jnp.float32))
     graph = _Graph(input_name)
     results = graph.run(traced.jaxpr, list(map(np.asarray, traced.consts)), [Tensor(input_name, (input_size,))])
     outputs = []
-    for result, output_name in zip(results, sorted(shapes), strict=True):  # as JAX sorts the keys of a dict
+    for result, output_name in zip(results, sorted(shapes), strict=True):  # JAX sorts the keys of a dict
         graph.nodes.append(helper.make_node("Identity", [graph.batched(result)], [output_name]))
-        outputs.append(_described(output_name, shapes[output_name].shape[0]))
-    inputs = [_described(input_name, input_size)]
+        outputs.append(_value_info(output_name, shapes[output_name].shape[0]))
+    inputs = [_value_info(input_name, input_size)]
     proto = helper.make_graph(graph.nodes, name, inputs, outputs, list(graph.constants.values()))
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(proto, opset_imports=opset, ir_version=IR_VERSION, producer_name="mimic")
@@ -73,12 +73,12 @@ def to_onnx(
     return model
 
 
-def _described(name: str, size: int) -> onnx.ValueInfoProto:
+def _value_info(name: str, size: int) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
 
 
 class _Graph:
-    """A graph that grows: nodes in the order in which they run."""
+    """A graph under construction, with its nodes in execution order."""
 
     def __init__(self, input_name: str):
         self.nodes: list[onnx.NodeProto] = []
@@ -87,16 +87,16 @@ class _Graph:
         self._names = 0
 
     def run(self, jaxpr: Any, consts: Sequence[Value], arguments: Sequence[Value]) -> list[Value]:
-        """The results of a traced function."""
-        known: dict[Any, Value] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
-        for equation in _needed(jaxpr):
-            results = self._apply(equation, [_read(known, variable) for variable in equation.invars])
-            known.update(zip(equation.outvars, results, strict=True))
-        return [_read(known, variable) for variable in jaxpr.outvars]
+        """Adds a traced function and returns its results."""
+        values: dict[Any, Value] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
+        for equation in _live_equations(jaxpr):
+            results = self._apply(equation, [_read(values, variable) for variable in equation.invars])
+            values.update(zip(equation.outvars, results, strict=True))
+        return [_read(values, variable) for variable in jaxpr.outvars]
 
     def _apply(self, equation: Any, inputs: list[Value]) -> list[Value]:
         primitive, params = equation.primitive, equation.params
-        if not any(isinstance(value, Tensor) for value in inputs):  # the same for all samples: computed now
+        if not any(isinstance(value, Tensor) for value in inputs):  # constant over the batch: folded
             results = primitive.bind(*inputs, **params)
             return list(map(np.asarray, results if primitive.multiple_results else [results]))
         inner = params.get("jaxpr", params.get("call_jaxpr"))
@@ -107,10 +107,10 @@ class _Graph:
             return self._split(inputs[0], shapes, params["axis"])
         if name in ("copy", "optimization_barrier", "stop_gradient"):
             return inputs
-        return [Tensor(self._one(name, inputs, shapes[0], params), shapes[0])]
+        return [Tensor(self._single_output(name, inputs, shapes[0], params), shapes[0])]
 
-    def _one(self, name: str, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
-        """The name of the result of an operation that has one."""
+    def _single_output(self, name: str, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
+        """Adds an operation with one output, and returns its name."""
         if name in _UNARY:
             return self.node(_UNARY[name], *inputs)
         if name in _BINARY:
@@ -120,11 +120,11 @@ class _Graph:
         if name in ("reshape", "squeeze", "expand_dims"):
             return self._reshape(inputs[0], shape)
         if name not in _RULES:
-            raise NotImplementedError(f"onnx: the operation {name!r} is not known; known are {', '.join(_known())}")
+            raise NotImplementedError(f"onnx: unsupported operation {name!r}; supported are {', '.join(_supported())}")
         return _RULES[name](self, inputs, shape, params)
 
     def node(self, kind: str, *inputs: Value | str, **attributes: Any) -> str:
-        """Adds a node; the name of its output."""
+        """Adds a node and returns the name of its output."""
         self._names += 1
         output = f"{kind}_{self._names}"
         self.nodes.append(helper.make_node(kind, [self.name(value) for value in inputs], [output], **attributes))
@@ -142,7 +142,7 @@ class _Graph:
         return self.constants[key].name
 
     def batched(self, value: Value) -> str:
-        """The name of a value with its batch axis, also where it is the same for all samples."""
+        """The name of a value with a batch axis, which is added to constants."""
         if isinstance(value, Tensor):
             return value.name
         batch = self.node("Shape", self._input, end=1)
@@ -175,26 +175,26 @@ class _Graph:
         y, x = inputs
         zero = np.float32(0)
         divisor = self.node("Where", self.node("Equal", x, np.asarray(zero)), np.asarray(_TINY), x)
-        near = self.node("Atan", self.node("Div", y, divisor))  # right where x is not negative
-        half_turn = np.asarray(math.pi, np.float32), np.asarray(-math.pi, np.float32)
-        turn = self.node("Where", self.node("GreaterOrEqual", y, np.asarray(zero)), *half_turn)
-        is_behind = self.node("Less", divisor, np.asarray(zero))
-        return self.node("Where", is_behind, self.node("Add", near, turn), near)
+        angle = self.node("Atan", self.node("Div", y, divisor))  # correct for x >= 0
+        pi = np.asarray(math.pi, np.float32), np.asarray(-math.pi, np.float32)
+        shift = self.node("Where", self.node("GreaterOrEqual", y, np.asarray(zero)), *pi)
+        is_negative = self.node("Less", divisor, np.asarray(zero))
+        return self.node("Where", is_negative, self.node("Add", angle, shift), angle)
 
     def _select(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
-        which, otherwise, chosen = inputs  # of two cases, by a truth value
-        return self.node("Where", which, chosen, otherwise)
+        condition, if_false, if_true = inputs
+        return self.node("Where", condition, if_true, if_false)
 
     def _convert(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         return self.node("Cast", inputs[0], to=helper.np_dtype_to_tensor_dtype(np.dtype(params["new_dtype"])))
 
     def _broadcast(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         dimensions = params["broadcast_dimensions"]
-        kept = [1] * len(shape)
+        aligned = [1] * len(shape)
         for axis, size in zip(dimensions, inputs[0].shape, strict=True):
-            kept[axis] = size
-        placed = self._reshape(inputs[0], kept)
-        return placed if tuple(kept) == shape else self.node("Expand", placed, _ints([1, *shape]))
+            aligned[axis] = size
+        reshaped = self._reshape(inputs[0], aligned)
+        return reshaped if tuple(aligned) == shape else self.node("Expand", reshaped, _ints([1, *shape]))
 
     def _slice(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         strides = params["strides"] or [1] * len(shape)
@@ -207,8 +207,8 @@ class _Graph:
 
     def _stack(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         axis = params["axis"]
-        one = [*shape[:axis], 1, *shape[axis + 1 :]]
-        return self.node("Concat", *(self._reshape(self.batched(value), one) for value in inputs), axis=axis + 1)
+        unit_shape = [*shape[:axis], 1, *shape[axis + 1 :]]
+        return self.node("Concat", *(self._reshape(self.batched(value), unit_shape) for value in inputs), axis=axis + 1)
 
     def _transpose(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         return self.node("Transpose", inputs[0], perm=[0, *(axis + 1 for axis in params["permutation"])])
@@ -231,8 +231,8 @@ class _Graph:
         rows, index, *others = inputs
         if params["slice_sizes"] != (1, *rows.shape[1:]) or any(np.any(start) for start in others):
             raise NotImplementedError(f"onnx: expected one whole row of {rows.shape}, got {params['slice_sizes']}")
-        at = self._reshape(self.node("Cast", index, to=TensorProto.INT64), [1])
-        return self._reshape(self.node("GatherND", rows, at, batch_dims=1), shape)
+        position = self._reshape(self.node("Cast", index, to=TensorProto.INT64), [1])
+        return self._reshape(self.node("GatherND", rows, position, batch_dims=1), shape)
 
 
 _RULES: dict[str, Callable[[_Graph, list[Value], tuple[int, ...], Mapping[str, Any]], str]] = {
@@ -254,22 +254,22 @@ _RULES: dict[str, Callable[[_Graph, list[Value], tuple[int, ...], Mapping[str, A
 }
 
 
-def _known() -> list[str]:
+def _supported() -> list[str]:
     return sorted([*_UNARY, *_BINARY, *_REDUCTIONS, *_RULES, "expand_dims", "reshape", "split", "squeeze"])
 
 
-def _needed(jaxpr: Any) -> list[Any]:
-    """The equations that lead to a result: PPO's network also gives a spread, which nobody exports."""
-    wanted, kept = {variable for variable in jaxpr.outvars if not hasattr(variable, "val")}, []
+def _live_equations(jaxpr: Any) -> list[Any]:
+    """The equations that the results depend on, without the standard deviation of PPO's network, for example."""
+    live_variables, live = {variable for variable in jaxpr.outvars if not hasattr(variable, "val")}, []
     for equation in reversed(jaxpr.eqns):
-        if wanted.intersection(equation.outvars):
-            kept.append(equation)
-            wanted.update(variable for variable in equation.invars if not hasattr(variable, "val"))
-    return kept[::-1]
+        if live_variables.intersection(equation.outvars):
+            live.append(equation)
+            live_variables.update(variable for variable in equation.invars if not hasattr(variable, "val"))
+    return live[::-1]
 
 
-def _read(known: Mapping[Any, Value], variable: Any) -> Value:
-    return np.asarray(variable.val) if hasattr(variable, "val") else known[variable]
+def _read(values: Mapping[Any, Value], variable: Any) -> Value:
+    return np.asarray(variable.val) if hasattr(variable, "val") else values[variable]
 
 
 def _ints(values: Sequence[int]) -> np.ndarray:

@@ -1,6 +1,5 @@
-"""What a person sees of a run: a progress bar while it trains or searches, a table at its end."""
+"""Progress bars of a training and a search, and the tables of a report."""
 
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,11 +13,11 @@ from mimic.trainers.trainer import Trainer
 
 
 class TrainingProgress:
-    """A bar with quality figures, steps/s and time left; without a terminal, a line for each evaluation."""
+    """A progress bar with metrics, steps/s and remaining time; without a terminal, one line for each evaluation."""
 
     def __init__(self, console: Console, total_steps: int, done_steps: int = 0):
         self._console = console
-        self._started, self._done, self._total = time.perf_counter(), done_steps, total_steps
+        self._total = total_steps
         self._bar = Progress(
             TextColumn("[bold]training"),
             BarColumn(),
@@ -38,7 +37,7 @@ class TrainingProgress:
         self._bar.stop()
 
     def update(self, step: int, status: str, steps_per_second: float | None) -> None:
-        """Shows the state after an evaluation."""
+        """Shows the state after an evaluation at a step."""
         if steps_per_second:
             left = max(self._total - step, 0) / steps_per_second
             status += f"  {steps_per_second:,.0f} steps/s  {_duration(left)} left"
@@ -48,7 +47,7 @@ class TrainingProgress:
 
 
 class SearchProgress:
-    """A bar over the updates of a search, from its first update on; without a terminal, ten lines."""
+    """A progress bar over the updates of a search, shown from the first one on; without a terminal, ten lines."""
 
     def __init__(self, console: Console, total: int):
         self._console, self._total = console, total
@@ -71,7 +70,7 @@ class SearchProgress:
             self._bar.stop()
 
     def update(self, done: int, status: str) -> None:
-        """Shows the state after an update."""
+        """Shows the state after `done` updates."""
         self._bar.start()
         self._bar.update(self._task, completed=done, status=status)
         if not self._console.is_terminal and (done % max(self._total // 10, 1) == 0 or done == self._total):
@@ -83,8 +82,8 @@ def _duration(seconds: float) -> str:
 
 
 def similarity_table(similarity: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
-    """How alike motions look, for each way of moving the learner: means of the measures, a section for each split."""
-    title = "similarity, which nothing is optimised for; 0 is alike"
+    """Similarity of expert and learner for each controller: means of the measures, with a section for each split."""
+    title = "similarity (not optimised by any trainer); 0 is identical"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     table.add_column("learner moved by", no_wrap=True)
     for header in SIMILARITY_HEADERS.values():
@@ -105,7 +104,7 @@ def _similarity_cell(key: str, value: float) -> str:
 
 
 def report_table(report: Mapping[str, Any], trainer: Trainer) -> Table:
-    """The figures of a report, training next to held-out data."""
+    """The metrics of a report, on training and held-out data."""
     table = Table(title=f"{report['env']}  {report['trainer']}  seed {report['seed']}", title_justify="left")
     table.add_column("")
     table.add_column("training", justify="right")

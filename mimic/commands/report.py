@@ -1,4 +1,4 @@
-"""The report of a run: what is in report.json, and what of it is shown."""
+"""The report of a run: its content and its tables on the terminal."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,31 +13,31 @@ from mimic.trainers.trainer import Trainer
 
 
 def show_report(console: Console, report: Mapping[str, Any], trainer: Trainer) -> None:
-    """Prints a report as tables."""
+    """Prints the tables of a report."""
     console.print(report_table(report, trainer))
     if "similarity" in report:
         console.print(similarity_table(report["similarity"]))
 
 
 def make_report(
-    config: TrainConfig, trainer: Trainer, figures: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
+    config: TrainConfig, trainer: Trainer, metrics: Mapping[str, Any], stopwatch: Stopwatch, steps: int, trained: int
 ) -> dict[str, Any]:
-    """What report.json holds.
+    """Content of report.json.
 
     Args:
-      config: of the run.
-      trainer: of the run.
-      figures: of the evaluation.
-      stopwatch: of the process.
-      steps: that the evaluated parameters were trained for.
-      trained: steps that this process trained.
+      config: config of the run.
+      trainer: trainer of the run.
+      metrics: metrics of the evaluation.
+      stopwatch: wall time of the process, by stage.
+      steps: training steps of the evaluated parameters.
+      trained: training steps of this process.
     """
     wall_time = stopwatch.report()
     return {
         "env": config.env.name,
         "trainer": config.trainer.name,
         "seed": config.seed,
-        **figures,
+        **metrics,
         "wall_time_s": wall_time,
         trainer.unit: steps,
         "steps_per_second": trained / wall_time["train"] if wall_time["train"] else 0.0,

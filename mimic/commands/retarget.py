@@ -1,4 +1,4 @@
-"""Retargeting: demonstrations of one arm as motions of another, pose by pose."""
+"""`python -m mimic.retarget`: demonstrations of one arm as motions of another, pose by pose."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from rich.console import Console
 from rich.table import Table
 
-from mimic.arms.arm import rated_speed
+from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import RetargetConfig
 from mimic.commands.progress import similarity_table
@@ -22,7 +22,7 @@ from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.motions import largest_jump, optimal_motions
-from mimic.retargeting.pose import pose_limits
+from mimic.retargeting.pose import continuous_joints, wrap_angles
 from mimic.trainers.pose_mapper.model import PoseMapper
 
 
@@ -34,127 +34,136 @@ def retarget(
     *,
     mapper: PoseMapper | None = None,
     seed: int = 0,
-) -> tuple[Demonstrations, dict[str, Any]]:
-    """The learner's motions that are nearest to the expert's, without a jump.
+) -> tuple[Demonstrations, dict[str, Any]]:  # longer than 40 lines for its docstring
+    """Retargets demonstrations of the expert to the learner, pose by pose, with bounded joint velocities.
 
-    No joint moves faster than its rated speed, pi rad/s where it has none. Velocities are central differences.
+    No joint exceeds its velocity limit, or pi rad/s where the limit is unknown. Velocities are central differences.
 
     Args:
-      demonstrations: the expert's.
-      expert: n joints.
-      learner: n_hat joints.
-      metric: what near means; velocities do not count.
-      mapper: proposes the poses, see `follow_mapper`; the optimiser does where None, see `imitate_trajectory`.
-      seed: of the random poses that the optimiser searches minima from.
+      demonstrations: demonstrations of the expert.
+      expert: arm with n joints.
+      learner: arm with n_hat joints.
+      metric: metric to minimise; its weights on velocities are ignored.
+      mapper: proposes the poses, see `follow_mapper`. Default None: the optimiser, see `imitate_trajectory`.
+      seed: seed of the random initial poses of the optimiser.
 
     Returns:
-      The learner's motions, and a report: `distance`, mean of all; `largest_jump` [rad] of a joint between two times;
-      `settled`, the fraction of poses at a minimum, or at one that the mapper proposes; `similarity` of the motions and
-      of `mimic.retargeting.pose_baselines.BASELINES`, means of the measures of `mimic.metric.similarity`.
+      The learner's motions, and a report: `distance`, the mean over all poses; `largest_jump` [rad], the maximum change
+      of a joint in a time step; `settled`, the fraction of poses at a minimum, or at a pose proposed by the mapper;
+      `similarity`, means of the measures of `mimic.metric.similarity` for the motions and for
+      `mimic.retargeting.pose_baselines.BASELINES`.
 
     Raises:
-      ValueError: demonstrations of another arm, poses outside its range, or a mapper between other arms.
+      ValueError: the demonstrations belong to another arm or leave its joint range, or the mapper is for other arms.
     """
     _check(demonstrations, expert)
-    rated, jump = rated_speed(learner), largest_jump(learner, demonstrations.dt)
+    jump = largest_jump(learner, demonstrations.dt)
     expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
     if mapper is None:
-        found = optimal_motions(expert, learner, expert_qpos, metric, jump, seed)
-        qpos, distance, settled = (np.asarray(x) for x in (found.qpos, found.distance, found.converged))
+        solution = optimal_motions(expert, learner, expert_qpos, metric, jump, seed)
+        learner_qpos, distance, settled = solution.qpos, solution.distance, solution.converged
     else:
         mapper.check_fits(expert, learner)
-        qpos, distance, settled = follow_mapper(mapper, expert_qpos, jump)
-    qpos = np.asarray(qpos, float)
-    velocity = np.gradient(qpos, demonstrations.dt, axis=1)
-    motions = Demonstrations(
-        qpos=qpos,
-        qvel=np.clip(velocity, -rated, rated),  # angles came in float32, whose rounding may lift a bounded jump
-        goals=qpos[:, -1],
-        dt=demonstrations.dt,
-        arm=learner.name,
-        joint_names=learner.joint_names,
-        seed=demonstrations.seed,
-    )
+        learner_qpos, distance, settled = follow_mapper(mapper, expert_qpos, jump)
+    qpos = np.asarray(learner_qpos, float)
     report = {
-        "distance": float(np.mean(distance)),
+        "distance": float(np.mean(np.asarray(distance))),
         "largest_jump": float(np.abs(np.diff(qpos, axis=1)).max()),
-        "settled": float(np.mean(settled)),
+        "settled": float(np.mean(np.asarray(settled))),
         "similarity": pose_similarity(expert, learner, demonstrations.qpos, {"retargeted": qpos}),
     }
-    return motions, report
+    return _motions(learner, qpos, demonstrations.dt, demonstrations.seed), report
+
+
+def _motions(learner: Embodiment, qpos: np.ndarray, dt: float, seed: int) -> Demonstrations:
+    limit, velocity = finite_velocity_limit(learner), np.gradient(qpos, dt, axis=1)
+    return Demonstrations(
+        qpos=qpos,
+        qvel=np.clip(velocity, -limit, limit),  # float32 rounding may lift a jump above its bound
+        goals=qpos[:, -1],
+        dt=dt,
+        arm=learner.name,
+        joint_names=learner.joint_names,
+        seed=seed,
+    )
 
 
 def follow_mapper(
     mapper: PoseMapper, qpos: Float[Array, "motions time joints"], largest_jump: Float[np.ndarray, " learner_joints"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Motions through the poses that a mapper proposes.
+    """Computes motions through the poses that a pose mapper proposes.
 
-    At each time one head's pose is chosen, such that the whole motion has the least sum of distances and of what jumps
-    exceed their bound [rad] (dynamic programming). Where a jump is left, the joints go there at their bound.
+    Each head of the mapper proposes one pose per time step. Dynamic programming selects a head at each step, such that
+    the sum over the motion of the distances and of the jumps' excess over `largest_jump` [rad] is minimal. Jumps that
+    still exceed their bound are cut off at it.
 
     Args:
-      mapper: of the arm.
+      mapper: pose mapper between the two arms.
       qpos: the expert's motions [rad].
-      largest_jump: of each joint between two times [rad].
+      largest_jump: maximum change of each joint in a time step [rad].
 
     Returns:
-      The learner's poses [motions, time, learner_joints], their distances, and whether each is the proposed one.
+      The learner's poses [motions, time, learner_joints] [rad], their distances [motions, time], and whether each pose
+      equals the proposed one [motions, time].
     """
     model = mapper.model
     candidates = jax.jit(jax.vmap(jax.vmap(functools.partial(model.candidates, mapper.params))))(qpos)
     distances = jax.jit(jax.vmap(jax.vmap(jax.vmap(model.distance, (None, 0)))))(qpos, candidates)
-    full_turn = np.isinf(pose_limits(model.learner, np.float32)[0])
+    continuous = continuous_joints(model.learner)
 
-    def turn(change: Array) -> Array:
-        return jnp.where(full_turn, change - 2 * jnp.pi * jnp.round(change / (2 * jnp.pi)), change)
-
-    def one(candidates: Array, distances: Array) -> tuple[Array, Array]:
-        def forth(cost: Array, now: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            before, after, distance = now
-            change = jnp.abs(turn(after[None] - before[:, None]))
-            total = cost[:, None] + jnp.maximum(change - largest_jump, 0).sum(axis=-1)
-            return total.min(axis=0) + distance, total.argmin(axis=0)
-
-        cost, origin = jax.lax.scan(forth, distances[0], (candidates[:-1], candidates[1:], distances[1:]))
-        last = cost.argmin()
-        _, chosen = jax.lax.scan(lambda head, from_: (from_[head], from_[head]), last, origin, reverse=True)
-        chosen = jnp.append(chosen, last)
-        proposed = jnp.take_along_axis(candidates, chosen[:, None, None], axis=1)[:, 0]
+    def motion(candidates: Array, distances: Array) -> tuple[Array, Array]:
+        heads = _select_heads(candidates, distances, largest_jump, continuous)
+        proposed = jnp.take_along_axis(candidates, heads[:, None, None], axis=1)[:, 0]
 
         def follow(pose: Array, target: Array) -> tuple[Array, tuple[Array, Array]]:
-            change = turn(target - pose)
+            change = wrap_angles(target - pose, continuous)
             bounded = jnp.clip(change, -largest_jump, largest_jump)
             return pose + bounded, (pose + bounded, jnp.all(bounded == change))
 
         _, (poses, settled) = jax.lax.scan(follow, proposed[0], proposed)
         return poses, settled
 
-    poses, settled = jax.jit(jax.vmap(one))(candidates, distances)
+    poses, settled = jax.jit(jax.vmap(motion))(candidates, distances)
     distance = jax.jit(jax.vmap(jax.vmap(model.distance)))(qpos, poses)
     return np.asarray(poses), np.asarray(distance), np.asarray(settled)
 
 
+def _select_heads(candidates: Array, distances: Array, largest_jump: np.ndarray, continuous: np.ndarray) -> Array:
+    """The head [time] of the mapper for each step of a motion, by dynamic programming; see `follow_mapper`."""
+
+    def extend(cost: Array, step: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        previous, current, distance = step
+        change = jnp.abs(wrap_angles(current[None] - previous[:, None], continuous))
+        total = cost[:, None] + jnp.maximum(change - largest_jump, 0).sum(axis=-1)
+        return total.min(axis=0) + distance, total.argmin(axis=0)
+
+    cost, predecessors = jax.lax.scan(extend, distances[0], (candidates[:-1], candidates[1:], distances[1:]))
+    last_head = cost.argmin()
+    _, heads = jax.lax.scan(lambda head, row: (row[head], row[head]), last_head, predecessors, reverse=True)
+    return jnp.append(heads, last_head)
+
+
 def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
-    """What retargets a file of demonstrations, says how well it went, and writes the result.
+    """Checks the config of a retargeting and loads its files.
 
     Raises:
-      ValueError: a name that is missing, an `out` that exists, a file or an environment that does not fit.
+      ValueError: a file name is missing, `out` exists, or a file belongs to other arms.
     """
     if not config.demonstrations:
         raise ValueError("demonstrations: expected a file, as in demonstrations=FILE")
     out = new_file("out", config.out)
     env = env_config(config.learner, limits=config.limits)
     expert, learner = env.build_arms().embodiments
-    loaded = load_demonstrations(Path(config.demonstrations).expanduser())
-    _check(loaded, expert)
+    demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
+    _check(demonstrations, expert)
     mapper = PoseMapper.load(Path(config.mapper).expanduser()) if config.mapper else None
     if mapper:
         mapper.check_fits(expert, learner)
 
     def run() -> None:
         console = Console()
-        with console.status(f"retargeting {loaded.count} motions from {expert.name} to {learner.name}"):
-            motions, report = retarget(loaded, expert, learner, env.metric, mapper=mapper, seed=config.seed)
+        with console.status(f"retargeting {demonstrations.count} motions from {expert.name} to {learner.name}"):
+            motions, report = retarget(demonstrations, expert, learner, env.metric, mapper=mapper, seed=config.seed)
         motions.save(out)
         console.print(_table(motions, report))
         console.print(similarity_table(report["similarity"]))
@@ -164,15 +173,15 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
 
 
 def _check(demonstrations: Demonstrations, arm: Embodiment) -> None:
-    """Refuses demonstrations of another arm, and poses outside of its range."""
+    """Raises a `ValueError` for demonstrations of another arm, and for poses outside its joint range."""
     demonstrations.check_fits(arm, demonstrations.dt, demonstrations.horizon)
     lower, upper = np.asarray(arm.joint_range).T
     outside = (demonstrations.qpos < lower - 1e-6) | (demonstrations.qpos > upper + 1e-6)
     if outside.any():
-        which, time, joint = np.argwhere(outside)[0]
+        demonstration, sample, joint = np.argwhere(outside)[0]
         raise ValueError(
-            f"demonstrations: {arm.joint_names[joint]} of demonstration {which} is at "
-            f"{demonstrations.qpos[which, time, joint]:.4f} rad at sample {time}, outside of its range "
+            f"demonstrations: {arm.joint_names[joint]} of demonstration {demonstration} is at "
+            f"{demonstrations.qpos[demonstration, sample, joint]:.4f} rad at sample {sample}, outside its range "
             f"[{lower[joint]:.4f}, {upper[joint]:.4f}]"
         )
 
@@ -180,6 +189,6 @@ def _check(demonstrations: Demonstrations, arm: Embodiment) -> None:
 def _table(motions: Demonstrations, report: Mapping[str, Any]) -> Table:
     table = Table("", "value", title=f"{motions.count} motions of {motions.arm}", title_justify="left")
     table.add_row("mean distance", f"{report['distance']:.4f}")
-    table.add_row("largest jump of a joint", f"{report['largest_jump']:.3f} rad in {motions.dt} s")
-    table.add_row("poses at a minimum, or as mapped", f"{report['settled']:.1%}")
+    table.add_row("maximum jump of a joint", f"{report['largest_jump']:.3f} rad in {motions.dt} s")
+    table.add_row("poses at a minimum, or as proposed", f"{report['settled']:.1%}")
     return table

@@ -1,11 +1,11 @@
-"""One run from config to report: what `python -m mimic.train` and `python -m mimic.evaluate` do."""
+"""`python -m mimic.train`: one training run, from its config to its report."""
 
 import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from omegaconf import OmegaConf
 from rich.console import Console
@@ -13,7 +13,7 @@ from rich.console import Console
 from mimic.commands.progress import TrainingProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
-from mimic.config import to_dict
+from mimic.config import flatten, to_dict
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.loggers import check_loggers, make_loggers
@@ -35,69 +35,70 @@ def prepare_training(
     group: ProcessGroup | None = None,
     signals: Signals | None = None,
 ) -> Callable[[], int]:
-    """A new run, or one to go on with, ready to start; nothing is written yet.
+    """Checks the config of a new or resumed run and prepares its trainer; writes nothing.
 
     Args:
-      config: of the run; with `resume`, what the run directory says counts, but for the overrides.
+      config: config of the run. With `resume`, the config in the run directory replaces it, except for `overrides`.
       started: `time.perf_counter()` at the start of the process.
-      overrides: of the command line, applied to the config of a resumed run.
-      group: of processes that train together; the first of them does all but the training by itself.
-      signals: where those that come are noted; the group's, where there is one.
+      overrides: command-line overrides, applied to the config of a resumed run.
+      group: processes that train together. The first one also evaluates, logs and reports.
+      signals: records the signals received; replaced by the group's signals where there is a group.
 
     Returns:
-      What trains, evaluates and reports; it returns the exit code: 0, or 128 plus the number of the signal that
-      stopped it.
+      A function that trains, evaluates and reports. It returns 0, or 128 plus the number of the signal that stopped it.
 
     Raises:
-      ValueError: input that cannot be trained.
+      ValueError: the config, the arms, the demonstrations or the checkpoint are invalid.
     """
     stopwatch = Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
-    resumed = Path(config.resume).expanduser() if config.resume else None
-    if resumed:
-        config = _resumed_config(resumed, config, overrides)
+    resumed_dir = Path(config.resume).expanduser() if config.resume else None
+    if resumed_dir:
+        config = _resumed_config(resumed_dir, config, overrides)
     if group and config.trainer.name != "ppo":
         raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
-    leads = group is None or group.first
+    is_first = group is None or group.first
     check_loggers(config.loggers)
-    run_dir = resumed or (new_run_dir(config) if leads else Path())
+    run_dir = resumed_dir or (new_run_dir(config) if is_first else Path())
     with stopwatch.stage("build"):
-        trainer = make_trainer(config, resumed)
-        restore = load_checkpoint(resumed, trainer.params_template()) if resumed else None
+        trainer = make_trainer(config, resumed_dir)
+        restore = load_checkpoint(resumed_dir, trainer.params_template()) if resumed_dir else None
     config = dataclasses.replace(config, trainer=trainer.settings)
-    if group and not group.first:
+    if group and not is_first:
         return lambda: _follow(trainer, restore, group)
-    noted = group.signals if group else signals or Signals()
-    return lambda: _train(config, trainer, run_dir, restore, stopwatch, group, noted)
+    signals = group.signals if group else signals or Signals()
+    return lambda: _train(config, trainer, run_dir, restore, stopwatch, group, signals)
 
 
-def _resumed_config(run_dir: Path, given: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
+def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
+    """The config of a run directory, with the overrides of the command line that a resumed run accepts."""
     config = load_config(run_dir)
     steps = check_checkpoint(run_dir)
-    of_the_process = ("resume=", "compilation_cache=", "distributed.", "logger=")
-    changes = [override for override in overrides if not override.startswith(of_the_process)]
-    logger = {"logger": given.logger} if any(override.startswith("logger=") for override in overrides) else {}
-    refused = [c for c in changes if not c.startswith("trainer.") or c.startswith(("trainer.preset=", "trainer.name="))]
-    if refused:
+    process_keys = ("resume=", "compilation_cache=", "distributed.", "logger=")  # taken from `requested`
+    changes = [override for override in overrides if not override.startswith(process_keys)]
+    logger = {"logger": requested.logger} if any(override.startswith("logger=") for override in overrides) else {}
+    fixed = ("trainer.preset=", "trainer.name=")
+    rejected = [change for change in changes if not change.startswith("trainer.") or change.startswith(fixed)]
+    if rejected:
         raise ValueError(
-            f"resume: only settings of the trainer can change, as in trainer.{config.trainer.length_key}=N; "
-            f"got {refused[0]!r}"
+            f"resume: expected overrides of the trainer only, as in trainer.{config.trainer.length_key}=N, "
+            f"got {rejected[0]!r}"
         )
     merged = OmegaConf.merge(run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
     config = cast(TrainConfig, OmegaConf.to_object(merged))
-    total = config.trainer.total_steps
+    total = config.trainer.resolve().total_steps
     if steps >= total:
         raise ValueError(
-            f"resume: {str(run_dir)!r} is trained for {steps} of {total} steps; "
-            f"give a larger trainer.{config.trainer.length_key}"
+            f"resume: {str(run_dir)!r} has been trained for {steps} of {total} steps; "
+            f"increase trainer.{config.trainer.length_key}"
         )
     return dataclasses.replace(
-        config, compilation_cache=given.compilation_cache, distributed=given.distributed, **logger
+        config, compilation_cache=requested.compilation_cache, distributed=requested.distributed, **logger
     )
 
 
 def _follow(trainer: Trainer, restore: tuple[int, Params] | None, group: ProcessGroup) -> int:
-    """What a process does that is not the first: it trains in step, until that one ends it."""
+    """Trains in lockstep with the first process, which ends this one. For the other processes of a group."""
     with noted_signals(group.signals):
         trainer.follow(restore)
         group.wait()
@@ -113,31 +114,29 @@ def _train(
     group: ProcessGroup | None,
     signals: Signals,
 ) -> int:
+    """Trains, evaluates and reports; returns the exit code."""
     console = Console()
-    device = hardware()["device"]
-    with noted_signals(signals):  # also while the report is made: all is done then, and a signal changes nothing
+    with noted_signals(signals):  # also during the report: training is done, so a signal has no effect
         run_dir.mkdir(parents=True, exist_ok=restore is not None)
         save_config(run_dir, config)
         trainer.save_inputs(run_dir)
-        console.print(
-            f"{trainer.headline} on {device} (preset {trainer.settings.preset})\nrun directory: {run_dir}",
-            highlight=False,
-            soft_wrap=True,
-        )
+        headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
+        console.print(f"{headline}\nrun directory: {run_dir}", highlight=False, soft_wrap=True)
         try:
             steps, params = _train_and_log(config, trainer, run_dir, signals, restore, stopwatch, console)
-        except Interrupted as stop:
+        except Interrupted as interruption:
             if group:
-                group.end(stop.exit_code)
-            console.print(f"stopped by {stop}; go on with: python -m mimic.train resume={run_dir}", soft_wrap=True)
-            return stop.exit_code
+                group.end(interruption.exit_code)
+            command = f"python -m mimic.train resume={run_dir}"
+            console.print(f"stopped by {interruption}; continue with: {command}", soft_wrap=True)
+            return interruption.exit_code
         if group:
             group.end(0)
         with stopwatch.stage("evaluate"):
             outcome = trainer.evaluate(params)
-            figures = {**trainer.figures(outcome), **trainer.details(outcome)}
-        done_before = restore[0] if restore else 0
-        report = make_report(config, trainer, figures, stopwatch, steps, steps - done_before)
+            metrics = {**trainer.metrics(outcome), **trainer.details(outcome)}
+        resumed_steps = restore[0] if restore else 0
+        report = make_report(config, trainer, metrics, stopwatch, steps, steps - resumed_steps)
         write_report(run_dir, report)
         trainer.save_outcome(run_dir, outcome)
     show_report(console, report, trainer)
@@ -154,36 +153,25 @@ def _train_and_log(
     stopwatch: Stopwatch,
     console: Console,
 ) -> tuple[int, Params]:
-    """Trains; evaluates, logs and shows the result after each stretch. Steps and parameters of the result."""
-    done_before = restore[0] if restore else 0
+    """Trains; evaluates and logs after each training epoch. Returns the steps and the parameters of the result."""
+    resumed_steps = restore[0] if restore else 0
     with contextlib.ExitStack() as stack:
         loggers = [MetricsLog(run_dir), *make_loggers(config.loggers, run_dir, to_dict(config))]
         for logger in loggers:
             stack.callback(logger.close)  # also where training is interrupted
-        progress = stack.enter_context(TrainingProgress(console, trainer.total_steps, done_before))
+        progress = stack.enter_context(TrainingProgress(console, trainer.total_steps, resumed_steps))
         stack.enter_context(stopwatch.stage("train"))
 
-        def on_evaluation(step: int, params: Params, metrics: Mapping[str, float]) -> bool:
+        def on_evaluation(step: int, params: Params, training_metrics: Mapping[str, float]) -> bool:
             with stopwatch.stage("evaluate"):
-                figures = trainer.figures(trainer.evaluate(params))
-                if metrics:
-                    row = {f"quality/{key}": value for key, value in _flat(figures).items()}
-                    row |= {f"training/{key}": value for key, value in metrics.items()}
+                metrics = trainer.metrics(trainer.evaluate(params))
+                if training_metrics:
+                    row = {f"quality/{key}": value for key, value in flatten(metrics).items()}
+                    row |= {f"training/{key}": value for key, value in training_metrics.items()}
                     row["wall_time_s"] = time.perf_counter() - stopwatch.started
                     for logger in loggers:
                         logger.write(step, row)
-                progress.update(step, trainer.status(figures), metrics.get("sps"))
-            return trainer.good_enough(figures)
+                progress.update(step, trainer.status(metrics), training_metrics.get("sps"))
+            return trainer.good_enough(metrics)
 
         return trainer.train(run_dir, on_evaluation, signals, restore)
-
-
-def _flat(figures: Mapping[str, Any]) -> dict[str, float]:
-    """Nested figures as one level, split names behind a dot."""
-    flat: dict[str, float] = {}
-    for key, value in figures.items():
-        if isinstance(value, Mapping):
-            flat |= {f"{key}.{name}": number for name, number in value.items()}
-        else:
-            flat[key] = value
-    return flat

@@ -1,4 +1,4 @@
-"""What `python -m mimic.view` does: serves a live view, or a policy's playback, until it is interrupted."""
+"""`python -m mimic.view`: serves a live view or the playback of a policy until it is interrupted."""
 
 import contextlib
 import importlib.util
@@ -21,19 +21,19 @@ from mimic.viewer.live_session import Frame, LiveSession
 if TYPE_CHECKING:
     from mimic.viewer.page import Page
 
-_LONGEST_STEP = 0.1  # s: after a pause of the process, arms go on instead of jumping
-_NEAR = 1e-3  # of the distance: what counts as the bound itself
+_MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
+_AT_BOUND = 1e-3  # fraction of the distance within which it counts as the bound
 
 
 def prepare_view(config: ViewConfig) -> Callable[[], int]:
-    """What serves the view that a config describes.
+    """Checks the config of a view and loads its arms, its pose mapper or its policy.
 
     Raises:
-      ValueError: no viser, a port that is taken, arms or runs that cannot be shown.
+      ValueError: viser is not installed, the port is in use, or the arms or the run are invalid.
     """
     if not is_installed():
         raise ValueError(
-            "view: expected the package viser, which is not installed; it comes with the extra 'view': "
+            "view: expected the package viser, which is not installed; install it with the extra 'view': "
             "pip install 'mimic-mjx[view]'"
         )
     check_port(config.host, config.port)
@@ -59,24 +59,26 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
 
 
 def is_installed() -> bool:
-    """Whether viser is there."""
+    """Whether viser is installed."""
     return importlib.util.find_spec("viser") is not None
 
 
 def check_port(host: str, port: int) -> None:
-    """Raises a `ValueError` unless a server can be bound there."""
+    """Raises a `ValueError` unless a server can bind this address and port."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     except OSError as error:
         raise ValueError(f"host: expected an address of this machine, as 127.0.0.1, got {host!r}: {error}") from None
     with socket.socket(family, kind, protocol) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a server that just ended does not count
+        probe.setsockopt(
+            socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
+        )  # a port of a server that has just ended counts as free
         try:
             probe.bind(address)
         except OSError as error:
             raise ValueError(
-                f"port: expected one that is free at {host}, got {port}: {error.strerror}; "
-                f"name another, as in port={port + 1}"
+                f"port: expected a free port at {host}, got {port}: {error.strerror}; "
+                f"choose another, as in port={port + 1}"
             ) from None
 
 
@@ -87,13 +89,13 @@ def _serve(
     before: Callable[[], None] | None = None,
     after: Callable[[], None] | None = None,
 ) -> int:
-    """Shows a page until Ctrl-C or SIGTERM."""
+    """Serves a page until Ctrl-C or SIGTERM. Calls `before` before the server starts and `after` when it has ended."""
     import viser
 
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
 
-    for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C too, which is ignored in what a script starts with `&`
+    for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C too: it is ignored in background jobs of a script
         signal.signal(number, signal.default_int_handler)
     server = None
     try:
@@ -120,8 +122,8 @@ def _serve(
 
 
 def _title(config: ViewConfig, env: EnvConfig) -> str:
-    by = f"policy of {Path(config.run).name}" if config.run else "pose mapper" if config.mapper else "optimiser"
-    return f"{env.name or 'mimic'}: the learner is moved by the {by}"
+    controller = f"policy of {Path(config.run).name}" if config.run else "pose mapper" if config.mapper else "optimiser"
+    return f"{env.name or 'mimic'}: the learner is moved by the {controller}"
 
 
 def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
@@ -131,16 +133,16 @@ def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> 
     history, frame, was_compiling = History(), None, True
     for dt in _ticks():
         try:
-            frame_now = live.advance(dt)
+            new_frame = live.advance(dt)
         except ValueError as error:
             for client in page.server.get_clients().values():
                 client.add_notification("not possible", str(error), color="red", auto_close_seconds=6.0)
-            frame_now = None
+            new_frame = None
             controls.undo_locks()
         compiling = live.is_compiling
-        if frame_now is None and (compiling == was_compiling or frame is None):
+        if new_frame is None and (compiling == was_compiling or frame is None):
             continue
-        frame, was_compiling = frame_now or frame, compiling
+        frame, was_compiling = new_frame or frame, compiling
         assert frame is not None
         history.add(frame)
         page.show(frame, history.chart(), _note(frame, compiling, can_lock))
@@ -153,25 +155,25 @@ def _play(page: "Page", playback: Any, split: str) -> None:
     player = Player(page.server, playback, split)
     for dt in _ticks():
         if player.advance(dt):
-            which = player.split, player.demonstration
-            frame = playback.frame(*which, player.time)
-            page.show(frame, playback.chart(*which, player.time), playback.note(*which))
+            episode = player.split, player.demonstration
+            frame = playback.frame(*episode, player.time)
+            page.show(frame, playback.chart(*episode, player.time), playback.note(*episode))
 
 
 def _ticks() -> Any:
-    """Time since the last tick [s], `RATE` times a second where there is the time."""
+    """Yields the time since the last tick [s], at most `RATE` times per second."""
     last = time.perf_counter()
     while True:
         time.sleep(max(0.0, last + 1 / RATE - time.perf_counter()))
         now = time.perf_counter()
-        yield min(now - last, _LONGEST_STEP)
+        yield min(now - last, _MAX_STEP)
         last = now
 
 
 def _note(frame: Frame, compiling: bool, by_optimiser: bool) -> str:
     if compiling:
         return "compiling …"
-    above = frame.distance - frame.bound
-    if above <= _NEAR * max(frame.distance, _NEAR):
-        return "as near as this learner can be"
-    return f"{above:.4f} above the bound: " + ("on its way, or in a local minimum" if by_optimiser else "as mapped")
+    excess = frame.distance - frame.bound
+    if excess <= _AT_BOUND * max(frame.distance, _AT_BOUND):
+        return "at the kinematic bound"
+    return f"{excess:.4f} above the bound: " + ("moving, or in a local minimum" if by_optimiser else "pose mapper")

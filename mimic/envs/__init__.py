@@ -1,4 +1,4 @@
-"""MJX environments: `make` one by name, `environments` lists the names."""
+"""The imitation environments: `environments` lists their names, `make` makes one by its name."""
 
 import importlib.resources
 from typing import TYPE_CHECKING, Any
@@ -18,18 +18,17 @@ _METRICS = importlib.resources.files("mimic") / "conf" / "metric"
 
 
 def environments() -> tuple[str, ...]:
-    """Names of the environments that `make` knows."""
+    """The names of the environments."""
     return tuple(sorted(path.name.removesuffix(".yaml") for path in _PRESETS.iterdir() if path.name.endswith(".yaml")))
 
 
 def env_config(name: str, **overrides: Any) -> EnvConfig:
-    """The config of an environment.
+    """Returns the config of an environment.
 
     Args:
       name: one of `environments()`.
-      overrides: fields of `EnvConfig`; a nested config takes a dict, as in `demonstrations={"count": 1}`, an arm
-        also its name or file alone, as in `learner="arm.xml"`, and the metric its preset's name, as in
-        `metric="paper"`.
+      overrides: fields of `EnvConfig`. A nested config is a dict, as in `demonstrations={"count": 1}`. An arm may also
+        be its name or file, as in `learner="arm.xml"`, and the metric the name of a preset, as in `metric="paper"`.
 
     Raises:
       ValueError: an unknown name or field, or a value of the wrong type or out of range.
@@ -38,7 +37,7 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
         raise ValueError(f"unknown environment {name!r}; valid are {', '.join(environments())}")
     preset = OmegaConf.load(str(_PRESETS / f"{name}.yaml"))
     assert isinstance(preset, DictConfig)
-    del preset["defaults"]  # Hydra's; the schema is merged here
+    del preset["defaults"]  # Hydra's defaults list; the schema is merged below
     presets = {"metric": _metric_preset(overrides["metric"])} if isinstance(overrides.get("metric"), str) else {}
     arms = {key: {"model": overrides[key]} for key in ("expert", "learner") if isinstance(overrides.get(key), str)}
     try:
@@ -57,17 +56,17 @@ def _metric_preset(name: str) -> DictConfig:
 
 
 def make(name: str, **overrides: Any) -> "ImitationEnv":
-    """An environment with its training demonstrations.
+    """Makes an environment with its training demonstrations.
 
     Args:
       name: one of `environments()`.
-      overrides: see `env_config`.
+      overrides: fields of the config, see `env_config`.
 
     Raises:
       ValueError: an unknown name or field, a value of the wrong type or out of range, demonstrations that do not fit.
     """
     compat.import_mjx()
-    from mimic.envs.imitation import ImitationEnv  # brax and MJX, which take seconds to import
+    from mimic.envs.imitation import ImitationEnv  # imports brax and MJX, which takes seconds
 
     return ImitationEnv(env_config(name, **overrides))
 

@@ -1,4 +1,4 @@
-"""What defines an environment: filled in by the presets in mimic/conf/env, by `make`, and on the command line."""
+"""The config of an environment. The presets in mimic/conf/env, `make` and the command line set its fields."""
 
 import dataclasses
 import math
@@ -14,14 +14,14 @@ PHYSICS = ("mjx", "fused")
 
 @dataclasses.dataclass(frozen=True)
 class DemonstrationConfig:
-    """What the expert does.
+    """The demonstrations: what the expert does.
 
     Attributes:
-      path: a file of demonstrations; they are recorded where it is empty.
-      kind: of the recorded ones: "pd" or "reach", see `record_demonstrations`.
-      count: demonstrations to train on.
-      held_out: demonstrations to test on, never trained on.
-      seed: of the recorded goals.
+      path: file of demonstrations; where empty, demonstrations are recorded in simulation.
+      kind: controller of the recorded demonstrations: "pd" or "reach", see `record_demonstrations`.
+      count: number of training demonstrations.
+      held_out: number of held-out demonstrations, for evaluation only.
+      seed: random seed of the recorded goals.
     """
 
     path: str = ""
@@ -42,12 +42,12 @@ class DemonstrationConfig:
 
 @dataclasses.dataclass(frozen=True)
 class RandomizationConfig:
-    """How the learner differs from its model, drawn anew for each episode; nothing is random where both bounds agree.
+    """Randomization of the learner's dynamics, drawn at the start of each episode; a range of zero width is constant.
 
     Attributes:
-      mass: least and largest factor of the masses and inertias of the learner's bodies.
-      damping: least and largest factor of the damping of its joints.
-      torque_noise: standard deviation of a noise on each torque, as a share of the largest torque.
+      mass: minimum and maximum factor on the masses and inertias of the learner's bodies.
+      damping: minimum and maximum factor on the damping of its joints.
+      torque_noise: standard deviation of the noise on each torque, as a fraction of the maximum torque.
     """
 
     mass: list[float] = dataclasses.field(default_factory=lambda: [1.0, 1.0])
@@ -58,7 +58,7 @@ class RandomizationConfig:
         for name in ("mass", "damping"):
             bounds = list(getattr(self, name))
             if len(bounds) != 2 or not 0 < bounds[0] <= bounds[1] < math.inf:
-                raise ValueError(f"randomization.{name}: expected [least, largest] factor above 0, got {bounds}")
+                raise ValueError(f"randomization.{name}: expected [minimum, maximum] factor above 0, got {bounds}")
         if not 0 <= self.torque_noise < math.inf:
             raise ValueError(f"randomization.torque_noise: expected at least 0, got {self.torque_noise}")
 
@@ -68,20 +68,22 @@ class EnvConfig:
     """An imitation environment.
 
     Attributes:
-      name: of the preset.
+      name: name of the preset.
       expert, learner: the arms.
-      limits: "none" (zero pose, paper) or "hardware" (ready pose, the maker's joint ranges).
-      metric: the reward.
-      demonstrations: what is imitated.
-      horizon: steps of an episode.
-      control_dt: time that a torque is held [s].
+      limits: "none" (start in the zero pose, paper) or "hardware" (start in the ready pose, the manufacturer's joint
+        ranges).
+      metric: embodiment distance of the reward.
+      demonstrations: motions to imitate.
+      horizon: control steps of an episode.
+      control_dt: duration of a control step [s]; the torque is constant within it.
       substeps: physics steps in a control step.
-      physics: "mjx", the reference, or "fused": the same equations as one small program, many times faster.
-      randomization: how the learner differs from its model.
-      preview: expert steps that the learner sees beyond the present one; 0 is the paper.
-      limit_weight: in the reward, of joints near or beyond their range and rated speed; only where `limits` is
-        "hardware".
-      action_scale: of the torque range; 1 is twice the torque that takes a joint to its rated speed in one step.
+      physics: "mjx", the reference, or "fused": the same equations in one fused kernel, many times faster.
+      randomization: how the learner's dynamics differ from its model.
+      preview: how many control steps ahead the learner also observes the expert; 0 is the paper.
+      limit_weight: weight in the reward of joints near or beyond their range and velocity limit; only where `limits`
+        is "hardware".
+      action_scale: factor on the torque range; at 1 the range is twice the torque that takes a joint from rest to its
+        velocity limit in one step, cut at the torque limit.
       speed_bound: joint speed [rad/s] at which an episode ends as a runaway.
     """
 
@@ -104,9 +106,9 @@ class EnvConfig:
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)
         check_choice("physics", self.physics, PHYSICS)
-        for name, least in (("horizon", 1), ("substeps", 1), ("preview", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
+        for name, minimum in (("horizon", 1), ("substeps", 1), ("preview", 0)):
+            if getattr(self, name) < minimum:
+                raise ValueError(f"{name}: expected at least {minimum}, got {getattr(self, name)}")
         for name in ("control_dt", "action_scale", "speed_bound"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
@@ -114,9 +116,9 @@ class EnvConfig:
             raise ValueError(f"limit_weight: expected at least 0, got {self.limit_weight}")
 
     def build_arms(self) -> ArmPair:
-        """The arms, with the links that the metric asks for.
+        """Both arms, with the links that the metric compares.
 
         Raises:
-          ValueError: an arm that cannot be built.
+          ValueError: an arm that cannot be loaded.
         """
         return ArmPair(*(build_arm(arm, self.limits, self.metric.links) for arm in (self.expert, self.learner)))

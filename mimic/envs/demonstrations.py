@@ -1,4 +1,4 @@
-"""Demonstrations: what the expert did, in one file without pickle. Recorded by `mimic.envs.recording`, or brought."""
+"""Demonstrations: an expert's motions, saved in one npz file without pickle."""
 
 import dataclasses
 import os
@@ -15,7 +15,7 @@ from mimic.arms.embodiment import Embodiment
 FORMAT = "mimic-demonstrations-1"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
 _OPTIONAL_ARRAYS = ("torque",)
-_ROUNDING = 1e-6  # relative, what a value may be above its limit: a file in float32 rounds by 6e-8
+_ROUNDING = 1e-6  # relative tolerance of a value above its limit: a file in float32 rounds by 6e-8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,13 +25,12 @@ class Demonstrations:
     Attributes:
       qpos: [N, T+1, n] joint angles [rad].
       qvel: [N, T+1, n] joint velocities [rad/s].
-      goals: [N, n] where the expert was told to go [rad].
+      goals: [N, n] target poses of the expert's controller [rad].
       dt: time between two samples [s].
       arm: the expert's name.
       joint_names: the expert's joints, base to tip.
-      seed: of the random goals.
-      torque: [N, T, n] what was held from each sample to the next [N m], beside the one that carries the arm's weight;
-        None where nobody knows.
+      seed: random seed of the goals.
+      torque: [N, T, n] torque between each sample and the next [N m], without gravity compensation; None if unknown.
     """
 
     qpos: Float[np.ndarray, "demonstrations samples joints"]
@@ -45,7 +44,7 @@ class Demonstrations:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number N of demonstrations."""
         return self.qpos.shape[0]
 
     @property
@@ -54,20 +53,23 @@ class Demonstrations:
         return self.qpos.shape[1] - 1
 
     def select(self, index: slice | Sequence[int]) -> "Demonstrations":
-        """Some of the demonstrations."""
+        """The demonstrations with these indices."""
         torque = None if self.torque is None else self.torque[index]
         return dataclasses.replace(
             self, qpos=self.qpos[index], qvel=self.qvel[index], goals=self.goals[index], torque=torque
         )
 
     def of_length(self, steps: int) -> "Demonstrations":
-        """Cut to some steps, or with the last sample repeated, which is what is imitated after the end."""
+        """The demonstrations with another number of steps: shortened, or with the last sample repeated.
+
+        Beyond a demonstration's end its last sample is imitated.
+        """
         sample = np.minimum(np.arange(steps + 1), self.horizon)
         torque = None if self.torque is None or steps > self.horizon else self.torque[:, :steps]
         return dataclasses.replace(self, qpos=self.qpos[:, sample], qvel=self.qvel[:, sample], torque=torque)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes one `.npz` file; a file of that name is replaced only when the new one is whole."""
+        """Writes one `.npz` file; an existing file is replaced only when the new one is complete."""
         partial = f"{os.fspath(path)}.partial"
         optional: dict[str, Any] = {} if self.torque is None else {"torque": self.torque}
         with open(partial, "wb") as file:
@@ -86,8 +88,8 @@ class Demonstrations:
         os.replace(partial, path)
 
     def check_fits(self, arm: Embodiment, dt: float, horizon: int) -> None:
-        """Raises a ValueError unless an environment with this expert and time step can use these."""
-        if (self.arm, self.joint_names) != (arm.name, arm.joint_names):  # joint1, joint2, … are names of many arms
+        """Raises a ValueError unless arm, time step and length fit those of an environment."""
+        if (self.arm, self.joint_names) != (arm.name, arm.joint_names):  # joint1, joint2, … are names in many arms
             raise ValueError(
                 f"demonstrations: recorded with the joints {', '.join(self.joint_names)} of {self.arm!r}, "
                 f"but the expert {arm.name!r} has {', '.join(arm.joint_names)}"
@@ -103,59 +105,60 @@ class Demonstrations:
 
 
 def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations:
-    """The demonstrations of both, of one arm and time step; with torques where both have them."""
-    join = {key: np.concatenate([getattr(first, key), getattr(second, key)]) for key in ("qpos", "qvel", "goals")}
+    """Joins two sets of demonstrations of one arm and time step. Torques are kept if both sets have them."""
+    joined = {key: np.concatenate([getattr(first, key), getattr(second, key)]) for key in ("qpos", "qvel", "goals")}
     torques = [part.torque for part in (first, second) if part.torque is not None]
-    return dataclasses.replace(first, **join, torque=np.concatenate(torques) if len(torques) == 2 else None)
+    return dataclasses.replace(first, **joined, torque=np.concatenate(torques) if len(torques) == 2 else None)
 
 
 def check_effort(demonstrations: Demonstrations, arm: Embodiment) -> None:
-    """Refuses what the arm cannot do: a joint above its rated speed, or above its torque limit where torques are known.
+    """Raises a ValueError if a joint exceeds its velocity limit, or its torque limit where torques are known.
 
     Raises:
       ValueError: names the first demonstration above a limit, with joint, time, value and limit.
     """
-    checks = [("turns at", demonstrations.qvel, "rad/s", "rated speed", arm.velocity_limit)]
+    checks = [("velocity", demonstrations.qvel, "rad/s", arm.velocity_limit)]
     if demonstrations.torque is not None:
-        checks.append(("is held at", demonstrations.torque, "N m", "torque limit", arm.torque_limit))
-    for does, values, unit, limit_name, limit in checks:
-        beyond = np.argwhere(np.abs(values) > np.asarray(limit) * (1 + _ROUNDING))
-        if len(beyond):
-            which, sample, joint = beyond[0]
+        checks.append(("torque", demonstrations.torque, "N m", arm.torque_limit))
+    for quantity, values, unit, limit in checks:
+        above_limit = np.argwhere(np.abs(values) > np.asarray(limit) * (1 + _ROUNDING))
+        if len(above_limit):
+            demonstration, sample, joint = above_limit[0]
             raise ValueError(
-                f"demonstrations: {arm.joint_names[joint]} of demonstration {which} {does} "
-                f"{values[which, sample, joint]:.7g} {unit} at {sample * demonstrations.dt:.4g} s, "
-                f"but its {limit_name} is {limit[joint]:.7g} {unit}"
+                f"demonstrations: {arm.joint_names[joint]} of demonstration {demonstration} has a {quantity} of "
+                f"{values[demonstration, sample, joint]:.7g} {unit} at {sample * demonstrations.dt:.4g} s, "
+                f"but its {quantity} limit is {limit[joint]:.7g} {unit}"
             )
 
 
 def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonstrations:
-    """More demonstrations out of some: each joint moves as it does in a random one of them.
+    """Additional demonstrations, mixed from existing ones: each joint moves as in a random one of them.
 
-    Where joints are controlled apart from each other, as under joint-space PD control from one home pose, the result is
-    what the expert would have shown for goals mixed in the same way. Else it is at least smooth, and within its range.
+    If the joints are controlled independently, as by joint-space PD control from one home pose, a mixed demonstration
+    is what the expert would do for goals that are mixed in the same way. Otherwise it is at least smooth and within the
+    joint ranges.
 
     Args:
-      demonstrations: the given ones.
-      count: how many to make.
-      seed: of the choice.
+      demonstrations: the existing demonstrations.
+      count: number of additional demonstrations.
+      seed: random seed of the mixing.
     """
     joints = np.arange(len(demonstrations.joint_names))
-    chosen = np.random.default_rng(seed).integers(demonstrations.count, size=(count, len(joints)))
+    parents = np.random.default_rng(seed).integers(demonstrations.count, size=(count, len(joints)))
     mixed: dict[str, Any] = {
-        "qpos": demonstrations.qpos.swapaxes(1, 2)[chosen, joints].swapaxes(1, 2),
-        "qvel": demonstrations.qvel.swapaxes(1, 2)[chosen, joints].swapaxes(1, 2),
-        "goals": demonstrations.goals[chosen, joints],
+        "qpos": demonstrations.qpos.swapaxes(1, 2)[parents, joints].swapaxes(1, 2),
+        "qvel": demonstrations.qvel.swapaxes(1, 2)[parents, joints].swapaxes(1, 2),
+        "goals": demonstrations.goals[parents, joints],
     }
     return dataclasses.replace(demonstrations, torque=None, **mixed)
 
 
 def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
-    """Reads and validates a file that `Demonstrations.save` wrote, or one made like it.
+    """Reads and validates a file of demonstrations, in the format of `Demonstrations.save`.
 
     Raises:
-      ValueError: the file is missing, truncated, no npz, holds pickled objects, lacks an array, or holds wrong shapes
-        or values that are not finite.
+      ValueError: the file is missing, truncated or no npz file, has pickled objects, lacks an array, or has arrays of
+        wrong shape or with values that are not finite.
     """
     name = os.fspath(path)
     if not os.path.isfile(path):
@@ -163,7 +166,7 @@ def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
     try:
         archive = np.load(path, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError("it holds a single array")
+            raise ValueError("it has a single array")
         with archive:
             missing = [key for key in _ARRAYS if key not in archive.files]
             if missing:
@@ -171,26 +174,47 @@ def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
             optional = [key for key in _OPTIONAL_ARRAYS if key in archive.files]
             content = {key: archive[key] for key in (*_ARRAYS, *optional)}
     except (ValueError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        reason = "it holds pickled objects" if "allow_pickle" in str(error) else str(error)
-        raise ValueError(f"demonstrations: {name!r} is not a whole npz file of demonstrations: {reason}") from error
+        reason = "it has pickled objects" if "allow_pickle" in str(error) else str(error)
+        raise ValueError(f"demonstrations: {name!r} is not a complete npz file of demonstrations: {reason}") from error
     if str(content["format"]) != FORMAT:
         raise ValueError(f"demonstrations: {name!r} has format {str(content['format'])!r}, expected {FORMAT!r}")
     return _validated(content, name)
 
 
 def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
-    qpos, qvel, goals = content["qpos"], content["qvel"], content["goals"]
     joint_names = tuple(map(str, np.atleast_1d(content["joint_names"])))
-    torque = content.get("torque")
+    _check_trajectories(content, name, len(joint_names))
+    for key in ("dt", "seed", "arm"):
+        if content[key].shape != ():
+            raise ValueError(f"demonstrations: {key} in {name!r} must be one value, got shape {content[key].shape}")
+    if not np.issubdtype(content["seed"].dtype, np.integer):
+        raise ValueError(f"demonstrations: seed in {name!r} must be an integer, got {content['seed'].dtype}")
+    if content["dt"] <= 0:
+        raise ValueError(f"demonstrations: dt in {name!r} must be one number above 0, got {content['dt']}")
+    return Demonstrations(
+        qpos=content["qpos"],
+        qvel=content["qvel"],
+        goals=content["goals"],
+        dt=float(content["dt"]),
+        arm=str(content["arm"]),
+        joint_names=joint_names,
+        seed=int(content["seed"]),
+        torque=content.get("torque"),
+    )
+
+
+def _check_trajectories(content: dict[str, np.ndarray], name: str, joints: int) -> None:
+    """Checks type, values and shapes of the numeric arrays."""
+    qpos, qvel, goals, torque = content["qpos"], content["qvel"], content["goals"], content.get("torque")
     numeric = {key: content[key] for key in ("qpos", "qvel", "goals", "dt", "torque") if key in content}
     for key, array in numeric.items():
         if not np.issubdtype(array.dtype, np.floating):
             raise ValueError(f"demonstrations: {key} in {name!r} must be floating point, got {array.dtype}")
         if not np.all(np.isfinite(array)):
             raise ValueError(f"demonstrations: {key} in {name!r} has values that are not finite")
-    if qpos.ndim != 3 or qpos.shape[0] < 1 or qpos.shape[1] < 2 or qpos.shape[2] != len(joint_names):
+    if qpos.ndim != 3 or qpos.shape[0] < 1 or qpos.shape[1] < 2 or qpos.shape[2] != joints:
         raise ValueError(
-            f"demonstrations: qpos in {name!r} must be [demonstrations, samples >= 2, {len(joint_names)} joints], "
+            f"demonstrations: qpos in {name!r} must be [demonstrations, samples >= 2, {joints} joints], "
             f"got {list(qpos.shape)}"
         )
     if qvel.shape != qpos.shape or goals.shape != (qpos.shape[0], qpos.shape[2]):
@@ -201,20 +225,3 @@ def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
     steps = [qpos.shape[0], qpos.shape[1] - 1, qpos.shape[2]]
     if torque is not None and list(torque.shape) != steps:
         raise ValueError(f"demonstrations: torque in {name!r} must be {steps}, got {list(torque.shape)}")
-    for key in ("dt", "seed", "arm"):
-        if content[key].shape != ():
-            raise ValueError(f"demonstrations: {key} in {name!r} must be one value, got shape {content[key].shape}")
-    if not np.issubdtype(content["seed"].dtype, np.integer):
-        raise ValueError(f"demonstrations: seed in {name!r} must be an integer, got {content['seed'].dtype}")
-    if content["dt"] <= 0:
-        raise ValueError(f"demonstrations: dt in {name!r} must be one number above 0, got {content['dt']}")
-    return Demonstrations(
-        qpos=qpos,
-        qvel=qvel,
-        goals=goals,
-        dt=float(content["dt"]),
-        arm=str(content["arm"]),
-        joint_names=joint_names,
-        seed=int(content["seed"]),
-        torque=torque,
-    )

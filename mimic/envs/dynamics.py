@@ -1,11 +1,11 @@
-"""Forward dynamics of a serial arm, on scalar components: what MJX computes, as one program without small arrays.
+"""Dynamics of a serial arm on scalar components: the equations of MJX without small arrays, for a fused kernel.
 
-The composite rigid body algorithm gives the mass matrix, the recursive Newton-Euler algorithm the forces of the motion
-(Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 6 and 5), in frames that sit on the joints with their z
-along the axis. No gravity, contacts or constraints.
+The composite rigid body algorithm computes the mass matrix, the recursive Newton-Euler algorithm the Coriolis and
+centrifugal forces (Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 6 and 5). Frames are at the joints,
+with z along the joint's axis. There are no gravity, contacts or constraints.
 
-The time that a GPU's compiler takes grows with the square of the number of operations. So a body's mass is here as its
-sums of m r and m r r^T, which take fewer operations than a centre and an inertia tensor.
+The compile time on a GPU grows with the square of the number of operations. So the mass distribution of a body is given
+by the sums of m r and m r r^T, which need fewer operations than a centre of mass and an inertia tensor.
 """
 
 import dataclasses
@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
+from mimic.arms.embodiment import snap_to_units
 from mimic.metric.spatial import (
     IDENTITY,
     ZERO,
@@ -37,15 +38,15 @@ from mimic.metric.spatial import (
 
 _Z: Vector = (0.0, 0.0, 1.0)
 _NONE: Rotation = (ZERO, ZERO, ZERO)
-_ROUNDING = 1e-12  # what rotations to and fro leave of a zero
 
 
 @dataclasses.dataclass(frozen=True)
 class Inertia:
-    """How the mass of a rigid body lies about the origin of a joint's frame.
+    """First and second moments of mass of a rigid body about the origin of its joint's frame.
 
-    Mass on the axis of a joint moves alike whether it belongs to the body that the joint moves or to the one before. It
-    is counted to the one before, and that goes on to the base: no body has a total mass, nor z and zz of its own.
+    Mass on the axis of a joint moves in the same way as part of the body that the joint moves or of its parent. It is
+    counted as part of the parent, for all joints up to the base. So a body has no total mass, and its moments z and zz
+    are zero.
 
     Attributes:
       first: sum of m r over the points of the body [kg m].
@@ -58,15 +59,16 @@ class Inertia:
 
 @dataclasses.dataclass(frozen=True)
 class Segment:
-    """A joint and the body that it moves, as numbers.
+    """Parameters of a joint and of the body that it moves. The parent frame is that of the previous joint.
 
     Attributes:
-      placement: maps this joint's frame into the one before, at `reference`.
-      offset: the point of this joint's axis nearest to the origin before, its own origin, in the frame before [m].
-      reference: joint angle at which that holds [rad].
-      inertia: of the body.
-      armature: [kg m^2].
-      damping: [N m s/rad].
+      placement: maps this joint's frame into the parent frame, at the angle `reference`.
+      offset: origin of this joint's frame in the parent frame [m]: the point on its axis nearest to the parent's
+        origin.
+      reference: joint angle of `placement` [rad].
+      inertia: moments of mass of the body.
+      armature: rotor inertia [kg m^2].
+      damping: viscous damping [N m s/rad].
     """
 
     placement: Rotation
@@ -78,10 +80,10 @@ class Segment:
 
 
 def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
-    """The joints of an arm, base to tip.
+    """The segments of an arm, base to tip.
 
     Args:
-      model: from `simulation_model`: one serial chain of hinges.
+      model: from `simulation_model`: one serial chain of revolute joints.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
@@ -94,12 +96,12 @@ def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
         previous_frame, previous_origin = frame, origin
         frame, origin = _frame(axis, previous_frame), anchor + axis @ (previous_origin - anchor) * axis
         pose = np.eye(4)
-        pose[:3, :3] = _rounded(previous_frame.T @ frame)
-        pose[:3, 3] = _rounded(previous_frame.T @ (origin - previous_origin))
+        pose[:3, :3] = snap_to_units(previous_frame.T @ frame)
+        pose[:3, 3] = snap_to_units(previous_frame.T @ (origin - previous_origin))
         body = int(model.jnt_bodyid[joint])
-        carries = last_joint[body] == joint  # of several joints in one body, the last one moves it
+        has_body = last_joint[body] == joint  # if a body has several joints, the others move no mass of their own
         poses.append(pose)
-        masses.append(_mass(model, data, body, frame, origin) if carries else np.zeros((4, 4)))
+        masses.append(_mass(model, data, body, frame, origin) if has_body else np.zeros((4, 4)))
     for joint in reversed(range(model.njnt)):  # see `Inertia`
         on_axis = np.zeros((4, 4))
         on_axis[2:, 2:] = masses[joint][2:, 2:]
@@ -127,33 +129,33 @@ def acceleration(
     mass: Scalar = 1.0,
     damping: Scalar = 1.0,
 ) -> list[Scalar]:
-    """Joint accelerations [rad/s^2] under a torque.
+    """Forward dynamics: joint accelerations [rad/s^2] under joint torques.
 
     Args:
       arm: from `segments`.
       qpos: joint angles [rad].
       qvel: joint velocities [rad/s].
-      torque: [N m].
-      mass: factor of all bodies' masses and inertias.
-      damping: factor of all joints' damping.
+      torque: joint torques [N m].
+      mass: factor on the masses and inertias of all bodies.
+      damping: factor on the damping of all joints.
     """
-    turns = _turns(arm, qpos)
-    matrix = mass_matrix(arm, turns)
-    forces = bias_forces(arm, turns, qvel)
-    lightness = 1.0 / mass  # all else divided by the mass is cheaper than the matrix times it
+    rotations = _rotations(arm, qpos)
+    matrix = mass_matrix(arm, rotations)
+    forces = bias_forces(arm, rotations, qvel)
+    inverse_mass = 1.0 / mass  # dividing the other terms by the factor is cheaper than multiplying the matrix by it
     for i, segment in enumerate(arm):
-        matrix[i][i] = plus(matrix[i][i], times(segment.armature, lightness))
-        forces[i] = times(torque[i] - times(damping, segment.damping) * qvel[i], lightness) - forces[i]
+        matrix[i][i] = plus(matrix[i][i], times(segment.armature, inverse_mass))
+        forces[i] = times(torque[i] - times(damping, segment.damping) * qvel[i], inverse_mass) - forces[i]
     return _solve(matrix, forces)
 
 
 def inverse(
     arm: Sequence[Segment], qpos: Sequence[Scalar], qvel: Sequence[Scalar], qacc: Sequence[Scalar]
 ) -> list[Scalar]:
-    """Joint torques [N m] that give the accelerations [rad/s^2]; for the rest see `acceleration`."""
-    turns = _turns(arm, qpos)
-    matrix = mass_matrix(arm, turns)
-    torque = bias_forces(arm, turns, qvel)
+    """Inverse dynamics: joint torques [N m] for joint accelerations [rad/s^2]; see `acceleration` for the arguments."""
+    rotations = _rotations(arm, qpos)
+    matrix = mass_matrix(arm, rotations)
+    torque = bias_forces(arm, rotations, qvel)
     for i, segment in enumerate(arm):
         torque[i] = torque[i] + segment.armature * qacc[i] + segment.damping * qvel[i]
         for j in range(len(arm)):
@@ -161,59 +163,59 @@ def inverse(
     return torque
 
 
-def _turns(arm: Sequence[Segment], qpos: Sequence[Scalar]) -> list[Rotation]:
-    """Maps of each joint's frame into the one before; none of the first angle, on which nothing depends."""
+def _rotations(arm: Sequence[Segment], qpos: Sequence[Scalar]) -> list[Rotation]:
+    """Rotation of each joint's frame into its parent frame; the identity for the first, whose angle has no effect."""
     return [IDENTITY] + [
         compose(segment.placement, axis_rotation(_Z, plus(angle, -segment.reference)))
         for segment, angle in zip(arm[1:], qpos[1:], strict=True)
     ]
 
 
-def mass_matrix(arm: Sequence[Segment], turns: Sequence[Rotation]) -> list[list[Scalar]]:
+def mass_matrix(arm: Sequence[Segment], rotations: Sequence[Rotation]) -> list[list[Scalar]]:
     """Lower triangle of the joint-space inertia, without armature.
 
     Args:
       arm: from `segments`.
-      turns: maps each joint's frame into the one before.
+      rotations: rotation of each joint's frame into its parent frame.
     """
     matrix: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(len(arm))]
     composite = Inertia(ZERO, _NONE)
     for i in reversed(range(len(arm))):
-        composite = _joined(composite, arm[i].inertia)
+        composite = _summed(composite, arm[i].inertia)
         matrix[i][i] = plus(composite.second[0][0], composite.second[1][1])
         if i == 0:
             break
         trace = plus(matrix[i][i], composite.second[2][2])
-        composite = _turned(composite, turns[i])
-        # Force and moment for a unit acceleration about this joint, as the joints below feel them.
+        composite = _rotated(composite, rotations[i])
+        # Force and moment of a unit acceleration about this joint, in the frames of the proximal joints.
         axis, offset = transpose(arm[i].placement)[2], arm[i].offset
         force = cross(axis, composite.first)
         moment = add(scale(trace, axis), rotate(composite.second, scale(-1.0, axis)))
         moment = add(moment, cross(offset, force))
         matrix[i][i - 1] = moment[2]
         for j in reversed(range(1, i)):
-            force, moment = _passed_on(arm[: j + 1], turns[j], force, moment)
+            force, moment = _passed_on(arm[: j + 1], rotations[j], force, moment)
             matrix[i][j - 1] = moment[2]
         composite = _shifted(composite, offset)
     return matrix
 
 
-def bias_forces(arm: Sequence[Segment], turns: Sequence[Rotation], qvel: Sequence[Scalar]) -> list[Scalar]:
-    """Joint torques [N m] that keep the velocities as they are: Coriolis and centrifugal forces.
+def bias_forces(arm: Sequence[Segment], rotations: Sequence[Rotation], qvel: Sequence[Scalar]) -> list[Scalar]:
+    """Joint torques [N m] for zero joint acceleration: Coriolis and centrifugal forces.
 
     Args:
       arm: from `segments`.
-      turns: maps each joint's frame into the one before.
+      rotations: rotation of each joint's frame into its parent frame.
       qvel: joint velocities [rad/s].
     """
     omega, alpha, linear = ZERO, ZERO, ZERO  # angular velocity and acceleration, linear acceleration of the origin
-    field = _NONE  # a point r of the body accelerates by linear + field r
+    field = _NONE  # the acceleration of the body's point r is linear + field r
     wrenches: list[tuple[Vector, Vector]] = []
-    for segment, turn, speed in zip(arm, turns, qvel, strict=True):
-        back = transpose(turn)
-        linear = rotate(back, add(linear, rotate(field, segment.offset)))
-        spin, carried = scale(speed, _Z), rotate(back, omega)
-        omega, alpha = add(carried, spin), add(rotate(back, alpha), cross(carried, spin))
+    for segment, parent_rotation, speed in zip(arm, rotations, qvel, strict=True):
+        to_child = transpose(parent_rotation)
+        linear = rotate(to_child, add(linear, rotate(field, segment.offset)))
+        spin, carried = scale(speed, _Z), rotate(to_child, omega)
+        omega, alpha = add(carried, spin), add(rotate(to_child, alpha), cross(carried, spin))
         field = _acceleration_field(omega, alpha)
         first, second = segment.inertia.first, segment.inertia.second
         moment = add(_moment(field, second), cross(first, linear))
@@ -223,13 +225,15 @@ def bias_forces(arm: Sequence[Segment], turns: Sequence[Rotation], qvel: Sequenc
     for i in reversed(range(len(arm))):
         force, moment = add(force, wrenches[i][0]), add(moment, wrenches[i][1])
         torques[i] = moment[2]
-        force, moment = _passed_on(arm[: i + 1], turns[i], force, moment)
+        force, moment = _passed_on(arm[: i + 1], rotations[i], force, moment)
     return torques
 
 
-def _passed_on(arm: Sequence[Segment], turn: Rotation, force: Vector, moment: Vector) -> tuple[Vector, Vector]:
-    """What acts in the frame of the last joint, in the frame before; without the force where no joint feels it."""
-    force, moment = rotate(turn, force), rotate(turn, moment)
+def _passed_on(
+    arm: Sequence[Segment], parent_rotation: Rotation, force: Vector, moment: Vector
+) -> tuple[Vector, Vector]:
+    """Transforms a wrench from the last joint's frame to its parent; the force is dropped where it has no effect."""
+    force, moment = rotate(parent_rotation, force), rotate(parent_rotation, moment)
     moment = add(moment, cross(arm[-1].offset, force))
     return force if any(any(segment.offset) for segment in arm[:-1]) else ZERO, moment
 
@@ -273,29 +277,29 @@ def _solve(matrix: list[list[Scalar]], values: list[Scalar]) -> list[Scalar]:
         for j in range(i):
             pivot = pivot - times(scaled[j], lower[i][j])
         inverse.append(1.0 / pivot)
-    found = list(values)
+    solution = list(values)
     for i in range(size):
         for j in range(i):
-            found[i] = found[i] - times(lower[i][j], found[j])
-    found = [times(x, y) for x, y in zip(found, inverse, strict=True)]
+            solution[i] = solution[i] - times(lower[i][j], solution[j])
+    solution = [times(x, y) for x, y in zip(solution, inverse, strict=True)]
     for i in reversed(range(size)):
         for j in range(i + 1, size):
-            found[i] = found[i] - times(lower[j][i], found[j])
-    return found
+            solution[i] = solution[i] - times(lower[j][i], solution[j])
+    return solution
 
 
-def _joined(a: Inertia, b: Inertia) -> Inertia:
+def _summed(a: Inertia, b: Inertia) -> Inertia:
     return Inertia(add(a.first, b.first), _symmetric(lambda i, j: plus(a.second[i][j], b.second[i][j])))
 
 
-def _turned(inertia: Inertia, turn: Rotation) -> Inertia:
-    """The same mass along the axes that `turn` maps into."""
-    half = compose(turn, inertia.second)
-    return Inertia(rotate(turn, inertia.first), _symmetric(lambda i, j: dot(half[i], turn[j])))
+def _rotated(inertia: Inertia, parent_rotation: Rotation) -> Inertia:
+    """The moments along the axes that the rotation maps into."""
+    half = compose(parent_rotation, inertia.second)
+    return Inertia(rotate(parent_rotation, inertia.first), _symmetric(lambda i, j: dot(half[i], parent_rotation[j])))
 
 
 def _shifted(inertia: Inertia, offset: Vector) -> Inertia:
-    """The same mass about the origin of the frame before."""
+    """The moments about the origin of the parent frame."""
     first, second = inertia.first, inertia.second
 
     def entry(i: int, j: int) -> Scalar:
@@ -313,7 +317,7 @@ def _symmetric(entry: Callable[[int, int], Scalar]) -> Rotation:
 
 
 def _frame(axis: np.ndarray, previous: np.ndarray) -> np.ndarray:
-    """Axes of a frame with z along a joint; x along an axis of the frame before if one is normal to z."""
+    """Axes of a frame with z along a joint; x is along an axis of the parent frame if one is normal to z."""
     normal = previous[:, np.argmin(np.abs(previous.T @ axis))]
     x = normal - (normal @ axis) * axis
     x /= np.linalg.norm(x)
@@ -328,9 +332,3 @@ def _mass(model: mujoco.MjModel, data: mujoco.MjData, body: int, frame: np.ndarr
     result[:3, :3] = axes @ np.diag(inertia.sum() / 2 - inertia) @ axes.T
     centre = np.append(frame.T @ (data.xipos[body] - origin), 1.0)
     return result + model.body_mass[body] * np.outer(centre, centre)
-
-
-def _rounded(values: np.ndarray) -> np.ndarray:
-    """Exact zeros and ones where they are meant: what is known to be zero is not computed."""
-    near = np.round(values)
-    return np.where(np.abs(values - near) < _ROUNDING, near, values)

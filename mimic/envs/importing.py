@@ -1,4 +1,4 @@
-"""Motions from elsewhere as demonstrations: CSV tables, and npz files as LocoMuJoCo writes them."""
+"""Imports motions as demonstrations: CSV tables, and npz files in LocoMuJoCo's format."""
 
 import csv
 import os
@@ -16,44 +16,45 @@ from mimic.envs.demonstrations import Demonstrations, check_effort
 SOURCES = (".csv", ".npz")
 _TIME, _DEMONSTRATION = ("time", "t"), "demonstration"  # columns of a table
 _ANGLE_PREFIXES, _VELOCITY_PREFIXES = ("", "q_", "q", "qpos_"), ("qdot_", "qdot", "qvel_", "dq_")
-_SIZES = {0: (7, 6), 2: (1, 1), 3: (1, 1)}  # columns of qpos and qvel by MuJoCo's joint type: free, slide, hinge
-_ROUNDING = 1e-6  # share of a step that an episode may be short of, rad that a float32 may be beyond a range of pi
+_SIZES = {0: (7, 6), 2: (1, 1), 3: (1, 1)}  # columns of qpos and qvel by MuJoCo's joint type: free, slide, revolute
+_ROUNDING = 1e-6  # tolerance of the duration (relative) and of joint ranges (rad): float32 rounds pi by 9e-8
 
 
 class Motion(NamedTuple):
-    """One motion, at the times it came with; `qvel` is None where nobody measured it."""
+    """One motion at the times of its file; `qvel` is None if the file has no velocities."""
 
     time: Float[np.ndarray, " samples"]
     qpos: Float[np.ndarray, "samples joints"]
     qvel: Float[np.ndarray, "samples joints"] | None
 
 
+# Above 40 lines because of its docstring.
 def import_demonstrations(
     path: str | os.PathLike[str], arm: Embodiment, *, dt: float = 0.1, horizon: int = 50, joints: Sequence[str] = ()
 ) -> tuple[Demonstrations, bool]:
-    """Reads motions, resamples them to control steps, and checks that the arm can do them.
+    """Reads motions, resamples them at control steps, and checks them against the arm's limits.
 
-    A CSV table has a header: `time` [s], and for each joint its angle [rad], as its name or `q_NAME` or `q_1`, `q_2`,
-    ... by its number; optionally its velocity [rad/s], as `qdot_NAME` or `qdot_1`, ...; and optionally `demonstration`,
-    a number that tells several motions apart. An npz file has `qpos`, `joint_names` and `frequency` [1/s] (or `dt`),
-    and optionally `qvel`, `jnt_type` and `split_points`, where motions begin, as LocoMuJoCo writes them.
+    A CSV table has a header with the columns `time` [s] and, for each joint, its angle [rad]: its name, `q_NAME`, or
+    `q_1`, `q_2`, ... by number. Optional columns are the joint's velocity [rad/s], `qdot_NAME` or `qdot_1`, ..., and
+    `demonstration`, the number of the motion. An npz file has `qpos`, `joint_names` and `frequency` [1/s] (or `dt`),
+    and optionally `qvel`, `jnt_type` and `split_points`, the first samples of the motions, in LocoMuJoCo's format.
 
-    Between samples the angles are cubic in time, with the velocities of the file, or with central differences where it
-    has none. Every demonstration is cut to the horizon.
+    Between samples the angles are cubic in time, with the file's velocities, or with central differences if it has
+    none. Every demonstration is cut to the horizon.
 
     Args:
-      path: the file; its ending tells which kind.
+      path: the file; its suffix selects the format.
       arm: the expert.
       dt: control step [s].
       horizon: steps of a demonstration.
-      joints: what the file calls the arm's joints, base to tip; the arm's own names where empty.
+      joints: names of the arm's joints in the file, base to tip; the arm's own names where empty.
 
     Returns:
-      The demonstrations, and whether their velocities were differentiated.
+      The demonstrations, and whether their velocities were computed by differentiation.
 
     Raises:
-      ValueError: a file that is missing or of another kind, without the joints, shorter than the horizon, not in rad,
-        or faster than the arm's rated speeds.
+      ValueError: a file that is missing or has another format, lacks joints, is shorter than the horizon, is not in
+        rad, or exceeds the arm's velocity limits.
     """
     source = Path(path)
     if not source.is_file():
@@ -79,10 +80,10 @@ def _check(motion: Motion, name: str, arm: Embodiment, duration: float) -> None:
             raise ValueError(f"source: {name} has values that are not finite")
     if len(motion.time) < 2 or np.any(np.diff(motion.time) <= 0):
         raise ValueError(f"source: {name} needs two or more samples at times that increase")
-    lasts = motion.time[-1] - motion.time[0]
-    if lasts < duration * (1 - _ROUNDING):
+    length = motion.time[-1] - motion.time[0]
+    if length < duration * (1 - _ROUNDING):
         raise ValueError(
-            f"source: {name} lasts {lasts:g} s, but an episode {duration:g} s; a smaller env.horizon makes it shorter"
+            f"source: {name} lasts {length:g} s, but an episode {duration:g} s; a smaller env.horizon makes it shorter"
         )
     lower, upper = np.asarray(arm.joint_range).T
     beyond = np.argwhere((motion.qpos < lower - _ROUNDING) | (motion.qpos > upper + _ROUNDING))
@@ -96,12 +97,12 @@ def _check(motion: Motion, name: str, arm: Embodiment, duration: float) -> None:
 
 def _resampled(motion: Motion, dt: float, horizon: int) -> tuple[np.ndarray, np.ndarray]:
     """Angles and velocities at control steps."""
-    from scipy.interpolate import CubicHermiteSpline  # half a second, and few need it
+    from scipy.interpolate import CubicHermiteSpline  # takes half a second, and only imports of motions need it
 
     time = motion.time - motion.time[0]
     qvel = np.gradient(motion.qpos, time, axis=0) if motion.qvel is None else motion.qvel
     spline = CubicHermiteSpline(time, motion.qpos, qvel)
-    steps = np.minimum(dt * np.arange(horizon + 1), time[-1])  # rounding must not ask for what comes after the end
+    steps = np.minimum(dt * np.arange(horizon + 1), time[-1])  # rounding must not extrapolate
     return spline(steps), spline(steps, 1)
 
 
@@ -121,32 +122,35 @@ def _read_csv(path: Path, names: Sequence[str]) -> list[Motion]:
             f"joints {', '.join(names)}, by name or as q_1, q_2, ..., got the columns {', '.join(header)}"
         )
     velocities = _columns(header, names, _VELOCITY_PREFIXES)
-    known = [column for column in velocities if column is not None]
-    if known and len(known) < len(names):
+    velocity_columns = [column for column in velocities if column is not None]
+    if velocity_columns and len(velocity_columns) < len(names):
         missing = [name for name, column in zip(names, velocities, strict=True) if column is None]
         raise ValueError(f"source: {str(path)!r} has velocities of some joints, but none of {', '.join(missing)}")
-    which = table[:, header.index(_DEMONSTRATION)] if _DEMONSTRATION in header else np.zeros(len(table))
-    parts = [table[which == number] for number in np.unique(which)]
+    numbers = table[:, header.index(_DEMONSTRATION)] if _DEMONSTRATION in header else np.zeros(len(table))
+    parts = [table[numbers == number] for number in np.unique(numbers)]
     if not parts:
         raise ValueError(f"source: {str(path)!r} has no rows")
-    at = np.array(angles, int)
-    return [Motion(part[:, times[0]], part[:, at], part[:, known] if known else None) for part in parts]
+    angle_columns = np.array(angles, int)
+    return [
+        Motion(part[:, times[0]], part[:, angle_columns], part[:, velocity_columns] if velocity_columns else None)
+        for part in parts
+    ]
 
 
 def _columns(header: Sequence[str], names: Sequence[str], prefixes: Sequence[str]) -> list[int | None]:
-    """Where the value of each joint stands, by its name or its number from 1."""
-    found: list[int | None] = []
+    """Column of each joint, by its name or its number from 1; None if there is none."""
+    columns: list[int | None] = []
     for number, name in enumerate(names, start=1):
         spellings = [prefix + key for key in (name, str(number)) for prefix in prefixes if prefix or key == name]
-        found.append(next((header.index(spelling) for spelling in spellings if spelling in header), None))
-    return found
+        columns.append(next((header.index(spelling) for spelling in spellings if spelling in header), None))
+    return columns
 
 
-def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
+def _npz_content(path: Path) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as archive:  # of what is pickled, as LocoMuJoCo's metadata, we read none
-            wanted = ("qpos", "qvel", "joint_names", "frequency", "dt", "jnt_type", "split_points")
-            content: dict[str, Any] = {key: archive[key] for key in wanted if key in archive.files}
+        with np.load(path, allow_pickle=False) as archive:  # pickled arrays, as LocoMuJoCo's metadata, are not read
+            keys = ("qpos", "qvel", "joint_names", "frequency", "dt", "jnt_type", "split_points")
+            content: dict[str, Any] = {key: archive[key] for key in keys if key in archive.files}
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError) as error:
         raise ValueError(f"source: {str(path)!r} cannot be read as an npz file of motions: {error}") from error
     lacking = [key for key in ("qpos", "joint_names") if key not in content]
@@ -157,12 +161,17 @@ def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
             f"source: {str(path)!r} lacks {', '.join(lacking)}; expected qpos, joint_names, frequency or dt, and "
             "optionally qvel, jnt_type, split_points"
         )
+    return content
+
+
+def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
+    content = _npz_content(path)
     qpos, qvel = content["qpos"], content.get("qvel")
     present = list(map(str, np.atleast_1d(content["joint_names"])))
     if missing := [name for name in names if name not in present]:
         raise ValueError(
             f"source: {str(path)!r} lacks the joints {', '.join(missing)}; it has {', '.join(present)}; "
-            "joints=[...] says which of these are the arm's"
+            "joints=[...] names the arm's joints among these"
         )
     angle_at, velocity_at = _addresses(content.get("jnt_type"), present)
     for key, values, width in (("qpos", qpos, angle_at[-1]), ("qvel", qvel, velocity_at[-1])):
@@ -174,9 +183,9 @@ def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
     if rate.shape != () or not 0 < float(rate) < np.inf:
         raise ValueError(f"source: frequency or dt in {str(path)!r} must be one number above 0, got {rate}")
     step = float(rate) if "dt" in content else 1 / float(rate)
-    which = [present.index(name) for name in names]
-    qpos = np.asarray(qpos, float)[:, angle_at[which]]
-    qvel = None if qvel is None else np.asarray(qvel, float)[:, velocity_at[which]]
+    indices = [present.index(name) for name in names]
+    qpos = np.asarray(qpos, float)[:, angle_at[indices]]
+    qvel = None if qvel is None else np.asarray(qvel, float)[:, velocity_at[indices]]
     bounds = [int(point) for point in np.atleast_1d(content.get("split_points", (0, len(qpos))))]
     if len(bounds) < 2 or bounds[0] != 0 or bounds[-1] != len(qpos) or np.any(np.diff(bounds) <= 0):
         raise ValueError(
@@ -189,7 +198,7 @@ def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
 
 
 def _addresses(types: np.ndarray | None, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """First column of each joint in qpos and in qvel, and last how many columns there are."""
+    """First column of each joint in qpos and in qvel; the last entry is the number of columns."""
     kinds = [3] * len(names) if types is None else [int(kind) for kind in types]
     if len(kinds) != len(names) or any(kind not in _SIZES for kind in kinds):
         raise ValueError(f"source: jnt_type: expected 0, 2 or 3 for each of {', '.join(names)}, got {kinds}")

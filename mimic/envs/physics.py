@@ -1,4 +1,4 @@
-"""The learner's motion: torque in, joint state out; on MJX, or by our own dynamics as one fused program."""
+"""Simulation of the learner, from torques to joint states: by MJX, or by mimic's own dynamics in a fused kernel."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,15 +12,15 @@ from mujoco import mjx
 from mimic.envs import dynamics
 from mimic.metric import fused_kernel
 
-_LAYOUT = fused_kernel.LaunchConfig(block=64, warps=2)  # by measurement
+_LAYOUT = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest by measurement
 
 
 class Load(NamedTuple):
-    """How an arm differs from its model.
+    """Factors on the parameters of an arm's model.
 
     Attributes:
-      mass: factor of the masses and inertias of its bodies.
-      damping: factor of the damping of its joints.
+      mass: factor on the masses and inertias of its bodies.
+      damping: factor on the damping of its joints.
     """
 
     mass: Float[Array, ""] | float = 1.0
@@ -31,22 +31,22 @@ Advance = Callable[[Array, Array, Array, Load], tuple[Array, Array]]
 
 
 def make_advance(model: mujoco.MjModel, timestep: float, substeps: int, physics: str = "mjx") -> Advance:
-    """A function (qpos, qvel, torque, load) -> (qpos, qvel) that holds a torque for `substeps` steps.
+    """Makes a function (qpos, qvel, torque, load) -> (qpos, qvel) of `substeps` steps with a constant torque.
 
-    Classical fourth-order Runge-Kutta, as MuJoCo's RK4, over the forward dynamics.
+    It integrates the forward dynamics by the classical fourth-order Runge-Kutta method, as MuJoCo's RK4 does.
 
     Args:
-      model: from `simulation_model`: hinges only, no constraints.
-      timestep: of a step [s].
+      model: from `simulation_model`: revolute joints only, no constraints.
+      timestep: duration of a step [s].
       substeps: steps per call.
-      physics: "mjx", or "fused" for the same equations as one small program: a single kernel on NVIDIA GPUs.
+      physics: "mjx", or "fused" for the same equations in one fused function: a single kernel on NVIDIA GPUs.
     """
     make = {"mjx": _mjx_advance, "fused": _fused_advance}[physics]
     return make(model, timestep, substeps)
 
 
 def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advance:
-    device = jax.local_devices()[0]  # MJX's own choice is process 0's, where no other may write
+    device = jax.local_devices()[0]  # MJX would choose a device of process 0, which other processes cannot use
     constants = jax.device_get((mjx.put_model(model, device=device), mjx.make_data(model, device=device)))
 
     def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
@@ -58,7 +58,7 @@ def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advan
         )
 
         def acceleration(qpos: Array, qvel: Array) -> Array:
-            # `Data` is rebuilt here and never carried: all that a step needs of it is the joint state.
+            # `Data` is not carried from step to step: a step needs only its joint state.
             data = blank.replace(qpos=qpos, qvel=qvel, qfrc_applied=torque)
             return mjx.forward(loaded, data).qacc
 
@@ -68,7 +68,7 @@ def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advan
 
 
 def _constant(value: Any) -> Array:
-    """For a program. An empty one is computed: on a literal jaxlib 0.11.2 crashes, with several devices."""
+    """A constant array. Empty ones are computed: jaxlib 0.11.2 crashes on empty literals with several devices."""
     return jnp.asarray(value) if value.size else jnp.zeros(value.shape, value.dtype)
 
 
@@ -81,7 +81,7 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
 
         return _runge_kutta(acceleration, qpos, qvel, timestep, substeps)
 
-    # On CPUs a loop over a few arrays is twice as fast as one over as many as there are joints.
+    # For CPUs: a loop over a few arrays is twice as fast as a loop over an array for each joint.
     widths = len(arm), len(arm)
     step = fused_kernel.fused(_scalar_step(arm, timestep, substeps), widths, plain=plain, layout=_LAYOUT)
 
@@ -92,8 +92,8 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
     return advance
 
 
-def _scalar_step(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: int) -> fused_kernel.Program:
-    """The same on scalars."""
+def _scalar_step(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: int) -> fused_kernel.ScalarFunction:
+    """The steps on scalar components, for the kernel."""
 
     def step(qpos: Any, qvel: Any, torque: Any, load: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         def acceleration(qpos: Any, qvel: Any) -> tuple[Any, ...]:
@@ -107,21 +107,21 @@ def _scalar_step(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: i
 def _runge_kutta(
     acceleration: Callable[[Any, Any], Any], qpos: Any, qvel: Any, timestep: float, substeps: int
 ) -> tuple[Any, Any]:
-    """Steps over arrays or tuples of them. The stages run in a loop, so that the dynamics are compiled once."""
+    """Runge-Kutta steps of arrays or tuples of arrays. A loop over the stages compiles the dynamics only once."""
     dtype = jax.tree.leaves(qpos)[0].dtype
 
-    def along(start: Any, reach: Any, rate: Any) -> Any:
-        return jax.tree.map(lambda x, y: x + reach * y, start, rate)
+    def extrapolate(start: Any, duration: Any, rate: Any) -> Any:
+        return jax.tree.map(lambda x, y: x + duration * y, start, rate)
 
     def stage(index: Any, carry: Any) -> Any:
         start, (stage_qpos, stage_qvel), (end_qpos, end_qvel) = carry
         qacc = acceleration(stage_qpos, stage_qvel)
-        weight = timestep / 6 * (1 + jnp.minimum(index, 3 - index)).astype(dtype)  # 1 2 2 1, of this stage in the step
-        reach = timestep / 2 * (1 + index // 2).astype(dtype)  # 1 1 2, from the start of the step to the next stage
+        weight = timestep / 6 * (1 + jnp.minimum(index, 3 - index)).astype(dtype)  # of the stages: 1 2 2 1
+        to_next = timestep / 2 * (1 + index // 2).astype(dtype)  # from the start of the step to the next stage: 1 1 2
         return (
             start,
-            (along(start[0], reach, stage_qvel), along(start[1], reach, qacc)),
-            (along(end_qpos, weight, stage_qvel), along(end_qvel, weight, qacc)),
+            (extrapolate(start[0], to_next, stage_qvel), extrapolate(start[1], to_next, qacc)),
+            (extrapolate(end_qpos, weight, stage_qvel), extrapolate(end_qvel, weight, qacc)),
         )
 
     def step(_: Any, start: Any) -> Any:

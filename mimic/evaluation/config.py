@@ -1,16 +1,16 @@
-"""The config of a search for the best torques."""
+"""The config of a search for optimal torques."""
 
 import dataclasses
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchConfig:
-    """A search for the best torques: see `search_torques`.
+    """A search for optimal torques, see `search_torques`.
 
     Attributes:
-      iterations: updates of each sequence of torques.
-      starts: sequences for each demonstration: of the policy, computed_torque, pd and hold in this order, then of the
-        policy with noise.
+      iterations: updates of each torque sequence.
+      starts: initial torque sequences for each demonstration: those of the policy, computed_torque, pd and hold in this
+        order, then of the policy with noise.
     """
 
     iterations: int = 40

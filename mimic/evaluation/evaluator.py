@@ -1,8 +1,8 @@
-"""How good a controller is: every demonstration once, against the kinematic bound and against holding still."""
+"""Evaluates controllers: every demonstration once, relative to the kinematic bound and to holding the start pose."""
 
 import csv
 import functools
-import os
+import io
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,19 +24,20 @@ from mimic.metric.similarity import CentreLine, centre_line_table
 from mimic.retargeting.kinematic_bound import closest_motion
 from mimic.retargeting.pose import pose_limits, shared_joints
 from mimic.retargeting.pose_baselines import baseline_poses
+from mimic.runs.files import write_atomically
 
-Controller = Callable[[State], Array]  # state of the environment -> action
+Controller = Callable[[State], Array]  # (state of the environment) -> action
 Motions = Float[np.ndarray, "demonstrations time joints"]
 
 
 @struct.dataclass
 class Rollouts:
-    """What a controller did on each demonstration.
+    """Rollouts of a controller, one for each demonstration.
 
     Attributes:
       qpos: [demonstrations, T, joints] learner's joint angles after each step [rad].
-      qvel: [demonstrations, T, joints] its velocities [rad/s].
-      torque: [demonstrations, T, joints] that the controller asked for in each step, within its range [N m].
+      qvel: [demonstrations, T, joints] its joint velocities after each step [rad/s].
+      torque: [demonstrations, T, joints] the controller's torques, within their range and without noise [N m].
       distance: [demonstrations, T] embodiment distance after each step.
     """
 
@@ -51,11 +52,11 @@ class Evaluator:
 
     Args:
       env: the training environment.
-      held_out: demonstrations that are not trained on.
+      held_out: demonstrations for evaluation only.
 
     Attributes:
-      training_env: the environment that was given.
-      env: the same environment on all demonstrations, training first.
+      training_env: the training environment.
+      env: the same environment on all demonstrations, those for training first.
     """
 
     def __init__(self, env: ImitationEnv, held_out: Demonstrations):
@@ -65,24 +66,25 @@ class Evaluator:
         self._references = Background(lambda: _references(self.env))
 
     def prepare(self) -> None:
-        """Begins to compute `lower_bound`, `hold_distance` and the baselines in the background."""
+        """Starts to compute `lower_bound`, `hold_distance` and the baselines in the background."""
         self._references.start()
 
     @property
     def lower_bound(self) -> Float[np.ndarray, "demonstrations time"]:
-        """The kinematic bound, which is the best of a search and so an upper estimate of the true minimum.
+        """The kinematic bound at each step.
 
-        Computed when it is first asked for, if not before. Reports have called it `lower_bound` since they exist.
+        It is the best result of an optimisation, and so an upper estimate of the true minimum. Its name is that of the
+        report key, which stays for old runs. It is computed at the first access, unless `prepare` was called.
         """
         return self._references().bound
 
     @property
     def hold_distance(self) -> Float[np.ndarray, "demonstrations time"]:
-        """Distance of the learner at rest in its home pose."""
+        """Embodiment distance at each step of a learner that stays at rest in its home pose."""
         return self._references().hold
 
     def rollout(self, controller: Controller) -> Rollouts:
-        """Runs a controller on every demonstration; the caller jits this, with the parameters inside."""
+        """Runs a controller on every demonstration. Call it under `jax.jit`."""
         env = self.env
 
         def begin(demonstration: Array) -> State:
@@ -95,14 +97,14 @@ class Evaluator:
             after: Any = state.pipeline_state
             return state, Rollouts(after.qpos, after.qvel, action * env.torque_scale, state.metrics["distance"])
 
-        # Batched within the loop: around it JAX would trace a step once for one demonstration, and again for all.
+        # `vmap` is inside the loop: around the loop, JAX would trace a step twice, without and with the batch.
         start = jax.vmap(begin)(jnp.arange(env.demonstrations.count))
         _, over_time = jax.lax.scan(lambda state, _: jax.vmap(step)(state), start, None, length=env.config.horizon)
         return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), over_time)
 
     @property
     def parts(self) -> dict[str, slice]:
-        """Which demonstrations are trained on, and which are held out."""
+        """The demonstrations of each split, as slices of all demonstrations."""
         return {"train": slice(0, self._num_train), "held_out": slice(self._num_train, None)}
 
     @functools.cached_property
@@ -112,7 +114,7 @@ class Evaluator:
         return centre_line_table(self.env.expert, self.env.demonstrations.qpos[:, 1 : steps + 1].astype(np.float32))
 
     def similarity(self, qpos: Motions) -> Table:
-        """How alike a learner's motions look, one row for each demonstration: see `measure_similarity`."""
+        """Similarity of a learner's motions, one row for each demonstration, see `measure_similarity`."""
         return measure_similarity(self._expert_line, self.env.learner, np.asarray(qpos, np.float32))
 
     @functools.cached_property
@@ -120,15 +122,16 @@ class Evaluator:
         return {name: self.similarity(qpos) for name, qpos in self._references().motions.items()}
 
     def similarity_summary(self, rollouts: Rollouts, controller: str) -> dict[str, dict[str, dict[str, float]]]:
-        """Means by split of each measure of similarity, for a controller and for the baselines beside it.
+        """Means by split of each measure of similarity, for a controller and for the baselines.
 
-        Beside it: `nearest_poses`, where the kinematic bound is, and `mimic.retargeting.pose_baselines.BASELINES`.
+        The baselines are `nearest_poses`, the poses of the kinematic bound, and those of
+        `mimic.retargeting.pose_baselines.BASELINES`.
         """
         tables = {controller: self.similarity(np.asarray(rollouts.qpos)), **self._baseline_similarity}
         return means_by_split(tables, self.parts)
 
     def table(self, rollouts: Rollouts) -> Table:
-        """One row for each demonstration: see `measure`; and mean distance, bound, holding the start pose, the gap."""
+        """One row for each demonstration: gap, mean distance, bound, distance of the start pose, and `measure`'s."""
         qpos, qvel, torque = (np.asarray(x) for x in (rollouts.qpos, rollouts.qvel, rollouts.torque))
         states = link_state_table(self.env.learner, qpos, qvel)
         distances = np.asarray(rollouts.distance), self.lower_bound, self.hold_distance
@@ -142,7 +145,7 @@ class Evaluator:
         }
 
     def summary(self, rollouts: Rollouts) -> dict[str, Any]:
-        """The quality figures of a controller, for the training and the held-out demonstrations."""
+        """The metrics of a controller, for the training and the held-out demonstrations."""
         table, parts = self.table(rollouts), self.parts
 
         def by_split(values: np.ndarray, total: Callable[..., Any] = np.mean) -> dict[str, float]:
@@ -160,16 +163,16 @@ class Evaluator:
         }
 
     def worst(self, rollouts: Rollouts) -> dict[str, dict[str, float]]:
-        """Gap of the worst demonstrations of each split, by their number."""
+        """The largest gaps of each split, by number of the demonstration."""
         gap = self.table(rollouts)["optimality_gap"]
-        named = {}
+        worst = {}
         for split, part in self.parts.items():
             order = np.argsort(-gap[part])[:WORST]  # those without a gap come last
-            named[split] = {str(index): float(gap[part][index]) for index in order if np.isfinite(gap[part][index])}
-        return named
+            worst[split] = {str(index): float(gap[part][index]) for index in order if np.isfinite(gap[part][index])}
+        return worst
 
     def save_curves(self, rollouts: Rollouts, out: Path) -> None:
-        """Writes the distance over the time of an episode as CSV, for each split: what `quality.png` shows."""
+        """Writes the curves of `quality.png` as CSV: the distance over the time of an episode, for each split."""
         dt, distance = self.env.config.control_dt, np.asarray(rollouts.distance)
         rows = []
         for split, part in self.parts.items():
@@ -188,21 +191,19 @@ class Evaluator:
 
 
 def _write_csv(out: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Replaces a file only when the new one is whole."""
-    partial = out.with_name(out.name + ".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows(rows)
-    os.replace(partial, out)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(header)
+    writer.writerows(rows)
+    write_atomically(out, text.getvalue())
 
 
 class References(NamedTuple):
-    """What a controller is measured against, over [demonstrations, time].
+    """The references of the metrics.
 
     Attributes:
-      bound: the kinematic bound.
-      hold: distance of holding the start pose.
+      bound: [demonstrations, time] the kinematic bound.
+      hold: [demonstrations, time] distance of holding the start pose.
       motions: the learner's angles [demonstrations, time, joints] [rad] by baseline; see
         `Evaluator.similarity_summary`.
     """
@@ -215,29 +216,29 @@ class References(NamedTuple):
 def _references(env: ImitationEnv) -> References:
     steps, home = env.config.horizon, np.asarray(env.learner.home)
     qpos, qvel = (x[:, 1 : steps + 1] for x in (env.demonstrations.qpos, env.demonstrations.qvel))
-    own_qpos, own_qvel = (shared_joints(env.expert, env.learner, x) for x in (qpos, qvel))
-    own_qpos = np.clip(own_qpos, *pose_limits(env.learner, float))
+    copied_qpos, copied_qvel = (shared_joints(env.expert, env.learner, x) for x in (qpos, qvel))
+    copied_qpos = np.clip(copied_qpos, *pose_limits(env.learner, float))
     expert = jax.tree.map(lambda x: np.asarray(x)[:, 1 : steps + 1], env.expert_states)
     distance = jax.jit(jax.vmap(jax.vmap(env.states_distance)))
-    still = np.broadcast_to(home, own_qpos.shape)
-    own, hold = (
+    held_qpos = np.broadcast_to(home, copied_qpos.shape)
+    copied, hold = (
         np.asarray(distance(expert, link_state_table(env.learner, *motion)))
-        for motion in ((own_qpos, own_qvel), (still, np.zeros_like(own_qvel)))
+        for motion in ((copied_qpos, copied_qvel), (held_qpos, np.zeros_like(copied_qvel)))
     )
-    # Where the learner can do just what the expert does there is nothing to search: no distance is below 0.
-    bound, nearest = _lower_bound(env, qpos, qvel) if own.any() else (own, own_qpos)
+    # If copying the expert's joints gives distance 0 everywhere, the bound needs no optimisation.
+    bound, nearest = _lower_bound(env, qpos, qvel) if copied.any() else (copied, copied_qpos)
     motions = {"nearest_poses": nearest, **baseline_poses(env.expert, env.learner, qpos)}
     return References(bound, hold, motions)
 
 
 def _lower_bound(env: ImitationEnv, qpos: Motions, qvel: Motions) -> tuple[np.ndarray, Motions]:
-    """The kinematic bound [demonstrations, time], and the poses that have it."""
+    """The kinematic bound [demonstrations, time], and its poses."""
 
     def closest(qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        found = closest_motion(env.expert, env.learner, qpos, qvel, **env.metric.arguments)
-        return found.distance, found.qpos
+        solution = closest_motion(env.expert, env.learner, qpos, qvel, **env.metric.arguments)
+        return solution.distance, solution.qpos
 
-    # On the host's processor where JAX may use it: there the program compiles several times faster, and it runs once.
+    # On the CPU, where the function compiles several times faster; it runs only once.
     with on_host():
-        found = jax.jit(jax.vmap(closest))(qpos.astype(np.float32), qvel.astype(np.float32))
-        return np.asarray(found[0]), np.asarray(found[1])
+        distance, poses = jax.jit(jax.vmap(closest))(qpos.astype(np.float32), qvel.astype(np.float32))
+        return np.asarray(distance), np.asarray(poses)

@@ -1,4 +1,6 @@
-"""Splits of the demonstrations and names of measures, as keys and as people read them."""
+"""Keys and display names of splits, measures of similarity and baselines."""
+
+from collections.abc import Mapping
 
 SPLITS = ("train", "held_out")
 SIMILARITY_HEADERS = {  # positions in chain lengths
@@ -9,10 +11,20 @@ SIMILARITY_HEADERS = {  # positions in chain lengths
     "hand_angle_deg": "hand\nangle",
 }
 SPLIT_NAMES = {"train": "training", "held_out": "held out"}
-SIMILARITY_NAMES = {  # of what moves the learner, where the name is not said by its key
+SIMILARITY_NAMES = {  # display names that differ from their keys
     "nearest_poses": "nearest poses (metric)",
     "copy_joints": "copying shared joints",
     "hand_ik": "IK of the scaled hand",
     "align_segments": "aligning segments",
     "hold_home": "holding start pose",
 }
+
+
+def similarity_texts(similarity: Mapping[str, float]) -> dict[str, tuple[str, str]]:
+    """Label and value of each measure of one moment by the measure's name, as the viewer and videos show them."""
+
+    def text(name: str) -> str:
+        return f"{similarity[name]:.0f}°" if name.endswith("_deg") else f"{similarity[name]:.3f}"
+
+    headers = SIMILARITY_HEADERS.items()
+    return {name: (header.replace("\n", " "), text(name)) for name, header in headers if name in similarity}

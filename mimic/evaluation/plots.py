@@ -1,4 +1,4 @@
-"""Pictures of a run: how it learned, and how near the learner stays to the expert."""
+"""Plots of a run: its training, and the learner's distance and similarity to the expert."""
 
 import csv
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 
-from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES  # noqa: E402
+from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES, SPLIT_NAMES  # noqa: E402
 from mimic.evaluation.rollout_metrics import WORST  # noqa: E402
 from mimic.runs.files import METRICS  # noqa: E402
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
     from mimic.evaluation.evaluator import Evaluator, Rollouts
 
 _COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
-_LABELS = {"train": "training", "held_out": "held-out"}
+_LABELS = {split: name.replace(" ", "-") for split, name in SPLIT_NAMES.items()}  # adjectives: held-out demonstrations
 
 
-def plot_training(folder: Path, figure_name: str, label: str, *, of: str, title: str) -> None:
-    """A figure in percent over the steps, on training and held-out data; of a folder that holds no run, nothing."""
-    metrics = folder / METRICS
-    if not metrics.is_file():
+def plot_training(folder: Path, metric: str, label: str, *, of: str, title: str) -> None:
+    """Plots a metric in percent over the steps, on training and held-out data; nothing if the folder has no run."""
+    log = folder / METRICS
+    if not log.is_file():
         return
-    with metrics.open(newline="") as file:
+    with log.open(newline="") as file:
         rows = list(csv.DictReader(file))
     steps = [int(row["step"]) for row in rows]
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
     for split, colour in _COLOURS.items():
-        percent = [100 * float(row[f"quality/{figure_name}.{split}"]) for row in rows]
+        percent = [100 * float(row[f"quality/{metric}.{split}"]) for row in rows]
         axes.plot(steps, percent, "o-", markersize=3, color=colour, label=f"{_LABELS[split]} {of}")
     axes.set(xlabel="steps", ylabel=label, title=title, yscale="log")
     axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
@@ -44,7 +44,7 @@ def plot_training(folder: Path, figure_name: str, label: str, *, of: str, title:
 
 
 def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, controller: str, title: str) -> None:
-    """Mean distance over the time of an episode, between the kinematic bound and holding still."""
+    """Plots the mean distance over the time of an episode, with the kinematic bound and holding the start pose."""
     time = evaluator.env.config.control_dt * np.arange(1, evaluator.env.config.horizon + 1)
     figure, all_axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
     for axes, (split, part) in zip(all_axes, evaluator.parts.items(), strict=True):
@@ -63,7 +63,7 @@ def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, con
 def plot_demonstrations(
     evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, controller: str, title: str
 ) -> None:
-    """Gap of each demonstration, the worst first; below it the distances that it is made of."""
+    """Plots the gap of each demonstration, the worst first, and below it the distances that define it."""
     table, parts = evaluator.table(rollouts), evaluator.parts
     counts = [len(table["optimality_gap"][part]) for part in parts.values()]
     widths = [max(count, max(counts) / 3) for count in counts]
@@ -84,9 +84,9 @@ def plot_demonstrations(
         below.plot(place, distance, ".", color=_COLOURS[split], label=controller)
         below.plot(place, bound, "k_", markersize=4, label="kinematic bound")
         above.set(title=f"{_LABELS[split]}: {count}")
-        below.set(xlabel="place, worst gap first", xlim=(0, count + 1))
+        below.set(xlabel="rank, worst gap first", xlim=(0, count + 1))
         below.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(7, integer=True, min_n_ticks=1))
-        above.margins(y=0.12)  # for the numbers of the worst
+        above.margins(y=0.12)  # room for the numbers of the worst
         for axes in (above, below):
             axes.grid(alpha=0.3, axis="y")
     rows[0, 0].set(ylabel="optimality gap [%]", ylim=(min(0, 100 * np.nanmin([0.0, *table["optimality_gap"]])), None))
@@ -95,7 +95,7 @@ def plot_demonstrations(
 
 
 def plot_similarity(similarity: Mapping[str, Mapping[str, Mapping[str, float]]], out: Path, *, title: str) -> None:
-    """Bars of each measure of similarity, for the controller and each baseline; training beside held-out data."""
+    """Plots bars of each measure of similarity, for the controller and each baseline, by split."""
     names = list(similarity)
     figure, all_axes = plt.subplots(
         1, len(SIMILARITY_HEADERS), figsize=(12, 0.42 * len(names) + 1.6), sharey=True, layout="constrained"
@@ -110,11 +110,16 @@ def plot_similarity(similarity: Mapping[str, Mapping[str, Mapping[str, float]]],
         axes.grid(alpha=0.3, axis="x")
     all_axes[0].set_yticks(place, [SIMILARITY_NAMES.get(name, name.replace("_", " ")) for name in names])
     all_axes[0].invert_yaxis()
-    _finish(figure, all_axes[0], f"{title}: how alike the motions look (0 is alike), beside ways without learning", out)
+    _finish(
+        figure,
+        all_axes[0],
+        f"{title}: similarity of the motions (0 is identical), with baselines without learning",
+        out,
+    )
 
 
 def _finish(figure: Any, labelled: Any, title: str, out: Path) -> None:
-    """Title above, one legend below all axes, where it hides nothing."""
+    """Adds a title, and one legend below all axes, where it hides no data."""
     figure.suptitle(title)
     handles, labels = labelled.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize="small")

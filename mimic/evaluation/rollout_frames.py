@@ -1,4 +1,4 @@
-"""A policy's rollout as it is shown: resampled in time, with its distance, bound and what each link adds."""
+"""A policy's rollout for pictures and videos: resampled in time, with its distance, bound and each link's part."""
 
 import jax
 import jax.numpy as jnp
@@ -10,30 +10,29 @@ from mimic.metric.kinematics import link_states
 
 
 def demonstration_index(evaluator: Evaluator, split: str, demonstration: int) -> int:
-    """Which of all demonstrations one of a split is.
+    """The index among all demonstrations of a demonstration of a split.
 
     Raises:
-      ValueError: there is no such one.
+      ValueError: the split has no such demonstration.
     """
-    part = evaluator.parts[split]
-    which = range(evaluator.env.demonstrations.count)[part]
-    if not 0 <= demonstration < len(which):
+    indices = range(evaluator.env.demonstrations.count)[evaluator.parts[split]]
+    if not 0 <= demonstration < len(indices):
         raise ValueError(
-            f"demonstration: expected 0 to {len(which) - 1}, the {split} ones of the run, got {demonstration}"
+            f"demonstration: expected 0 to {len(indices) - 1}, the {split} ones of the run, got {demonstration}"
         )
-    return which[demonstration]
+    return indices[demonstration]
 
 
 class RolloutFrames:
-    """One rollout, resampled for pictures.
+    """One rollout, resampled at the frames of a video.
 
     Attributes:
       time: [frames] [s].
       expert, learner: [frames, joints] [rad].
-      distance, bound, hold: [T] after each control step.
+      distance, bound, hold: [T] distance, kinematic bound and distance of holding the start pose after each step.
       links: [T, expert links, learner links] weighted distance of every pair of links.
       matrix: [T, expert links, learner links] correspondence.
-      by_link: [T, learner links] share of each in the distance.
+      by_link: [T, learner links] part of each learner link in the distance.
     """
 
     def __init__(self, evaluator: Evaluator, rollouts: Rollouts, index: int, frames_per_second: int):
@@ -58,24 +57,20 @@ class RolloutFrames:
 def interpolate(
     qpos: Float[np.ndarray, "samples joints"], qvel: Float[np.ndarray, "samples joints"], dt: float, time: np.ndarray
 ) -> Float[np.ndarray, "frames joints"]:
-    """Angles at any time: cubics through angles and velocities."""
-    step = np.minimum((time / dt).astype(int), len(qpos) - 2)
-    s = (time / dt - step)[:, None]
-    start, end, out, into = qpos[step], qpos[step + 1], dt * qvel[step], dt * qvel[step + 1]
-    return (
-        (2 * s**3 - 3 * s**2 + 1) * start + (3 * s**2 - 2 * s**3) * end + (s**3 - 2 * s**2 + s) * out
-        + (s**3 - s**2) * into
-    )  # fmt: skip
+    """Angles at any time, by a cubic Hermite spline through angles and velocities at multiples of dt."""
+    from scipy.interpolate import CubicHermiteSpline  # takes half a second to import
+
+    return CubicHermiteSpline(dt * np.arange(len(qpos)), qpos, qvel)(time)
 
 
 def _links(evaluator: Evaluator, index: int, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Link distances D' and correspondence W after each step."""
+    """Link distances D' and correspondence W after each step, [T, expert links, learner links] each."""
     env = evaluator.env
 
-    def one(qpos: jax.Array, qvel: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def at_step(qpos: jax.Array, qvel: jax.Array, step: jax.Array) -> tuple[jax.Array, jax.Array]:
         learner = link_states(env.learner, qpos, qvel)
         distances = env.metric.link_distances(env.expert_at(jnp.asarray(index), step), learner)
         return distances, env.metric.matrix(distances)
 
-    links, matrix = jax.jit(jax.vmap(one))(qpos, qvel, jnp.arange(1, len(qpos) + 1))
+    links, matrix = jax.jit(jax.vmap(at_step))(qpos, qvel, jnp.arange(1, len(qpos) + 1))
     return np.asarray(links), np.asarray(matrix)

@@ -1,4 +1,4 @@
-"""What is measured on each demonstration: how near, how alike, how smooth, and within which limits a learner moves."""
+"""Metrics of rollouts, one row for each demonstration: accuracy, similarity, smoothness and limit violations."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -12,15 +12,16 @@ from mimic.metric.similarity import CentreLine, centre_line_table, similarity
 from mimic.retargeting.pose import pose_limits
 from mimic.retargeting.pose_baselines import baseline_poses
 
-if TYPE_CHECKING:  # brax and MJX, which pose mappers need not
+if TYPE_CHECKING:  # imports brax and MJX, which pose mappers do not need
     from mimic.envs.imitation import ImitationEnv
 
 Table = dict[str, Float[np.ndarray, " demonstrations"]]
-WORST = 3  # demonstrations of each split that are named
-LEAST_SPAN = 0.25  # of the distance of holding the start pose, that a best motion must save for a gap to mean something
-_ROUNDING = 1e-5  # what float32 leaves of a torque at its limit, or of a joint at its stop; relative and in rad
+WORST = 3  # number of the worst demonstrations of each split in a report
+MIN_SPAN = 0.25  # of the distance of holding the start pose, that a best motion must save for a gap to mean something
+_ROUNDING = 1e-5  # float32 error of a torque at its limit (relative), or of a joint at the end of its range (rad)
 
 
+# Above 40 lines because of its docstring.
 def measure(
     env: "ImitationEnv",
     learner: LinkStates,
@@ -28,58 +29,63 @@ def measure(
     qvel: Float[np.ndarray, "demonstrations time joints"],
     torque: Float[np.ndarray, "demonstrations time joints"],
 ) -> Table:
-    """Columns of a table with one row for each demonstration; means over time, joints and links.
+    """Computes the columns of a table with one row for each demonstration; means over time, joints and links.
 
-    - `link_angle_error_deg`: angle of each learner link to the expert links that correspond to it, by their share in W;
-      `link_angle_error_deg.LINK` for each link.
-    - `angular_velocity_error`: the same for the links' angular velocities [rad/s], length of the difference.
-    - `torque_rms`: torque as a share of the largest one.
-    - `torque_change`: change of the torque from step to step, likewise; 0 is smooth.
-    - `torque_saturation`: share of the steps with a torque at its largest.
-    - `position_violations`, `speed_violations`, `torque_violations`: steps with a joint beyond its range (if that is
-      less than a full turn), its rated speed, or its torque limit.
+    - `link_angle_error_deg`: angle between each learner link and its corresponding expert links, weighted by W;
+      `link_angle_error_deg.LINK` is that of one link.
+    - `angular_velocity_error`: the same for the links' angular velocities [rad/s], norm of the difference.
+    - `torque_rms`: root mean square of the torque, as a fraction of the maximum.
+    - `torque_change`: root mean square of the torque's change between steps, as a fraction of the maximum.
+    - `torque_saturation`: fraction of the steps in which a torque is at its maximum.
+    - `position_violations`, `speed_violations`, `torque_violations`: number of steps in which a joint exceeds its range
+      (if that is less than a full rotation), its velocity limit, or its torque limit.
 
     Args:
-      env: with the demonstrations that were imitated.
+      env: the environment with these demonstrations.
       learner: link states after each step, [demonstrations, time, links, 3].
       qpos: learner's joint angles after each step [rad].
-      qvel: its velocities [rad/s].
-      torque: that was held in each step [N m].
+      qvel: its joint velocities after each step [rad/s].
+      torque: constant torque in each step [N m].
     """
     arm = env.learner
-    shares = env.config.metric.shares(env.expert, arm)
+    shares = env.config.metric.link_fractions(env.expert, arm)
     expert = {key: np.asarray(value)[:, 1 : qpos.shape[1] + 1] for key, value in vars(env.expert_states).items()}
     cosine = np.einsum("dtix,dtjx->dtij", expert["direction"], np.asarray(learner.direction))
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=1)
     by_link = (angle * shares).sum(axis=1)
-    turning = expert["angular_velocity"][:, :, :, None] - np.asarray(learner.angular_velocity)[:, :, None]
+    difference = expert["angular_velocity"][:, :, :, None] - np.asarray(learner.angular_velocity)[:, :, None]
     relative = torque / np.asarray(env.torque_scale)
     change = np.diff(relative, axis=1)
+    return {
+        "link_angle_error_deg": by_link.mean(axis=1),
+        **{f"link_angle_error_deg.{name}": by_link[:, i] for i, name in enumerate(arm.link_names)},
+        "angular_velocity_error": (np.linalg.norm(difference, axis=-1).mean(axis=1) * shares).sum(axis=1).mean(axis=1),
+        "torque_rms": np.sqrt((relative**2).mean(axis=(1, 2))),
+        "torque_change": np.sqrt((change**2).mean(axis=(1, 2))) if change.size else np.zeros(len(qpos)),
+        "torque_saturation": (np.abs(relative) > 0.99).any(axis=-1).mean(axis=1),
+        **_violations(arm, qpos, qvel, torque),
+    }
+
+
+def _violations(arm: Embodiment, qpos: np.ndarray, qvel: np.ndarray, torque: np.ndarray) -> Table:
+    """Number of steps in which a joint exceeds a limit."""
     lower, upper = pose_limits(arm, float)
-    within = {  # what is not a number, after a runaway, is within nothing
+    within = {  # False for NaN, after a runaway
         "position": (qpos >= lower - _ROUNDING) & (qpos <= upper + _ROUNDING),
         "speed": np.abs(qvel) <= np.asarray(arm.velocity_limit) * (1 + _ROUNDING),
         "torque": np.abs(torque) <= np.asarray(arm.torque_limit) * (1 + _ROUNDING),
     }
-    return {
-        "link_angle_error_deg": by_link.mean(axis=1),
-        **{f"link_angle_error_deg.{name}": by_link[:, i] for i, name in enumerate(arm.link_names)},
-        "angular_velocity_error": (np.linalg.norm(turning, axis=-1).mean(axis=1) * shares).sum(axis=1).mean(axis=1),
-        "torque_rms": np.sqrt((relative**2).mean(axis=(1, 2))),
-        "torque_change": np.sqrt((change**2).mean(axis=(1, 2))) if change.size else np.zeros(len(qpos)),
-        "torque_saturation": (np.abs(relative) > 0.99).any(axis=-1).mean(axis=1),
-        **{f"{name}_violations": (~flags.all(axis=-1)).sum(axis=1) for name, flags in within.items()},
-    }
+    return {f"{name}_violations": (~flags.all(axis=-1)).sum(axis=1) for name, flags in within.items()}
 
 
 def measure_similarity(
     expert: CentreLine, learner: Embodiment, qpos: Float[np.ndarray, "demonstrations time joints"]
 ) -> Table:
-    """Columns of the measures of `mimic.metric.similarity`, means over time.
+    """Computes the columns of the measures of `mimic.metric.similarity`, means over time.
 
     Args:
       expert: centre lines of the demonstrations, [demonstrations, time, samples, 3].
-      learner: the arm.
+      learner: the learner.
       qpos: its joint angles at the same times [rad].
     """
     values = similarity(expert, centre_line_table(learner, qpos))
@@ -87,7 +93,7 @@ def measure_similarity(
 
 
 def means_by_split(tables: Mapping[str, Table], parts: Mapping[str, slice]) -> dict[str, dict[str, dict[str, float]]]:
-    """Means of each column of each table over each split of its rows: {table: {column: {split: mean}}}."""
+    """Means of the columns of tables over the splits of their rows, as {table: {column: {split: mean}}}."""
     return {
         name: {
             column: {split: float(values[part].mean()) for split, part in parts.items()}
@@ -105,14 +111,14 @@ def pose_similarity(
     *,
     split: str = "all",
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Mean similarity of the learner's poses by name, and of the baselines beside them.
+    """Mean similarity of poses of the learner, and of the baselines' poses, as {method: {column: {split: mean}}}.
 
     Args:
-      expert: n joints.
-      learner: n_hat joints.
-      expert_qpos: its poses [rad].
-      poses: the learner's at the same times [rad], by what moves it.
-      split: what all of these poses are called.
+      expert: embodiment with n joints.
+      learner: embodiment with n_hat joints.
+      expert_qpos: poses of the expert [rad].
+      poses: poses of the learner at the same times [rad], by method.
+      split: name of the split that all of these poses belong to.
     """
     expert_qpos = np.asarray(expert_qpos, np.float32)
     line = centre_line_table(expert, expert_qpos)
@@ -122,9 +128,9 @@ def pose_similarity(
 
 
 def gaps(distance: Any, bound: Any, hold: Any) -> Any:
-    """Optimality gap of distances, numbers or arrays: 0 at the kinematic bound, 1 at holding the start pose.
+    """Optimality gap of distances (numbers or arrays): 0 at the kinematic bound, 1 at holding the start pose.
 
-    NaN where `has_gap` says that it would mean nothing.
+    It is NaN where `has_gap` is False.
     """
     distance, bound, hold = (np.asarray(x, float) for x in (distance, bound, hold))
     meaningful = has_gap(bound, hold)
@@ -132,10 +138,10 @@ def gaps(distance: Any, bound: Any, hold: Any) -> Any:
 
 
 def has_gap(bound: Any, hold: Any) -> Any:
-    """Whether the best motion is clearly nearer than holding the start pose.
+    """Whether the kinematic bound is clearly below the distance of holding the start pose.
 
-    Else the optimality gap divides by next to nothing, and small motions that the learner cannot follow at all give
-    gaps of hundreds of percent.
+    Otherwise the optimality gap divides by almost zero, and small motions that the learner cannot follow have gaps of
+    hundreds of percent.
     """
     bound, hold = np.asarray(bound), np.asarray(hold)
-    return (bound <= (1 - LEAST_SPAN) * hold) & (hold > 0)
+    return (bound <= (1 - MIN_SPAN) * hold) & (hold > 0)

@@ -1,4 +1,4 @@
-"""What a user would do without learning: hold still, or track the optimal poses with a feedback controller."""
+"""Controllers without learning: holding the start pose, and feedback control along the optimal poses."""
 
 from collections.abc import Callable
 
@@ -14,52 +14,53 @@ from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.retargeting.motions import largest_jump, optimal_motions
 
-_FREQUENCIES = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)  # rad/s that are tried; a torque is held for 0.1 s
+_FREQUENCIES = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)  # candidates [rad/s]; a torque is constant for 0.1 s
 
-_Law = Callable[[Array, Array, Array], Array]  # desired acceleration, qpos, qvel -> torque
+_Law = Callable[[Array, Array, Array], Array]  # (desired acceleration, qpos, qvel) -> torque
 
 
 def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, float]:
-    """Runs a controller that is not learned on all demonstrations.
+    """Runs a controller without learning on all demonstrations.
 
-    - "hold": no torque; the arm stays at rest in its home pose.
-    - "pd": proportional-derivative feedback onto `imitate_trajectory`'s poses at each joint, with the inertia that the
-      joint feels in the home pose: nothing else is known of the dynamics.
+    - "hold": zero torque; the arm stays at rest in its home pose.
+    - "pd": proportional-derivative feedback of each joint along the poses of `imitate_trajectory`, scaled by the
+      joint's effective inertia in the home pose. The controller has no other model of the dynamics.
     - "computed_torque": the same feedback through the arm's exact inverse dynamics, with feed-forward.
 
-    Both are critically damped. Their frequency is the one of a few that is best on the training demonstrations.
+    Both feedback controllers are critically damped. Of several frequencies, the one with the smallest distance on the
+    training demonstrations is used.
 
     Args:
-      evaluator: of the environment and its demonstrations.
+      evaluator: evaluator of the environment and its demonstrations.
       name: "hold", "pd" or "computed_torque".
 
     Returns:
-      What it did, and its frequency [rad/s].
+      Rollouts of the controller, and its frequency [rad/s].
     """
     env = evaluator.env
     if name == "hold":
-        still = jnp.zeros(env.action_size)
-        return jax.jit(lambda: evaluator.rollout(lambda state: still))(), 0.0
-    make = _tracking(env, {"pd": _joint_law, "computed_torque": _inverse_dynamics_law}[name](env))
-    program = jax.jit(lambda frequency: evaluator.rollout(make(frequency)))
-    tried = [(program(frequency), frequency) for frequency in _FREQUENCIES]
+        zero = jnp.zeros(env.action_size)
+        return jax.jit(lambda: evaluator.rollout(lambda state: zero))(), 0.0
+    make_controller = _tracking(env, {"pd": _joint_law, "computed_torque": _inverse_dynamics_law}[name](env))
+    run = jax.jit(lambda frequency: evaluator.rollout(make_controller(frequency)))
+    candidates = [(run(frequency), frequency) for frequency in _FREQUENCIES]
     part = evaluator.parts["train"]
-    return min(tried, key=lambda one: float(np.asarray(one[0].distance)[part].mean()))
+    return min(candidates, key=lambda candidate: float(np.asarray(candidate[0].distance)[part].mean()))
 
 
 def reference_motions(
     env: ImitationEnv,
 ) -> tuple[Float[np.ndarray, "demonstrations samples joints"], Float[np.ndarray, "demonstrations samples joints"]]:
-    """Angles and velocities of the optimal poses of all demonstrations, without a jump."""
+    """Angles and velocities of the optimal poses of all demonstrations, as continuous motions."""
     qpos = jnp.asarray(env.demonstrations.qpos, jnp.float32)
     jump = largest_jump(env.learner, env.config.control_dt)
-    found = optimal_motions(env.expert, env.learner, qpos, env.config.metric, jump, seed=0)
-    angles = np.asarray(found.qpos, float)
+    motions = optimal_motions(env.expert, env.learner, qpos, env.config.metric, jump, seed=0)
+    angles = np.asarray(motions.qpos, float)
     return angles, np.gradient(angles, env.config.control_dt, axis=1)
 
 
 def _tracking(env: ImitationEnv, law: _Law) -> Callable[[Array], Controller]:
-    """A controller for a frequency: feedback onto the reference, and the acceleration that it has in the step."""
+    """A function from a frequency to a controller: feedback along the reference motion, and its acceleration."""
     dt = env.config.control_dt
     qpos, qvel = (jnp.asarray(x, jnp.float32) for x in reference_motions(env))
 
@@ -69,8 +70,8 @@ def _tracking(env: ImitationEnv, law: _Law) -> Callable[[Array], Controller]:
             motion, now = arm.demonstration, arm.step
             position_error, velocity_error = qpos[motion, now] - arm.qpos, qvel[motion, now] - arm.qvel
             acceleration = (qvel[motion, now + 1] - qvel[motion, now]) / dt
-            wanted = acceleration + frequency**2 * position_error + 2 * frequency * velocity_error
-            return law(wanted, arm.qpos, arm.qvel) / env.torque_scale
+            desired = acceleration + frequency**2 * position_error + 2 * frequency * velocity_error
+            return law(desired, arm.qpos, arm.qvel) / env.torque_scale
 
         return controller
 
@@ -79,13 +80,13 @@ def _tracking(env: ImitationEnv, law: _Law) -> Callable[[Array], Controller]:
 
 def _joint_law(env: ImitationEnv) -> _Law:
     inertia = jnp.asarray(effective_inertia(env.arm.model, np.asarray(env.learner.home)), jnp.float32)
-    return lambda wanted, qpos, qvel: inertia * wanted
+    return lambda acceleration, qpos, qvel: inertia * acceleration
 
 
 def _inverse_dynamics_law(env: ImitationEnv) -> _Law:
     arm = dynamics.segments(env.arm.model)
 
-    def law(wanted: Array, qpos: Array, qvel: Array) -> Array:
-        return jnp.stack(dynamics.inverse(arm, list(qpos), list(qvel), list(wanted)))
+    def law(acceleration: Array, qpos: Array, qvel: Array) -> Array:
+        return jnp.stack(dynamics.inverse(arm, list(qpos), list(qvel), list(acceleration)))
 
     return law

@@ -1,9 +1,9 @@
 """Descent of open-loop torques through the physics: a damped Gauss-Newton method over a whole episode.
 
 Differential dynamic programming with bounds on the torque (Tassa, Mansard, Todorov, "Control-Limited Differential
-Dynamic Programming", ICRA 2014), on first derivatives of the dynamics ("iLQR"). A plain gradient through 50 control
-steps is badly conditioned; here each update is a feedback law around the last rollout, which keeps the arm near it.
-Only one control step is differentiated, forwards, so that it compiles in seconds.
+Dynamic Programming", ICRA 2014), with first derivatives of the dynamics only ("iLQR"). A plain gradient through 50
+control steps is badly conditioned. Here each update is a feedback law around the last rollout, which keeps the arm near
+it. Only one control step is differentiated, in forward mode, so that it compiles in seconds.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,13 @@ from mimic.envs.physics import Load, make_advance
 from mimic.metric.distance import PARTS, PairDistances, Weights, pair_distances
 from mimic.metric.kinematics import LinkStates, link_states
 
-_STEPS = (1.0, 0.5, 0.2, 0.05, 0.01)  # of the full update; all are rolled out, and the best one is taken
-_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-6, 1e3  # added to the curvature by the action
-_LESS, _MORE = 0.3, 4.0  # factors of the damping after an update that was taken in full, and after one that was not
-_ACTIVE_SETS = 4  # rounds in which actions at their bound are found
-# A norm |r| has curvature 1 / |r| across r, which is infinite at a match: |r| counts as this at least, in the units of
+_STEPS = (1.0, 0.5, 0.2, 0.05, 0.01)  # fractions of the full update; all are rolled out, and the best is used
+_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-2, 1e-6, 1e3  # added to the curvature with respect to the action
+_LESS, _MORE = 0.3, 4.0  # factors on the damping after a full update, and after a rejected update
+_ACTIVE_SETS = 4  # iterations that identify the actions at their bounds
+# A norm |r| has curvature 1 / |r| across r, which is infinite at a match. So |r| is at least this, in the units of
 # `PairDistances`.
-_LEAST_NORM = {"translation": 1e-3, "linear_velocity": 1e-2, "angular_velocity": 1e-2}
+_MIN_NORM = {"translation": 1e-3, "linear_velocity": 1e-2, "angular_velocity": 1e-2}
 _FIELDS = {
     "translation": "position",
     "rotation": "direction",
@@ -34,11 +34,11 @@ _FIELDS = {
 
 
 class Episodes(NamedTuple):
-    """Sequences of torques and what they lead to, as a batch.
+    """A batch of torque sequences and their rollouts.
 
     Attributes:
-      action: [sequences, T, joints] torque as a share of the largest, in [-1, 1].
-      qpos: [sequences, T + 1, joints] joint angles before, between and after the steps [rad].
+      action: [sequences, T, joints] torque as a fraction of the maximum, in [-1, 1].
+      qpos: [sequences, T + 1, joints] joint angles at the start and after each step [rad].
       qvel: [sequences, T + 1, joints] joint velocities [rad/s].
       objective: [sequences] mean over time of distance and limit penalty; infinite for runaways.
       damping: [sequences] of the next update.
@@ -52,11 +52,11 @@ class Episodes(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What each sequence is for.
+    """The expert's motion and the learner's load of each sequence.
 
     Attributes:
       expert: link states after each step, [sequences, T, links, 3] each.
-      load: factors of mass and damping of the learner, [sequences] each.
+      load: factors on mass and damping of the learner, [sequences] each.
     """
 
     expert: LinkStates
@@ -64,13 +64,13 @@ class Task(NamedTuple):
 
 
 class _Model(NamedTuple):
-    """Rollouts as a linear function of changes, and the objective as a quadratic one; of one sequence.
+    """Linear model of the dynamics and quadratic model of the objective around the rollout of one sequence.
 
     Attributes:
-      by_state: [T, 2 joints, 2 joints] derivative of a step's joint state by the one before.
-      by_action: [T, 2 joints, joints] derivative of it by the action.
+      by_state: [T, 2 joints, 2 joints] derivative of the joint state after a step by that before.
+      by_action: [T, 2 joints, joints] derivative of the joint state after a step by the action.
       gradient: [T, 2 joints] of the step's objective by the joint state after the step.
-      curvature: [T, 2 joints, 2 joints] positive semidefinite.
+      curvature: [T, 2 joints, 2 joints] of the same, positive semidefinite.
     """
 
     by_state: Array
@@ -80,11 +80,11 @@ class _Model(NamedTuple):
 
 
 class TrajectoryDescent:
-    """The objective and its descent for the learner of an environment; by "fused" physics, whatever the environment's.
+    """Descent of the objective for the learner of an environment, always in "fused" physics.
 
     Args:
       env: the environment.
-      chunk: control steps that are differentiated at a time, which bounds the memory.
+      chunk: number of control steps that are differentiated at a time; it bounds the memory.
     """
 
     def __init__(self, env: ImitationEnv, chunk: int):
@@ -95,7 +95,7 @@ class TrajectoryDescent:
         self.improve = jax.jit(jax.default_matmul_precision("highest")(self._improve))
 
     def _start(self, task: Task, action: Float[Array, "sequences time joints"]) -> Episodes:
-        """Rolls sequences out."""
+        """Rolls out sequences."""
         action = jnp.clip(action, -1.0, 1.0)
         over_time = jnp.swapaxes(action, 0, 1)
         qpos, qvel, _ = self._rollout(task, lambda now, qpos, qvel: now, over_time, len(action))
@@ -103,12 +103,12 @@ class TrajectoryDescent:
         return Episodes(action, qpos, qvel, objective, jnp.full(len(action), _DAMPING, action.dtype))
 
     def _improve(self, task: Task, episodes: Episodes) -> Episodes:
-        """One update of each sequence; those that it would make worse stay as they are, with more damping."""
+        """Updates each sequence once; a sequence that would get worse stays, with more damping."""
         count = len(episodes.action)
         model = self._linearize(task, episodes)
         change, gain = jax.vmap(_backward)(model, episodes.action, episodes.damping)
         sizes = jnp.asarray(_STEPS, change.dtype)
-        tried = jax.tree.map(lambda x: jnp.concatenate([x] * len(_STEPS)), task)
+        repeated_task = jax.tree.map(lambda x: jnp.concatenate([x] * len(_STEPS)), task)
 
         def law(now: Any, qpos: Array, qvel: Array) -> Array:
             action, change, gain, old = now
@@ -119,18 +119,18 @@ class TrajectoryDescent:
 
         old = jnp.concatenate([episodes.qpos, episodes.qvel], axis=-1)[:, :-1]
         over_time = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (episodes.action, change, gain, old))
-        qpos, qvel, action = self._rollout(tried, law, over_time, len(_STEPS) * count)
-        objective = self._objective(tried, qpos, qvel).reshape(len(_STEPS), count)
-        best = jnp.argmin(objective, axis=0)  # there is no NaN in it
+        qpos, qvel, action = self._rollout(repeated_task, law, over_time, len(_STEPS) * count)
+        objective = self._objective(repeated_task, qpos, qvel).reshape(len(_STEPS), count)
+        best = jnp.argmin(objective, axis=0)  # the objective is never NaN
 
-        def chosen(x: Array) -> Array:
+        def of_best(x: Array) -> Array:
             return x.reshape(len(_STEPS), count, *x.shape[1:])[best, jnp.arange(count)]
 
-        least = jnp.min(objective, axis=0)
-        better = least < episodes.objective
+        best_objective = jnp.min(objective, axis=0)
+        better = best_objective < episodes.objective
         factor = jnp.where(better, jnp.where(best == 0, _LESS, 1.0), _MORE)
-        damping = jnp.clip(episodes.damping * factor, _LEAST_DAMPING, _MOST_DAMPING)
-        new = Episodes(chosen(action), chosen(qpos), chosen(qvel), least, damping)
+        damping = jnp.clip(episodes.damping * factor, _MIN_DAMPING, _MAX_DAMPING)
+        new = Episodes(of_best(action), of_best(qpos), of_best(qvel), best_objective, damping)
         kept = episodes._replace(damping=damping)
         return jax.tree.map(lambda x, y: jnp.where(better.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, kept)
 
@@ -152,12 +152,12 @@ class TrajectoryDescent:
         def at(expert: LinkStates, qpos: Array, qvel: Array) -> Array:
             return self._distance(expert, link_states(self._env.learner, qpos, qvel)) + self._penalty(qpos, qvel)
 
-        def one(expert: LinkStates, qpos: Array, qvel: Array) -> Array:
+        def of_sequence(expert: LinkStates, qpos: Array, qvel: Array) -> Array:
             mean = jnp.mean(jax.vmap(at)(expert, qpos[1:], qvel[1:]))
             safe = jnp.all(jnp.abs(qvel) < self._env.config.speed_bound) & jnp.isfinite(mean)
             return jnp.where(safe, mean, jnp.inf)
 
-        return jax.vmap(one)(task.expert, qpos, qvel)
+        return jax.vmap(of_sequence)(task.expert, qpos, qvel)
 
     def _distance(self, expert: LinkStates, learner: LinkStates) -> Array:
         return self._env.states_distance(expert, learner)
@@ -167,18 +167,18 @@ class TrajectoryDescent:
         return weight * self._env.limit_excess(qpos, qvel) if weight else jnp.zeros(())
 
     def _linearize(self, task: Task, episodes: Episodes) -> _Model:
-        """Of all sequences, a few at a time."""
+        """Models of all sequences, computed a few sequences at a time."""
         count, horizon = episodes.action.shape[:2]
         rounds = min(-(-count * horizon // self._chunk), count)
         size = -(-count // rounds)
-        # Rounds of one size, the last one filled up: what is left over would be compiled by itself.
+        # All rounds have the same size and the last one is padded, because a smaller one would compile separately.
         rows = jnp.minimum(jnp.arange(rounds * size), count - 1)
-        given = jax.tree.map(lambda x: x[rows], (task, episodes))
-        model = jax.lax.map(lambda one: self._linearized(*one), given, batch_size=size)
+        padded = jax.tree.map(lambda x: x[rows], (task, episodes))
+        model = jax.lax.map(lambda sequence: self._linearized(*sequence), padded, batch_size=size)
         return jax.tree.map(lambda x: x[:count], model)
 
     def _linearized(self, task: Task, episodes: Episodes) -> _Model:
-        """Of one sequence."""
+        """The model of one sequence."""
         joints = self._env.action_size
 
         def step(state: Array, action: Array) -> Array:
@@ -209,24 +209,24 @@ class TrajectoryDescent:
         return gradient, curvature
 
     def _link_curvature(self, expert: LinkStates, learner: LinkStates) -> dict[str, Float[Array, " links"]]:
-        """How strongly the distance bends with each part of each learner link's state.
+        """Curvature of the distance by each part of each learner link's state.
 
-        For a norm |r| that counts w in the distance it is w / |r|, that of the parabola through both minima that
-        touches it at r: a bound from above, as in iteratively reweighted least squares. For (pi/4) |e - e_hat|^2 it is
-        its own, w pi/2. What w is for adaptive weights or a soft correspondence follows from differentiation.
+        For a norm |r| with weight w in the distance it is w / |r|, the curvature of the parabola that touches the norm
+        at r and is an upper bound, as in iteratively reweighted least squares. For (pi/4) |e - e_hat|^2 it is the exact
+        curvature, w pi/2. For adaptive weights or a soft correspondence, w follows from differentiation.
         """
         measure: Any = self._env.config.metric.rotation_measure
         over_learner = jax.vmap(lambda a, b: pair_distances(a, b, measure), in_axes=(None, 0))
         parts = jax.vmap(over_learner, in_axes=(0, None))(expert, learner)
-        counts = jax.grad(self._of_parts)(parts)
-        bends = {}
+        weights = jax.grad(self._of_parts)(parts)
+        curvature = {}
         for part in PARTS:
             if part == "rotation":
                 rate: Any = 0.5 * jnp.pi
             else:
-                rate = 1 / jnp.maximum(getattr(parts, part), _LEAST_NORM[part])
-            bends[part] = jnp.sum(jnp.maximum(getattr(counts, part), 0) * rate, axis=0)
-        return bends
+                rate = 1 / jnp.maximum(getattr(parts, part), _MIN_NORM[part])
+            curvature[part] = jnp.sum(jnp.maximum(getattr(weights, part), 0) * rate, axis=0)
+        return curvature
 
     def _of_parts(self, parts: PairDistances) -> Array:
         """The embodiment distance as a function of the parts of its pair distances."""
@@ -244,15 +244,18 @@ def _backward(model: _Model, action: Array, damping: Array) -> tuple[Array, Arra
 
     def step(value: tuple[Array, Array], now: tuple[_Model, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
         at, action = now
-        slope, bend = value[0] + at.gradient, value[1] + at.curvature  # by the state after the step, from there on
-        by_action, by_state = at.by_action.T @ slope, at.by_state.T @ slope
-        across = at.by_action.T @ bend
-        action_bend, mixed = across @ at.by_action, across @ at.by_state
-        damped = action_bend + damping * jnp.eye(len(action), dtype=action.dtype)
+        # Of the objective from this step on, by the joint state after the step.
+        gradient, curvature = value[0] + at.gradient, value[1] + at.curvature
+        by_action, by_state = at.by_action.T @ gradient, at.by_state.T @ gradient
+        across = at.by_action.T @ curvature
+        action_curvature, mixed = across @ at.by_action, across @ at.by_state
+        damped = action_curvature + damping * jnp.eye(len(action), dtype=action.dtype)
         change, gain = _bounded_law(damped, by_action, mixed, -1.0 - action, 1.0 - action)
-        slope = by_state + gain.T @ (action_bend @ change + by_action) + mixed.T @ change
-        bend = at.by_state.T @ bend @ at.by_state + gain.T @ action_bend @ gain + gain.T @ mixed + mixed.T @ gain
-        return (slope, 0.5 * (bend + bend.T)), (change, gain)
+        gradient = by_state + gain.T @ (action_curvature @ change + by_action) + mixed.T @ change
+        curvature = (
+            at.by_state.T @ curvature @ at.by_state + gain.T @ action_curvature @ gain + gain.T @ mixed + mixed.T @ gain
+        )
+        return (gradient, 0.5 * (curvature + curvature.T)), (change, gain)
 
     zero = jnp.zeros_like(model.gradient[0]), jnp.zeros_like(model.curvature[0])
     _, law = jax.lax.scan(step, zero, (model, action), reverse=True)
@@ -262,21 +265,21 @@ def _backward(model: _Model, action: Array, damping: Array) -> tuple[Array, Arra
 def _bounded_law(
     matrix: Array, gradient: Array, mixed: Array, lower: Array, upper: Array
 ) -> tuple[Float[Array, " joints"], Float[Array, "joints states"]]:
-    """Minimum of x.matrix.x / 2 + gradient.x between bounds, and how it follows a state on which it depends by `mixed`.
+    """Minimum of x.matrix.x / 2 + gradient.x between bounds, and its derivative by a state that enters by `mixed`.
 
-    By rounds of Newton's method on the components that no bound holds (Bertsekas, "Projected Newton Methods", 1982). A
-    component that is held follows nothing.
+    Newton iterations on the components that are not at a bound (Bertsekas, "Projected Newton Methods", 1982). The
+    derivative of a component at a bound is zero.
     """
     identity = jnp.eye(len(gradient), dtype=gradient.dtype)
     change = jnp.zeros_like(gradient)
     for _ in range(_ACTIVE_SETS):
-        slope = gradient + matrix @ change
-        held = ((change <= lower) & (slope > 0)) | ((change >= upper) & (slope < 0))
-        free = ~held
+        slope_at_change = gradient + matrix @ change
+        at_bound = ((change <= lower) & (slope_at_change > 0)) | ((change >= upper) & (slope_at_change < 0))
+        free = ~at_bound
         kept = jnp.where(free, 0.0, change)
         reduced = jnp.where(free[:, None] & free[None, :], matrix, identity)
         sides = jnp.concatenate([(gradient + matrix @ kept)[:, None], mixed], axis=1)
         factor = jax.scipy.linalg.cho_factor(reduced)
-        solved = -jax.scipy.linalg.cho_solve(factor, jnp.where(free[:, None], sides, 0.0))
-        change, gain = jnp.clip(jnp.where(free, solved[:, 0], kept), lower, upper), solved[:, 1:]
+        solution = -jax.scipy.linalg.cho_solve(factor, jnp.where(free[:, None], sides, 0.0))
+        change, gain = jnp.clip(jnp.where(free, solution[:, 0], kept), lower, upper), solution[:, 1:]
     return change, gain

@@ -1,1 +1,1 @@
-"""The metric between embodiments: link states, distances, correspondences, similarity, and its fast kernels."""
+"""The metric between embodiments: link states, distances, correspondences, similarity, and fast kernels."""

@@ -1,9 +1,9 @@
-"""The usual embodiment distance of two arms' motions, and its gradient in closed form, on scalar components.
+"""The distance of two arms' motions under a static metric, and its gradient in closed form, on scalar components.
 
-Usual: a given correspondence and constant weights, the smooth rotational measure, the mean. The distance is then a sum
-over pairs of links and parts, sum_k f_k |x_k - y_k| (translation, velocities) + sum_k f_k (pi/4) |e_k - e^_k|^2
-(rotation). Its slopes with respect to the links' states are carried to the joints as forces are by the transposed
-Jacobian: one sweep from the tip to the base, whatever the number of joints.
+A static metric has a constant correspondence, constant weights, the smooth rotational measure and the mean. The
+distance is then a sum over pairs of links and parts, sum_k f_k |x_k - y_k| (translation, velocities) + sum_k f_k (pi/4)
+|e_k - e^_k|^2 (rotation). Its gradients with respect to the links' states are mapped to the joints as forces are by the
+transposed Jacobian: in one sweep from tip to base, whatever the number of joints.
 """
 
 import math
@@ -26,13 +26,13 @@ _REST = LinkVectors(ZERO, ZERO, ZERO, ZERO)
 
 
 class Adjoints(NamedTuple):
-    """Sums over the links behind a joint: of the distance's slopes with respect to their states, and of moments."""
+    """Sums over the links distal to a joint: gradients of the distance with respect to their states, and moments."""
 
-    force: Vector  # by positions
-    push: Vector  # by linear velocities
-    spin: Vector  # by angular velocities
-    moment: Vector  # states x slopes, of all four
-    swing: Vector  # positions x slopes by linear velocities
+    force: Vector  # gradients with respect to positions
+    push: Vector  # gradients with respect to linear velocities
+    spin: Vector  # gradients with respect to angular velocities
+    moment: Vector  # states x gradients, of all four parts
+    swing: Vector  # positions x gradients with respect to linear velocities
 
 
 NO_ADJOINTS = Adjoints(ZERO, ZERO, ZERO, ZERO, ZERO)
@@ -42,70 +42,70 @@ def distance_and_gradient(
     expert: Embodiment,
     learner: Embodiment,
     factors: Float[np.ndarray, "parts expert learner"],
-    wanted: Sequence[int],
+    arguments: Sequence[int],
     *motion: Sequence[Scalar],
 ) -> list[list[Scalar]]:
-    """The distance, and its gradient by some of the arguments.
+    """The distance, and its gradients with respect to some of the arguments.
 
     Args:
       expert: in units of its chain length.
       learner: likewise.
-      factors: what each part of each pair's distance counts for; one that is 0 costs nothing.
-      wanted: indices into `motion`.
+      factors: factor of each part of each pair's distance; a factor 0 costs nothing.
+      arguments: indices into `motion`.
       *motion: qpos [rad] and qvel [rad/s] of the expert, then of the learner.
 
     Returns:
-      [distance], then a gradient for each that is wanted.
+      [distance], then the gradient with respect to each of `arguments`.
     """
     arms = expert, learner
     frames = [joint_frames(arm, *motion[2 * side : 2 * side + 2]) for side, arm in enumerate(arms)]
-    links = [link_vectors(arm, own) for arm, own in zip(arms, frames, strict=True)]
-    value, slopes = _compare(factors, *links)
+    links = [link_vectors(arm, arm_frames) for arm, arm_frames in zip(arms, frames, strict=True)]
+    value, state_gradients = _compare(factors, *links)
     gradients: list[list[Scalar]] = []
     for side, arm in enumerate(arms):
-        is_wanted = any(index // 2 == side for index in wanted)
-        gradients.extend(_by_joints(arm, frames[side], links[side], slopes[side]) if is_wanted else ([], []))
-    return [[value], *(gradients[k] for k in wanted)]
+        is_needed = any(index // 2 == side for index in arguments)
+        gradients.extend(_by_joints(arm, frames[side], links[side], state_gradients[side]) if is_needed else ([], []))
+    return [[value], *(gradients[k] for k in arguments)]
 
 
 def _compare(
     factors: Float[np.ndarray, "parts expert learner"], expert: list[LinkVectors], learner: list[LinkVectors]
 ) -> tuple[Scalar, list[list[LinkVectors]]]:
-    """The distance of links, and its slopes with respect to the states of the expert's and of the learner's links."""
+    """Distance of the links, and its gradients with respect to the states of the expert's and the learner's links."""
     value: Scalar = 0.0
-    slopes = [[list(_REST) for _ in links] for links in (expert, learner)]
+    gradients = [[list(_REST) for _ in links] for links in (expert, learner)]
     for part, i, j in np.argwhere(factors).tolist():
-        term, slope = compare_part(part, float(factors[part, i, j]), expert[i], learner[j])
+        term, gradient = compare_part(part, float(factors[part, i, j]), expert[i], learner[j])
         value = plus(value, term)
-        slopes[0][i][part] = subtract(slopes[0][i][part], slope)
-        slopes[1][j][part] = add(slopes[1][j][part], slope)
-    return value, [[LinkVectors(*slope) for slope in side] for side in slopes]
+        gradients[0][i][part] = subtract(gradients[0][i][part], gradient)
+        gradients[1][j][part] = add(gradients[1][j][part], gradient)
+    return value, [[LinkVectors(*vectors) for vectors in side] for side in gradients]
 
 
 def compare_part(part: int, factor: Scalar, expert: LinkVectors, learner: LinkVectors) -> tuple[Scalar, Vector]:
-    """A part of the distance of two links times a factor, and its slope with respect to the learner's state.
+    """A part of the distance of two links times a factor, and its gradient with respect to the learner's state.
 
-    The slope with respect to the expert's is the negative of it.
+    The gradient with respect to the expert's state is the negative.
 
     Args:
       part: index into `PARTS`.
-      factor: what the part of this pair's distance counts for.
-      expert: one of its links, in units of its chain length.
-      learner: likewise.
+      factor: of this part of the pair's distance.
+      expert: state of the expert's link, in units of its chain length.
+      learner: state of the learner's link, likewise.
     """
-    apart = subtract(learner[part], expert[part])
-    square = dot(apart, apart)
+    difference = subtract(learner[part], expert[part])
+    square = dot(difference, difference)
     if part == _ROTATION:
-        return times(times(0.25 * math.pi, factor), square), scale(times(0.5 * math.pi, factor), apart)
+        return times(times(0.25 * math.pi, factor), square), scale(times(0.5 * math.pi, factor), difference)
     inverse = _inverse_root(square)
-    return times(times(factor, square), inverse), scale(times(factor, inverse), apart)
+    return times(times(factor, square), inverse), scale(times(factor, inverse), difference)
 
 
 def _inverse_root(square: Scalar) -> Scalar:
-    """1 / sqrt of the square of a length, in units of about 1; but no more than 1 / rounding.
+    """1 / sqrt(square) for the square of a length of order 1, limited to 1 / (machine epsilon).
 
-    A length and its gradient are then 0 at a match. A compiler may compute a difference twice, rounded otherwise the
-    second time: the gradient of a length of nothing but rounding is still of the order of 1.
+    A length and its gradient are then 0 at a match. A compiler may compute a difference twice with different rounding;
+    the gradient of a length that is only rounding error stays of order 1.
     """
     if isinstance(square, float):
         return 1 / math.sqrt(square) if square else 0.0
@@ -113,54 +113,60 @@ def _inverse_root(square: Scalar) -> Scalar:
 
 
 def _by_joints(
-    arm: Embodiment, frames: Sequence[JointFrame], links: Sequence[LinkVectors], slopes: Sequence[LinkVectors]
+    arm: Embodiment, frames: Sequence[JointFrame], links: Sequence[LinkVectors], gradients: Sequence[LinkVectors]
 ) -> tuple[list[Scalar], list[Scalar]]:
-    """The gradient by qpos and by qvel."""
-    behind = NO_ADJOINTS
+    """The gradients with respect to qpos and qvel."""
+    distal = NO_ADJOINTS
     by_qpos, by_qvel = [], []
     for joint in reversed(range(arm.num_joints)):
-        for link in (link for link, own in enumerate(arm.link_joint) if own == joint):
-            behind = with_link(behind, links[link], slopes[link])
+        for link in (link for link, mover in enumerate(arm.link_joint) if mover == joint):
+            distal = with_link(distal, links[link], gradients[link])
         frame = frames[joint + 1]
         axis = spatial.rotate(frame.rotation, spatial.vector(arm.joint_axis[joint]))
-        by_angle, by_speed = by_joint(frame, axis, behind)
+        by_angle, by_speed = by_joint(frame, axis, distal)
         by_qpos.append(by_angle)
         by_qvel.append(by_speed)
     return by_qpos[::-1], by_qvel[::-1]
 
 
-def with_link(behind: Adjoints, link: LinkVectors, slope: LinkVectors) -> Adjoints:
-    """The sums with one more link."""
-    moment = behind.moment
-    for state, by_state in zip(link, slope, strict=True):
+def with_link(distal: Adjoints, link: LinkVectors, gradient: LinkVectors) -> Adjoints:
+    """The sums with one more link.
+
+    Args:
+      distal: sums over the links distal to it.
+      link: its state.
+      gradient: of the distance with respect to its state.
+    """
+    moment = distal.moment
+    for state, by_state in zip(link, gradient, strict=True):
         moment = add(moment, cross(state, by_state))
     return Adjoints(
-        force=add(behind.force, slope.position),
-        push=add(behind.push, slope.linear_velocity),
-        spin=add(behind.spin, slope.angular_velocity),
+        force=add(distal.force, gradient.position),
+        push=add(distal.push, gradient.linear_velocity),
+        spin=add(distal.spin, gradient.angular_velocity),
         moment=moment,
-        swing=add(behind.swing, cross(link.position, slope.linear_velocity)),
+        swing=add(distal.swing, cross(link.position, gradient.linear_velocity)),
     )
 
 
-def by_joint(frame: JointFrame, axis: Vector, behind: Adjoints) -> tuple[Scalar, Scalar]:
-    """The slopes by a joint's angle and by its velocity.
+def by_joint(frame: JointFrame, axis: Vector, distal: Adjoints) -> tuple[Scalar, Scalar]:
+    """Derivatives of the distance with respect to a joint's angle and velocity.
 
-    With the joint's axis a, its anchor c that moves at u, and the angular velocity w of the body behind it, for a link
-    behind it at r = p - c, whose body turns at w_l
+    The joint has the axis a and the anchor c, which moves at u; its child body rotates at w. For a distal link at
+    r = p - c, whose body rotates at w_l,
 
         dp/dq = a x r    de/dq = a x e    dw_l/dq = a x (w_l - w)    dv/dq = a x (v - u) + (w x a) x r
                                           dw_l/dqdot = a             dv/dqdot = a x r
 
-    so that only sums over all links behind the joint are needed.
+    so that only sums over all distal links are needed.
 
     Args:
-      frame: of the body behind the joint.
-      axis: the joint's, in the base frame.
-      behind: of the links.
+      frame: of the joint's child body.
+      axis: of the joint, in the base frame.
+      distal: sums over the links distal to the joint.
     """
-    about_anchor = subtract(behind.swing, cross(frame.anchor, behind.push))
-    turning = subtract(behind.moment, cross(frame.anchor, behind.force))
-    turning = subtract(turning, cross(frame.linear_velocity, behind.push))
-    turning = add(turning, cross(frame.angular_velocity, subtract(ZERO, add(behind.spin, about_anchor))))
-    return dot(axis, turning), dot(axis, add(behind.spin, about_anchor))
+    about_anchor = subtract(distal.swing, cross(frame.anchor, distal.push))
+    torque = subtract(distal.moment, cross(frame.anchor, distal.force))
+    torque = subtract(torque, cross(frame.linear_velocity, distal.push))
+    torque = add(torque, cross(frame.angular_velocity, subtract(ZERO, add(distal.spin, about_anchor))))
+    return dot(axis, torque), dot(axis, add(distal.spin, about_anchor))

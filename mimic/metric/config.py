@@ -1,4 +1,4 @@
-"""The config of a metric, and what it is made into."""
+"""The config of a metric, and the metric that it describes."""
 
 import dataclasses
 import math
@@ -35,15 +35,15 @@ CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")
 
 @dataclasses.dataclass(frozen=True)
 class MetricConfig:
-    """The distance that is the reward. The defaults were chosen by `benchmarks.similarity`: see docs/similarity.md.
+    """Config of the embodiment distance. `benchmarks.similarity` chose the defaults: see docs/similarity.md.
 
     Attributes:
       translation, rotation, linear_velocity, angular_velocity: weights; per chain length, rad, and their rates.
-      adaptive: the paper's distance-dependent weights for translation and rotation instead.
+      adaptive: replace the weights of translation and rotation by the paper's distance-dependent ones.
       rotation_measure: "cosine" or "angle".
-      links: "kept" (a locked joint removes no link) or "merged" (it makes one chord of two links; paper).
+      links: "kept" (a locked joint removes no link) or "merged" (its two links become one chord; paper).
       correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance); "chord_overlap" is the overlap
-        of runs before links were kept.
+        of old runs, which merged links.
       xi: sharpness of the soft correspondence, below 0.
       reduction: "mean" or "frobenius".
     """
@@ -71,22 +71,22 @@ class MetricConfig:
                 raise ValueError(f"{name}: expected a finite weight of at least 0, got {getattr(self, name)}")
 
     def make_weights(self) -> Weights:
-        """The weights as the metric takes them."""
+        """The weights: constants, or a function of the distances."""
         velocities = {"linear_velocity": self.linear_velocity, "angular_velocity": self.angular_velocity}
         if self.adaptive:
             return lambda distances: dataclasses.replace(adaptive_weights(distances), **velocities)
         return DistanceWeights(self.translation, self.rotation, **velocities)
 
     def make_correspondence(self, expert: Embodiment, learner: Embodiment) -> Correspondence:
-        """W, or the function that makes it of the link distances."""
-        made: dict[str, Callable[[], Correspondence]] = {
+        """W, or a function of the link distances that returns it."""
+        constructors: dict[str, Callable[[], Correspondence]] = {
             "arc_length": lambda: arc_length_correspondence(expert, learner),
             "overlap": lambda: overlap_correspondence(expert, learner),
             "chord_overlap": lambda: overlap_correspondence(expert, learner, lengths="chord"),
             "hard": lambda: hard_correspondence,
             "soft": lambda: partial(soft_correspondence, xi=self.xi),
         }
-        return made[self.correspondence]()
+        return constructors[self.correspondence]()
 
     def build(self, expert: Embodiment, learner: Embodiment) -> Metric:
         """The metric between two arms."""
@@ -94,8 +94,11 @@ class MetricConfig:
         rotation, reduction = cast(RotationMeasure, self.rotation_measure), cast(Reduction, self.reduction)
         return Metric(correspondence, self.make_weights(), rotation, reduction)
 
-    def shares(self, expert: Embodiment, learner: Embodiment) -> Float[np.ndarray, "expert learner"]:
-        """How much each expert link counts for a learner link: columns sum to 1; alike where W depends on the state."""
+    def link_fractions(self, expert: Embodiment, learner: Embodiment) -> Float[np.ndarray, "expert learner"]:
+        """Fraction of each expert link in the target of a learner link; columns sum to 1.
+
+        From the static correspondence; equal fractions where W depends on the state.
+        """
         correspondence = self.make_correspondence(expert, learner)
         shape = expert.num_links, learner.num_links
         matrix = np.ones(shape) if callable(correspondence) else np.asarray(correspondence)

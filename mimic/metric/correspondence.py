@@ -1,4 +1,4 @@
-"""Which links of two embodiments belong together: correspondence matrices W [n, n_hat]."""
+"""Correspondence matrices W [n, n_hat]: how strongly each pair of links of two embodiments corresponds."""
 
 from types import ModuleType
 from typing import Any, Literal
@@ -16,9 +16,9 @@ LinkLengths = Literal["path", "chord"]
 
 
 def hard_correspondence(distances: Float[Array, "expert learner"]) -> Float[Array, "expert learner"]:
-    """One for the nearest learner link of each expert link, plus one for the nearest expert link of each learner link.
+    """1 at the nearest learner link of each expert link, plus 1 at the nearest expert link of each learner link.
 
-    The paper's W12 + W21. The first index wins a tie. Constant under differentiation.
+    W12 + W21 of the paper. The first index wins a tie. Constant under differentiation.
 
     Args:
       distances: D' [n, n_hat], see `link_distances`.
@@ -30,7 +30,7 @@ def hard_correspondence(distances: Float[Array, "expert learner"]) -> Float[Arra
 
 
 def soft_correspondence(distances: Float[Array, "expert learner"], *, xi: ArrayLike) -> Float[Array, "expert learner"]:
-    """Softmax of xi D' over each row plus softmax of it over each column (paper).
+    """Softmax of xi D' over each row, plus softmax of xi D' over each column (paper).
 
     Tends to `hard_correspondence` as xi -> -inf.
 
@@ -50,51 +50,51 @@ def soft_correspondence(distances: Float[Array, "expert learner"], *, xi: ArrayL
 def overlap_correspondence(
     expert: Embodiment, learner: Embodiment, *, lengths: LinkLengths = "path"
 ) -> Float[Array, "expert learner"]:
-    """Static correspondence by where the links lie along their chains; every link counts the same (paper).
+    """Static correspondence by the overlap of links along their chains, with the same weight for each link (paper).
 
-    Both chains are laid on [0, 1]; with o_ij the length that link i and link j share there, W_ij = o_ij / l_i +
-    o_ij / l_j, so that every row of the first part and every column of the second sums to 1. An arm with itself gives
+    Both chains are mapped onto [0, 1]. Links i and j overlap there by a length o_ij, and W_ij = o_ij / l_i + o_ij / l_j
+    with the link lengths l. Each row of the first term and each column of the second sums to 1. For two equal arms W is
     2 I.
 
     Args:
       expert: n links.
       learner: n_hat links.
-      lengths: what is laid out: each link's "path" along the centre line, or its "chord" from start to end. They differ
-        for merged links alone.
+      lengths: lengths of the links: "path" along the centre line, or "chord" from start to end. They differ only for
+        merged links.
     """
-    shared, (length_a, length_b), numpy = _shared_lengths(expert, learner, lengths)
-    return jnp.asarray(shared / length_a[:, None] + shared / length_b[None, :])
+    overlap, (length_a, length_b), numpy = _overlaps(expert, learner, lengths)
+    return jnp.asarray(overlap / length_a[:, None] + overlap / length_b[None, :])
 
 
 def arc_length_correspondence(expert: Embodiment, learner: Embodiment) -> Float[Array, "expert learner"]:
-    """Static correspondence by common arc length: W_ij = n n_hat o_ij, with o_ij as in `overlap_correspondence`.
+    """Static correspondence by arc length: W_ij = n n_hat o_ij, with o_ij as in `overlap_correspondence`.
 
-    The mean of W o D' is then the integral of the pair distance along both arms: a link counts by its length, and
-    nothing changes when a straight link is cut in two. An arm of n links with itself gives n^2 diag(l) / sum(l).
+    The mean of W o D' is then the integral of the pair distance along both arms: links count by their length, and
+    cutting a straight link in two changes nothing. For two equal arms of n links W is n^2 diag(l) / sum(l).
 
     Args:
       expert: n links.
       learner: n_hat links.
     """
-    shared, _, numpy = _shared_lengths(expert, learner, "path")
-    return jnp.asarray(expert.num_links * learner.num_links * shared / numpy.sum(shared))
+    overlap, _, numpy = _overlaps(expert, learner, "path")
+    return jnp.asarray(expert.num_links * learner.num_links * overlap / numpy.sum(overlap))
 
 
-def _shared_lengths(expert: Embodiment, learner: Embodiment, lengths: LinkLengths) -> tuple[Any, Any, ModuleType]:
-    """Length that each pair of links shares on [0, 1], [n, n_hat]; the links' own lengths there; and NumPy or JAX's."""
+def _overlaps(expert: Embodiment, learner: Embodiment, lengths: LinkLengths) -> tuple[Any, Any, ModuleType]:
+    """Overlap of each pair of links on [0, 1], [n, n_hat]; the links' lengths there; and the array library."""
     arms = expert, learner
-    is_known = all(isinstance(leaf, np.ndarray) for arm in arms for leaf in (arm.link_lengths, arm.segment_start))
-    numpy = np if is_known else jnp
-    own = [arm.link_lengths if lengths == "chord" else _path_lengths(arm, numpy) for arm in arms]
-    (start_a, end_a), (start_b, end_b) = (_laid_on_unit_interval(length, numpy) for length in own)
-    shared = numpy.minimum(end_a[:, None], end_b[None, :]) - numpy.maximum(start_a[:, None], start_b[None, :])
-    # Neighbours that touch share rounding errors, not length.
-    rounding = 4 * sum(shared.shape) * numpy.finfo(shared.dtype).eps
-    return numpy.where(shared > rounding, shared, 0), (end_a - start_a, end_b - start_b), numpy
+    is_constant = all(isinstance(leaf, np.ndarray) for arm in arms for leaf in (arm.link_lengths, arm.segment_start))
+    numpy = np if is_constant else jnp
+    link_lengths = [arm.link_lengths if lengths == "chord" else _path_lengths(arm, numpy) for arm in arms]
+    (start_a, end_a), (start_b, end_b) = (_on_unit_interval(length, numpy) for length in link_lengths)
+    overlap = numpy.minimum(end_a[:, None], end_b[None, :]) - numpy.maximum(start_a[:, None], start_b[None, :])
+    # Overlaps of neighbours that only touch are rounding errors.
+    rounding = 4 * sum(overlap.shape) * numpy.finfo(overlap.dtype).eps
+    return numpy.where(overlap > rounding, overlap, 0), (end_a - start_a, end_b - start_b), numpy
 
 
 def _path_lengths(arm: Embodiment, numpy: ModuleType) -> Any:
-    """Length of each link along the centre line, [num_links]; the link's own where it is a single segment."""
+    """Length of each link along the centre line, [num_links]."""
     if len(arm.segment_link) == arm.num_links:
         return arm.link_lengths
     segments = numpy.sqrt(numpy.sum((arm.segment_end - arm.segment_start) ** 2, axis=1))
@@ -102,7 +102,7 @@ def _path_lengths(arm: Embodiment, numpy: ModuleType) -> Any:
     return numpy.sum(numpy.where(belongs, segments, 0), axis=1)
 
 
-def _laid_on_unit_interval(lengths: Float[Any, " n"], numpy: ModuleType) -> tuple[Any, Any]:
-    """Where each link starts and ends on its chain of length 1."""
+def _on_unit_interval(lengths: Float[Any, " n"], numpy: ModuleType) -> tuple[Any, Any]:
+    """Start and end of each link on a chain of length 1."""
     ends = numpy.cumsum(lengths) / numpy.sum(lengths)
     return numpy.concatenate([numpy.zeros(1, ends.dtype), ends[:-1]]), ends

@@ -1,4 +1,4 @@
-"""How far apart two embodiments are: the link-pair kernel, its weights, and the reduction to one number."""
+"""Distance between two embodiments: distances of link pairs, their weights, and the reduction to one number."""
 
 import dataclasses
 from collections.abc import Callable
@@ -35,12 +35,12 @@ class DistanceWeights:
 
 
 PAPER_WEIGHTS = DistanceWeights(translation=0.0, rotation=1.0, linear_velocity=0.001, angular_velocity=0.01)
-"""What the paper uses in all dynamic simulations."""
+"""The weights of all dynamic simulations in the paper."""
 
 
 @struct.dataclass
 class PairDistances:
-    """The unweighted parts of the distance between two links: chain lengths, rad, chain lengths/s, rad/s."""
+    """Unweighted parts of the distance between two links: chain lengths, rad, chain lengths/s, rad/s."""
 
     translation: Float[Array, "*pairs"]
     rotation: Float[Array, "*pairs"]
@@ -75,9 +75,9 @@ def rotation_distance(
     """
     check_choice("rotation", measure, ROTATION_MEASURES)
     a, b = spatial.vector(direction_a), spatial.vector(direction_b)
-    if measure == "angle":  # atan2, because the derivative of arccos is infinite at a match
+    if measure == "angle":  # arctan2, because the derivative of arccos is infinite at a match
         return jnp.arctan2(spatial.norm(spatial.cross(a, b)), spatial.dot(a, b))
-    # 1 - cos beta = |a - b|^2 / 2 for unit vectors: written so, it is 0 at a match to the last digit
+    # 1 - cos beta = |a - b|^2 / 2 for unit vectors; this form is exactly 0 at a match
     difference = spatial.subtract(a, b)
     return 0.25 * jnp.pi * spatial.dot(difference, difference)
 
@@ -85,16 +85,16 @@ def rotation_distance(
 def link_distances(
     expert_states: LinkStates, learner_states: LinkStates, weights: Weights, *, rotation: RotationMeasure = "cosine"
 ) -> Float[Array, "expert learner"]:
-    """Distance of every pair of an expert's and a learner's link, D' (paper, eqs. 8 and 19).
+    """Matrix D' of the distances between each link of the expert and each link of the learner (paper, eqs. 8, 19).
 
     Args:
-      expert_states: link states of one arm (normalized, to compare arms of different size).
-      learner_states: link states of the other.
-      weights: constants, or a function of the unweighted distances of one pair, as `adaptive_weights`.
+      expert_states: link states of the expert; normalized, to compare arms of different size.
+      learner_states: link states of the learner.
+      weights: constants, or a function of the unweighted distances of one pair, such as `adaptive_weights`.
       rotation: the rotational measure, see `rotation_distance`.
 
     Raises:
-      ValueError: an unknown measure, or candidate points with a weight on what they lack.
+      ValueError: an unknown measure, or a weight on a part that candidate points lack.
     """
     check_choice("rotation", rotation, ROTATION_MEASURES)
     if not callable(weights):
@@ -112,10 +112,10 @@ def link_distances(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Metric:
-    """All of the embodiment distance but the link states; called with these, it is the distance.
+    """The metric between two embodiments. Calling it with their link states returns the embodiment distance.
 
     Attributes:
-      correspondence: W [n, n_hat], or a function that makes it of the link distances, as `hard_correspondence`.
+      correspondence: W [n, n_hat], or a function of the link distances that returns W, such as `hard_correspondence`.
       weights: see `link_distances`.
       rotation: see `link_distances`.
       reduction: "mean" of all n n_hat entries of W o D' (paper), or their "frobenius" norm.
@@ -135,12 +135,12 @@ class Metric:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The attributes, as keyword arguments of the functions that take a metric in parts."""
+        """The attributes as keyword arguments, for functions that take the parts of a metric."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @property
     def is_static(self) -> bool:
-        """Whether it is a constant W and constant weights with cosines and the mean: closed forms exist for these."""
+        """Whether W and weights are constant, with "cosine" and "mean"; such a metric has closed forms."""
         constant = not callable(self.correspondence) and isinstance(self.weights, DistanceWeights)
         return constant and self.rotation == "cosine" and self.reduction == "mean"
 
@@ -153,10 +153,10 @@ class Metric:
         return link_distances(expert_states, learner_states, self.weights, rotation=self.rotation)
 
     def matrix(self, distances: Float[Array, "expert learner"]) -> Float[Array, "expert learner"]:
-        """W, for these link distances.
+        """W for these link distances.
 
         Raises:
-          ValueError: W of another shape.
+          ValueError: W has another shape than the distances.
         """
         matrix = self.correspondence(distances) if callable(self.correspondence) else self.correspondence
         matrix = jnp.asarray(matrix, distances.dtype)
@@ -167,7 +167,7 @@ class Metric:
         return matrix
 
     def reduced(self, distances: Float[Array, "expert learner"]) -> Float[Array, ""]:
-        """The corresponding links' distances as one number."""
+        """Reduction of the link distances to one number."""
         weighted = self.matrix(distances) * distances
         if self.reduction == "mean":
             return jnp.mean(weighted)
@@ -183,7 +183,7 @@ def embodiment_distance(
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
 ) -> Float[Array, ""]:
-    """Distance between two embodiments: the corresponding links' distances, reduced to a number (paper, Algorithm 1).
+    """Distance between two embodiments: the reduction of W o D' to one number (paper, Algorithm 1).
 
     Args:
       expert_states: link states of the expert.
@@ -194,38 +194,38 @@ def embodiment_distance(
       reduction: see `Metric`.
 
     Raises:
-      ValueError: W of another shape, an unknown measure or reduction, or what `link_distances` rejects.
+      ValueError: W has another shape, an unknown measure or reduction, or what `link_distances` rejects.
     """
     return Metric(correspondence, weights, rotation, reduction)(expert_states, learner_states)
 
 
 def pair_distances(a: LinkStates, b: LinkStates, measure: RotationMeasure) -> PairDistances:
-    """The parts of the distance between two links (paper, the terms of eq. 19), in the units of `PairDistances`.
+    """Parts of the distance between two links (paper, the terms of eq. 19), in the units of `PairDistances`.
 
     Args:
-      a: states of one link, each [3]; what is None makes its part 0.
-      b: of the other.
+      a: state of one link, each [3]; the part of a field that is None is 0.
+      b: state of the other link.
       measure: see `rotation_distance`.
     """
-    zero = jnp.zeros((), a.position.dtype)  # of what candidate points lack
+    zero = jnp.zeros((), a.position.dtype)  # for the parts that candidate points lack
 
-    def apart(x: Array | None, y: Array | None) -> Array:
-        lacking = x is None or y is None
-        return zero if lacking else spatial.norm(spatial.subtract(spatial.vector(x), spatial.vector(y)))
+    def difference(x: Array | None, y: Array | None) -> Array:
+        is_missing = x is None or y is None
+        return zero if is_missing else spatial.norm(spatial.subtract(spatial.vector(x), spatial.vector(y)))
 
-    def turned(x: Array | None, y: Array | None) -> Array:
+    def angle(x: Array | None, y: Array | None) -> Array:
         return zero if x is None or y is None else rotation_distance(x, y, measure)
 
     return PairDistances(
-        translation=apart(a.position, b.position),
-        rotation=turned(a.direction, b.direction),
-        linear_velocity=apart(a.linear_velocity, b.linear_velocity),
-        angular_velocity=apart(a.angular_velocity, b.angular_velocity),
+        translation=difference(a.position, b.position),
+        rotation=angle(a.direction, b.direction),
+        linear_velocity=difference(a.linear_velocity, b.linear_velocity),
+        angular_velocity=difference(a.angular_velocity, b.angular_velocity),
     )
 
 
 def _weight(part: str, value: Any, distances: Array) -> Any:
-    """A weight as a Python float where it is a number, else as an array like the distances."""
+    """A weight as a Python float where it is a number, else broadcast to the shape of the distances."""
     if isinstance(value, int | float | np.number):
         return float(value)
     weight = jnp.asarray(value, distances.dtype)

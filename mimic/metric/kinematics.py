@@ -1,4 +1,4 @@
-"""Frames, twists and link states of an embodiment: one sample per call, batched by `jax.vmap`."""
+"""Link frames, twists and link states of an embodiment: one sample per call, batched by `jax.vmap`."""
 
 import dataclasses
 import functools
@@ -32,12 +32,12 @@ class Frames:
 
 @struct.dataclass
 class LinkStates:
-    """What the metric compares, each [n, 3] in the base frame.
+    """Positions, directions and velocities of the links, which the metric compares; each [n, 3] in the base frame.
 
     Attributes:
-      position: origins of the link frames, divided by the chain length where normalized, else [m].
+      position: origins of the link frames; in chain lengths where normalized, else [m].
       direction: unit x-axes of the link frames; None for candidate points.
-      linear_velocity: of the origins, divided by the chain length [1/s] where normalized, else [m/s].
+      linear_velocity: of the origins; in chain lengths per second where normalized, else [m/s].
       angular_velocity: spatial angular velocity [rad/s]; None for candidate points.
     """
 
@@ -48,7 +48,7 @@ class LinkStates:
 
 
 class JointFrame(NamedTuple):
-    """A body that moves with a joint: its rotation from the zero pose, the joint's anchor, and how both move."""
+    """State of a joint's child body: its rotation from the zero pose, the joint's anchor, and their velocities."""
 
     rotation: Rotation
     anchor: Vector
@@ -66,7 +66,7 @@ class LinkVectors(NamedTuple):
 
 
 BASE = JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)
-LONG = 16  # joints; `link_states` of more is a loop, because a program that spells them out takes long to compile
+LONG = 16  # joints; `link_states` of more is a loop, because unrolled code takes long to compile
 
 
 def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Frames:
@@ -84,7 +84,7 @@ def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Fr
     positions, rotations = [], []
     for link, joint in enumerate(arm.link_joint):
         frame = frames[joint + 1]
-        positions.append(spatial.add(frame.anchor, spatial.rotate(frame.rotation, _zero_lever(arm, link, joint))))
+        positions.append(spatial.add(frame.anchor, spatial.rotate(frame.rotation, _zero_offset(arm, link, joint))))
         rotations.append(spatial.compose(frame.rotation, spatial.rotation(arm.link_rotation[link])))
     return Frames(
         position=spatial.stack(positions, qpos.dtype),
@@ -104,7 +104,7 @@ def link_states(
     Args:
       arm: the embodiment.
       qpos: joint angles [rad].
-      qvel: joint velocities [rad/s]; at rest where None.
+      qvel: joint velocities [rad/s]; zero where None.
       normalized: divide positions and linear velocities by the chain length.
 
     Raises:
@@ -114,28 +114,28 @@ def link_states(
     if qvel is not None:
         qvel = joint_values(arm, qvel, "qvel")
     if arm.num_joints > LONG:
-        of_dtype = jax.tree.map(lambda leaf: jnp.asarray(leaf, qpos.dtype), arm)
-        return _states_of_long_arm(of_dtype, qpos, jnp.zeros_like(qpos) if qvel is None else qvel, normalized)
+        arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, qpos.dtype), arm)
+        return _states_of_long_arm(arm, qpos, jnp.zeros_like(qpos) if qvel is None else qvel, normalized)
     columns = _link_state_columns(arm, qpos, qvel, normalized)
     return LinkStates(*(spatial.stack(column, qpos.dtype) for column in columns))
 
 
 @functools.partial(jax.jit, static_argnames="normalized")
 def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: bool) -> LinkStates:
-    """The same by a loop over the joints, which is compiled once for all of them; all numbers are of one dtype."""
+    """`link_states` by a loop over the joints, compiled once for all of them; all numbers have one dtype."""
     base = jax.tree.map(lambda number: jnp.asarray(number, qpos.dtype), BASE)
 
-    def behind(parent: JointFrame, joint: Any) -> tuple[JointFrame, JointFrame]:
+    def next_frame(parent: JointFrame, joint: Any) -> tuple[JointFrame, JointFrame]:
         offset, axis, angle, speed = joint
         frame = child_frame(parent, spatial.vector(offset), spatial.vector(axis), angle, speed)
         return frame, frame
 
     anchors = jnp.concatenate([jnp.zeros((1, 3), qpos.dtype), arm.joint_anchor])  # the base's first
-    _, frames = jax.lax.scan(behind, base, (jnp.diff(anchors, axis=0), arm.joint_axis, qpos, qvel))
-    moves = np.asarray(arm.link_joint) + 1
-    frames = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest])[moves], base, frames)
-    levers, directions = arm.link_position - anchors[moves], arm.link_rotation[:, :, 0]
-    links = link_state(frames, spatial.vector(levers.T), spatial.vector(directions.T))
+    _, frames = jax.lax.scan(next_frame, base, (jnp.diff(anchors, axis=0), arm.joint_axis, qpos, qvel))
+    frame_index = np.asarray(arm.link_joint) + 1
+    frames = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest])[frame_index], base, frames)
+    offsets, directions = arm.link_position - anchors[frame_index], arm.link_rotation[:, :, 0]
+    links = link_state(frames, spatial.vector(offsets.T), spatial.vector(directions.T))
     unit = 1 / arm.chain_length if normalized else 1.0
     return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, links)))
 
@@ -143,7 +143,7 @@ def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: b
 def link_state_table(
     arm: Embodiment, qpos: Float[np.ndarray, "*batch joints"], qvel: Float[np.ndarray, "*batch joints"]
 ) -> LinkStates:
-    """Link states of whole trajectories, by NumPy: what is made once needs no compiler.
+    """Link states of whole trajectories by NumPy, without compilation, for tables that are computed once.
 
     Args:
       arm: the embodiment.
@@ -151,7 +151,7 @@ def link_state_table(
       qvel: joint velocities [rad/s].
 
     Returns:
-      Each [*batch, links, 3]: computed in double precision, rounded to float32.
+      Arrays [*batch, links, 3], computed in double precision and rounded to float32.
     """
     shape = np.shape(qpos)[:-1]
     angles, speeds = (np.asarray(x, float).reshape(-1, arm.num_joints).T for x in (qpos, qvel))
@@ -160,7 +160,7 @@ def link_state_table(
         rows = [np.stack(np.broadcast_arrays(*row, angles[0])[:3], axis=-1) for row in column]
         return np.stack(rows, axis=1).reshape(*shape, len(rows), 3).astype(np.float32)
 
-    with np.errstate(invalid="ignore", over="ignore"):  # of an arm that ran away
+    with np.errstate(invalid="ignore", over="ignore"):  # of an unstable rollout
         return LinkStates(*map(table, _link_state_columns(arm, [*angles], [*speeds], normalized=True)))  # pyright: ignore[reportArgumentType]
 
 
@@ -172,13 +172,13 @@ def _link_state_columns(arm: Embodiment, qpos: Any, qvel: Any, normalized: bool)
 
 
 def _in_units(unit: spatial.Scalar, link: LinkVectors) -> LinkVectors:
-    """With lengths times a factor."""
+    """The state with its lengths multiplied by a factor."""
     position, velocity = (spatial.scale(unit, x) for x in (link.position, link.linear_velocity))
     return link._replace(position=position, linear_velocity=velocity)
 
 
 def candidate_points(states: LinkStates) -> LinkStates:
-    """Positions and linear velocities alone (paper, eq. 11)."""
+    """Link states reduced to positions and linear velocities (paper, eq. 11)."""
     return dataclasses.replace(states, direction=None, angular_velocity=None)
 
 
@@ -203,9 +203,9 @@ def body_twists(
     twists = [(omega, v)]
     for joint in range(arm.num_joints):
         axis, anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
-        turn = spatial.axis_rotation(axis, qpos[joint])
-        shift = spatial.subtract(anchor, spatial.rotate(turn, anchor))  # exp(q S) = [turn, shift]
-        omega, v = _inverse_adjoint(turn, shift, omega, v)
+        rotation = spatial.axis_rotation(axis, qpos[joint])
+        shift = spatial.subtract(anchor, spatial.rotate(rotation, anchor))  # exp(q S) = [rotation, shift]
+        omega, v = _inverse_adjoint(rotation, shift, omega, v)
         omega = spatial.add(omega, spatial.scale(qvel[joint], axis))
         v = spatial.add(v, spatial.scale(qvel[joint], spatial.cross(anchor, axis)))
         twists.append((omega, v))
@@ -224,7 +224,12 @@ def _inverse_adjoint(rotation: Rotation, position: Vector, omega: Vector, v: Vec
 
 
 def joint_axes(arm: Embodiment, frames: Sequence[JointFrame]) -> list[Vector]:
-    """The joints' unit axes in the base frame, of the frames that `joint_frames` gives."""
+    """Unit axes of the joints in the base frame.
+
+    Args:
+      arm: the embodiment.
+      frames: from `joint_frames`.
+    """
     return [
         spatial.rotate(frame.rotation, spatial.vector(axis))
         for frame, axis in zip(frames[1:], arm.joint_axis, strict=True)
@@ -234,12 +239,12 @@ def joint_axes(arm: Embodiment, frames: Sequence[JointFrame]) -> list[Vector]:
 def joint_frames(
     arm: Embodiment, qpos: Sequence[spatial.Scalar] | Array, qvel: Sequence[spatial.Scalar] | Array | None
 ) -> list[JointFrame]:
-    """The base, then the body behind each joint, in the base frame and the arm's own unit of length.
+    """Frames of the base and of each joint's child body, in the base frame and the arm's own unit of length.
 
     Args:
       arm: the embodiment.
-      qpos: an angle [rad] for each joint.
-      qvel: a velocity [rad/s] for each joint; at rest where None.
+      qpos: angle of each joint [rad].
+      qvel: velocity of each joint [rad/s]; zero where None.
     """
     frames = [BASE]
     previous_anchor = spatial.ZERO  # in the zero pose
@@ -254,49 +259,77 @@ def joint_frames(
 def child_frame(
     parent: JointFrame, offset: Vector, axis: Vector, angle: spatial.Scalar, speed: spatial.Scalar
 ) -> JointFrame:
-    """The body behind a joint; offset is the joint's anchor from the parent's, in the zero pose as the axis."""
-    lever = spatial.rotate(parent.rotation, offset)
-    spin = spatial.scale(speed, spatial.rotate(parent.rotation, axis))
+    """Frame of a joint's child body.
+
+    Args:
+      parent: frame of the parent body.
+      offset: from the parent joint's anchor to the joint's anchor, in the zero pose.
+      axis: of the joint, in the zero pose.
+      angle: of the joint [rad].
+      speed: of the joint [rad/s].
+    """
+    offset = spatial.rotate(parent.rotation, offset)
+    joint_velocity = spatial.scale(speed, spatial.rotate(parent.rotation, axis))
     return JointFrame(
         rotation=spatial.compose(parent.rotation, spatial.axis_rotation(axis, angle)),
-        anchor=spatial.add(parent.anchor, lever),
-        angular_velocity=spatial.add(parent.angular_velocity, spin),
-        linear_velocity=spatial.add(parent.linear_velocity, spatial.cross(parent.angular_velocity, lever)),
+        anchor=spatial.add(parent.anchor, offset),
+        angular_velocity=spatial.add(parent.angular_velocity, joint_velocity),
+        linear_velocity=spatial.add(parent.linear_velocity, spatial.cross(parent.angular_velocity, offset)),
     )
 
 
 def link_vectors(arm: Embodiment, frames: Sequence[JointFrame]) -> list[LinkVectors]:
-    """The links' states, of the frames that `joint_frames` gives."""
+    """States of the links as scalar components.
+
+    Args:
+      arm: the embodiment.
+      frames: from `joint_frames`.
+    """
     directions = [spatial.vector(rotation[:, 0]) for rotation in arm.link_rotation]
     return [
-        link_state(frames[joint + 1], _zero_lever(arm, link, joint), directions[link])
+        link_state(frames[joint + 1], _zero_offset(arm, link, joint), directions[link])
         for link, joint in enumerate(arm.link_joint)
     ]
 
 
-def link_state(frame: JointFrame, lever: Vector, direction: Vector) -> LinkVectors:
-    """Of one link, with its lever from the anchor and its direction in the zero pose."""
-    lever = spatial.rotate(frame.rotation, lever)
+def link_state(frame: JointFrame, offset: Vector, direction: Vector) -> LinkVectors:
+    """State of one link.
+
+    Args:
+      frame: of the body of the link.
+      offset: from the joint's anchor to the link's origin, in the zero pose.
+      direction: of the link, in the zero pose.
+    """
+    offset = spatial.rotate(frame.rotation, offset)
     return LinkVectors(
-        position=spatial.add(frame.anchor, lever),
+        position=spatial.add(frame.anchor, offset),
         direction=spatial.rotate(frame.rotation, direction),
-        linear_velocity=spatial.add(frame.linear_velocity, spatial.cross(frame.angular_velocity, lever)),
+        linear_velocity=spatial.add(frame.linear_velocity, spatial.cross(frame.angular_velocity, offset)),
         angular_velocity=frame.angular_velocity,
     )
 
 
-def _zero_lever(arm: Embodiment, link: int, joint: int) -> Vector:
-    """From the anchor of the joint that moves a link to its origin, in the zero pose."""
+def _zero_offset(arm: Embodiment, link: int, joint: int) -> Vector:
+    """Vector from the anchor of the joint that moves a link to the link's origin, in the zero pose."""
     anchor = spatial.vector(arm.joint_anchor[joint]) if joint >= 0 else spatial.ZERO
     return spatial.subtract(spatial.vector(arm.link_position[link]), anchor)
 
 
-def joint_values(arm: Embodiment, values: ArrayLike, what: str) -> Array:
-    """One floating number for each joint."""
+def joint_values(arm: Embodiment, values: ArrayLike, name: str) -> Array:
+    """The values as a floating-point array, checked to be one number for each joint.
+
+    Args:
+      arm: the embodiment.
+      values: of its joints.
+      name: of the argument, for the error.
+
+    Raises:
+      ValueError: another shape.
+    """
     values = jnp.asarray(values)
     if values.shape != (arm.num_joints,):
         raise ValueError(
-            f"{what}: expected shape ({arm.num_joints},), one number for each joint of {arm.name}, got {values.shape}"
+            f"{name}: expected shape ({arm.num_joints},), one number for each joint of {arm.name}, got {values.shape}"
             + ("; batch with jax.vmap" if values.ndim > 1 else "")
         )
     is_floating = jnp.issubdtype(values.dtype, jnp.floating)

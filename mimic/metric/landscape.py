@@ -1,4 +1,4 @@
-"""The metric over all poses of a two-joint learner: where its local minima are (paper, Fig. 2 d-f)."""
+"""The metric over all poses of a two-joint learner, and its local minima (paper, Fig. 2 d-f)."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,10 @@ from mimic.metric.kinematics import link_states
 
 
 class Landscape(NamedTuple):
-    """Distance to one pose of the expert, over a grid of the learner's angles.
+    """Embodiment distance to one pose of the expert over a grid of the learner's angles.
 
     Attributes:
-      angles: [k] grid of both joints in [-pi, pi) [rad].
+      angles: [k] grid of each joint in [-pi, pi) [rad].
       distance: [k, k] embodiment distance; rows are the first joint.
     """
 
@@ -35,7 +35,7 @@ def distance_landscape(
     rotation: RotationMeasure = "cosine",
     resolution: int = 180,
 ) -> Landscape:
-    """The embodiment distance of every pose of a two-joint learner to one pose of the expert.
+    """Embodiment distance between one pose of the expert and each pose of a two-joint learner on a grid.
 
     Args:
       expert: n joints.
@@ -44,10 +44,10 @@ def distance_landscape(
       correspondence: see `embodiment_distance`.
       weights: see `embodiment_distance`.
       rotation: see `embodiment_distance`.
-      resolution: poses k of each joint.
+      resolution: number k of angles of each joint.
 
     Raises:
-      ValueError: the learner does not have two joints, or a resolution below 3.
+      ValueError: the learner does not have two joints, or the resolution is below 3.
     """
     if learner.num_joints != 2:
         raise ValueError(f"learner: expected 2 joints, got {learner.num_joints} of {learner.name}")
@@ -66,8 +66,8 @@ def distance_landscape(
 
 
 def local_minima(distance: Float[ArrayLike, "k k"]) -> Int[np.ndarray, "minima 2"]:
-    """Indices of the poses that are nearer than all eight around them; the grid is periodic."""
+    """Indices of the grid poses with a smaller distance than all eight neighbours; the grid is periodic."""
     values = np.asarray(distance)
     shifts = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    lowest = np.all([values < np.roll(values, shift, axis=(0, 1)) for shift in shifts], axis=0)
-    return np.argwhere(lowest)
+    is_minimum = np.all([values < np.roll(values, shift, axis=(0, 1)) for shift in shifts], axis=0)
+    return np.argwhere(is_minimum)

@@ -1,10 +1,11 @@
-"""How alike two arms look: measures on their centre lines and hands, which no metric and no trainer optimises.
+"""Similarity of two arms: measures on their centre lines and hands, which no metric and no trainer optimises.
 
 An arm's centre line is the polyline of its segments from base to tip, in units of its own length; its hand is the tip.
-So arms of different size and number of links compare, whatever metric the learner was moved by. Both base frames are
-taken to agree.
+The measures thus compare arms of different size and number of links, independently of the metric that was optimised.
+They assume that both base frames coincide.
 """
 
+import dataclasses
 from types import ModuleType
 from typing import Any
 
@@ -17,6 +18,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
+from mimic.metric.spatial import array_library
 
 SAMPLES = 64  # of a centre line
 MEASURES = ("centre_line_distance", "tangent_angle_deg", "frechet_distance", "hand_position_error", "hand_angle_deg")
@@ -24,12 +26,12 @@ MEASURES = ("centre_line_distance", "tangent_angle_deg", "frechet_distance", "ha
 
 @struct.dataclass
 class CentreLine:
-    """An arm's centre line in one pose, or in many, in its base frame.
+    """Centre line of an arm in one or many poses, in its base frame.
 
     Attributes:
-      points: [*batch, samples, 3] in the middle of intervals of equal arc length, base to tip [chain lengths].
-      tangents: [*batch, samples, 3] unit directions of the centre line there.
-      hand_position: [*batch, 3] the tip [chain lengths].
+      points: [*batch, samples, 3] middles of intervals of equal arc length, base to tip [chain lengths].
+      tangents: [*batch, samples, 3] unit directions of the centre line at these points.
+      hand_position: [*batch, 3] position of the tip [chain lengths].
       hand_direction: [*batch, 3] unit direction of the last segment.
     """
 
@@ -40,15 +42,15 @@ class CentreLine:
 
 
 def centre_line(arm: Embodiment, qpos: Float[ArrayLike, " joints"], *, samples: int = SAMPLES) -> CentreLine:
-    """The centre line of an arm in one pose.
+    """Centre line of an arm in one pose.
 
     Args:
       arm: the embodiment.
       qpos: joint angles [rad].
-      samples: points at equal arc length.
+      samples: number of points at equal arc length.
 
     Raises:
-      ValueError: `qpos` is not one angle for each joint, or fewer than one sample.
+      ValueError: `qpos` is not one angle for each joint, or `samples` is below 1.
     """
     return _sampled(arm, link_states(segment_arm(arm), qpos, normalized=False), samples)
 
@@ -56,20 +58,20 @@ def centre_line(arm: Embodiment, qpos: Float[ArrayLike, " joints"], *, samples: 
 def centre_line_table(
     arm: Embodiment, qpos: Float[np.ndarray, "*batch joints"], *, samples: int = SAMPLES
 ) -> CentreLine:
-    """The centre lines of an arm in many poses, by NumPy in single precision; see `centre_line`."""
+    """Centre lines of an arm in many poses, computed by NumPy in single precision; see `centre_line`."""
     segments = segment_arm(arm)
     length = float(segments.chain_length)
     states = link_state_table(segments, qpos, np.zeros_like(qpos))
-    return _sampled(arm, states.replace(position=states.position * np.float32(length)), samples)  # type: ignore[attr-defined]
+    return _sampled(arm, dataclasses.replace(states, position=states.position * np.float32(length)), samples)
 
 
 def _sampled(arm: Embodiment, segments: LinkStates, samples: int) -> CentreLine:
-    """The centre line, of where its segments start [m] and their directions."""
+    """The centre line, from the starts [m] and directions of its segments."""
     if samples < 1:
         raise ValueError(f"samples: expected at least 1, got {samples}")
     start, direction = segments.position, segments.direction
     assert direction is not None
-    numpy = _library(start)
+    numpy = array_library(start)
     lengths = np.linalg.norm(np.asarray(arm.segment_end) - np.asarray(arm.segment_start), axis=1)
     ends = np.cumsum(lengths)
     arc = (np.arange(samples) + 0.5) / samples * ends[-1]
@@ -82,11 +84,11 @@ def _sampled(arm: Embodiment, segments: LinkStates, samples: int) -> CentreLine:
 
 
 def centre_line_distance(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
-    """Mean distance of the points at equal arc length [chain lengths].
+    """Mean distance between points at equal arc length [chain lengths].
 
     Args:
-      expert: of one arm.
-      learner: of the other, in as many samples.
+      expert: centre line of the expert.
+      learner: centre line of the learner, with as many samples.
     """
     return _norm(expert.points - learner.points).mean(axis=-1)
 
@@ -95,8 +97,8 @@ def tangent_angle(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch
     """Mean angle between the tangents at equal arc length [rad], in [0, pi].
 
     Args:
-      expert: of one arm.
-      learner: of the other, in as many samples.
+      expert: centre line of the expert.
+      learner: centre line of the learner, with as many samples.
     """
     return _angle(expert.tangents, learner.tangents).mean(axis=-1)
 
@@ -104,52 +106,50 @@ def tangent_angle(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch
 def frechet_distance(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
     """Discrete Frechet distance of the centre lines [chain lengths] (Eiter and Mannila 1994).
 
-    The shortest leash with which two walkers can go along both lines without turning back: it does not depend on how
-    the lines are parametrised, as the other measures do.
+    The minimum over monotone walks along both lines of the maximum distance. Unlike the other measures, it does not
+    depend on the parametrisation of the lines.
 
     Args:
-      expert: of one arm.
-      learner: of the other, in any number of samples.
+      expert: centre line of the expert.
+      learner: centre line of the learner, with any number of samples.
     """
-    numpy = _library(expert.points)
-    # [3, samples, *batch]: whole batches lie in one piece, which is what NumPy is fast on.
+    numpy = array_library(expert.points)
+    # [3, samples, *batch]: batches are contiguous, which is fast in NumPy.
     a, b = (numpy.moveaxis(line.points, (-1, -2), (0, 1)) for line in (expert, learner))
-    return _longest_leash(a, b) if numpy is jnp else _longest_leash_numpy(a, np.ascontiguousarray(b))
+    return _frechet(a, b) if numpy is jnp else _frechet_numpy(a, np.ascontiguousarray(b))
 
 
-def _longest_leash(a: Float[Array, "3 m *batch"], b: Float[Array, "3 n *batch"]) -> Float[Array, "*batch"]:
-    """By rows of the table of leashes [n, *batch]: the shortest leash up to a point of `a` and each point of `b`."""
+def _frechet(a: Float[Array, "3 m *batch"], b: Float[Array, "3 n *batch"]) -> Float[Array, "*batch"]:
+    """By rows [n, *batch] of the dynamic programme: distance of the lines up to a point of `a` and each of `b`."""
 
-    def apart(point: Array) -> Array:
+    def point_distances(point: Array) -> Array:
         return _norm(jnp.moveaxis(point[:, None] - b, 0, -1))
 
     def next_row(row: Array, point: Array) -> tuple[Array, None]:
-        low = apart(point)
-        return _running_clamp(low, jnp.maximum(low, _entered(row, jnp))), None
+        low = point_distances(point)
+        return _running_clamp(low, jnp.maximum(low, _best_predecessor(row, jnp))), None
 
-    first = jax.lax.cummax(apart(a[:, 0]), axis=0)
+    first = jax.lax.cummax(point_distances(a[:, 0]), axis=0)
     return jax.lax.scan(next_row, first, jnp.moveaxis(a[:, 1:], 1, 0))[0][-1]
 
 
-def _longest_leash_numpy(
-    a: Float[np.ndarray, "3 m *batch"], b: Float[np.ndarray, "3 n *batch"]
-) -> Float[Any, "*batch"]:
+def _frechet_numpy(a: Float[np.ndarray, "3 m *batch"], b: Float[np.ndarray, "3 n *batch"]) -> Float[Any, "*batch"]:
     row = None
     for point in np.moveaxis(a, 1, 0):
         low = np.sqrt(sum((x - y) ** 2 for x, y in zip(point, b, strict=True)))
         if row is None:
             row = np.maximum.accumulate(low, axis=0)
             continue
-        entered = _entered(row, np)
-        row = np.maximum(low, entered)
+        predecessor = _best_predecessor(row, np)
+        row = np.maximum(low, predecessor)
         for j in range(1, len(row)):
-            np.maximum(low[j], np.minimum(entered[j], row[j - 1]), out=row[j, ...])
+            np.maximum(low[j], np.minimum(predecessor[j], row[j - 1]), out=row[j, ...])
     assert row is not None
     return row[-1]
 
 
-def _entered(row: Any, numpy: ModuleType) -> Any:
-    """The shorter leash of the two cells of the row before from which a cell can be entered."""
+def _best_predecessor(row: Any, numpy: ModuleType) -> Any:
+    """Minimum of the two cells of the previous row from which a cell can be reached."""
     return numpy.concatenate([row[:1], numpy.minimum(row[1:], row[:-1])])
 
 
@@ -163,7 +163,7 @@ def _running_clamp(low: Array, high: Array) -> Array:
 
 
 def hand_position_error(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
-    """Distance of the tips [chain lengths]."""
+    """Distance between the tips [chain lengths]."""
     return _norm(expert.hand_position - learner.hand_position)
 
 
@@ -173,11 +173,11 @@ def hand_angle(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
 
 
 def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, "*batch"]]:
-    """All measures by their names in `MEASURES`; 0 is alike, angles in degrees.
+    """All measures by their names in `MEASURES`, angles in degrees; 0 means equal.
 
     Args:
-      expert: of one arm.
-      learner: of the other, in as many samples.
+      expert: centre line of the expert.
+      learner: centre line of the learner, with as many samples.
     """
     degrees = 180 / np.pi
     values = (
@@ -190,17 +190,13 @@ def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, 
     return dict(zip(MEASURES, values, strict=True))
 
 
-def _library(values: Any) -> ModuleType:
-    return np if isinstance(values, np.ndarray) else jnp
-
-
 def _norm(vectors: Any) -> Any:
-    """Length along the last axis, whose derivative at 0 is 0."""
-    numpy = _library(vectors)
+    """Length along the last axis, with derivative 0 at 0."""
+    numpy = array_library(vectors)
     square = (vectors * vectors).sum(axis=-1)
     return numpy.where(square > 0, numpy.sqrt(numpy.where(square > 0, square, 1)), 0)
 
 
 def _angle(a: Any, b: Any) -> Any:
-    """Between unit vectors, by their difference and sum: exact at 0 and at pi."""
-    return 2 * _library(a).arctan2(_norm(a - b), _norm(a + b))
+    """Angle between unit vectors, from their difference and sum: accurate at 0 and at pi."""
+    return 2 * array_library(a).arctan2(_norm(a - b), _norm(a + b))

@@ -1,13 +1,14 @@
 """Small SE(3) algebra on scalar components.
 
-A vector is a tuple of three scalars and a rotation a tuple of three such rows. Nothing here builds a small array, so
-under `jax.vmap` every operation is elementwise over the batch: XLA fuses the whole chain into one program, and no
-matrix product is left for TF32 to round. Scalars that are Python floats are known while JAX traces, and what they make
-zero is never computed: that leaves a third of the operations of a Panda's forward kinematics.
+A vector is a tuple of three scalars; a rotation is a tuple of three such rows. No function here creates a small array,
+so under `jax.vmap` every operation is elementwise over the batch: XLA fuses the whole chain into one kernel, and no
+matrix product is rounded to TF32. Scalars that are Python floats are constants while JAX traces; products with 0 and 1
+are then not computed. This leaves a third of the operations of a Panda's forward kinematics.
 """
 
 import math
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
@@ -29,6 +30,11 @@ def scalar(number: Any) -> Scalar:
     return float(number) if isinstance(number, np.generic | np.ndarray) else number
 
 
+def array_library(values: Any) -> ModuleType:
+    """NumPy for a NumPy array, else `jax.numpy`."""
+    return np if isinstance(values, np.ndarray) else jnp
+
+
 def vector(array: Float[Any, "3"]) -> Vector:
     """The components of an array; Python floats where it is a NumPy array."""
     if isinstance(array, np.ndarray):
@@ -42,18 +48,18 @@ def rotation(array: Float[Any, "3 3"]) -> Rotation:
 
 
 def times(x: Scalar, y: Scalar) -> Scalar:
-    """The product; nothing to compute where one factor is known to be 0, 1 or -1."""
-    for known, other in ((x, y), (y, x)):
-        if isinstance(known, float):
-            if known == 0:
+    """The product; free where one factor is the constant 0, 1 or -1."""
+    for constant, other in ((x, y), (y, x)):
+        if isinstance(constant, float):
+            if constant == 0:
                 return 0.0
-            if abs(known) == 1:
-                return other if known > 0 else -other
+            if abs(constant) == 1:
+                return other if constant > 0 else -other
     return x * y
 
 
 def plus(x: Scalar, y: Scalar) -> Scalar:
-    """The sum; nothing to compute where one summand is known to be 0."""
+    """The sum; free where one summand is the constant 0."""
     if isinstance(x, float) and x == 0:
         return y
     if isinstance(y, float) and y == 0:
@@ -62,7 +68,7 @@ def plus(x: Scalar, y: Scalar) -> Scalar:
 
 
 def minus(x: Scalar, y: Scalar) -> Scalar:
-    """The difference; nothing to compute where y is known to be 0."""
+    """The difference; free where x or y is the constant 0."""
     if isinstance(x, float) and x == 0:
         return times(-1.0, y)
     if isinstance(y, float) and y == 0:
@@ -107,7 +113,7 @@ def norm(a: Vector) -> Scalar:
 
 def safe_sqrt(square: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Square root whose gradient is zero, not infinite, where its argument is zero."""
-    nonzero = square >= jnp.finfo(square.dtype).tiny  # below it a backend may flush to zero, and divide by it
+    nonzero = square >= jnp.finfo(square.dtype).tiny  # a backend may flush smaller numbers to zero, and divide by it
     return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, square, 1)), 0)
 
 
@@ -135,23 +141,26 @@ def add_outer(matrix: Rotation, a: Vector, b: Vector) -> Rotation:
 
 
 def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:
-    """exp([axis] angle) for a unit axis (Rodrigues); by NumPy where the angle is its array."""
-    library = np if isinstance(angle, np.ndarray) else jnp
-    sine, cosine = library.sin(angle), library.cos(angle)
+    """exp([axis] angle) for a unit axis (Rodrigues); computed by NumPy for a NumPy array of angles."""
+    numpy = array_library(angle)
+    sine, cosine = numpy.sin(angle), numpy.cos(angle)
     versine = 1 - cosine
 
     def entry(i: int, j: int) -> Scalar:
         square = times(axis[i], axis[j])
         if i == j:
-            known = isinstance(square, float)
-            return 1.0 if known and square == 1 else plus(cosine, times(versine, square))
+            is_one = isinstance(square, float) and square == 1
+            return 1.0 if is_one else plus(cosine, times(versine, square))
         towards_axis = times(axis[3 - i - j], sine)
         return plus(times(versine, square), towards_axis if (i - j) % 3 == 1 else times(-1.0, towards_axis))
 
-    return tuple(tuple(entry(i, j) for j in range(3)) for i in range(3))  # pyright: ignore[reportReturnType]
+    def row(i: int) -> Vector:
+        return entry(i, 0), entry(i, 1), entry(i, 2)
+
+    return row(0), row(1), row(2)
 
 
 def stack(vectors: Sequence[Sequence[Scalar]], dtype: Any) -> Float[Array, "n m"]:
-    """Rows of scalars as one array."""
+    """One array of rows of scalars."""
     scalars = [jnp.asarray(x, dtype) for row in vectors for x in row]
     return jnp.stack(compat.computed_once(scalars)).reshape(len(vectors), -1)

@@ -1,1 +1,1 @@
-"""The figures of the paper, drawn from the code."""
+"""Figures of the paper, computed and drawn by the code."""

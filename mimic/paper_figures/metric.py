@@ -1,4 +1,4 @@
-"""Pictures that explain the metric: what is compared, and which links with which."""
+"""Figures that explain the metric: link frames, distances and correspondence matrices."""
 
 import functools
 from collections.abc import Callable
@@ -12,7 +12,12 @@ import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 
 from mimic.arms.embodiment import Embodiment, planar_arm  # noqa: E402
-from mimic.metric.correspondence import hard_correspondence, overlap_correspondence, soft_correspondence  # noqa: E402
+from mimic.metric.correspondence import (  # noqa: E402
+    arc_length_correspondence,
+    hard_correspondence,
+    overlap_correspondence,
+    soft_correspondence,
+)
 from mimic.metric.distance import DistanceWeights, link_distances  # noqa: E402
 from mimic.metric.kinematics import link_states  # noqa: E402
 from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
@@ -26,7 +31,7 @@ _TRANSLATION, _ROTATION = DistanceWeights(translation=1.0, rotation=0.0), Distan
 
 
 def draw_links() -> Any:
-    """Two arms with the frames of their links, and the distances of all pairs of links in position and direction."""
+    """Draws two arms with the frames of their links, and the position and rotation distances of all pairs of links."""
     figure, (arms, *maps) = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained", width_ratios=(1.5, 1, 1))
     positions, directions = [], []
     for arm, pose, colour, label in (
@@ -58,8 +63,9 @@ def draw_links() -> Any:
 
 
 def draw_correspondence() -> Any:
-    """Both chains laid on [0, 1], and the matrices W that are made of it, or of the distances in one pose."""
-    figure, (chains, *maps) = plt.subplots(1, 4, figsize=(11, 3), layout="constrained", width_ratios=(1.6, 1, 1, 1))
+    """Draws both chains on [0, 1], and correspondence matrices W from overlap and from the distances in one pose."""
+    ratios = 1.6, 1, 1, 1, 1
+    figure, (chains, *maps) = plt.subplots(1, 5, figsize=(13, 3), layout="constrained", width_ratios=ratios)
     for height, arm, colour, label in ((1, _EXPERT, EXPERT_COLOUR, "expert"), (0, _LEARNER, LEARNER_COLOUR, "learner")):
         _draw_chain(chains, arm, height, colour)
         chains.text(-0.03, height, label, ha="right", va="center", color=colour)
@@ -69,6 +75,7 @@ def draw_correspondence() -> Any:
     distances = link_distances(*states, _ROTATION)
     soft: Callable[..., Any] = functools.partial(soft_correspondence, xi=_XI)
     matrices = {
+        "arc length (default)": arc_length_correspondence(_EXPERT, _LEARNER),
         "overlap": overlap_correspondence(_EXPERT, _LEARNER),
         "hard": hard_correspondence(distances),
         rf"soft, $\xi = {_XI:g}$": soft(distances),
@@ -79,7 +86,7 @@ def draw_correspondence() -> Any:
 
 
 def _draw_angle(axes: Any, corner: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
-    """The angle between two directions, drawn where the second one starts."""
+    """Draws the angle between two directions at the start of the second one."""
     axes.plot(*np.transpose([corner, corner + 1.4 * _ARROW * first]), ":", color="black", lw=1)
     angles = np.degrees([np.arctan2(*direction[::-1]) for direction in (first, second)])
     low, high = sorted(angles)
@@ -102,8 +109,8 @@ def _draw_chain(axes: Any, arm: Embodiment, height: float, colour: str) -> None:
 def _draw_matrix(axes: Any, matrix: np.ndarray, title: str) -> None:
     axes.imshow(matrix, cmap="viridis", vmin=0)
     for (row, column), value in np.ndenumerate(matrix):
-        light = value > 0.6 * matrix.max()
-        axes.text(column, row, f"{value:.2f}", ha="center", va="center", color="black" if light else "white")
+        is_light = value > 0.6 * matrix.max()
+        axes.text(column, row, f"{value:.2f}", ha="center", va="center", color="black" if is_light else "white")
     rows, columns = matrix.shape
     axes.set(xticks=range(columns), yticks=range(rows), title=title, xlabel="learner link", ylabel="expert link")
     axes.set_xticklabels(range(1, columns + 1))

@@ -1,4 +1,4 @@
-"""A picture of five poses of an expert, and of the learner's nearest poses below them."""
+"""Picture of five poses of an expert, with the learner's nearest poses below them."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ from mimic.metric.similarity import CentreLine, centre_line_table, similarity  #
 from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR  # noqa: E402
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
 
-# What the Panda's joints are turned by [rad]: poses that show the whole arm, within its joint ranges.
+# Joint positions of the Panda [rad] that show the whole arm and are within its joint ranges.
 PANDA_POSES = np.array(
     [
         [0.6, 0.7, -0.5, -1.3, 0.5, 1.6, 0.4],
@@ -32,18 +32,18 @@ PANDA_POSES = np.array(
     ],
     np.float32,
 )
-_PIXELS = 260  # of one picture; a mesh takes its time without a GPU
+_PIXELS = 260  # of one image; rendering meshes is slow without a GPU
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosePairs:
-    """Poses of an expert and the nearest ones of a learner.
+    """Poses of an expert and the nearest poses of a learner.
 
     Attributes:
-      expert_qpos: [poses, joints] [rad].
-      learner_qpos: [poses, learner_joints] of least embodiment distance [rad].
-      distance: [poses] embodiment distance of the two, at rest.
-      similarity: the measures of `mimic.metric.similarity`, [poses] each.
+      expert_qpos: joint positions of the expert [rad].
+      learner_qpos: joint positions of the learner with minimal embodiment distance [rad].
+      distance: embodiment distance of each pair, at rest.
+      similarity: measures of `mimic.metric.similarity`, each of shape [poses].
     """
 
     expert_qpos: Float[np.ndarray, "poses joints"]
@@ -65,32 +65,32 @@ class PosePairs:
 
 
 def readable_poses(
-    config: ArmConfig, arm: Arm, others: Float[np.ndarray, "candidates joints"]
+    config: ArmConfig, arm: Arm, candidates: Float[np.ndarray, "candidates joints"]
 ) -> Float[np.ndarray, "poses joints"]:
-    """Five poses of an expert [rad]: fixed ones of the Panda, else some of `others`, as far between as may be."""
+    """Returns five poses of an expert [rad]: fixed ones for the Panda, else evenly spaced ones from `candidates`."""
     if config.model == "panda":
         return PANDA_POSES[:, [int(name.removeprefix("joint")) - 1 for name in arm.embodiment.joint_names]]
     count = len(PANDA_POSES)
-    return np.asarray(others, np.float32)[np.linspace(0, len(others) - 1, count + 1).round().astype(int)[1:]]
+    return np.asarray(candidates, np.float32)[np.linspace(0, len(candidates) - 1, count + 1).round().astype(int)[1:]]
 
 
 def nearest_poses(
     expert: Arm, learner: Arm, metric: MetricConfig, qpos: Float[np.ndarray, "poses joints"]
 ) -> PosePairs:
-    """The learner's poses of least embodiment distance to poses of the expert [rad], and how alike they look."""
+    """Computes the learner's poses with minimal embodiment distance to poses of the expert [rad], and similarity."""
     pair = expert.embodiment, learner.embodiment
     arguments = metric.build(*pair).arguments
-    found = jax.jit(lambda qpos: imitate_pose(*pair, qpos, **arguments))(qpos)
-    learner_qpos = np.asarray(found.qpos)
-    alike = similarity(centre_line_table(pair[0], qpos), centre_line_table(pair[1], learner_qpos))
-    return PosePairs(qpos, learner_qpos, np.asarray(found.distance), alike)
+    solution = jax.jit(lambda qpos: imitate_pose(*pair, qpos, **arguments))(qpos)
+    learner_qpos = np.asarray(solution.qpos)
+    measures = similarity(centre_line_table(pair[0], qpos), centre_line_table(pair[1], learner_qpos))
+    return PosePairs(qpos, learner_qpos, np.asarray(solution.distance), measures)
 
 
 def save_poses(path: Path, expert: Arm, learner: Arm, env: EnvConfig, pairs: PosePairs) -> None:
-    """Draws each pose of the expert, the learner's below it, and both centre lines over each other.
+    """Draws each pose of the expert, the learner's pose below it, and below that both centre lines in one panel.
 
     Raises:
-      ValueError: no OpenGL.
+      ValueError: OpenGL is not available.
     """
     columns = len(pairs.expert_qpos)
     figure, rows = plt.subplots(3, columns, figsize=(2.2 * columns, 6.9), layout="constrained")
@@ -98,17 +98,17 @@ def save_poses(path: Path, expert: Arm, learner: Arm, env: EnvConfig, pairs: Pos
     arms = (env.expert, expert, pairs.expert_qpos, "expert"), (env.learner, learner, pairs.learner_qpos, "learner")
     for row, (config, arm, poses, role) in zip(rows, arms, strict=False):
         with ArmScene([config], limits=env.limits, width=_PIXELS, height=_PIXELS) as scene:
-            _show(row, [scene.image([pose]) for pose in poses], f"{role}: {arm.embodiment.name}")
+            show_images(row, [scene.image([pose]) for pose in poses], f"{role}: {arm.embodiment.name}")
             lines.append((role, scene.flattened(_with_ends(centre_line_table(arm.embodiment, poses)))))
     for column, axes in enumerate(rows[2]):
         for (role, points), colour, width in zip(lines, (EXPERT_COLOUR, LEARNER_COLOUR), (6, 2.5), strict=True):
             alpha = 0.45 if role == "expert" else 1.0
             axes.plot(*points[column].T, color=colour, lw=width, alpha=alpha, label=role, solid_capstyle="round")
         axes.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.15, 0.95), xticks=[], yticks=[])
-        measured = {name: float(values[column]) for name, values in pairs.similarity.items()}
+        measures = {name: float(values[column]) for name, values in pairs.similarity.items()}
         rows[1][column].set_title(
-            f"centre line {measured['centre_line_distance']:.3f}\n"
-            f"hand {measured['hand_position_error']:.3f}, {measured['hand_angle_deg']:.0f}°",
+            f"centre line {measures['centre_line_distance']:.3f}\n"
+            f"hand {measures['hand_position_error']:.3f}, {measures['hand_angle_deg']:.0f}°",
             fontsize="medium",
         )
     rows[2][0].set_ylabel("centre lines,\neach arm of length 1")
@@ -118,12 +118,13 @@ def save_poses(path: Path, expert: Arm, learner: Arm, env: EnvConfig, pairs: Pos
 
 
 def _with_ends(line: CentreLine) -> Float[np.ndarray, "poses points 3"]:
-    """Base, points and hand [chain lengths]."""
+    """A centre line with its base and its hand [chain lengths]."""
     hand = line.hand_position[..., None, :]
     return np.concatenate([line.points[..., :1, :] * 0, line.points, hand], axis=-2)
 
 
-def _show(row: Sequence[Any], images: Sequence[np.ndarray], label: str) -> None:
+def show_images(row: Sequence[Any], images: Sequence[np.ndarray], label: str) -> None:
+    """Shows images in a row of axes, without ticks and frames, with a label at the first one."""
     for axes, image in zip(row, images, strict=True):
         axes.imshow(image)
         axes.set(xticks=[], yticks=[])

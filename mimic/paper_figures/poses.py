@@ -1,7 +1,7 @@
-"""The figures of the metric and of static pose imitation (paper), each from our own computation."""
+"""Figures of the metric and of pose retargeting (static pose imitation in the paper), all computed here."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,35 +17,36 @@ import numpy as np  # noqa: E402
 from mimic.arms.embodiment import planar_arm  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs import env_config  # noqa: E402
+from mimic.metric.config import MetricConfig  # noqa: E402
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
 from mimic.metric.distance import DistanceWeights, adaptive_weights  # noqa: E402
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.paper_figures import candidate_points, similarity
 from mimic.paper_figures import metric as metric_figures  # noqa: E402
 from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
-from mimic.paper_figures.pose_picture import PANDA_POSES  # noqa: E402
+from mimic.paper_figures.pose_picture import PANDA_POSES, show_images  # noqa: E402
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
 from mimic.trainers.pose_mapper.model import PoseMapper  # noqa: E402
 
-LoadMapper = Callable[[str], PoseMapper]  # by the name of the environment
+LoadMapper = Callable[[str], PoseMapper]  # from the name of an environment
 
 _TWO_LINKS = planar_arm([0.5, 0.5])
-_CONTOUR_POSE = np.array([1.5, -1.5])  # the expert's in the paper's figure 2 d-f
+_CONTOUR_POSE = np.array([1.5, -1.5])  # of the expert in Fig. 2 d-f of the paper
 _WEIGHTS_POSE = np.array([2.3, -2.0])
-_OTHER_TWO_LINKS = planar_arm([0.25, 0.75])  # equal arms would match whatever the weights are
-_SHOWN = PANDA_POSES[:3]
+_OTHER_TWO_LINKS = planar_arm([0.25, 0.75])  # identical arms would match for any weights
+_PANDA_POSES = PANDA_POSES[:3]
 _PIXELS = 420
 
 
 def draw_weights(load_mapper: LoadMapper) -> Any:
-    """The nearest pose of an arm of other proportions under three weights (paper, Fig. 2 a-c)."""
+    """Draws the nearest pose of an arm of other link lengths under three weights (paper, Fig. 2 a-c)."""
     del load_mapper
     figure, all_axes = plt.subplots(1, 3, figsize=(8, 2.9), layout="constrained")
     for letter, axes, (translation, rotation) in zip("abc", all_axes, ((0.5, 1), (3, 1), (1, 1)), strict=True):
         weights = DistanceWeights(float(translation), float(rotation))
-        found = imitate_pose(_TWO_LINKS, _OTHER_TWO_LINKS, _WEIGHTS_POSE, hard_correspondence, weights)
+        solution = imitate_pose(_TWO_LINKS, _OTHER_TWO_LINKS, _WEIGHTS_POSE, hard_correspondence, weights)
         draw_arm(axes, _TWO_LINKS, _WEIGHTS_POSE, EXPERT_COLOUR, "expert")
-        draw_arm(axes, _OTHER_TWO_LINKS, found.qpos, LEARNER_COLOUR, "learner")
+        draw_arm(axes, _OTHER_TWO_LINKS, solution.qpos, LEARNER_COLOUR, "learner")
         axes.set_title(rf"({letter})  $\alpha_{{tr}}={translation}$, $\alpha_{{rot}}={rotation}$", fontsize="medium")
         axes.set(xlim=(-0.75, 0.65), ylim=(-0.15, 0.85), aspect="equal")
         axes.grid(alpha=0.3)
@@ -54,15 +55,20 @@ def draw_weights(load_mapper: LoadMapper) -> Any:
 
 
 def draw_contours(load_mapper: LoadMapper) -> Any:
-    """The distance over all poses of an equal two-link arm, with every local minimum (paper, Fig. 2 d-f)."""
+    """Draws the distance over all poses of an identical two-link arm, with every local minimum.
+
+    Panels d-f are those of Fig. 2 of the paper; panel g shows the default metric.
+    """
     del load_mapper
-    measures = (
+    default = MetricConfig()
+    metrics = (
         ("state-dependent W", hard_correspondence, DistanceWeights(1.5, 1.0)),
         ("state-dependent W, adaptive weights", hard_correspondence, adaptive_weights),
         ("static W, rotation only", overlap_correspondence(_TWO_LINKS, _TWO_LINKS), DistanceWeights(0.0, 1.0)),
+        ("default metric", default.make_correspondence(_TWO_LINKS, _TWO_LINKS), default.make_weights()),
     )
-    figure, all_axes = plt.subplots(1, 3, figsize=(10, 3.5), sharey=True, layout="constrained")
-    for letter, axes, (name, correspondence, weights) in zip("def", all_axes, measures, strict=True):
+    figure, all_axes = plt.subplots(1, 4, figsize=(13, 3.6), sharey=True, layout="constrained")
+    for letter, axes, (name, correspondence, weights) in zip("defg", all_axes, metrics, strict=True):
         angles, distance = distance_landscape(_TWO_LINKS, _TWO_LINKS, _CONTOUR_POSE, correspondence, weights)
         filled = axes.contourf(angles, angles, distance.T, levels=24, cmap="viridis")
         axes.contour(angles, angles, distance.T, levels=24, colors="black", linewidths=0.2)
@@ -71,7 +77,7 @@ def draw_contours(load_mapper: LoadMapper) -> Any:
         axes.plot(angles[minima[:, 0]], angles[minima[:, 1]], "o", color="white", mec="black", ms=6)
         axes.plot(angles[best[0]], angles[best[1]], "*", color="red", mec="white", ms=13)
         count = f"{len(minima)} local minima" if len(minima) > 1 else "1 local minimum"
-        axes.set_title(f"({letter})  {name}: {count}", fontsize="small")
+        axes.set_title(f"({letter})  {name}:\n{count}", fontsize="small")
         axes.set(xlabel=r"$\hat q_1$ [rad]", aspect="equal")
         figure.colorbar(filled, ax=axes, shrink=0.75, ticks=matplotlib.ticker.MaxNLocator(6))
     all_axes[0].set_ylabel(r"$\hat q_2$ [rad]")
@@ -79,18 +85,18 @@ def draw_contours(load_mapper: LoadMapper) -> Any:
 
 
 def draw_planar(load_mapper: LoadMapper) -> Any:
-    """What trained mappers make of unseen poses of planar arms (paper, Fig. 3)."""
+    """Draws the poses of trained pose mappers for unseen poses of planar arms (paper, Fig. 3)."""
     columns = 4
     figure, rows = plt.subplots(2, columns, figsize=(10, 5.4), layout="constrained")
-    for name, row in zip(("planar4dof", "planar7dof"), rows, strict=True):
+    for name, row in zip(MAPPERS["planar"], rows, strict=True):
         mapper = load_mapper(name)
         expert, learner = mapper.expert, mapper.learner
-        rng = np.random.default_rng(7)  # half the range that was trained on, to be told apart by eye
+        rng = np.random.default_rng(7)  # half the range trained on, so that arms overlap less
         poses = rng.uniform(-0.5 * np.pi, 0.5 * np.pi, (columns, expert.num_joints)).astype(np.float32)
         mapped, optimal, excess = _mapped_and_optimal(mapper, poses)
-        for axes, pose, own, best, percent in zip(row, poses, mapped, optimal, excess, strict=True):
+        for axes, pose, learner_qpos, best, percent in zip(row, poses, mapped, optimal, excess, strict=True):
             draw_arm(axes, expert, pose, EXPERT_COLOUR, "expert", width=5, alpha=0.55)
-            draw_arm(axes, learner, own, LEARNER_COLOUR, "learner, mapper", width=3)
+            draw_arm(axes, learner, learner_qpos, LEARNER_COLOUR, "learner, mapper", width=3)
             draw_arm(axes, learner, best, "black", "learner, optimum", width=0.8)
             axes.set_title(f"{percent:.2f} % above the optimum", fontsize="small")
             axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
@@ -101,17 +107,17 @@ def draw_planar(load_mapper: LoadMapper) -> Any:
 
 
 def draw_panda(load_mapper: LoadMapper) -> Any:
-    """What trained mappers make of unseen poses of the Panda; locked joints are red (paper, Fig. 4)."""
-    names = ("panda7dof", "panda4dof", "panda3dof")
+    """Draws the poses of trained pose mappers for unseen poses of the Panda; locked joints are red (paper, Fig. 4)."""
+    names = MAPPERS["panda"]
     expert = env_config(names[0]).expert
-    figure, rows = plt.subplots(len(names) + 1, len(_SHOWN), figsize=(7.6, 10.2), layout="constrained")
+    figure, rows = plt.subplots(len(names) + 1, len(_PANDA_POSES), figsize=(7.6, 10.2), layout="constrained")
     with ArmScene([expert], width=_PIXELS, height=_PIXELS) as scene:
-        _show_row(rows[0], [scene.image([pose]) for pose in _SHOWN], "expert, 7 joints")
+        show_images(rows[0], [scene.image([pose]) for pose in _PANDA_POSES], "expert, 7 joints")
     for name, row in zip(names, rows[1:], strict=True):
         mapper = load_mapper(name)
-        mapped, _, excess = _mapped_and_optimal(mapper, _SHOWN)
+        mapped, _, excess = _mapped_and_optimal(mapper, _PANDA_POSES)
         with ArmScene([env_config(name).learner], width=_PIXELS, height=_PIXELS) as scene:
-            _show_row(row, [scene.image([pose]) for pose in mapped], f"learner, {mapper.learner.num_joints} joints")
+            show_images(row, [scene.image([pose]) for pose in mapped], f"learner, {mapper.learner.num_joints} joints")
         for axes, percent in zip(row, excess, strict=True):
             axes.set_title(f"{percent:.2f} % above the optimum", fontsize="small")
     return figure
@@ -127,6 +133,10 @@ FIGURES: dict[str, Callable[[LoadMapper], Any]] = {
     "planar": draw_planar,
     "panda": draw_panda,
 }
+MAPPERS = {  # environments whose pose mappers a figure needs
+    "planar": ("planar4dof", "planar7dof"),
+    "panda": ("panda7dof", "panda4dof", "panda3dof"),
+}
 
 
 def save_figure(name: str, out: Path, load_mapper: LoadMapper) -> list[Path]:
@@ -140,25 +150,17 @@ def save_figure(name: str, out: Path, load_mapper: LoadMapper) -> list[Path]:
 
 
 def _mapped_and_optimal(mapper: PoseMapper, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The mapper's poses, the optimiser's, and how far the first are above the second [% of a random pose's way]."""
+    """Poses of the mapper and of the optimiser, and the mapper's excess distance [% of that of random poses]."""
     metric, expert, learner = mapper.model.metric, mapper.expert, mapper.learner
     mapped = np.asarray(mapper(poses))
     optimal = imitate_pose(expert, learner, poses, **metric.build(expert, learner).arguments)
     distance = functools.partial(_distances, mapper, poses)
     lower, upper = np.asarray(learner.joint_range).T
-    chance = np.random.default_rng(0).uniform(lower, upper, (1000, learner.num_joints))
-    random = np.array([_distances(mapper, np.repeat(pose[None], 1000, 0), chance).mean() for pose in poses])
+    random_poses = np.random.default_rng(0).uniform(lower, upper, (1000, learner.num_joints))
+    random = np.array([_distances(mapper, np.repeat(pose[None], 1000, 0), random_poses).mean() for pose in poses])
     best = distance(optimal.qpos)
     return mapped, np.asarray(optimal.qpos), 100 * (distance(mapped) - best) / (random - best)
 
 
 def _distances(mapper: PoseMapper, poses: np.ndarray, learner_poses: Any) -> np.ndarray:
     return np.asarray(jax.jit(jax.vmap(mapper.model.distance))(poses, jnp.asarray(learner_poses, jnp.float32)))
-
-
-def _show_row(row: Sequence[Any], images: Sequence[np.ndarray], label: str) -> None:
-    for axes, image in zip(row, images, strict=True):
-        axes.imshow(image)
-        axes.set(xticks=[], yticks=[])
-        axes.spines[:].set_visible(False)
-    row[0].set_ylabel(label)

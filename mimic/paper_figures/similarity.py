@@ -1,4 +1,4 @@
-"""A picture of the similarity measures: what each of them takes of two arms."""
+"""Figure that explains the similarity measures on two planar arms."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_
 
 _EXPERT, _LEARNER = planar_arm([0.4, 0.35, 0.25]), planar_arm([0.55, 0.45])
 _EXPERT_POSE, _LEARNER_POSE = np.array([1.9, -1.1, -1.0]), np.array([0.6, 0.9])
-_SAMPLES = 32  # of the lines
+_SAMPLES = 32  # of each centre line
 _ARROW = 0.13  # chain lengths
 _TITLES = (
     "1  centre-line distance",
@@ -27,14 +27,14 @@ _TITLES = (
 
 
 def draw_similarity() -> Any:
-    """Two planar arms in five panels, one for each measure, with its value."""
+    """Draws two planar arms in five panels: each panel shows one measure and its value."""
     lines = [
         centre_line_table(arm, pose, samples=_SAMPLES)
         for arm, pose in ((_EXPERT, _EXPERT_POSE), (_LEARNER, _LEARNER_POSE))
     ]
     values = similarity(*lines)
     figure, panels = plt.subplots(1, len(MEASURES), figsize=(14, 3.3), layout="constrained", sharex=True, sharey=True)
-    draws = (_draw_distances, _draw_tangents, _draw_leash, _draw_hands, _draw_hand_directions)
+    draws = (_draw_distances, _draw_tangents, _draw_frechet, _draw_hands, _draw_hand_directions)
     for axes, draw, name, title in zip(panels, draws, MEASURES, _TITLES, strict=True):
         draw_arm(axes, _EXPERT, _EXPERT_POSE, EXPERT_COLOUR, "expert", width=4, alpha=0.35)
         draw_arm(axes, _LEARNER, _LEARNER_POSE, LEARNER_COLOUR, "learner", width=4, alpha=0.35)
@@ -53,7 +53,7 @@ def _draw_distances(axes: Any, expert: CentreLine, learner: CentreLine) -> None:
 
 
 def _draw_tangents(axes: Any, expert: CentreLine, learner: CentreLine) -> None:
-    """Both tangents at some points of the expert."""
+    """Draws both tangents at some points of the expert."""
     for sample in range(3, _SAMPLES, 5):
         point = expert.points[sample, :2]
         for line, colour in ((expert, EXPERT_COLOUR), (learner, LEARNER_COLOUR)):
@@ -61,28 +61,29 @@ def _draw_tangents(axes: Any, expert: CentreLine, learner: CentreLine) -> None:
         _draw_angle(axes, point, expert.tangents[sample, :2], learner.tangents[sample, :2])
 
 
-def _draw_leash(axes: Any, expert: CentreLine, learner: CentreLine) -> None:
-    """The leash at some moments of the best walk, and where it is longest."""
-    apart = np.linalg.norm(expert.points[:, None] - learner.points[None], axis=-1)
-    walk = _best_walk(apart)
-    for i, j in walk[1::5]:
+def _draw_frechet(axes: Any, expert: CentreLine, learner: CentreLine) -> None:
+    """Draws pairs of points of the optimal coupling, and the pair with the maximum distance."""
+    distances = np.linalg.norm(expert.points[:, None] - learner.points[None], axis=-1)
+    coupling = _optimal_coupling(distances)
+    for i, j in coupling[1::5]:
         axes.plot(*np.transpose([expert.points[i, :2], learner.points[j, :2]]), "-", color="grey", lw=0.8)
-    i, j = max(walk, key=lambda pair: apart[pair])
+    i, j = max(coupling, key=lambda pair: distances[pair])
     axes.plot(*np.transpose([expert.points[i, :2], learner.points[j, :2]]), "-", color="black", lw=2)
 
 
-def _best_walk(apart: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of samples along both lines, forwards alone, whose largest distance is the least."""
-    leash = np.full((len(apart) + 1, apart.shape[1] + 1), np.inf)
-    leash[0, 0] = 0
-    for i, j in np.ndindex(apart.shape):
-        leash[i + 1, j + 1] = max(apart[i, j], min(leash[i, j], leash[i, j + 1], leash[i + 1, j]))
-    walk = [(len(apart) - 1, apart.shape[1] - 1)]
-    while walk[-1] != (0, 0):
-        i, j = walk[-1]
-        before = [(i - 1, j - 1), (i - 1, j), (i, j - 1)]
-        walk.append(min((p for p in before if min(p) >= 0), key=lambda p: (leash[p[0] + 1, p[1] + 1], apart[p])))
-    return walk[::-1]
+def _optimal_coupling(distances: np.ndarray) -> list[tuple[int, int]]:
+    """Monotone pairs of samples along both lines whose maximum distance is minimal: the discrete Fréchet coupling."""
+    cost = np.full((len(distances) + 1, distances.shape[1] + 1), np.inf)
+    cost[0, 0] = 0
+    for i, j in np.ndindex(distances.shape):
+        cost[i + 1, j + 1] = max(distances[i, j], min(cost[i, j], cost[i, j + 1], cost[i + 1, j]))
+    coupling = [(len(distances) - 1, distances.shape[1] - 1)]
+    while coupling[-1] != (0, 0):
+        i, j = coupling[-1]
+        previous = [(i - 1, j - 1), (i - 1, j), (i, j - 1)]
+        valid = (pair for pair in previous if min(pair) >= 0)
+        coupling.append(min(valid, key=lambda pair: (cost[pair[0] + 1, pair[1] + 1], distances[pair])))
+    return coupling[::-1]
 
 
 def _draw_hands(axes: Any, expert: CentreLine, learner: CentreLine) -> None:

@@ -1,1 +1,1 @@
-"""Poses and motions of one arm that resemble those of another, by optimisation, in closed form, and by baselines."""
+"""Retargeting of poses and motions from one arm to another: by optimisation, in closed form, and by baselines."""

@@ -1,15 +1,15 @@
-"""First and second derivatives of the static distance by the learner's joint angles, in closed form.
+"""First and second derivatives of the static distance with respect to the learner's joint angles, in closed form.
 
-Each link of the learner is pulled by the expert: its direction e towards a unit vector t with strength c, its position
-p towards points p_i with weights w_i. Up to a constant of the expert, the distance is the sum over the links of
+The expert pulls each link of the learner: its direction e towards a unit vector t with strength c, and its position p
+towards points p_i with weights w_i. Up to a constant of the expert, the distance is the sum over the links of
 
     c (1 - e . t) + sum_i w_i h(|p - p_i|)        with a smoothed length, h(d) = sqrt(d^2 + s^2) - s.
 
-A length has a kink at 0, where Newton's method would divide by it, and a sum of lengths often has its minimum there, at
-links that match exactly. Smoothed, it is 0 with derivative 0 at a match, and nowhere off by more than s.
+A length has a kink at 0, where Newton's method would divide by it; a sum of lengths often has its minimum there, at
+links that match exactly. The smoothed length is 0 with derivative 0 at a match, and its error is at most s.
 
-All is done on scalar components (see `mimic.metric.spatial`). Rotating joint k moves all distal links: with its axis a
-and a point c on it, a link's position by J = a x (p - c) = m + a x p, m = c x a. Sums over the distal links are
+The computation is on scalar components (see `mimic.metric.spatial`). Rotating joint k moves all distal links: with its
+axis a and a point c on it, a link's position by J = a x (p - c) = m + a x p, m = c x a. Sums over the distal links are
 accumulated from tip to base, as for a composite rigid body: the force g = grad h, the moments M of force and pull, and
 the stiffness of position.
 """
@@ -23,9 +23,9 @@ from mimic.metric import spatial
 from mimic.metric.spatial import Rotation, Scalar, Vector
 from mimic.retargeting.optimizers import Derivatives
 
-# s [chain lengths]. Newton's steps overshoot a kink that is far away in units of s, so a descent begins with the rough
-# one. Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone
-# leaves more than 1e-4 of distance on 55 % of them, both on 3 %; with 1e-4 alone 89 % converge.
+# s [chain lengths]. Newton steps overshoot a kink that is many s away, so a descent begins with the rough smoothing.
+# Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone leaves
+# more than 1e-4 of distance on 55 % of them, both on 3 %; with 1e-4 alone 89 % converge.
 ROUGH_SMOOTHING, SMOOTHING = 1e-2, 1e-3
 
 Symmetric = tuple[Scalar, ...]  # xx, xy, xz, yy, yz, zz of a symmetric 3x3 matrix
@@ -34,12 +34,12 @@ _ZEROS: Rotation = (spatial.ZERO, spatial.ZERO, spatial.ZERO)
 
 
 class Pull(NamedTuple):
-    """What pulls on one link.
+    """Pull of the expert on one link.
 
     Attributes:
-      unit: t, where its direction is pulled to.
-      strength: c, 0 or more.
-      points: p_i, where its position is pulled to [chain lengths].
+      unit: t, target of its direction.
+      strength: c, at least 0.
+      points: p_i, targets of its position [chain lengths].
       weights: w_i.
     """
 
@@ -58,13 +58,13 @@ class Body(NamedTuple):
 
 
 class _Load(NamedTuple):
-    """Of the links distal to a joint, about the base's origin.
+    """Sums over the links distal to a joint, about the origin of the base.
 
     Attributes:
       value: of the distance.
-      force: its gradient by a translation.
-      moment: sum of p g^T - c e t^T. Its antisymmetric part is the gradient by a rotation.
-      linear, coupling, angular: second derivative K, B, C by the positions' part of a twist (a, m):
+      force: its gradient with respect to a translation.
+      moment: sum of p g^T - c e t^T. Its antisymmetric part is the gradient with respect to a rotation.
+      linear, coupling, angular: second derivative K, B, C of the position terms with respect to a twist (a, m):
         force K m + B a, torque C a + B^T m.
     """
 
@@ -77,7 +77,7 @@ class _Load(NamedTuple):
 
 
 def smoothed_length(square: Scalar, smoothing: float) -> Scalar:
-    """The smoothed length h [chain lengths], of the square of the length; without cancellation at 0."""
+    """Smoothed length h [chain lengths] from the square of the length, without cancellation at 0."""
     return square / (jnp.sqrt(square + smoothing**2) + smoothing)
 
 
@@ -88,7 +88,7 @@ def static_derivatives(
     pulls: Sequence[Pull],
     smoothing: float,
 ) -> Derivatives:
-    """Derivatives of the static distance; its value up to a constant of the pulls.
+    """Derivatives of the static distance, whose value is up to a constant of the pulls.
 
     With M taken about a point on axis l, and the twist's torque and force of the stiffness,
 
@@ -98,8 +98,8 @@ def static_derivatives(
     Args:
       axes: unit axis of each joint, base to tip.
       anchors: a point on each axis [chain lengths].
-      links: of the learner.
-      pulls: on each link.
+      links: links of the learner.
+      pulls: pull on each link.
       smoothing: s [chain lengths].
     """
     moments = [spatial.cross(anchor, axis) for anchor, axis in zip(anchors, axes, strict=True)]
@@ -122,8 +122,8 @@ def static_derivatives(
 
 
 def _add_direction(load: _Load, direction: Vector, pull: Pull) -> _Load:
-    apart = spatial.subtract(direction, pull.unit)  # |e - t|^2 / 2 = 1 - e . t, to the last digit at a match
-    value = 0.5 * pull.strength * spatial.dot(apart, apart)
+    difference = spatial.subtract(direction, pull.unit)  # |e - t|^2 / 2 = 1 - e . t, exactly 0 at a match
+    value = 0.5 * pull.strength * spatial.dot(difference, difference)
     moment = spatial.add_outer(load.moment, spatial.scale(-pull.strength, direction), pull.unit)
     return load._replace(value=spatial.plus(load.value, value), moment=moment)
 
@@ -133,13 +133,13 @@ def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: float) -
         return load
     value, force, stiffness = load.value, spatial.ZERO, _NONE
     for point, weight in zip(pull.points, pull.weights, strict=True):
-        apart = spatial.subtract(position, point)
-        square = spatial.dot(apart, apart)
+        difference = spatial.subtract(position, point)
+        square = spatial.dot(difference, difference)
         inverse = 1 / jnp.sqrt(square + smoothing**2)
         tension = weight * inverse
         value = spatial.plus(value, weight * smoothed_length(square, smoothing))
-        force = spatial.add(force, spatial.scale(tension, apart))
-        stiffness = tuple(map(spatial.plus, stiffness, _projection(tension, spatial.scale(inverse, apart))))
+        force = spatial.add(force, spatial.scale(tension, difference))
+        stiffness = tuple(map(spatial.plus, stiffness, _projection(tension, spatial.scale(inverse, difference))))
     x, y, z = _rows(stiffness)
     coupling = spatial.cross(position, x), spatial.cross(position, y), spatial.cross(position, z)
     columns = [spatial.cross(position, column) for column in spatial.transpose(coupling)]
@@ -171,6 +171,6 @@ def _rows(matrix: Symmetric) -> Rotation:
 
 
 def _twice_antisymmetric(matrix: Rotation) -> Vector:
-    """The sum of r x g, of the sum of r g^T."""
+    """The sum of r x g, computed from the sum of r g^T."""
     (_, xy, xz), (yx, _, yz), (zx, zy, _) = matrix
     return spatial.minus(yz, zy), spatial.minus(zx, xz), spatial.minus(xy, yx)

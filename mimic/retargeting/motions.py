@@ -1,27 +1,27 @@
-"""Motions of a learner that resemble those of an expert: a trajectory at a time, under a metric."""
+"""Motions of a learner that resemble those of an expert under a metric, one trajectory at a time."""
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.arms.arm import rated_speed
+from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.pose import PoseImitation, imitate_trajectory
 
 
 def largest_jump(arm: Embodiment, dt: float) -> Float[np.ndarray, " joints"]:
-    """How far each joint goes in a time [s] at its rated speed [rad]."""
-    return rated_speed(arm) * dt
+    """Maximum change of each joint [rad] in a time [s], at its velocity limit."""
+    return finite_velocity_limit(arm) * dt
 
 
 def optimal_motions(
     expert: Embodiment, learner: Embodiment, qpos: Array, metric: MetricConfig, largest_jump: np.ndarray, seed: int
 ) -> PoseImitation:
-    """The `imitate_trajectory` of each of an expert's motions [motions, time, joints] under a metric."""
+    """`imitate_trajectory` of each of the expert's motions [motions, time, joints]."""
     arguments = metric.build(expert, learner).arguments
 
-    def one(qpos: jax.Array) -> PoseImitation:
+    def imitate(qpos: jax.Array) -> PoseImitation:
         return imitate_trajectory(
             expert,
             learner,
@@ -31,5 +31,5 @@ def optimal_motions(
             **arguments,
         )
 
-    # One demonstration after the other: the minima that are tracked fill the processor, and memory stays small.
-    return jax.jit(lambda all_qpos: jax.lax.map(one, all_qpos))(qpos)
+    # One demonstration after the other: the tracked minima already fill the processor, and memory stays small.
+    return jax.jit(lambda all_qpos: jax.lax.map(imitate, all_qpos))(qpos)

@@ -1,6 +1,6 @@
-"""Descents of a smooth function of joint angles, within limits; each from one start, batched by `jax.vmap`.
+"""Minimisers of a smooth function of joint angles within limits, from one start; batch them with `jax.vmap`.
 
-All is done on scalar components (see `mimic.metric.spatial`): a batch of descents is one elementwise program.
+They compute on scalar components (see `mimic.metric.spatial`), so that a batch of descents is elementwise.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,14 +13,14 @@ from jaxtyping import Array, Float
 
 from mimic.metric.spatial import Scalar, plus, times
 
-_LARGEST_STEP = 1.0  # rad, of a joint in one Newton step
-_FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: at the start, after a success, after a failure
-# rad per unit of gradient, of plain descent: stable for the static rotational measure (2 over its largest curvature is
-# 0.46 for planar arms of 4 and 7 links, 0.64 for two Pandas).
+_MAX_STEP = 1.0  # rad, of a joint in one Newton step
+_FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: initial value, factors after a success and a failure
+# rad per unit of gradient, in gradient descent: stable for the static rotational measure (2 over its maximum curvature
+# is 0.46 for planar arms of 4 and 7 links, 0.64 for two Pandas).
 _GRADIENT_STEP = 0.4
 
 Scalars = Sequence[Scalar]
-Limits = tuple[Any, Any]  # lower, upper [rad]; a joint whose limits are known to be infinite costs nothing
+Limits = tuple[Any, Any]  # lower, upper [rad]; constant infinite limits cost nothing
 
 
 class Derivatives(NamedTuple):
@@ -28,7 +28,7 @@ class Derivatives(NamedTuple):
 
     Attributes:
       value: of the function.
-      gradient: by each joint.
+      gradient: with respect to each joint.
       hessian: rows of the second derivative, at least up to the diagonal.
     """
 
@@ -38,12 +38,12 @@ class Derivatives(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Where a descent came to.
+    """Result of a descent.
 
     Attributes:
       qpos: [joints] [rad].
-      value: of the objective there.
-      gradient_norm: largest derivative by a joint that no limit holds.
+      value: of the objective at this pose.
+      gradient_norm: maximum absolute derivative with respect to a joint that no limit holds.
     """
 
     qpos: Float[Array, " joints"]
@@ -55,7 +55,7 @@ Objective = Callable[[Scalars], Derivatives]
 
 
 def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> Solution:
-    """Damped Newton descent: the exact second derivative, with its concave directions turned round."""
+    """Damped Newton descent with the exact second derivative and negative curvature flipped (saddle-free Newton)."""
     joints = start.shape[0]
     bounds = _bounds(limits, joints)
 
@@ -63,40 +63,39 @@ def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits,
         qpos, here, damping = carry
         free = _free(qpos, here.gradient, bounds)
         step = _descent_step(here, free, damping)
-        longest = _largest(step)
-        scale = 1 / jnp.maximum(longest / _LARGEST_STEP, 1.0)
-        tried = _within([q + s * scale for q, s in zip(qpos, step, strict=True)], bounds)
-        there = _symmetric(objective(tried))
+        scale = 1 / jnp.maximum(_max_abs(step) / _MAX_STEP, 1.0)
+        new_qpos = _within([q + s * scale for q, s in zip(qpos, step, strict=True)], bounds)
+        there = _symmetric(objective(new_qpos))
         better = there.value < here.value
-        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (tried, there), (qpos, here))
+        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (new_qpos, there), (qpos, here))
         return (*kept, damping * jnp.where(better, _LESS, _MORE)), None
 
     qpos = _within([start[k] for k in range(joints)], bounds)
-    # Nothing is known at the start: the first step is none, and what it finds is better than infinity.
+    # The start is not evaluated yet: the first step is zero, and its value is below infinity.
     zero = jnp.zeros_like(start[0])
-    unknown = Derivatives(zero + jnp.inf, (zero,) * joints, tuple((zero,) * (k + 1) for k in range(joints)))
-    first = qpos, unknown, zero + _FIRST_DAMPING / _LESS
-    (qpos, here, _), _ = jax.lax.scan(iterate, first, None, length=iterations + 1)
-    return _end(qpos, here, bounds)
+    unevaluated = Derivatives(zero + jnp.inf, (zero,) * joints, tuple((zero,) * (k + 1) for k in range(joints)))
+    initial = qpos, unevaluated, zero + _FIRST_DAMPING / _LESS
+    (qpos, here, _), _ = jax.lax.scan(iterate, initial, None, length=iterations + 1)
+    return _solution(qpos, here, bounds)
 
 
 def gradient_descent(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> Solution:
-    """Plain descent (paper): each step is the slope times a constant."""
+    """Gradient descent with a constant step size (paper)."""
     bounds = _bounds(limits, start.shape[0])
 
     def iterate(qpos: Any, _: None) -> tuple[Any, None]:
-        gradient = objective(qpos).gradient  # what is not used of the rest is not computed
+        gradient = objective(qpos).gradient  # the other derivatives are unused and eliminated
         return _within([q - _GRADIENT_STEP * g for q, g in zip(qpos, gradient, strict=True)], bounds), None
 
     qpos, _ = jax.lax.scan(iterate, _within(list(start), bounds), None, length=iterations)
-    return _end(qpos, objective(qpos), bounds)
+    return _solution(qpos, objective(qpos), bounds)
 
 
 def _descent_step(here: Derivatives, free: Scalars, damping: Scalar) -> Scalars:
     """-(L |D| L^T)^-1 g for the damped Hessian L D L^T of the free joints: downhill, whatever the curvature."""
     joints, eps = len(here.gradient), jnp.finfo(jnp.result_type(here.value)).eps
-    largest = _largest([row[-1] for row in here.hessian])
-    unit = 1 / (largest + jnp.finfo(jnp.result_type(here.value)).tiny)
+    scale = _max_abs([row[-1] for row in here.hessian])
+    unit = 1 / (scale + jnp.finfo(jnp.result_type(here.value)).tiny)
     matrix = [[times(times(free[i], free[j]), here.hessian[i][j] * unit) for j in range(i + 1)] for i in range(joints)]
     for i in range(joints):
         matrix[i][i] = plus(matrix[i][i] + damping, 1.0 - free[i])
@@ -119,17 +118,18 @@ def _descent_step(here: Derivatives, free: Scalars, damping: Scalar) -> Scalars:
 
 
 def _symmetric(derivatives: Derivatives) -> Derivatives:
-    """With the lower triangle of the Hessian alone."""
+    """Derivatives with the lower triangle of the Hessian only."""
     lower = tuple(tuple(row[: i + 1]) for i, row in enumerate(derivatives.hessian))
     return Derivatives(derivatives.value, tuple(derivatives.gradient), lower)
 
 
 def _bounds(limits: Limits, joints: int) -> list[tuple[Scalar, Scalar] | None]:
-    """Lower and upper limit of each joint, None where they are known to be infinite."""
-    known = all(isinstance(limit, np.ndarray) for limit in limits)
+    """Lower and upper limit of each joint; None for constant infinite limits."""
+    is_constant = all(isinstance(limit, np.ndarray) for limit in limits)
     lower, upper = limits
     return [
-        None if known and np.isinf(lower[k]) and np.isinf(upper[k]) else (lower[k], upper[k]) for k in range(joints)
+        None if is_constant and np.isinf(lower[k]) and np.isinf(upper[k]) else (lower[k], upper[k])
+        for k in range(joints)
     ]
 
 
@@ -138,26 +138,26 @@ def _within(qpos: Scalars, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> tu
 
 
 def _free(qpos: Scalars, gradient: Scalars, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> Scalars:
-    """1 for the joints that may move, 0 for those that a limit holds against the descent."""
+    """1 for joints that can move downhill, 0 for joints held by a limit."""
     return [
-        1.0 if bound is None else _held_open(q, slope, *bound)
-        for q, slope, bound in zip(qpos, gradient, bounds, strict=True)
+        1.0 if bound is None else _is_free(q, derivative, *bound)
+        for q, derivative, bound in zip(qpos, gradient, bounds, strict=True)
     ]
 
 
-def _held_open(qpos: Scalar, slope: Scalar, lower: Scalar, upper: Scalar) -> Scalar:
-    held = ((qpos <= lower) & (slope > 0)) | ((qpos >= upper) & (slope < 0))
+def _is_free(qpos: Scalar, derivative: Scalar, lower: Scalar, upper: Scalar) -> Scalar:
+    held = ((qpos <= lower) & (derivative > 0)) | ((qpos >= upper) & (derivative < 0))
     return jnp.where(held, 0, 1).astype(jnp.result_type(qpos))
 
 
-def _largest(values: Scalars) -> Scalar:
-    largest = jnp.abs(values[0])
+def _max_abs(values: Scalars) -> Scalar:
+    maximum = jnp.abs(values[0])
     for value in values[1:]:
-        largest = jnp.maximum(largest, jnp.abs(value))
-    return largest
+        maximum = jnp.maximum(maximum, jnp.abs(value))
+    return maximum
 
 
-def _end(qpos: Scalars, here: Derivatives, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> Solution:
+def _solution(qpos: Scalars, here: Derivatives, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> Solution:
     free = _free(qpos, here.gradient, bounds)
-    slope = _largest([times(f, g) for f, g in zip(free, here.gradient, strict=True)])
-    return Solution(jnp.stack(qpos), here.value, slope)
+    gradient_norm = _max_abs([times(f, g) for f, g in zip(free, here.gradient, strict=True)])
+    return Solution(jnp.stack(qpos), here.value, gradient_norm)

@@ -1,7 +1,7 @@
-"""Ways to pose a learner like an expert without a metric and without training: what imitation has to beat.
+"""Retargeting baselines without a metric and without training.
 
-Each is a function of (expert, learner, qpos [..., time, n]) that gives the learner's qpos [..., time, n_hat], or None
-where it does not apply to the two arms. Poses that are no motion are motions of one sample: [poses, 1, n].
+Each is a function of (expert, learner, qpos [..., time, n]) that returns the learner's qpos [..., time, n_hat], or None
+where it does not apply to the two arms. Independent poses are motions of one sample: [poses, 1, n].
 """
 
 from collections.abc import Callable
@@ -11,21 +11,23 @@ import numpy as np
 
 from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.metric.similarity import centre_line_table
-from mimic.retargeting.pose import pose_limits, shared_joints
-from mimic.retargeting.segment_alignment import Poses, align_segments, checked_poses
+from mimic.retargeting.pose import checked_poses, pose_limits, shared_joints
+from mimic.retargeting.segment_alignment import Poses, align_segments
 
-IK_EVERY = 5  # samples of a motion of which inverse kinematics solves one; a solve takes 0.1 ms
-_TRACKING_STEPS = 6  # from the solution of the sample before
+IK_EVERY = 5  # inverse kinematics solves every fifth sample of a motion; a solve takes 0.1 ms
+_TRACKING_STEPS = 6  # from the solution of the previous solved sample
 _FIRST_STEPS = 40
-_RANDOM_STARTS = 3  # beside the home pose, of the first sample
-_DIRECTION_COST = 0.1  # chain lengths per radian: a hand off by 0.1 costs as much as one turned by 57 degrees
+_RANDOM_STARTS = 3  # in addition to the home pose, for the first sample
+_DIRECTION_COST = (
+    0.1  # chain lengths per radian: a position error of 0.1 costs as much as a direction error of 57 degrees
+)
 _DAMPING, _STEP_DAMPING = 1e-6, 0.1  # constant, and per squared error
-_CONVERGED = 1e-4  # rad, the largest change of a joint in a step
+_CONVERGED = 1e-4  # rad, maximum change of a joint in a step
 _HAND = "hand"
 
 
 def copy_joints(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses | None:
-    """The expert's angles in the joints that both arms have by name, 0 in the others, within the learner's range.
+    """Copies the expert's angles to joints of the same name; 0 in the learner's other joints, clipped to its ranges.
 
     Args:
       expert: n joints.
@@ -33,9 +35,9 @@ def copy_joints(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses |
       qpos: the expert's poses [rad].
 
     Returns:
-      The learner's poses [rad]; None where no joint name is common.
+      The learner's poses [rad]; None where the arms have no joint name in common.
     """
-    qpos = checked_poses(expert, qpos)
+    qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
     if not set(expert.joint_names) & set(learner.joint_names):
         return None
     lower, upper = pose_limits(learner, qpos.dtype)
@@ -43,29 +45,29 @@ def copy_joints(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses |
 
 
 def hold_home(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses:
-    """The learner's home pose at all times; arguments as for `copy_joints`."""
-    shape = checked_poses(expert, qpos).shape[:-1]
+    """Holds the learner's home pose; arguments as for `copy_joints`."""
+    shape = checked_poses(expert, np.asarray(qpos), axes=("time",)).shape[:-1]
     return np.broadcast_to(np.asarray(learner.home, qpos.dtype), (*shape, learner.num_joints)).copy()
 
 
 def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int = IK_EVERY) -> Poses:
-    """Inverse kinematics of the hand with mink: the tip where the expert's is in chain lengths, its direction second.
+    """Inverse kinematics of the hand with mink: matches the position of the tip, and less strictly its direction.
 
-    The objective is |p - p*|^2 + (0.1 angle(e, e*))^2 with the tip p in chain lengths and the direction e of the last
-    segment, within the joint range. The first sample is the best of several starts, the home pose among them; each
-    later one starts from the one before. Of a motion, every fifth sample and the last one are solved, and joint angles
-    between them are interpolated.
+    The objective is |p - p*|^2 + (0.1 angle(e, e*))^2, with the tip p in chain lengths and the direction e of the last
+    segment, within the joint ranges. The first sample is the best solution from several initial guesses, one of them
+    the home pose; each later one starts from the previous solution. Every fifth sample of a motion and the last one are
+    solved; the joint angles between them are interpolated.
 
     Args:
       expert: n joints.
       learner: n_hat joints.
       qpos: the expert's poses [rad].
-      every: samples of a motion of which one is solved; 1 solves all.
+      every: interval between solved samples; 1 solves all.
 
     Raises:
-      ValueError: `qpos` is not [..., time, n], or `every` is less than 1.
+      ValueError: `qpos` is not [..., time, n] or not finite, or `every` is below 1.
     """
-    qpos = checked_poses(expert, qpos)
+    qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
     if every < 1:
         raise ValueError(f"every: expected at least 1, got {every}")
     time = qpos.shape[-2]
@@ -77,11 +79,11 @@ def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int 
         for motion in zip(hands.hand_position.astype(float), hands.hand_direction.astype(float), strict=True)
     ]
     result = np.empty((len(motions), time, learner.num_joints), qpos.dtype)
-    before = np.searchsorted(solved, np.arange(time), side="right") - 1
-    after = np.minimum(before + 1, len(solved) - 1)
-    share = (np.arange(time) - solved[before]) / np.maximum(solved[after] - solved[before], 1)
+    left = np.searchsorted(solved, np.arange(time), side="right") - 1
+    right = np.minimum(left + 1, len(solved) - 1)
+    fraction = (np.arange(time) - solved[left]) / np.maximum(solved[right] - solved[left], 1)
     for row, motion in zip(result, motions, strict=True):
-        row[:] = motion[before] + share[:, None] * (motion[after] - motion[before])
+        row[:] = motion[left] + fraction[:, None] * (motion[right] - motion[left])
     return result.reshape(*qpos.shape[:-1], learner.num_joints)
 
 
@@ -95,20 +97,20 @@ BASELINES: dict[str, Callable[[Embodiment, Embodiment, Poses], Poses | None]] = 
 
 def baseline_poses(expert: Embodiment, learner: Embodiment, qpos: Poses) -> dict[str, Poses]:
     """The learner's poses by each of `BASELINES` that applies to the two arms; arguments as for `copy_joints`."""
-    made = {name: pose(expert, learner, qpos) for name, pose in BASELINES.items()}
-    return {name: poses for name, poses in made.items() if poses is not None}
+    poses_by_name = {name: baseline(expert, learner, qpos) for name, baseline in BASELINES.items()}
+    return {name: poses for name, poses in poses_by_name.items() if poses is not None}
 
 
 class _HandSolver:
-    """mink on a model of the learner's joints alone, in chain lengths."""
+    """Inverse kinematics by mink on a model of only the learner's joints, in chain lengths."""
 
     def __init__(self, learner: Embodiment):
-        import mink  # half a second, and few need it
+        import mink  # takes half a second, and few need it
 
         self._mink = mink
         self._model = _kinematic_model(learner)
         self._configuration = mink.Configuration(self._model, np.array(learner.home, float))
-        # The hand's x-axis is its direction, so that a turn about it costs nothing.
+        # The hand's x-axis is its direction: rotation about it has no cost.
         self._task = mink.FrameTask(
             _HAND, "site", 1.0, orientation_cost=[0.0, _DIRECTION_COST, _DIRECTION_COST], lm_damping=_STEP_DAMPING
         )
@@ -116,14 +118,14 @@ class _HandSolver:
         lower, upper = np.asarray(learner.joint_range, float).T
         random = np.random.default_rng(0).uniform(lower, upper, (_RANDOM_STARTS, learner.num_joints))
         self._starts = np.concatenate([np.asarray(learner.home, float)[None], random])
-        self._firsts: dict[bytes, np.ndarray] = {}  # demonstrations start alike
+        self._firsts: dict[bytes, np.ndarray] = {}  # cache: many demonstrations have the same first pose
 
     def follow(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Joint angles [time, joints] for hands [time, 3]."""
         key = positions[0].tobytes() + directions[0].tobytes()
         if key not in self._firsts:
-            ends = [self._descend(start, positions[0], directions[0], _FIRST_STEPS) for start in self._starts]
-            self._firsts[key] = min(ends, key=lambda end: end[1])[0]
+            solutions = [self._descend(start, positions[0], directions[0], _FIRST_STEPS) for start in self._starts]
+            self._firsts[key] = min(solutions, key=lambda solution: solution[1])[0]
         path = [self._firsts[key]]
         for target in zip(positions[1:], directions[1:], strict=True):
             path.append(self._descend(path[-1], *target, _TRACKING_STEPS)[0])
@@ -132,29 +134,29 @@ class _HandSolver:
     def _descend(
         self, start: np.ndarray, position: np.ndarray, direction: np.ndarray, steps: int
     ) -> tuple[np.ndarray, float]:
-        """Angles, and the objective there."""
+        """Joint angles after some steps, and the objective at these angles."""
         configuration, mink = self._configuration, self._mink
         configuration.update(start)
         for _ in range(steps):
             frame = self._frame()
-            turned = _shortest_turn(frame[:, 0], direction) @ frame
-            self._task.set_target(mink.SE3.from_rotation_and_translation(mink.SO3.from_matrix(turned), position))
+            rotated = _smallest_rotation(frame[:, 0], direction) @ frame
+            self._task.set_target(mink.SE3.from_rotation_and_translation(mink.SO3.from_matrix(rotated), position))
             change = mink.solve_ik(
                 configuration, [self._task], 1.0, solver="daqp", damping=_DAMPING, limits=self._limits
             )
             configuration.integrate_inplace(change, 1.0)
             if np.abs(change).max() < _CONVERGED:
                 break
-        miss = self._configuration.data.site(_HAND).xpos - position
+        position_error = self._configuration.data.site(_HAND).xpos - position
         angle = np.arccos(np.clip(self._frame()[:, 0] @ direction, -1, 1))
-        return configuration.q.copy(), float(miss @ miss + (_DIRECTION_COST * angle) ** 2)
+        return configuration.q.copy(), float(position_error @ position_error + (_DIRECTION_COST * angle) ** 2)
 
     def _frame(self) -> np.ndarray:
         return self._configuration.data.site(_HAND).xmat.reshape(3, 3).copy()
 
 
 def _kinematic_model(arm: Embodiment) -> mujoco.MjModel:
-    """A MuJoCo model of an embodiment's joints and hand, in chain lengths; masses mean nothing."""
+    """MuJoCo model of an embodiment's joints and hand, in chain lengths; its masses are arbitrary."""
     spec = mujoco.MjSpec()
     spec.compiler.autolimits = False
     spec.compiler.degree = False
@@ -171,7 +173,7 @@ def _kinematic_model(arm: Embodiment) -> mujoco.MjModel:
         body.add_joint(name=name, axis=axis, range=joint_range, limited=limited)
         bodies.append((body, anchor))
     start, end = unit * np.asarray(arm.segment_start[-1]), unit * np.asarray(arm.segment_end[-1])
-    rotation = _shortest_turn(np.array([1.0, 0.0, 0.0]), (end - start) / np.linalg.norm(end - start))
+    rotation = _smallest_rotation(np.array([1.0, 0.0, 0.0]), (end - start) / np.linalg.norm(end - start))
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, rotation.ravel())
     body, origin = bodies[arm.link_joint[arm.segment_link[-1]] + 1]
@@ -179,8 +181,8 @@ def _kinematic_model(arm: Embodiment) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotation that takes a unit vector onto another, [3, 3]; about any axis where they are opposite."""
+def _smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The smallest rotation that maps a unit vector onto another, [3, 3]; about any axis where they are opposite."""
     middle = a + b
     square = middle @ middle
     if square < 1e-12:

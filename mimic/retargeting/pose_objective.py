@@ -11,26 +11,26 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Int
 
-from mimic.arms.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.metric import spatial
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
 from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
 from mimic.retargeting.optimizers import Derivatives, Scalars
 
-Target = Any  # what of the expert's pose counts: a pytree
+Target = Any  # pytree: the data of the expert's pose that the objective needs
 
 
 @dataclasses.dataclass(frozen=True)
 class PoseObjective:
-    """What pose imitation minimises.
+    """The objective of pose imitation, as functions.
 
     Attributes:
-      distance: embodiment distance of the expert's and the learner's link states, both at rest.
-      target: of the expert's link states.
-      value: of the target and the learner's link states: the distance, up to a constant of the target.
-      derivatives: of the target and the learner's joint angles: of the distance, its value up to a constant too.
-      rough_derivatives: the same of a smoother function, with minima nearby: what a descent begins with.
+      distance: (expert's link states, learner's link states) -> embodiment distance, both at rest.
+      target: (expert's link states) -> target.
+      value: (target, learner's link states) -> distance, up to a constant of the target.
+      derivatives: (target, learner's joint angles) -> derivatives of the distance; the value up to this constant.
+      rough_derivatives: the same for a smoother function with nearby minima, for the first iterations.
     """
 
     distance: Callable[[LinkStates, LinkStates], Array]
@@ -41,7 +41,7 @@ class PoseObjective:
 
 
 def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
-    """In closed form for a static metric, see `_static`; any other is differentiated automatically."""
+    """The objective: in closed form for a static metric, see `_static`; else by automatic differentiation."""
     return _static(learner, metric) if metric.is_static else _differentiated(learner, metric)
 
 
@@ -58,12 +58,12 @@ def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
 
 
 class StaticTarget(NamedTuple):
-    """What of the expert counts for the static measure: one pull on each direction of the learner, and positions.
+    """Target of a static metric: pulls on the learner's directions and positions (`mimic.retargeting.closed_form`).
 
     Attributes:
-      unit, strength: [links, 3], [links] of the pull on the learner's directions, see `mimic.retargeting.closed_form`.
-      points, weights: [pairs, 3], [pairs] of the pulls on its positions.
-      pulls: the same on each link, as scalar components.
+      unit, strength: [links, 3], [links] of the pulls on directions.
+      points, weights: [pairs, 3], [pairs] of the pulls on positions.
+      pulls: both for each link, as scalar components.
     """
 
     unit: Array
@@ -76,17 +76,17 @@ class StaticTarget(NamedTuple):
 def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
     """Constant W and weights, cosines and the mean: sums of W_ij (pi/2) (1 - e_i . e^_j) and W_ij |p_i - p^_j|.
 
-    Of the directions all that counts of the expert is one pull for each link of the learner, t_j = sum_i W_ij e_i.
+    For the directions the expert reduces to one pull for each link of the learner, t_j = sum_i W_ij e_i.
     """
     correspondence, weights = metric.correspondence, cast(DistanceWeights, metric.weights)
     directions, positions = (_pair_weights(correspondence, w) for w in (weights.rotation, weights.translation))
-    pairs = _counting_pairs(correspondence, weights.translation)
-    arm = _of_chain_length_one(learner)
+    pairs = _weighted_pairs(correspondence, weights.translation)
+    arm = in_chain_lengths(learner)
 
     def target(states: LinkStates) -> StaticTarget:
         assert states.direction is not None
         dtype = states.direction.dtype
-        # Elementwise: TF32 never touches it.
+        # Elementwise, so that nothing is rounded to TF32.
         pull = np.pi / 2 * jnp.sum(directions[:, :, None] * states.direction[:, None, :], axis=0)
         strength = spatial.safe_sqrt(jnp.sum(pull * pull, axis=-1))
         unit = pull / jnp.maximum(strength, jnp.finfo(pull.dtype).tiny)[:, None]
@@ -98,13 +98,14 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
     def value(target: StaticTarget, states: LinkStates) -> Array:
         assert states.direction is not None
         aligned = jnp.vdot(target.strength[:, None] * target.unit, states.direction)
-        apart = states.position[pairs[:, 1]] - target.points
-        return jnp.sum(target.weights * smoothed_length(jnp.sum(apart * apart, axis=-1), SMOOTHING)) - aligned
+        difference = states.position[pairs[:, 1]] - target.points
+        square = jnp.sum(difference * difference, axis=-1)
+        return jnp.sum(target.weights * smoothed_length(square, SMOOTHING)) - aligned
 
     def derivatives(smoothing: float, target: StaticTarget, qpos: Scalars) -> Derivatives:
         frames = joint_frames(arm, qpos, None)
-        moved = zip(arm.link_joint, link_vectors(arm, frames), strict=True)
-        links = [Body(joint, link.direction, link.position) for joint, link in moved]
+        vectors = zip(arm.link_joint, link_vectors(arm, frames), strict=True)
+        links = [Body(joint, link.direction, link.position) for joint, link in vectors]
         anchors = [frame.anchor for frame in frames[1:]]
         return static_derivatives(joint_axes(arm, frames), anchors, links, target.pulls, smoothing)
 
@@ -113,30 +114,25 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
 
 
 def _pair_weights(correspondence: Any, weight: Any) -> Any:
-    """W o weight, divided by the number of pairs: [expert, learner]; by NumPy where both are known."""
-    known = not any(isinstance(x, Tracer) for x in (correspondence, weight))
-    numpy = np if known else jnp
+    """W o weight, divided by the number of pairs: [expert, learner]; by NumPy where both are constants."""
+    is_constant = not any(isinstance(x, Tracer) for x in (correspondence, weight))
+    numpy = np if is_constant else jnp
     matrix = numpy.asarray(correspondence)
     return numpy.broadcast_to(numpy.asarray(weight), matrix.shape) * matrix / matrix.size
 
 
-def _counting_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 2"]:
-    """Pairs of links whose positions count; all of them where W is known only when the program runs."""
-    counts = np.full(np.shape(correspondence), True)
+def _weighted_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 2"]:
+    """Pairs of links with a weight on positions; all pairs where W is traced."""
+    has_weight = np.full(np.shape(correspondence), True)
     if not isinstance(correspondence, Tracer):
-        counts &= np.asarray(correspondence) != 0
+        has_weight &= np.asarray(correspondence) != 0
     if not isinstance(weight, Tracer):
-        counts &= np.asarray(weight) != 0
-    return np.argwhere(counts)
+        has_weight &= np.asarray(weight) != 0
+    return np.argwhere(has_weight)
 
 
-def _pull(unit: Array, strength: Array, points: Array, weights: Array, own: Bool[np.ndarray, " pairs"]) -> Pull:
-    """On one link, as scalars: taken out of their arrays once, not in each step of a descent."""
-    mine = np.flatnonzero(own)
-    return Pull(spatial.vector(unit), strength, [spatial.vector(points[i]) for i in mine], [weights[i] for i in mine])
-
-
-def _of_chain_length_one(arm: Embodiment) -> Embodiment:
-    """The arm with its lengths in chain lengths."""
-    unit = 1 / arm.chain_length
-    return dataclasses.replace(arm, joint_anchor=unit * arm.joint_anchor, link_position=unit * arm.link_position)
+def _pull(unit: Array, strength: Array, points: Array, weights: Array, is_on_link: Bool[np.ndarray, " pairs"]) -> Pull:
+    """Pull on one link as scalars, extracted from the arrays once and not in each step of a descent."""
+    indices = np.flatnonzero(is_on_link)
+    points_of_link = [spatial.vector(points[i]) for i in indices]
+    return Pull(spatial.vector(unit), strength, points_of_link, [weights[i] for i in indices])

@@ -1,4 +1,4 @@
-"""Poses a learner so that upper arm, forearm and hand point where the expert's do, joint by joint in closed form.
+"""Retargets poses in closed form: upper arm, forearm and hand of the learner get the directions of the expert's.
 
 The idea is that of SEW-Mimic (arXiv 2602.01632), for any serial chain of revolute joints. Shoulder, elbow, wrist and
 hand are vertices of the centre line; the three parts of an arm lie between them.
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.kinematics import joint_frames
-from mimic.retargeting.pose import pose_limits
+from mimic.retargeting.pose import checked_poses, pose_limits, wrap_angles
 from mimic.retargeting.subproblems import (
     PARALLEL,
     bend_to_angle,
@@ -28,13 +28,13 @@ from mimic.retargeting.subproblems import (
 Poses = Float[np.ndarray, "*batch time joints"]
 
 _PARTS = 3  # upper arm, forearm, hand
-_SWEEPS = 3  # repeated for joints whose axis does not pass through the start of their part
-_LEAST_TURN = 0.05  # rad; a joint that turns a part by less for each rad does not orient it
-_ROLL = np.cos(np.radians(30))  # a joint whose axis is nearer than that to its part rolls it, and orients the next one
-_RIGID = 0.1  # of its length, what an upper arm or forearm may change by when joints move
-_LEAST_SHARE = 0.5  # of the arm's length from the shoulder on, for upper arm and forearm
-_BEYOND_RANGE = 1e3  # rad; a solution within the joint range comes before any beyond it
-_GENERIC_POSES = 32  # random poses in which it is measured what a joint turns
+_SWEEPS = 3  # more than one for joints whose axis does not pass through the start of their part
+_MIN_ROTATION_RATE = 0.05  # rad/rad; a joint that rotates a part by less does not orient it
+_ROLL = np.cos(np.radians(30))  # a joint with its axis within 30 degrees of its part rolls it, and orients the next one
+_RIGID = 0.1  # maximum change of the length of an upper arm or forearm by joint motion, as a fraction of it
+_MIN_FRACTION = 0.5  # of the arm's length from the shoulder on, for upper arm and forearm together
+_BEYOND_RANGE = 1e3  # 1/rad; prefers any solution within the joint range to those beyond it
+_GENERIC_POSES = 32  # random poses in which the effect of each joint is measured
 
 
 class Landmarks(NamedTuple):
@@ -47,14 +47,14 @@ class Landmarks(NamedTuple):
 
 
 class PartJoints(NamedTuple):
-    """At most two joints, base to tip, that orient a part; the first may roll the part before about itself."""
+    """At most two joints, base to tip, that orient a part; the first may be the roll joint of the previous part."""
 
     joints: tuple[int, ...]
     takes_roll: bool
 
 
 class Placement(NamedTuple):
-    """An arm in some poses: its joints' axes and anchors, and the vertices of its centre line, base frame, [m]."""
+    """Joint axes and anchors and centre-line vertices of an arm in some poses, in the base frame [m]."""
 
     axes: Float[np.ndarray, "joints poses 3"]
     anchors: Float[np.ndarray, "joints poses 3"]
@@ -62,12 +62,13 @@ class Placement(NamedTuple):
 
 
 def align_segments(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses | None:
-    """Upper arm, forearm and hand point where the expert's do, as nearly as the learner's joints allow.
+    """Rotates upper arm, forearm and hand to the directions of the expert's, as nearly as the learner's joints allow.
 
-    From base to tip, the joints that orient a part take it to the expert's direction: two of them by Paden and Kahan's
-    subproblem 2 with its least-squares extension, one by subproblem 1. A joint that rolls a part about itself orients
-    the next one; then both parts are solved together. Joints of a part beyond these stay at home. Of several solutions
-    the one within the joint range, then the one nearest to home is taken, and angles are clipped to the range.
+    From base to tip, the joints that orient a part rotate it to the expert's direction: two joints by Paden and Kahan's
+    subproblem 2 with its least-squares extension, one joint by subproblem 1. A joint that rolls a part about itself
+    orients the next part; both parts are then solved together. Further joints of a part stay in the home pose. Of
+    several solutions one within the joint range is preferred, then the one nearest to the home pose; angles are clipped
+    to the range.
 
     Args:
       expert: n joints.
@@ -75,12 +76,12 @@ def align_segments(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Pose
       qpos: the expert's poses [rad].
 
     Returns:
-      The learner's poses [rad]; None where an arm has no elbow: fewer than three segments that a joint turns.
+      The learner's poses [rad]; None where an arm has no elbow: fewer than three segments that a joint rotates.
 
     Raises:
       ValueError: `qpos` is not [..., time, n], or not finite.
     """
-    qpos = checked_poses(expert, qpos)
+    qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
     expert_marks = landmarks(expert)
     learner_marks = expert_marks if _same_segments(expert, learner) else landmarks(learner)
     if expert_marks is None or learner_marks is None:
@@ -89,7 +90,7 @@ def align_segments(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Pose
     solved = np.tile(np.asarray(learner.home, float), (directions.shape[1], 1))
     steps = _steps(part_joints(learner, learner_marks))
     for _ in range(_SWEEPS):
-        near = solved.copy()  # at first the home pose
+        near = solved.copy()  # initially the home pose
         for part, joints in steps:
             solve = _orient_two_parts if len(joints) == 4 else _orient
             goals = directions[part : part + 2]
@@ -99,14 +100,14 @@ def align_segments(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Pose
 
 
 def landmarks(arm: Embodiment) -> Landmarks | None:
-    """Shoulder, elbow, wrist and hand of an arm; None where fewer than three of its segments can be turned.
+    """Shoulder, elbow, wrist and hand of an arm; None where joints rotate fewer than three of its segments.
 
-    The hand is the tip. Shoulder, elbow and wrist are the vertices with the largest product of upper arm and forearm
-    (in the zero pose) whose lengths no joint changes, from the first segment on that a joint turns. Where such parts
-    are short beside the arm, as of a snake, lengths may change.
+    The hand is the tip. Shoulder, elbow and wrist are the vertices with the maximum product of the lengths of upper arm
+    and forearm (in the zero pose), among those whose lengths no joint changes, starting at the first segment that a
+    joint rotates. Where such parts are short compared to the arm, as in a snake robot, the lengths may change.
     """
     points = _zero_vertices(arm)
-    first = next((i for i in range(len(points) - 1) if _is_turned(arm, i)), len(points))
+    first = next((i for i in range(len(points) - 1) if _is_rotated(arm, i)), len(points))
     triples = list(itertools.combinations(range(first, len(points) - 1), 3))
     if not triples:
         return None
@@ -119,7 +120,7 @@ def landmarks(arm: Embodiment) -> Landmarks | None:
         parts = [(shoulder, elbow), (elbow, wrist)]
         lengths = [zero[part] for part in parts]
         steady = all(spans[part] <= _RIGID * length for part, length in zip(parts, lengths, strict=True))
-        return steady and sum(lengths) >= _LEAST_SHARE * reach
+        return steady and sum(lengths) >= _MIN_FRACTION * reach
 
     candidates = [triple for triple in triples if is_rigid(triple)] or [t for t in triples if t[0] == first]
     return Landmarks(*max(candidates, key=lambda t: float(zero[t[0], t[1]] * zero[t[1], t[2]])), len(points) - 1)
@@ -134,55 +135,41 @@ def part_directions(
 
 
 def part_joints(arm: Embodiment, marks: Landmarks) -> list[PartJoints]:
-    """The joints that are to orient each part, base to tip."""
+    """Joints that orient each part, base to tip."""
     placement = _placement(arm, _generic_poses(arm))
     result: list[PartJoints] = []
     used: set[int] = set()
-    roll: int | None = None  # of the part before
+    roll: int | None = None  # roll joint of the previous part
     for part in range(_PARTS):
         start, end = marks[part : part + 2]
         free = [joint for joint in range(arm.num_joints) if joint not in used]
-        turning = [joint for joint in free if _turn_rate(arm, placement, joint, start, end) > _LEAST_TURN]
-        rolls_this = bool(turning) and part + 1 < _PARTS and _is_roll(placement, turning[-1], start, end)
-        next_roll = turning.pop() if rolls_this else None
+        rotating = [joint for joint in free if _rotation_rate(arm, placement, joint, start, end) > _MIN_ROTATION_RATE]
+        rolls_this = bool(rotating) and part + 1 < _PARTS and _is_roll(placement, rotating[-1], start, end)
+        next_roll = rotating.pop() if rolls_this else None
         chosen: list[int] = []
-        for joint in turning:
+        for joint in rotating:
             if not any(_are_parallel(placement, joint, other) for other in chosen):
                 chosen.append(joint)
         joints = tuple(chosen[:2])
         result.append(PartJoints(joints, bool(joints) and joints[0] == roll))
-        used |= set(turning)  # those that are left over stay at home
+        used |= set(rotating)  # the remaining ones stay in the home pose
         if roll is not None:
             used.add(roll)
-        # A joint that rolls two parts in line turns neither: nothing between them bends.
+        # A joint that rolls two parts in line rotates neither: no joint between them bends.
         roll = None if next_roll == roll else next_roll
     return result
 
 
 def _steps(parts: list[PartJoints]) -> list[tuple[int, list[int]]]:
-    """Which part is oriented by which joints; with four joints, that part and the next."""
-    steps, taken = [], False
+    """Parts with the joints that orient them; four joints orient a part and the next one."""
+    steps, is_done = [], False
     for part, (joints, _) in enumerate(parts):
         following = parts[part + 1] if part + 1 < len(parts) else PartJoints((), False)
-        both = not taken and following.takes_roll and len(joints) == len(following.joints) == 2
-        if not taken and joints:
+        both = not is_done and following.takes_roll and len(joints) == len(following.joints) == 2
+        if not is_done and joints:
             steps.append((part, [*joints, *(following.joints if both else ())]))
-        taken = both
+        is_done = both
     return steps
-
-
-def checked_poses(arm: Embodiment, qpos: Poses) -> Poses:
-    """The poses as floating-point numbers.
-
-    Raises:
-      ValueError: they are not [..., time, joints], or not finite.
-    """
-    qpos = np.asarray(qpos)
-    if qpos.ndim < 2 or qpos.shape[-1] != arm.num_joints:
-        raise ValueError(f"qpos: expected shape [..., time, {arm.num_joints}] for {arm.name}, got {qpos.shape}")
-    if not np.all(np.isfinite(qpos)):
-        raise ValueError("qpos: expected finite angles [rad], got some that are not")
-    return qpos if np.issubdtype(qpos.dtype, np.floating) else qpos.astype(float)
 
 
 def _orient(
@@ -193,12 +180,12 @@ def _orient(
     goals: Float[np.ndarray, "parts poses 3"],
     near: np.ndarray,
 ) -> np.ndarray:
-    """Angles [poses, joints] of one or two joints that take a part to the first goal."""
+    """Angles [poses, joints] of one or two joints that rotate a part to the first goal."""
     placement = _placement(arm, qpos)
     part = unit(placement.vertices[marks[1]] - placement.vertices[marks[0]])
     axes = [placement.axes[joint] for joint in joints]
     if len(joints) == 1:
-        return _wrapped(arm, qpos[:, joints] + rotate_onto(axes[0], part, goals[0])[:, None], joints)
+        return _wrap(arm, qpos[:, joints] + rotate_onto(axes[0], part, goals[0])[:, None], joints)
     changes = rotate_onto_by_two(axes[0], axes[1], part, goals[0])
     return _nearest(arm, qpos, joints, [np.stack(change, axis=1) for change in changes], near)
 
@@ -211,10 +198,10 @@ def _orient_two_parts(
     goals: Float[np.ndarray, "parts poses 3"],
     near: np.ndarray,
 ) -> np.ndarray:
-    """Angles [poses, 4] of shoulder (two), roll and elbow that take two parts to their goals.
+    """Angles [poses, 4] of shoulder (two), roll and elbow that rotate two parts to their goals.
 
-    The elbow makes the angle between the parts. The rotation that then takes both parts to their goals is that of the
-    other three joints: the shoulder takes the roll axis to where that rotation has it, the roll joint does the rest.
+    The elbow sets the angle between the parts. The other three joints then rotate both parts to their goals: the
+    shoulder brings the roll axis to its direction under that rotation, and the roll joint completes it.
     """
     placement = _placement(arm, qpos)
     points = [placement.vertices[mark] for mark in marks]
@@ -225,8 +212,8 @@ def _orient_two_parts(
     for bend in bend_to_angle(elbow, lower, upper, dot(goals[0], goals[1])):
         bent = rotated(elbow, bend, lower)
         rotation = goal @ frame_of(upper, bent).swapaxes(1, 2)
-        turned_axis = np.einsum("nij,nj->ni", rotation, roll)
-        for a, b in rotate_onto_by_two(first, second, roll, turned_axis):
+        goal_axis = np.einsum("nij,nj->ni", rotation, roll)
+        for a, b in rotate_onto_by_two(first, second, roll, goal_axis):
             back = rotated(second, -b, rotated(first, -a, goals[1]))
             changes.append(np.stack([a, b, rotate_onto(roll, bent, back), bend], axis=1))
     return _nearest(arm, qpos, joints, changes, near)
@@ -235,11 +222,11 @@ def _orient_two_parts(
 def _nearest(
     arm: Embodiment, qpos: np.ndarray, joints: list[int], changes: list[np.ndarray], near: np.ndarray
 ) -> np.ndarray:
-    """Of the solutions [poses, joints], the one least beyond the joint range, then the one nearest to other angles."""
-    solutions = np.stack([_wrapped(arm, qpos[:, joints] + change, joints) for change in changes])
+    """The solution [poses, joints] that exceeds the joint range least; of equal ones, the nearest to other angles."""
+    solutions = np.stack([_wrap(arm, qpos[:, joints] + change, joints) for change in changes])
     lower, upper = (limit[joints] for limit in pose_limits(arm, float))
     beyond = np.maximum(np.maximum(lower - solutions, solutions - upper), 0).sum(axis=-1)
-    cost = _BEYOND_RANGE * beyond + (_wrapped(arm, solutions - near[:, joints], joints) ** 2).sum(axis=-1)
+    cost = _BEYOND_RANGE * beyond + (_wrap(arm, solutions - near[:, joints], joints) ** 2).sum(axis=-1)
     return np.take_along_axis(solutions, cost.argmin(axis=0)[None, :, None], axis=0)[0]
 
 
@@ -249,7 +236,7 @@ def _generic_poses(arm: Embodiment) -> Float[np.ndarray, "poses joints"]:
 
 
 def _spans(vertices: Float[np.ndarray, "vertices poses 3"]) -> Float[np.ndarray, "vertices vertices"]:
-    """How much the distance of each pair of vertices changes over the poses [m]."""
+    """Range of the distance between each pair of vertices over the poses [m]."""
     distances = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1)
     return distances.max(axis=-1) - distances.min(axis=-1)
 
@@ -273,7 +260,7 @@ def _placement(arm: Embodiment, qpos: Float[np.ndarray, "poses joints"]) -> Plac
 
 
 def _movers(arm: Embodiment) -> list[int]:
-    """The last joint that moves each vertex of the centre line; -1 for none."""
+    """Last joint that moves each vertex of the centre line; -1 for none."""
     movers = [arm.link_joint[link] for link in arm.segment_link]
     return [-1, *movers]
 
@@ -283,30 +270,30 @@ def _zero_vertices(arm: Embodiment) -> Float[np.ndarray, "vertices 3"]:
 
 
 def _same_segments(expert: Embodiment, learner: Embodiment) -> bool:
-    """Whether the centre lines are of the same segments, as with joints locked; names of links do not tell."""
+    """Whether both centre lines have the same segments, as of one arm with different locked joints."""
     a, b = (np.linalg.norm(arm.segment_end - arm.segment_start, axis=1) for arm in (expert, learner))
     return len(a) == len(b) and bool(np.allclose(a, b))
 
 
-def _is_turned(arm: Embodiment, segment: int) -> bool:
-    """Whether a joint changes the direction of a segment: not one about the segment itself."""
-    way = unit(np.asarray(arm.segment_end[segment] - arm.segment_start[segment]))
+def _is_rotated(arm: Embodiment, segment: int) -> bool:
+    """Whether a joint changes the direction of a segment; rotation about the segment itself does not."""
+    direction = unit(np.asarray(arm.segment_end[segment] - arm.segment_start[segment]))
     axes = np.asarray(arm.joint_axis)[: _movers(arm)[segment + 1] + 1]
-    return bool(np.any(np.linalg.norm(np.cross(axes, way), axis=-1) > PARALLEL))
+    return bool(np.any(np.linalg.norm(np.cross(axes, direction), axis=-1) > PARALLEL))
 
 
-def _turn_rate(arm: Embodiment, placement: Placement, joint: int, start: int, end: int) -> float:
-    """How fast a joint turns the direction from one vertex to another [rad/rad], root mean square over the poses."""
+def _rotation_rate(arm: Embodiment, placement: Placement, joint: int, start: int, end: int) -> float:
+    """Rotation of the direction from one vertex to another by a joint [rad/rad], root mean square over the poses."""
     axis, anchor = placement.axes[joint], placement.anchors[joint]
     points = placement.vertices[start], placement.vertices[end]
     moved = [mover >= joint for mover in (_movers(arm)[start], _movers(arm)[end])]
     rates = [np.cross(axis, point - anchor) * moves for point, moves in zip(points, moved, strict=True)]
-    way = points[1] - points[0]
-    return float(np.sqrt(np.mean(np.sum(np.cross(way, rates[1] - rates[0]) ** 2, axis=1) / dot(way, way) ** 2)))
+    part = points[1] - points[0]
+    return float(np.sqrt(np.mean(np.sum(np.cross(part, rates[1] - rates[0]) ** 2, axis=1) / dot(part, part) ** 2)))
 
 
 def _is_roll(placement: Placement, joint: int, start: int, end: int) -> bool:
-    """Whether a joint's axis is along a part, in all poses."""
+    """Whether a joint's axis is nearly along a part in all poses."""
     part = unit(placement.vertices[end] - placement.vertices[start])
     return bool(np.all(np.abs(dot(part, placement.axes[joint])) > _ROLL))
 
@@ -315,7 +302,6 @@ def _are_parallel(placement: Placement, joint: int, other: int) -> bool:
     return bool(np.all(np.linalg.norm(np.cross(placement.axes[joint], placement.axes[other]), axis=1) < PARALLEL))
 
 
-def _wrapped(arm: Embodiment, angles: np.ndarray, joints: list[int]) -> np.ndarray:
-    """Angles in [-pi, pi], or the turn of them nearest to the middle of a joint's range."""
-    middle = np.asarray(arm.joint_range, float)[joints].mean(axis=1)
-    return angles - 2 * np.pi * np.round((angles - middle) / (2 * np.pi))
+def _wrap(arm: Embodiment, angles: np.ndarray, joints: list[int]) -> np.ndarray:
+    """Angles within pi of the middle of each joint's range."""
+    return wrap_angles(angles, centre=np.asarray(arm.joint_range, float)[joints].mean(axis=1))

@@ -1,4 +1,4 @@
-"""Rotations about given axes that take one direction onto another, in closed form and batched by NumPy.
+"""Rotations about given axes that bring one direction to another, in closed form and batched by NumPy.
 
 Subproblems 1 and 2 are Paden and Kahan's (Murray, Li, Sastry 1994, section 3.2), for directions, with the least-squares
 solution where there is no exact one.
@@ -7,29 +7,29 @@ solution where there is no exact one.
 import numpy as np
 from jaxtyping import Float
 
-PARALLEL = 1e-3  # sine between axes that are taken for one axis
+PARALLEL = 1e-3  # sine of the angle between axes that count as parallel
 
 Vectors = Float[np.ndarray, "poses 3"]
 Angles = Float[np.ndarray, " poses"]
 
 
 def rotate_onto(axis: Vectors, vector: Vectors, goal: Vectors) -> Angles:
-    """Angle [rad] about an axis that brings a vector nearest to the direction of another (subproblem 1)."""
+    """Angle [rad] of the rotation about an axis that brings a vector nearest to a goal direction (subproblem 1)."""
     return np.arctan2(dot(axis, np.cross(vector, goal)), dot(vector, goal) - dot(axis, vector) * dot(axis, goal))
 
 
 def rotate_onto_by_two(
     first: Vectors, second: Vectors, vector: Vectors, goal: Vectors
 ) -> tuple[tuple[Angles, Angles], tuple[Angles, Angles]]:
-    """Angles [rad] so that R(first, a) R(second, b) vector is nearest to the goal (subproblem 2): both solutions.
+    """Both solutions (a, b) [rad] with R(first, a) R(second, b) vector nearest to the goal (subproblem 2).
 
-    Both cones, of the vector about the second axis and of the goal about the first, meet in two directions. Where they
-    do not, both solutions are the one that brings them nearest: in the plane of the axes.
+    The cones of the vector about the second axis and of the goal about the first axis intersect in two directions.
+    Where they do not intersect, both solutions are the nearest approach, in the plane of the axes.
 
     Args:
       first: unit axis of the proximal joint.
       second: unit axis of the distal joint, not parallel.
-      vector: unit vector that is turned.
+      vector: unit vector to rotate.
       goal: unit vector.
     """
     cosine = dot(first, second)
@@ -40,21 +40,24 @@ def rotate_onto_by_two(
         (along_second - cosine * along_first) / square
     )[:, None] * second
     height = np.sqrt(np.maximum(1 - dot(in_plane, in_plane), 0) / square)[:, None] * across
-    meets = in_plane + height, in_plane - height
-    return tuple((-rotate_onto(first, goal, meet), rotate_onto(second, vector, meet)) for meet in meets)  # type: ignore[return-value]
+
+    def solution(intersection: Vectors) -> tuple[Angles, Angles]:
+        return -rotate_onto(first, goal, intersection), rotate_onto(second, vector, intersection)
+
+    return solution(in_plane + height), solution(in_plane - height)
 
 
 def bend_to_angle(axis: Vectors, vector: Vectors, other: Vectors, cosine: Angles) -> tuple[Angles, Angles]:
-    """Angles [rad] about an axis that give a vector an angle to another, or the nearest to it: both solutions."""
+    """Both rotations [rad] about an axis that give a vector an angle to another vector, or the nearest possible one."""
     along = dot(axis, vector)[:, None] * axis
     a, b = dot(other, vector - along), dot(other, np.cross(axis, vector))
     amplitude = np.maximum(np.hypot(a, b), np.finfo(float).tiny)
-    apart = np.arccos(np.clip((cosine - dot(other, along)) / amplitude, -1, 1))
-    return np.arctan2(b, a) + apart, np.arctan2(b, a) - apart
+    half = np.arccos(np.clip((cosine - dot(other, along)) / amplitude, -1, 1))
+    return np.arctan2(b, a) + half, np.arctan2(b, a) - half
 
 
 def frame_of(x: Vectors, y: Vectors) -> Float[np.ndarray, "poses 3 3"]:
-    """Rotations whose first column is x and whose third is across x and y; any that is, where they are parallel."""
+    """Rotations with first column x and third column perpendicular to x and y; any such one where they are parallel."""
     across = np.cross(x, y)
     any_across = np.cross(x, np.eye(3)[np.abs(x).argmin(axis=1)])
     is_parallel = np.linalg.norm(across, axis=1, keepdims=True) < PARALLEL**2
@@ -63,7 +66,7 @@ def frame_of(x: Vectors, y: Vectors) -> Float[np.ndarray, "poses 3 3"]:
 
 
 def rotated(axis: Vectors, angle: Angles, vector: Vectors) -> Vectors:
-    """Rodrigues' formula."""
+    """Vectors rotated about an axis (Rodrigues' formula)."""
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
     along = dot(axis, vector)[:, None] * axis
     return along + cosine * (vector - along) + sine * np.cross(axis, vector)

@@ -34,13 +34,13 @@ def delete_checkpoint(run_dir: Path, step: int) -> None:
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:
-    """Environment steps of the checkpoints of a run, in order."""
+    """Environment steps of the checkpoints of a run, ascending."""
     folder = run_dir / FOLDER
     return sorted(int(path.name) for path in folder.iterdir() if path.name.isdigit()) if folder.is_dir() else []
 
 
 def check_checkpoint(run_dir: Path, step: int | None = None) -> int:
-    """Environment steps of a checkpoint of a run, of the last one where None.
+    """Returns the environment steps of a checkpoint of a run; those of the last one where None.
 
     Raises:
       ValueError: the run has no such checkpoint.
@@ -55,15 +55,15 @@ def check_checkpoint(run_dir: Path, step: int | None = None) -> int:
 
 
 def load_checkpoint(run_dir: Path, template: Any, step: int | None = None) -> tuple[int, Any]:
-    """Reads a checkpoint of a run: its step, and a pytree like the template.
+    """Reads a checkpoint of a run; returns its environment steps and a pytree with the template's structure.
 
     Args:
       run_dir: the run directory.
-      template: arrays or shapes of the structure that was saved.
+      template: arrays or shapes with the structure of the checkpoint.
       step: environment steps of the checkpoint; the last one where None.
 
     Raises:
-      ValueError: no such checkpoint, a damaged one, or one of other arms or another network.
+      ValueError: no such checkpoint, a damaged checkpoint, or one of other arms or another network.
     """
     step = check_checkpoint(run_dir, step)
     path = (run_dir / FOLDER / f"{step:012d}").absolute()
@@ -72,19 +72,19 @@ def load_checkpoint(run_dir: Path, template: Any, step: int | None = None) -> tu
     try:
         with _checkpointer() as checkpointer:
             stored = _shapes(checkpointer.metadata(path).item_metadata.tree)
-            if stored == expected:  # else orbax would fail in its threads, which print what they think of it
+            if stored == expected:  # otherwise orbax would fail in its threads, which print their own errors
                 return step, checkpointer.restore(path, abstract)
-    except Exception as error:  # orbax has many kinds for a folder that is damaged
+    except Exception as error:  # orbax raises many types of error for a damaged folder
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"checkpoint {str(path)!r} cannot be read: {reason}") from error
     name = next(key for key in {**expected, **stored} if expected.get(key) != stored.get(key))
     raise ValueError(
-        f"checkpoint {str(path)!r} does not fit the config of its run: it is of other arms or another network "
+        f"checkpoint {str(path)!r} does not fit the config of its run: it has other arms or another network "
         f"({name}: expected shape {expected.get(name)}, got {stored.get(name)})"
     )
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-    """Shape of each leaf, by its path; saved or not, a tuple is a list, and a dataclass a dict."""
+    """Shape of each leaf by its path. Paths do not depend on whether a node is a tuple or list, dataclass or dict."""
     leaves = jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: hasattr(node, "shape"))
     return {jax.tree_util.keystr(path, simple=True, separator="."): np.shape(leaf) for path, leaf in leaves}

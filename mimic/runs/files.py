@@ -1,4 +1,4 @@
-"""Files of a run directory: their names, and writing them so that none is ever half there."""
+"""Files of a run directory: their names, and writing them atomically."""
 
 import json
 import math
@@ -11,14 +11,14 @@ CONFIG, REPORT, METRICS, DEMONSTRATIONS = "config.yaml", "report.json", "metrics
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Replaces a file only when the new one is whole."""
+    """Writes a file; an existing one is replaced only when the new one is complete."""
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text)
     os.replace(partial, path)
 
 
 def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:
-    """Writes report.json; what is not a number, as after a divergence, is null there."""
+    """Writes report.json; numbers that are not finite, as after a divergence, are null."""
     write_atomically(run_dir / REPORT, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
 
 

@@ -1,4 +1,4 @@
-"""Where the metrics of a run go beside its own files, which are always written: Weights & Biases, MLflow."""
+"""Services that a run's metrics are sent to, in addition to its own files: Weights & Biases, MLflow."""
 
 import importlib
 import math
@@ -16,17 +16,17 @@ class Logger(Protocol):
         ...
 
     def close(self) -> None:
-        """Ends the run there."""
+        """Ends the run at the service."""
         ...
 
 
 class _WandbLogger:
-    """Weights & Biases; its project, mode and account are what its own environment variables say."""
+    """Weights & Biases; its own environment variables set project, mode and account."""
 
     def __init__(self, run_dir: Path, config: Mapping[str, Any]):
         self._run = _package("wandb").init(
             name=run_dir.name,
-            id=run_dir.name,  # a resumed run goes on there too
+            id=run_dir.name,  # a resumed run continues its run at the service
             resume="allow",
             dir=str(run_dir),
             config=dict(config),
@@ -41,16 +41,16 @@ class _WandbLogger:
 
 
 class _MlflowLogger:
-    """MLflow; where to, is what its own environment variables say."""
+    """MLflow; its own environment variables set the server."""
 
     def __init__(self, run_dir: Path, config: Mapping[str, Any]):
         self._mlflow = _package("mlflow")
-        if wanted := _unless_set("MLFLOW_EXPERIMENT_NAME", experiment_name="mimic"):
-            self._mlflow.set_experiment(**wanted)
-        known = run_dir / "mlflow_run_id"
-        self._mlflow.start_run(run_id=known.read_text() if known.exists() else None, run_name=run_dir.name)
-        if not known.exists():
-            known.write_text(self._mlflow.active_run().info.run_id)
+        if experiment := _unless_set("MLFLOW_EXPERIMENT_NAME", experiment_name="mimic"):
+            self._mlflow.set_experiment(**experiment)
+        run_id = run_dir / "mlflow_run_id"
+        self._mlflow.start_run(run_id=run_id.read_text() if run_id.exists() else None, run_name=run_dir.name)
+        if not run_id.exists():
+            run_id.write_text(self._mlflow.active_run().info.run_id)
             self._mlflow.log_dict(dict(config), "config.json")
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
@@ -65,17 +65,17 @@ _SERVICES: dict[str, type[_WandbLogger] | type[_MlflowLogger]] = {"wandb": _Wand
 
 
 def check_loggers(names: Sequence[str]) -> None:
-    """Raises a ValueError where a package is missing, or nobody says where MLflow shall write."""
+    """Raises a ValueError if a service's package is missing, or if MLflow's server is not set."""
     for name in names:
         if name in _SERVICES:
             _package(name)
-    # MLflow's own default lies beside the run directory, and needs a database that its client does not bring.
+    # MLflow's default is a folder next to the run directory, which needs a database that its client does not include.
     if "mlflow" in names and not os.environ.get("MLFLOW_TRACKING_URI"):
         raise ValueError("logger=mlflow: expected MLFLOW_TRACKING_URI in the environment, as in http://localhost:5000")
 
 
 def make_loggers(names: Sequence[str], run_dir: Path, config: Mapping[str, Any]) -> list[Logger]:
-    """A run at each of the services; "local" is none of them."""
+    """Starts a run at each of the services; "local" is none."""
     return [_SERVICES[name](run_dir, config) for name in dict.fromkeys(names) if name in _SERVICES]
 
 

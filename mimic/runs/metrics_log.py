@@ -1,4 +1,4 @@
-"""Metrics of a run over its training, as CSV and as TensorBoard events."""
+"""The metrics log of a training: CSV and TensorBoard events."""
 
 import csv
 from collections.abc import Mapping
@@ -9,15 +9,15 @@ from mimic.runs.files import METRICS
 
 
 class MetricsLog:
-    """Metrics over training, as one CSV file and as TensorBoard events; goes on where a run is resumed."""
+    """Metrics over training, as one CSV file and as TensorBoard events. A resumed run appends to them."""
 
     def __init__(self, run_dir: Path):
         self._path = run_dir / METRICS
         self._writer = compat.import_tensorboard().SummaryWriter(str(run_dir / "tensorboard"))
-        self._columns: list[str] = []  # of the file, once it is known
+        self._columns: list[str] = []  # of the file, once it has been read or created
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Appends one row; what it does not have of the columns is empty."""
+        """Appends one row; columns without a metric are empty."""
         row = {"step": step, **metrics}
         if not set(row) <= set(self._columns):
             self._add_columns(row)
@@ -27,7 +27,7 @@ class MetricsLog:
             self._writer.add_scalar(name, value, step)
 
     def _add_columns(self, row: Mapping[str, float]) -> None:
-        """Gives the file those that it lacks: all in a new run, some where another version began it, else none."""
+        """Adds missing columns to the file: all for a new run, some if another version of mimic started the run."""
         rows: list[dict[str, str]] = []
         if self._path.exists():
             with self._path.open(newline="") as file:
@@ -44,5 +44,5 @@ class MetricsLog:
             new.replace(self._path)
 
     def close(self) -> None:
-        """Writes what is buffered."""
+        """Writes buffered events."""
         self._writer.close()

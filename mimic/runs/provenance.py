@@ -1,4 +1,4 @@
-"""What a result was computed with: versions of packages, and the hardware."""
+"""The provenance of a result: versions of packages, and the hardware."""
 
 import contextlib
 import importlib.metadata
@@ -14,15 +14,15 @@ _PACKAGES = ("mimic-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on."""
-    found = {"python": platform.python_version()}
+    installed = {"python": platform.python_version()}
     for package in _PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            found[package] = importlib.metadata.version(package)
-    return found
+            installed[package] = importlib.metadata.version(package)
+    return installed
 
 
 def hardware() -> dict[str, Any]:
-    """What the run computed on."""
+    """The hardware of this process: backend, devices, processes and CPU."""
     devices = jax.devices()
     return {
         "backend": jax.default_backend(),

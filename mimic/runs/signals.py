@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGUSR2 while a run goes on: noted, and acted on after the next checkpoint."""
+"""Ctrl-C, SIGTERM and SIGUSR2 during a run: they are noted, and stop the run after the next checkpoint."""
 
 import signal
 import sys
@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-STOPPED_BY_SIGNAL = 128  # plus the signal's number: the exit code by convention
-NOTED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)  # the last is how submitit has Slurm warn of a time limit
-_NOTICE = "stopping at the next checkpoint; again to stop at once"
+STOPPED_BY_SIGNAL = 128  # plus the signal's number: the conventional exit code
+NOTED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)  # submitit lets Slurm send SIGUSR2 before a time limit
+_NOTICE = "stopping at the next checkpoint; repeat to stop immediately"
 
 
 class Interrupted(Exception):
@@ -21,7 +21,7 @@ class Interrupted(Exception):
 
 
 class Signals:
-    """The signals that came.
+    """The signals that a process received.
 
     Attributes:
       caught: their numbers, in order.
@@ -32,18 +32,18 @@ class Signals:
 
     @property
     def exit_code(self) -> int:
-        """Of a process that the first of them ended; 0 if none came."""
+        """The exit code after the first signal; 0 without signals."""
         return STOPPED_BY_SIGNAL + self.caught[0] if self.caught else 0
 
     def check(self) -> None:
-        """Raises `Interrupted` if one came."""
+        """Raises `Interrupted` if a signal was received."""
         if self.caught:
             raise Interrupted(self.caught[0])
 
 
 @contextmanager
 def noted_signals(signals: Signals, notice: str = _NOTICE) -> Iterator[None]:
-    """Notes signals instead of acting on them, and prints what follows; a second one of a kind acts at once."""
+    """Context in which a signal is noted and a notice printed; the same signal again has its usual effect."""
     previous: dict[int, Any] = {}
 
     def note(number: int, _: FrameType | None) -> None:

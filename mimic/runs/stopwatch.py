@@ -1,4 +1,4 @@
-"""Wall time of a run by stage."""
+"""Wall time of a run, by stage."""
 
 import contextlib
 import threading
@@ -12,15 +12,19 @@ from mimic.compilation import WAITED
 
 
 class Stopwatch:
-    """Wall time by stage, with the time that JAX traces and compiles kept apart. Stages may lie within stages.
+    """Measures wall time by stage; tracing and compilation by JAX are a stage of their own. Stages may be nested.
 
-    What compiles in other threads counts as far as this one waits for it.
+    Compilation in other threads counts only while this thread waits for it.
     """
 
     _COMPILE_EVENTS = ("/jax/core/compile/", WAITED)
 
     def __init__(self, started: float):
-        """`started`: `time.perf_counter()` at the start of the process."""
+        """Starts to measure.
+
+        Args:
+          started: `time.perf_counter()` at the start of the process.
+        """
         self.started = started
         self._compiling = 0.0
         self._thread = threading.get_ident()
@@ -33,13 +37,13 @@ class Stopwatch:
 
     @contextlib.contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Times a stage, less what it compiles and less the stages within it."""
+        """Context that measures a stage, without compilation and without nested stages."""
         began, counted = time.perf_counter(), sum(self.seconds.values())
         compiling = self._compiling
         try:
             yield
         finally:
-            within = sum(self.seconds.values()) - counted  # stages inside this one, with what they compiled
+            within = sum(self.seconds.values()) - counted  # nested stages with their compilation
             elapsed = time.perf_counter() - began - within
             compiled = min(self._compiling - compiling, elapsed)
             self._compiling = compiling

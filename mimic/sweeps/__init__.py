@@ -1,1 +1,1 @@
-"""Sweeps: many runs of one command line, and what they come to together."""
+"""Sweeps: many runs of one command line, their launchers, and the collection of their results."""

@@ -1,4 +1,4 @@
-"""The runs below a folder: what those that finished say of themselves, and why others are left out."""
+"""Runs in a folder: the results of finished runs, and the reason why other runs are left out."""
 
 import csv
 import dataclasses
@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mimic.config import to_dict
+from mimic.config import flatten, to_dict
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import CONFIG, METRICS, REPORT
 from mimic.runs.provenance import versions
@@ -16,23 +16,18 @@ from mimic.sweeps.sweeper import LOGS, SWEEP
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config
 
-_OF_THE_PROCESS = (
-    "run_dir",
-    "resume",
-    "logger",
-    "compilation_cache",
-    "distributed",
-)  # nothing that a result depends on
+# Keys that no result depends on.
+_PROCESS_KEYS = ("run_dir", "resume", "logger", "compilation_cache", "distributed")
 
 
 @dataclasses.dataclass(frozen=True)
-class Figure:
-    """The figure that runs of a trainer are compared by: 0 is the best, as a share.
+class QualityMetric:
+    """The metric by which runs of a trainer are compared: a fraction, 0 is optimal.
 
     Attributes:
-      key: in the report.
-      label: for people.
-      unit: key of the steps in the report.
+      key: key in the report.
+      label: label in tables and plots.
+      unit: key of the training steps in the report.
     """
 
     key: str
@@ -40,9 +35,9 @@ class Figure:
     unit: str
 
 
-FIGURES = {
-    "ppo": Figure("optimality_gap", "optimality gap", "env_steps"),
-    "pose_mapper": Figure("quality", "distance above the optimum", "training_poses"),
+QUALITY_METRICS = {
+    "ppo": QualityMetric("optimality_gap", "optimality gap", "env_steps"),
+    "pose_mapper": QualityMetric("quality", "distance above the optimum", "training_poses"),
 }
 
 
@@ -58,7 +53,7 @@ class FinishedRun:
         demonstrations and steps of the checkpoint.
       numbers: of its report by dotted keys, as optimality_gap.train.
       version: of mimic.
-      curves: the trainer's figure over the steps, by split.
+      curves: the quality metric over the steps, by split.
       finished: when its report was written [s since the epoch].
     """
 
@@ -74,35 +69,35 @@ class FinishedRun:
 
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
-    """A run that is not collected, and why, in one line."""
+    """A run that is not collected, with the reason in one line."""
 
     name: str
     reason: str
 
 
 def find_runs(folder: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
-    """The runs at any depth below a folder, in the order of their names."""
-    found: dict[Path, FinishedRun | LeftOut] = {}
+    """Finds the runs in a folder, at any depth, sorted by name."""
+    runs: dict[Path, FinishedRun | LeftOut] = {}
     planned: dict[Path, tuple[str, str]] = {}
     for path in _folders(folder):
         if (path / SWEEP).is_file():
             planned |= _planned(path)
         if (path / CONFIG).is_file():
-            found[path] = _read(path, _name(path, folder))
+            runs[path] = _read(path, _name(path, folder))
     for path, (label, reason) in planned.items():
-        known = found.get(path)
-        if known is None:
-            found[path] = LeftOut(_name(path, folder), f"{label}: {reason or 'not begun'}")
-        elif isinstance(known, LeftOut) and reason:
-            found[path] = LeftOut(known.name, reason)
-    ordered = [found[path] for path in sorted(found)]
+        run = runs.get(path)
+        if run is None:
+            runs[path] = LeftOut(_name(path, folder), f"{label}: {reason or 'not started'}")
+        elif isinstance(run, LeftOut) and reason:
+            runs[path] = LeftOut(run.name, reason)
+    ordered = [runs[path] for path in sorted(runs)]
     return [r for r in ordered if isinstance(r, FinishedRun)], [r for r in ordered if isinstance(r, LeftOut)]
 
 
 def _folders(folder: Path) -> Iterator[Path]:
-    """All of them, but what lies in run directories: services keep a config.yaml of their own there."""
-    for name, below, files in os.walk(folder):
-        below[:] = [] if CONFIG in files else sorted(entry for entry in below if not entry.startswith("."))
+    """All folders except those in run directories, where loggers keep a config.yaml of their own."""
+    for name, subfolders, files in os.walk(folder):
+        subfolders[:] = [] if CONFIG in files else sorted(entry for entry in subfolders if not entry.startswith("."))
         yield Path(name)
 
 
@@ -111,7 +106,7 @@ def _name(path: Path, folder: Path) -> str:
 
 
 def _planned(folder: Path) -> dict[Path, tuple[str, str]]:
-    """Of a sweep's runs, by their folders: what tells each from the others, and why it failed where that is known."""
+    """Label of each run of a sweep by its folder, and the reason why it failed, if known."""
     try:
         entries = json.loads((folder / SWEEP).read_text())["runs"]
         return {
@@ -120,7 +115,7 @@ def _planned(folder: Path) -> dict[Path, tuple[str, str]]:
             if entry["run_dir"]
         }
     except (ValueError, KeyError, TypeError):
-        return {}  # a sweep of another version; its runs speak for themselves
+        return {}  # a sweep of another version; its run directories are read anyway
 
 
 def _reason(folder: Path, entry: Mapping[str, Any]) -> str:
@@ -150,40 +145,40 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     history = _history(path / METRICS)
     if report is None:
         return LeftOut(name, _progress(path, config, history))
-    figure = FIGURES[config.trainer.name]
+    metric = QUALITY_METRICS[config.trainer.name]
     numbers = _numbers(report)
-    missing = [key for split in SPLITS if (key := f"{figure.key}.{split}") not in numbers]
+    missing = [key for split in SPLITS if (key := f"{metric.key}.{split}") not in numbers]
     if missing:
         reason = f"diverged, without a meaningful gap, or of another version ({version})"
         return LeftOut(name, f"{reason}: {REPORT} has no number {missing[0]}")
-    settings = _flat(to_dict(config))
+    settings = flatten(to_dict(config))
     if "evaluated" in report:
         is_policy = report["trainer"] == config.trainer.name
         settings |= {
             "controller": "policy" if is_policy else report["trainer"],
             "demonstrations": report["evaluated"]["demonstrations"],
-            figure.unit: numbers[figure.unit],
+            metric.unit: numbers[metric.unit],
         }
     return FinishedRun(
         name=name,
         trainer=config.trainer.name,
         seed=config.seed,
-        settings={key: x for key, x in settings.items() if key.split(".")[0] not in (*_OF_THE_PROCESS, "seed")},
+        settings={key: x for key, x in settings.items() if key.split(".")[0] not in (*_PROCESS_KEYS, "seed")},
         numbers=numbers,
         version=version,
-        curves={split: history.get(f"quality/{figure.key}.{split}", {}) for split in SPLITS},
+        curves={split: history.get(f"quality/{metric.key}.{split}", {}) for split in SPLITS},
         finished=(path / REPORT).stat().st_mtime,
     )
 
 
 def _progress(path: Path, config: TrainConfig, history: Mapping[str, Mapping[int, float]]) -> str:
     step = max((step for column in history.values() for step in column), default=0)
-    total = config.trainer.total_steps
-    return f"no {REPORT}: stopped or still running, at {step:,} of {total:,} steps; resume={path} goes on with it"
+    total = config.trainer.resolve().total_steps
+    return f"no {REPORT}: stopped or still running, at {step:,} of {total:,} steps; resume={path} continues it"
 
 
 def _history(path: Path) -> dict[str, dict[int, float]]:
-    """Columns of metrics.csv by step; where a run was resumed the later row counts."""
+    """Columns of metrics.csv by step; for steps that a resumed run repeated, the last row."""
     columns: dict[str, dict[int, float]] = {}
     if path.is_file():
         with path.open(newline="") as file:
@@ -196,14 +191,6 @@ def _history(path: Path) -> dict[str, dict[int, float]]:
 
 
 def _numbers(report: Mapping[str, Any]) -> dict[str, float]:
-    """Those for all data, or by split; null, which stands for what is not finite, is none."""
-    flat = _flat({key: report[key] for key in report if key not in ("worst_demonstrations", "seed")})
+    """The numbers of a report by dotted keys; null, which replaces values that are not finite, is left out."""
+    flat = flatten({key: report[key] for key in report if key not in ("worst_demonstrations", "seed")})
     return {key: x for key, x in flat.items() if isinstance(x, int | float) and not key.startswith("hardware")}
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested values by dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) and value else {f"{prefix}{key}": value}
-    return flat

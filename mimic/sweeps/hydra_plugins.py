@@ -1,7 +1,7 @@
-"""How our sweeper and launchers become Hydra's plugins, in this process alone.
+"""Registration of our sweeper and launchers as Hydra plugins, in this process only.
 
-Hydra takes these from the package `hydra_plugins` alone, whose modules every Hydra program in an environment imports.
-So ours is none of them on disk: other programs need not import mimic, and with it JAX.
+Hydra loads plugins only from the package `hydra_plugins`, whose modules every Hydra application in an environment
+imports. Ours is not on disk there, so that other applications do not import mimic and JAX.
 """
 
 import importlib
@@ -16,12 +16,12 @@ _PACKAGE, _MODULE = "hydra_plugins", "mimic"
 
 
 def target(name: str) -> str:
-    """What Hydra's configs call a plugin of ours."""
+    """The `_target_` of one of our plugins in Hydra's configs."""
     return f"{_PACKAGE}.{_MODULE}.{name}"
 
 
 def register(plugin: type[Plugin], config: type, group: str, choice: str) -> None:
-    """Makes a plugin known to Hydra, and its config a choice of a group."""
+    """Registers a plugin with Hydra, and its config as a choice of a config group."""
     package = _plugins()
     module = getattr(package, _MODULE, types.ModuleType(f"{_PACKAGE}.{_MODULE}"))
     setattr(package, _MODULE, module)
@@ -32,7 +32,7 @@ def register(plugin: type[Plugin], config: type, group: str, choice: str) -> Non
 
 
 def _plugins() -> types.ModuleType:
-    """Hydra's package of plugins, which is there only where some are installed."""
+    """Hydra's package of plugins; it is created if none are installed."""
     try:
         return importlib.import_module(_PACKAGE)
     except ImportError:

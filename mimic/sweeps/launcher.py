@@ -1,4 +1,4 @@
-"""What all launchers of ours share: they start each run of a sweep as a command, and wait."""
+"""Base of our launchers: each run of a sweep is started as a command and awaited."""
 
 import importlib
 import sys
@@ -18,27 +18,27 @@ from mimic.runs.signals import Signals, noted_signals
 from mimic.sweeps.run_command import RunCommand
 from mimic.sweeps.sweeper import FAILED, LOGS, Outcome, path_of
 
-LOCAL = "basic"  # Hydra's own: one run after the other, in the process of the sweep
-_LOOK_S = 0.2
+LOCAL = "basic"  # Hydra's own launcher: one run after the other, in the process of the sweep
+_POLL_S = 0.2
 
 
 class CommandLauncher(Launcher):
-    """A launcher whose runs are commands, started as there is room and waited for."""
+    """A launcher whose runs are commands, of which at most `max_parallel` run in parallel."""
 
     choice: str  # hydra/launcher=choice
     extra: str
     package: str
-    room: int | None = None  # runs at once; as many as there are where None
-    notice = "stopping: each run ends at its next checkpoint; again to stop at once"  # said on Ctrl-C
+    max_parallel: int | None = None  # maximum number of runs in parallel; None: all
+    notice = "stopping: each run ends at its next checkpoint; press again to stop immediately"  # printed on Ctrl-C
     waits_for_cancelled = True
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """See Hydra's Launcher.
 
         Raises:
-          HydraException: what it starts runs with is not there.
+          HydraException: a package or a service that it needs is not available.
         """
-        del hydra_context, task_function  # the runs get theirs from the command line
+        del hydra_context, task_function  # each run composes its own config
         self.config = config
         try:
             self._package = importlib.import_module(self.package)
@@ -50,14 +50,14 @@ class CommandLauncher(Launcher):
         self.connect()
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        """Starts the runs, waits for all of them, and says when each has ended.
+        """Starts the runs, waits for all of them, and prints when each has ended.
 
         Raises:
           SystemExit: stopped by a signal.
         """
         commands = [self._command(list(overrides), initial_job_idx + i) for i, overrides in enumerate(job_overrides)]
         waiting, running = list(range(len(commands))), dict[int, tuple[int, Any]]()  # number to slot and job
-        slots = list(range(self.room or len(commands)))
+        slots = list(range(self.max_parallel or len(commands)))
         outcomes: dict[int, Outcome] = {}
         signals = Signals()
         with noted_signals(signals, self.notice):
@@ -75,9 +75,9 @@ class CommandLauncher(Launcher):
                         del running[number]
                         slots.append(slot)
                         outcomes[number] = outcome = _outcome_of(lambda job=job: self.result(job))
-                        said = f"failed: {outcome.reason}" if outcome.exit_code else "done"
-                        print(f"run {initial_job_idx + number}: {said}", flush=True)
-                time.sleep(_LOOK_S)
+                        status = f"failed: {outcome.reason}" if outcome.exit_code else "done"
+                        print(f"run {initial_job_idx + number}: {status}", flush=True)
+                time.sleep(_POLL_S)
         return [
             JobReturn(overrides=list(overrides), status=JobStatus.COMPLETED, _return_value=outcomes[number])
             for number, overrides in enumerate(job_overrides)
@@ -87,7 +87,7 @@ class CommandLauncher(Launcher):
         for job in running:
             self.cancel(job)
         while self.waits_for_cancelled and not all(self.done(job) for job in running):
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         sys.exit(signals.exit_code)
 
     def _command(self, overrides: list[str], number: int) -> RunCommand:
@@ -106,11 +106,11 @@ class CommandLauncher(Launcher):
         )
 
     def connect(self) -> None:
-        """Finds what the runs are started with; raises a HydraException where it is not there."""
+        """Connects to the service that runs jobs; raises a HydraException if it is not available."""
 
     @abstractmethod
     def start(self, commands: Sequence[RunCommand], slots: Sequence[int]) -> Sequence[Any]:
-        """Starts runs, each in a slot of its own, and returns their jobs."""
+        """Starts one run in each slot and returns their jobs."""
 
     @abstractmethod
     def done(self, job: Any) -> bool:
@@ -118,7 +118,7 @@ class CommandLauncher(Launcher):
 
     @abstractmethod
     def result(self, job: Any) -> Outcome:
-        """Of a job that has ended; raises what the service makes of one that it lost."""
+        """Outcome of a job that has ended; raises the service's error for a job that it lost."""
 
     @abstractmethod
     def cancel(self, job: Any) -> None:
@@ -126,12 +126,12 @@ class CommandLauncher(Launcher):
 
     @abstractmethod
     def name(self, job: Any) -> str:
-        """What the service calls a job."""
+        """Name of a job in the service."""
 
 
 def _outcome_of(result: Callable[[], Outcome]) -> Outcome:
     try:
         return result()
-    except Exception as error:  # each service has its own kinds
+    except Exception as error:  # each service has its own exceptions
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         return Outcome(FAILED, f"{type(error).__name__}: {lines[0] if lines else 'no reason given'}")

@@ -1,7 +1,7 @@
-"""Where the runs of a sweep run: processes of this machine, jobs of Slurm, tasks of Ray; choices of hydra/launcher.
+"""Launchers of sweeps (choices of hydra/launcher): processes of this machine, Slurm jobs, Ray tasks.
 
-Hydra's plugins for these are not used: that for submitit has had no release since 2022, that for Ray holds cloudpickle
-below 3 and brings boto3, and both pickle Hydra's state.
+Hydra's plugins for these are not used: the one for submitit has had no release since 2022, the one for Ray requires
+cloudpickle below 3 and boto3, and both pickle Hydra's state.
 """
 
 import contextlib
@@ -23,8 +23,8 @@ from mimic.sweeps.run_command import RunCommand
 from mimic.sweeps.sweeper import Outcome
 
 _GPUS = "CUDA_VISIBLE_DEVICES"
-_NO_TIMEOUT_MIN = 365 * 24 * 60  # submitit wants one
-_ANSWER_S = 10
+_NO_TIMEOUT_MIN = 365 * 24 * 60  # submitit requires a time limit
+_CONNECT_TIMEOUT_S = 10
 
 
 @dataclasses.dataclass
@@ -32,8 +32,8 @@ class SubmititLocalConf:
     """Processes of this machine.
 
     Attributes:
-      parallel: runs at once.
-      gpus_per_run: how many GPUs each run has to itself; all see all GPUs where None.
+      parallel: maximum number of runs in parallel.
+      gpus_per_run: number of GPUs reserved for each run. Default None: every run sees all GPUs.
     """
 
     _target_: str = target("SubmititLocalLauncher")
@@ -43,17 +43,17 @@ class SubmititLocalConf:
 
 @dataclasses.dataclass
 class SubmititSlurmConf:
-    """Jobs of Slurm, as one array: see sbatch.
+    """Jobs of Slurm, as one job array; see sbatch.
 
     Attributes:
-      partition, account, qos, constraint: where, and on whose account.
-      gpus_per_node, cpus_per_task, mem_gb: what each run gets.
-      timeout_min: time limit [min]; a run that reaches it is queued again and goes on from its checkpoint.
-      signal_delay_s: before the limit, when the run is told to stop [s].
-      max_num_timeout: how often it goes on so.
-      array_parallelism: runs at once.
-      setup: shell commands before each run, as `module load cuda`.
-      additional_parameters: other options of sbatch, by their names.
+      partition, account, qos, constraint: options of sbatch.
+      gpus_per_node, cpus_per_task, mem_gb: resources of each run.
+      timeout_min: time limit [min]; a run that reaches it is queued again and resumes from its checkpoint.
+      signal_delay_s: time before the limit at which the run is stopped [s].
+      max_num_timeout: maximum number of times that a run is queued again.
+      array_parallelism: maximum number of runs in parallel.
+      setup: shell commands before each run, such as `module load cuda`.
+      additional_parameters: other options of sbatch by name.
     """
 
     _target_: str = target("SubmititSlurmLauncher")
@@ -61,7 +61,7 @@ class SubmititSlurmConf:
     account: str | None = None
     qos: str | None = None
     constraint: str | None = None
-    gpus_per_node: int | None = 1  # without one a run would train on the CPU, and say so in its report alone
+    gpus_per_node: int | None = 1  # with None, a run would train on the CPU, which only its report shows
     cpus_per_task: int = 8
     mem_gb: float | None = None
     timeout_min: int = 60
@@ -77,9 +77,9 @@ class RayConf:
     """Tasks of Ray.
 
     Attributes:
-      address: of a cluster, or "auto" for the one that this machine is in; Ray starts on this machine alone where None.
-      num_cpus: that Ray counts for each run.
-      num_gpus: that each run has to itself; without one it sees none.
+      address: address of a cluster, or "auto" for that of this machine. Default None: Ray starts on this machine.
+      num_cpus: CPUs reserved for each run.
+      num_gpus: GPUs reserved for each run; with 0 it sees none.
     """
 
     _target_: str = target("RayLauncher")
@@ -93,67 +93,72 @@ class _SubmititLauncher(CommandLauncher):
     cluster: str
 
     def executor(self, **settings: Any) -> Any:
-        """That takes jobs."""
+        """The executor of submitit that jobs are submitted to."""
         folder = Path(self.config.hydra.sweep.dir).absolute() / ".submitit"
         executor = self._package.AutoExecutor(folder=folder, cluster=self.cluster, **settings)
         executor.update_parameters(name="mimic")
         return executor
 
     def done(self, job: Any) -> bool:
-        """As submitit sees it."""
+        """Whether submitit considers the job ended."""
         return job.done()
 
     def result(self, job: Any) -> Outcome:
-        """What the run returned, through a file."""
+        """Outcome of the run, which submitit passes through a file."""
         return job.result()
 
 
 class SubmititLocalLauncher(_SubmititLauncher):
-    """Through submitit, as on Slurm, but on this machine."""
+    """Launches runs as processes of this machine, through submitit."""
 
     choice = "submitit_local"
     cluster = "local"
 
     def __init__(self, parallel: int, gpus_per_run: int | None):
-        self.room, self._gpus_per_run = parallel, gpus_per_run
+        self.max_parallel, self._gpus_per_run = parallel, gpus_per_run
 
     def connect(self) -> None:
-        """Checks that there is room for a run, and a GPU for each if they shall have one."""
-        if self.room is None or self.room < 1:
-            raise HydraException(f"hydra.launcher.parallel: expected at least 1, got {self.room}")
-        gpus_of(self.room - 1, self._gpus_per_run, os.environ.get(_GPUS))
+        """Checks the number of parallel runs, and that there are enough GPUs for them."""
+        if self.max_parallel is None or self.max_parallel < 1:
+            raise HydraException(f"hydra.launcher.parallel: expected at least 1, got {self.max_parallel}")
+        gpus_of(self.max_parallel - 1, self._gpus_per_run, os.environ.get(_GPUS))
 
     def start(self, commands: Sequence[RunCommand], slots: Sequence[int]) -> list[Any]:
-        """Each as a process that submitit watches."""
-        known, executor = os.environ.get(_GPUS), self.executor()
+        """Starts each run as a process that submitit monitors."""
+        visible, executor = os.environ.get(_GPUS), self.executor()
         executor.update_parameters(timeout_min=_NO_TIMEOUT_MIN)
         for command, slot in zip(commands, slots, strict=True):
-            command.environment[_GPUS] = gpus_of(slot, self._gpus_per_run, known)  # submitit would hide them
-        with _interrupts_ignored():  # by what is started: Ctrl-C reaches all processes of a terminal
+            command.environment[_GPUS] = gpus_of(slot, self._gpus_per_run, visible)  # else submitit hides them
+        with _interrupts_ignored():  # in the started processes: Ctrl-C reaches all processes of a terminal
             return [executor.submit(command) for command in commands]
 
     def cancel(self, job: Any) -> None:
-        """By SIGTERM; the way of submitit itself kills after a second."""
+        """Sends SIGTERM; submitit's own method kills the process after a second."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(int(job.job_id), signal.SIGTERM)
 
     def name(self, job: Any) -> str:
-        """By the process that watches it."""
+        """The process that monitors the run."""
         return f"process {job.job_id}"
 
 
 class SubmititSlurmLauncher(_SubmititLauncher):
-    """Through submitit, as one job array. The jobs do not need the process that queued them."""
+    """Launches runs as one Slurm job array, through submitit. The jobs outlive the process that queued them."""
 
     choice = "submitit_slurm"
     cluster = "slurm"
-    notice = "no longer waiting; the jobs stay with Slurm, and scancel ends them"
+    notice = "no longer waiting; the jobs stay in Slurm, and scancel ends them"
     waits_for_cancelled = False
 
     def __init__(self, max_num_timeout: int, **settings: Any):
         self._max_num_timeout = max_num_timeout
         plain = {key: OmegaConf.to_container(x) if OmegaConf.is_config(x) else x for key, x in settings.items()}
-        shared = ("timeout_min", "gpus_per_node", "cpus_per_task", "mem_gb")  # which submitit gives all clusters
+        shared = (
+            "timeout_min",
+            "gpus_per_node",
+            "cpus_per_task",
+            "mem_gb",
+        )  # names without the prefix slurm_ in submitit
         self._settings = {
             key if key in shared else f"slurm_{key}": value for key, value in plain.items() if value is not None
         }
@@ -167,7 +172,7 @@ class SubmititSlurmLauncher(_SubmititLauncher):
             )
 
     def start(self, commands: Sequence[RunCommand], slots: Sequence[int]) -> list[Any]:
-        """All as one array."""
+        """Submits all runs as one job array."""
         del slots
         executor = self.executor(slurm_max_num_timeout=self._max_num_timeout)
         executor.update_parameters(**self._settings)
@@ -175,16 +180,16 @@ class SubmititSlurmLauncher(_SubmititLauncher):
             return [executor.submit(command) for command in commands]
 
     def cancel(self, job: Any) -> None:
-        """Not: that is for scancel."""
+        """Does nothing: scancel ends jobs of Slurm."""
         del job
 
     def name(self, job: Any) -> str:
-        """By its number in the queue."""
+        """The job number in Slurm."""
         return f"job {job.job_id}"
 
 
 class RayLauncher(CommandLauncher):
-    """As tasks of Ray, which gives each its GPUs and lets the others wait."""
+    """Launches runs as Ray tasks; Ray assigns their GPUs and queues the others."""
 
     choice, extra, package = "ray", "ray", "ray"
 
@@ -193,73 +198,73 @@ class RayLauncher(CommandLauncher):
         self._resources = {"num_cpus": num_cpus, "num_gpus": num_gpus}
 
     def connect(self) -> None:
-        """Joins the cluster, or starts Ray on this machine."""
-        started = {} if self._address else {"include_dashboard": False}
+        """Connects to the cluster, or starts Ray on this machine."""
+        options = {} if self._address else {"include_dashboard": False}
         try:
             _check_port(self._address or "")
-            self._package.init(self._address, log_to_driver=False, logging_level="ERROR", **started)
+            self._package.init(self._address, log_to_driver=False, logging_level="ERROR", **options)
         except (OSError, ValueError, RuntimeError) as error:
             reason = " ".join(str(error).split())[:200]
             raise HydraException(f"hydra.launcher.address={self._address}: no Ray found: {reason}") from error
 
     def start(self, commands: Sequence[RunCommand], slots: Sequence[int]) -> list[Any]:
-        """All at once; Ray lets them wait for what they need."""
+        """Starts all tasks; Ray queues them until their resources are free."""
         del slots
-        # A task that dies is not run again: its run directory is there.
+        # A task that dies is not retried: its run directory exists already.
         run = self._package.remote(max_retries=0, **self._resources)(_call)
         return [run.remote(command) for command in commands]
 
     def done(self, job: Any) -> bool:
-        """Whether there is a result."""
+        """Whether the task has a result."""
         return bool(self._package.wait([job], timeout=0)[0])
 
     def result(self, job: Any) -> Outcome:
-        """What the run returned."""
+        """Outcome of the run."""
         return self._package.get(job)
 
     def cancel(self, job: Any) -> None:
-        """By a KeyboardInterrupt in the task."""
+        """Raises a KeyboardInterrupt in the task."""
         self._package.cancel(job, force=False)
 
     def name(self, job: Any) -> str:
-        """By Ray's number."""
+        """The task id in Ray."""
         return f"task {job.task_id().hex()}"
 
 
 def _check_port(address: str) -> None:
-    """Raises an OSError where nobody listens at HOST:PORT; Ray would go on trying for minutes."""
+    """Raises an OSError if no server listens at HOST:PORT; Ray would retry for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdigit():
-        socket.create_connection((host, int(port)), timeout=_ANSWER_S).close()
+        socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
 
 
 def _call(command: RunCommand) -> Outcome:
     return command()
 
 
-def gpus_of(slot: int, count: int | None, known: str | None) -> str | None:
+def gpus_of(slot: int, count: int | None, visible: str | None) -> str | None:
     """The GPUs of a slot, as CUDA_VISIBLE_DEVICES.
 
     Args:
-      slot: from 0.
-      count: GPUs of each slot; all see what this process sees where None.
-      known: CUDA_VISIBLE_DEVICES of this process, which sees all GPUs where None.
+      slot: index of the slot, from 0.
+      count: number of GPUs of each slot; None: the GPUs visible to this process.
+      visible: CUDA_VISIBLE_DEVICES of this process; None: all GPUs are visible.
 
     Raises:
-      HydraException: this process does not see as many.
+      HydraException: not enough GPUs are visible.
     """
     if count is None:
-        return known
-    needed = range(slot * count, (slot + 1) * count)
-    if known is None:
-        return ",".join(map(str, needed))
-    names = [name for name in known.split(",") if name]
-    if needed.stop > len(names):
+        return visible
+    indices = range(slot * count, (slot + 1) * count)
+    if visible is None:
+        return ",".join(map(str, indices))
+    names = [name for name in visible.split(",") if name]
+    if indices.stop > len(names):
         raise HydraException(
-            f"hydra.launcher.parallel: {slot + 1} runs with {count} GPUs each need {needed.stop}, got {len(names)}: "
-            f"{_GPUS}={known}"
+            f"hydra.launcher.parallel: {slot + 1} runs with {count} GPUs each need {indices.stop}, got {len(names)}: "
+            f"{_GPUS}={visible}"
         )
-    return ",".join(names[i] for i in needed)
+    return ",".join(names[i] for i in indices)
 
 
 @contextlib.contextmanager
@@ -272,9 +277,9 @@ def _interrupts_ignored() -> Iterator[None]:
 
 
 def check_launcher(choice: str) -> None:
-    """Raises a ValueError for a launcher of sweeps that a single run was given: Hydra would not use it, nor say so."""
+    """Raises a ValueError for a sweep launcher in a single run, which Hydra would silently ignore."""
     if choice != LOCAL:
-        raise ValueError(f"hydra/launcher={choice}: expected with a sweep alone; add -m to launch this run through it")
+        raise ValueError(f"hydra/launcher={choice}: expected only with a sweep; add -m to launch this run with it")
 
 
 _CONFIGS = {
@@ -285,6 +290,6 @@ _CONFIGS = {
 
 
 def register_launchers() -> None:
-    """Makes them choices of hydra/launcher."""
+    """Registers our launchers as choices of hydra/launcher."""
     for launcher, config in _CONFIGS.items():
         register(launcher, config, "hydra/launcher", launcher.choice)

@@ -1,4 +1,4 @@
-"""The figure of collected runs: how their groups learned, and where they ended."""
+"""Plot of collected runs: learning curves of their groups, and their final values."""
 
 import textwrap
 from collections.abc import Sequence
@@ -13,43 +13,43 @@ import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 from matplotlib.lines import Line2D  # noqa: E402
 
-from mimic.evaluation.labels import SPLITS
-from mimic.sweeps.finished_runs import Figure  # noqa: E402
+from mimic.evaluation.labels import SPLITS  # noqa: E402
+from mimic.sweeps.finished_runs import QualityMetric  # noqa: E402
 from mimic.sweeps.seed_groups import SeedGroup, mean_interval  # noqa: E402
 
 _LABELS = {"train": "training data", "held_out": "held-out data"}
 _MARKERS = {"train": "s", "held_out": "o"}
-_TICK_WIDTH = 26  # letters
+_TICK_WIDTH = 26  # characters
 _SMALL = 1e-6  # [%], for a logarithmic axis
-_TABLEAU = 10  # colours that tell groups apart; beyond, a colour map
+_TABLEAU = 10  # number of distinct colours; more groups use a colour map
 
 
-def plot_collected(groups: Sequence[SeedGroup], figure: Figure, out: Path) -> None:
-    """Learning curves on held-out data, and the final figure of each group, with confidence intervals; in percent."""
+def plot_collected(groups: Sequence[SeedGroup], metric: QualityMetric, out: Path) -> None:
+    """Plots held-out learning curves and the final metric of each group in percent, with confidence intervals."""
     height = max(4.0, 1.6 + 0.42 * len(groups))
-    drawing, (curves, final) = plt.subplots(1, 2, figsize=(11, height), layout="constrained")
+    figure, (curves, final) = plt.subplots(1, 2, figsize=(11, height), layout="constrained")
     colours = [_colour(number, len(groups)) for number in range(len(groups))]
     for group, colour in zip(groups, colours, strict=True):
         _draw_curves(curves, group, colour)
     percent = matplotlib.ticker.FormatStrFormatter("%g")
-    curves.set(xlabel=figure.unit.replace("_", " "), ylabel=f"{figure.label} [%]", yscale="log")
+    curves.set(xlabel=metric.unit.replace("_", " "), ylabel=f"{metric.label} [%]", yscale="log")
     curves.set_title("held-out data while training: seeds, mean, 95 % interval", fontsize="medium")
     curves.yaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
     curves.yaxis.set_major_formatter(percent)
     curves.yaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
-    seen = [100 * x for group in groups for run in group.runs for x in run.curves["held_out"].values() if x > 0]
-    curves.set_ylim(bottom=0.7 * min(seen) if seen else None)  # where a band goes below 0 it is cut off there
+    shown = [100 * x for group in groups for run in group.runs for x in run.curves["held_out"].values() if x > 0]
+    curves.set_ylim(bottom=0.7 * min(shown) if shown else None)  # bands below 0 are cut off
     for row, (group, colour) in enumerate(zip(groups, colours, strict=True)):
-        _draw_final(final, group, figure, row, colour)
+        _draw_final(final, group, metric, row, colour)
     final.set_yticks(range(len(groups)), [_tick(group) for group in groups])
-    final.set(xlabel=f"{figure.label} [%]", xlim=(min(0, final.get_xlim()[0]), None), ylim=(len(groups) - 0.5, -0.5))
+    final.set(xlabel=f"{metric.label} [%]", xlim=(min(0, final.get_xlim()[0]), None), ylim=(len(groups) - 0.5, -0.5))
     final.set_title("at the end: seeds (ticks), mean, 95 % interval", fontsize="medium")
     marks = [Line2D([], [], color="grey", marker=_MARKERS[split], mfc=_fill(split, "grey"), ls="") for split in SPLITS]
-    drawing.legend(marks, [_LABELS[split] for split in SPLITS], fontsize="small", loc="outside lower right", ncols=2)
+    figure.legend(marks, [_LABELS[split] for split in SPLITS], fontsize="small", loc="outside lower right", ncols=2)
     for axes in (curves, final):
         axes.grid(alpha=0.3, which="major")
-    drawing.savefig(out, dpi=150)
-    plt.close(drawing)
+    figure.savefig(out, dpi=150)
+    plt.close(figure)
 
 
 def _tick(group: SeedGroup) -> str:
@@ -65,7 +65,7 @@ def _colour(number: int, count: int) -> Any:
 
 
 def _draw_curves(axes: Any, group: SeedGroup, colour: Any) -> None:
-    """Each seed as a faint line; mean and band where all seeds have been, as some may end earlier."""
+    """Draws each seed as a faint line, and mean and band at the steps that all seeds have reached."""
     by_seed = [run.curves["held_out"] for run in group.runs]
     for curve in by_seed:
         axes.plot(list(curve), [100 * value for value in curve.values()], color=colour, alpha=0.3, lw=0.8)
@@ -77,9 +77,9 @@ def _draw_curves(axes: Any, group: SeedGroup, colour: Any) -> None:
         axes.fill_between(steps, np.maximum(low, _SMALL), high, color=colour, alpha=0.15, lw=0)
 
 
-def _draw_final(axes: Any, group: SeedGroup, figure: Figure, row: int, colour: Any) -> None:
+def _draw_final(axes: Any, group: SeedGroup, metric: QualityMetric, row: int, colour: Any) -> None:
     for split, shift in zip(SPLITS, (-0.15, 0.15), strict=True):
-        key = f"{figure.key}.{split}"
+        key = f"{metric.key}.{split}"
         interval = group.interval(key)
         half = [0.0 if interval.high is None else 100 * (interval.high - interval.mean)]
         seeds = [100 * run.numbers[key] for run in group.runs]

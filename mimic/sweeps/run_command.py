@@ -1,6 +1,6 @@
-"""A run of a sweep as a command of its own, which is what launchers start wherever the run shall be.
+"""A run of a sweep as a command of its own, which launchers start on the run's machine.
 
-Nothing of Hydra's or JAX's state goes from one process to another, and what ends one run ends no other.
+Processes share no state of Hydra or JAX, and the failure of one run does not end another.
 """
 
 import contextlib
@@ -16,20 +16,20 @@ from typing import Any
 from mimic.runs.signals import STOPPED_BY_SIGNAL
 from mimic.sweeps.sweeper import FAILED, Outcome, path_override
 
-_LOOK_S = 0.2
+_POLL_S = 0.2
 
 
 @dataclasses.dataclass
 class RunCommand:
-    """A run as a command; called where the run shall be, with its output in a log file.
+    """A run as a command with a log file; it is called on the run's machine.
 
     Attributes:
-      module: that the command runs.
-      arguments: of the command.
-      folder: that it starts in.
-      log: file that its output is added to, seen from there.
-      run_dir: where it writes, likewise; empty where nobody knows.
-      environment: variables that it gets; without those that are None.
+      module: Python module that the command runs.
+      arguments: arguments of the command.
+      folder: working directory of the command.
+      log: file that its output is appended to, relative to `folder`.
+      run_dir: run directory, relative to `folder`. Default "": unknown.
+      environment: environment variables to set; those that are None are removed.
     """
 
     module: str
@@ -40,7 +40,7 @@ class RunCommand:
     environment: dict[str, str | None] = dataclasses.field(default_factory=dict)
 
     def __call__(self) -> Outcome:
-        """Runs it to its end. SIGTERM is passed on to it; KeyboardInterrupt, Ray's way to cancel, becomes SIGTERM."""
+        """Runs the command to its end. Forwards SIGTERM, and KeyboardInterrupt (Ray's way to cancel) as SIGTERM."""
         variables = {**os.environ, **self.environment}
         with (Path(self.folder) / self.log).open("a") as log:
             process = subprocess.Popen(
@@ -49,13 +49,13 @@ class RunCommand:
                 env={name: value for name, value in variables.items() if value is not None},
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,  # a signal reaches it through this process alone
+                start_new_session=True,  # signals reach it only through this process
             )
         self._process = process
         previous = signal.signal(signal.SIGTERM, lambda *_: process.terminate())
         try:
-            while process.poll() is None:  # no wait(), which `checkpoint` could not interrupt
-                time.sleep(_LOOK_S)
+            while process.poll() is None:  # not wait(), which `checkpoint` could not interrupt
+                time.sleep(_POLL_S)
         except KeyboardInterrupt:
             process.terminate()
         finally:
@@ -66,14 +66,14 @@ class RunCommand:
         return self._outcome(process.wait())
 
     def checkpoint(self) -> Any:
-        """What submitit asks for when Slurm's time is up: the run stops, and is queued again to go on."""
+        """Called by submitit at Slurm's time limit: stops the run and queues it again to be resumed."""
         import submitit
 
         self._process.terminate()
-        with contextlib.suppress(ChildProcessError):  # ended, and known to have
+        with contextlib.suppress(ChildProcessError):  # already ended and reaped
             os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
-        begun = self.run_dir and (Path(self.folder) / self.run_dir / "config.yaml").exists()
-        arguments = [path_override("resume", self.run_dir)] if begun else self.arguments
+        can_resume = self.run_dir and (Path(self.folder) / self.run_dir / "config.yaml").exists()
+        arguments = [path_override("resume", self.run_dir)] if can_resume else self.arguments
         return submitit.helpers.DelayedSubmission(dataclasses.replace(self, arguments=arguments))
 
     def _outcome(self, exit_code: int) -> Outcome:
@@ -81,7 +81,9 @@ class RunCommand:
             return Outcome(FAILED, f"killed by {signal.Signals(-exit_code).name}; log: {self.log}")
         if exit_code > STOPPED_BY_SIGNAL:
             name = signal.Signals(exit_code - STOPPED_BY_SIGNAL).name
-            return Outcome(exit_code, f"stopped by {name}; go on with: python -m {self.module} resume={self.run_dir}")
+            return Outcome(
+                exit_code, f"stopped by {name}; continue with: python -m {self.module} resume={self.run_dir}"
+            )
         if exit_code:
             lines = (Path(self.folder) / self.log).read_text(errors="replace").split("\n")
             last = next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {exit_code}")

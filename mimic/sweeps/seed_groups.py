@@ -1,4 +1,4 @@
-"""Groups of runs that differ in nothing but seed, and the confidence intervals of their means."""
+"""Groups of runs that differ only in their seed, and the confidence intervals of their means."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ import scipy.special
 from mimic.sweeps.finished_runs import FinishedRun, LeftOut
 
 CONFIDENCE = 0.95
-HOW = (
+METHOD = (
     "mean over the seeds; low and high are mean -+ t s / sqrt(n), the interval of the mean with 95 % confidence: s is "
     "the sample standard deviation (by n - 1), t the 0.975 quantile of Student's t with n - 1 degrees of freedom; one "
     "seed has no interval"
@@ -22,7 +22,7 @@ HOW = (
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """Mean of numbers, and the interval that their true mean lies in; low and high are None for a single number."""
+    """Mean of numbers with its confidence interval; low and high are None for a single number."""
 
     mean: float
     low: float | None
@@ -33,7 +33,7 @@ class Interval:
 
 
 def mean_interval(values: Sequence[float]) -> Interval:
-    """Mean with its confidence interval by Student's t, which takes the numbers for independent and normal."""
+    """Mean with its confidence interval by Student's t, which assumes independent normal samples."""
     mean, n = float(np.mean(values)), len(values)
     half = None
     if n > 1:
@@ -48,9 +48,9 @@ class SeedGroup:
     """Runs with the same settings.
 
     Attributes:
-      label: what tells it from the other groups.
-      settings: the keys that differ between groups, with its values.
-      runs: by seed.
+      label: settings that distinguish the group from the others.
+      settings: values of the keys that differ between groups.
+      runs: runs of the group, sorted by seed.
     """
 
     label: str
@@ -58,12 +58,12 @@ class SeedGroup:
     runs: list[FinishedRun]
 
     def interval(self, key: str) -> Interval:
-        """Of a number of the reports."""
+        """Mean and confidence interval of a number of the reports."""
         return mean_interval([run.numbers[key] for run in self.runs])
 
 
 def drop_repeated(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], list[LeftOut]]:
-    """Of runs with the same settings and seed the last alone: a repetition is no further sample."""
+    """Keeps the newest of the runs with the same settings and seed: a repetition is not an independent sample."""
     newest: dict[tuple[str, int], FinishedRun] = {}
     repeated = []
     for run in sorted(runs, key=lambda run: run.finished):
@@ -71,46 +71,46 @@ def drop_repeated(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], list[
         if key in newest:
             repeated.append(LeftOut(newest[key].name, f"{run.name} has the same settings and seed, and is newer"))
         newest[key] = run
-    kept = set(map(id, newest.values()))
-    return [run for run in runs if id(run) in kept], repeated
+    newest_ids = set(map(id, newest.values()))
+    return [run for run in runs if id(run) in newest_ids], repeated
 
 
 def group_runs(runs: Sequence[FinishedRun]) -> list[SeedGroup]:
-    """The groups, in the order of their first runs."""
+    """Groups runs by their settings, in the order of the first run of each group."""
     by_settings: dict[str, list[FinishedRun]] = defaultdict(list)
     for run in runs:
         by_settings[_fingerprint(run)].append(run)
     members = [sorted(group, key=lambda run: run.seed) for group in by_settings.values()]
     settings = [group[0].settings for group in members]
-    keys = list(dict.fromkeys(key for one in settings for key in one))
-    differing = [key for key in keys if len({_text(one.get(key)) for one in settings}) > 1]
-    needed = _needed(differing, settings)
+    keys = list(dict.fromkeys(key for group in settings for key in group))
+    differing = [key for key in keys if len({_text(group.get(key)) for group in settings}) > 1]
+    label_keys = _distinguishing(differing, settings)
     return [
-        SeedGroup(_label(group[0], needed), {key: group[0].settings.get(key) for key in differing}, group)
+        SeedGroup(_label(group[0], label_keys), {key: group[0].settings.get(key) for key in differing}, group)
         for group in members
     ]
 
 
-def telling_keys(groups: Sequence[SeedGroup]) -> list[str]:
-    """Of the keys that differ, those that suffice to tell the groups apart: env.name says which joints are locked."""
-    return _needed(list(groups[0].settings), [group.settings for group in groups])
+def distinguishing_keys(groups: Sequence[SeedGroup]) -> list[str]:
+    """The keys that suffice to distinguish the groups: env.name implies the locked joints, for example."""
+    return _distinguishing(list(groups[0].settings), [group.settings for group in groups])
 
 
-def _needed(keys: Sequence[str], settings: Sequence[dict[str, Any]]) -> list[str]:
-    """The names first, then what tells groups apart that are the same by all keys before it."""
-    chosen: list[str] = []
+def _distinguishing(keys: Sequence[str], settings: Sequence[dict[str, Any]]) -> list[str]:
+    """Adds keys, names first, as long as they distinguish groups that are equal in the keys before."""
+    selected: list[str] = []
     for key in sorted(keys, key=lambda key: not key.endswith(".name")):
-        if _distinct(settings, [*chosen, key]) > _distinct(settings, chosen):
-            chosen.append(key)
-    return chosen
+        if _count_distinct(settings, [*selected, key]) > _count_distinct(settings, selected):
+            selected.append(key)
+    return selected
 
 
-def _distinct(settings: Sequence[dict[str, Any]], keys: Sequence[str]) -> int:
-    return len({tuple(_text(one.get(key)) for key in keys) for one in settings})
+def _count_distinct(settings: Sequence[dict[str, Any]], keys: Sequence[str]) -> int:
+    return len({tuple(_text(group.get(key)) for key in keys) for group in settings})
 
 
 def _label(run: FinishedRun, keys: Sequence[str]) -> str:
-    """The names by themselves, and other keys by their last part."""
+    """Text of these keys of a run: env.name without its key, others with the last part of their key."""
     parts = [
         str(run.settings.get(key)) if key == "env.name" else f"{key.rpartition('.')[2]}={run.settings.get(key)}"
         for key in keys

@@ -1,6 +1,6 @@
-"""Sweeps: which runs they are made of, where each of them goes, and what became of it.
+"""Sweeps: their runs, the run directory of each, and the outcome of each.
 
-Hydra's own sweeper stops at the first run that fails, and writes before it knows that all runs can be composed.
+Hydra's own sweeper stops at the first run that fails, and writes files before all runs are composed.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ FAILED = 1
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What became of a run: its exit code, and where that is not 0 the reason in one line."""
+    """Outcome of a run: its exit code, and the reason in one line if that is not 0."""
 
     exit_code: int = 0
     reason: str = ""
@@ -42,9 +42,9 @@ class PlannedRun:
     """A run of a sweep.
 
     Attributes:
-      label: the overrides that tell it from the others.
-      overrides: all of them, its run directory included.
-      run_dir: empty where the command has none.
+      label: overrides that distinguish the run from the others.
+      overrides: all overrides, including the run directory.
+      run_dir: run directory; "" if the command has none.
     """
 
     label: str
@@ -57,7 +57,7 @@ class SweeperConf:
     """The default sweeper.
 
     Attributes:
-      params: overrides with several values, beside those of the command line.
+      params: overrides with several values, in addition to those of the command line.
     """
 
     _target_: str = target("Sweeper")
@@ -65,7 +65,7 @@ class SweeperConf:
 
 
 class Sweeper(hydra.plugins.sweeper.Sweeper):
-    """Every combination of the values; ends with exit code 1 and the failed runs in one line each."""
+    """Runs every combination of the values. If runs failed, it prints one line for each and exits with 1."""
 
     def __init__(self, params: Mapping[str, str] | None = None):
         self._params = [f"{key}={values}" for key, values in (params or {}).items()]
@@ -104,10 +104,10 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         self._report(folder, planned, outcomes)
 
     def plan(self, arguments: list[str], folder: Path) -> list[PlannedRun]:
-        """The runs of a sweep with these overrides, composed; nothing is written.
+        """Composes the runs of a sweep; writes nothing.
 
         Raises:
-          HydraException: a run that cannot be composed.
+          HydraException: a run cannot be composed.
         """
         assert self.config is not None and self.hydra_context is not None
         loader = self.hydra_context.config_loader
@@ -127,7 +127,7 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         failed = [(run, outcome) for run, outcome in zip(planned, outcomes, strict=True) if outcome.exit_code]
         print(f"sweep: {len(planned) - len(failed)} of {len(planned)} runs done; results: {folder}")
         if any(run.run_dir for run in planned) and len(failed) < len(planned):
-            print(f"one table and figure of them: python -m mimic.collect {folder}")
+            print(f"one table and plot of them: python -m mimic.collect {folder}")
         for run, outcome in failed:
             print(f"failed: {run.label}: {outcome.reason}", file=sys.stderr)
         if failed:
@@ -135,7 +135,7 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
 
 
 def _run_dir(config: DictConfig, folder: Path, number: str) -> tuple[str, list[str]]:
-    """Where a run of a sweep writes, and the override that says so: none where the run says so itself."""
+    """Run directory of a run, and the override that sets it, unless the run sets it itself."""
     if OmegaConf.select(config, "run_dir") is None:
         return "", []
     for key in ("resume", "run_dir"):
@@ -147,13 +147,13 @@ def _run_dir(config: DictConfig, folder: Path, number: str) -> tuple[str, list[s
 
 
 def path_override(key: str, path: str) -> str:
-    """KEY=PATH as Hydra reads it, whatever is in the path."""
+    """KEY=PATH in Hydra's syntax, quoted if necessary."""
     quoted = path if re.fullmatch(r"[\w./-]+", path) else "'" + path.replace("'", r"\'") + "'"
     return f"{key}={quoted}"
 
 
 def path_of(override: str) -> str:
-    """The path of such an override."""
+    """The path in an override made by `path_override`."""
     value = override.partition("=")[2]
     return value[1:-1].replace(r"\'", "'") if value.startswith("'") else value
 
@@ -201,5 +201,5 @@ def _write_sweep(folder: Path, planned: Sequence[PlannedRun], outcomes: Sequence
 
 
 def register_sweeper() -> None:
-    """Puts our sweeper in the place of Hydra's default."""
+    """Replaces Hydra's default sweeper by ours."""
     register(Sweeper, SweeperConf, "hydra/sweeper", "basic")

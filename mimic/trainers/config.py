@@ -1,4 +1,4 @@
-"""What defines a training run. `python -m mimic.train` fills these in from mimic/conf and the command line."""
+"""The config of a training run. `python -m mimic.train` composes it from mimic/conf and the command line."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from mimic.trainers.distributed.process_group import DistributedConfig
 LOGGERS = ("local", "wandb", "mlflow")
 
 PRESETS: dict[str, dict[str, Any]] = {
-    # Two cores: few environments, many gradient steps on each sample, since the physics is what costs.
+    # Two cores: few environments and many gradient steps on each sample, because the physics takes most of the time.
     "cpu": {
         "num_timesteps": 3_000_000,
         "num_envs": 512,
@@ -29,7 +29,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "crossovers": 0,
         "evaluations": 10,
     },
-    # One GPU: as many environments as keep it busy. The high entropy makes the arm try other branches of poses.
+    # One GPU: enough environments to keep it busy. The high entropy cost makes the arm explore other pose branches.
     "gpu": {
         "num_timesteps": 150_000_000,
         "num_envs": 4096,
@@ -46,26 +46,32 @@ PRESETS: dict[str, dict[str, Any]] = {
         "evaluations": 8,
     },
 }
-_LOOKS = 5  # with a target gap, which is to be noticed soon: an evaluation costs less than the steps between two
+# Factor on the number of evaluations with a target gap, so that training ends soon after the gap is reached: an
+# evaluation takes less time than the steps between two evaluations.
+_TARGET_GAP_EVALUATIONS = 5
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainerConfig:
-    """What all trainers have.
+    """The fields of all trainers.
 
     Attributes:
-      name: of the trainer.
-      preset: where fields that are None take their values from.
+      name: name of the trainer.
+      preset: name of the preset; it gives the values of the fields that are None.
     """
 
-    length_key: ClassVar[str]  # the field that says how long to train
+    length_key: ClassVar[str]  # the field that sets the training length
 
     name: str = MISSING
     preset: str = MISSING
 
     @property
     def total_steps(self) -> int:
-        """How long resolved settings train."""
+        """Length of a training with resolved settings."""
+        raise NotImplementedError
+
+    def resolve(self) -> "TrainerConfig":
+        """The settings with every field filled in. Raises a `ValueError` where a value is out of range."""
         raise NotImplementedError
 
 
@@ -75,27 +81,31 @@ class PPOConfig(TrainerConfig):
 
     Attributes:
       name: "ppo".
-      preset: "cpu", "gpu", or "auto": by the backend that JAX found.
-      num_timesteps: environment steps to train for; rounded up to whole stretches between two evaluations.
-      num_envs: arms at once.
-      unroll_length: steps of an arm in a batch.
+      preset: "cpu", "gpu", or "auto", which follows JAX's backend.
+      num_timesteps: environment steps of the training, rounded up to whole training epochs; a training epoch is the
+        training between two evaluations.
+      num_envs: number of arms that are simulated in parallel.
+      unroll_length: steps of an unroll, which are consecutive steps of one arm.
       batch_size: unrolls in a minibatch.
       num_minibatches: minibatches in a batch; batch_size * num_minibatches must be a multiple of num_envs.
       num_updates_per_batch: passes over a batch.
-      learning_rate: of Adam at the start.
-      final_learning_rate: as a share of it at the end; the decay is linear.
-      discounting: of the reward.
-      gae_lambda: of the advantage estimate.
-      entropy_cost: reward for a wide action distribution.
-      clipping_epsilon: of the policy ratio.
-      max_grad_norm: gradients are clipped to it: see `updated` in mimic/trainers/ppo/updates.py.
-      reward_scaling: of the reward inside PPO.
-      hidden_layers: widths of policy and value network.
-      crossovers: demonstrations to train on beyond the given ones, mixed from them joint by joint: see `crossovers` in
-        mimic/envs/demonstrations.py.
-      target_gap: training ends early once the optimality gap on the training demonstrations is no larger; 0 never.
-      evaluations: how often the policy is evaluated and saved, as far as whole batches allow; with a target gap the
-        preset's number times five.
+      learning_rate: Adam's learning rate at the start.
+      final_learning_rate: learning rate at the end as a fraction of learning_rate; the decay is linear.
+      discounting: discount factor of the reward at the start.
+      final_discounting: discount factor at the end; the change is linear. The same as at the start where None.
+      gae_lambda: lambda of generalised advantage estimation.
+      entropy_cost: weight of the policy's entropy in the loss at the start.
+      final_entropy_cost: entropy cost at the end as a fraction of entropy_cost; the change is linear.
+      clipping_epsilon: the policy ratio is clipped to 1 +- this.
+      max_grad_norm: gradients are clipped to this norm, see `updated` in mimic/trainers/ppo/updates.py.
+      reward_scaling: factor on the reward inside PPO.
+      hidden_layers: widths of the hidden layers of the policy and value networks.
+      crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
+        `crossovers` in mimic/envs/demonstrations.py.
+      target_gap: training ends early when the optimality gap on the training demonstrations is at most this; 0 disables
+        it.
+      evaluations: number of evaluations and checkpoints, as far as whole batches allow; with a target gap five times
+        the preset's number.
     """
 
     length_key: ClassVar[str] = "num_timesteps"
@@ -111,8 +121,10 @@ class PPOConfig(TrainerConfig):
     learning_rate: float | None = None
     final_learning_rate: float | None = None
     discounting: float | None = None
+    final_discounting: float | None = None
     gae_lambda: float = 0.9
     entropy_cost: float | None = None
+    final_entropy_cost: float = 1.0
     clipping_epsilon: float = 0.2
     max_grad_norm: float = 1.0
     reward_scaling: float = 10.0
@@ -126,11 +138,11 @@ class PPOConfig(TrainerConfig):
         check_choice("trainer.name", self.name, ("ppo",))
 
     def resolve(self, backend: str = "cpu", devices: int = 1) -> "PPOSettings":
-        """The same with every field filled in, and the preset's name.
+        """Returns the settings: every field has a value, and `preset` is never "auto".
 
         Args:
-          backend: of JAX; chooses the preset where that is "auto".
-          devices: that environments and batches are spread over.
+          backend: JAX's backend; it chooses the preset where that is "auto".
+          devices: number of devices that environments and batches are distributed over.
 
         Raises:
           ValueError: numbers out of range, or batch sizes that PPO cannot divide.
@@ -138,15 +150,18 @@ class PPOConfig(TrainerConfig):
         name = self.preset if self.preset != "auto" else "cpu" if backend == "cpu" else "gpu"
         preset = PRESETS[name]
         if self.target_gap > 0:
-            preset = {**preset, "evaluations": _LOOKS * preset["evaluations"]}
-        settings = PPOSettings(**{**_filled_in(self, preset), "preset": name})
+            preset = {**preset, "evaluations": _TARGET_GAP_EVALUATIONS * preset["evaluations"]}
+        fields = _filled_in(self, preset)
+        if self.final_discounting is None:
+            fields["final_discounting"] = fields["discounting"]
+        settings = PPOSettings(**{**fields, "preset": name})
         settings.check(devices)
         return settings
 
 
 @dataclasses.dataclass(frozen=True)
 class PPOSettings(PPOConfig):
-    """A PPO config with every field filled in: what trains, and what a run directory keeps."""
+    """A PPO config where every field has a value: used by the training and saved in the run directory."""
 
     num_timesteps: int = MISSING
     num_envs: int = MISSING
@@ -157,6 +172,7 @@ class PPOSettings(PPOConfig):
     learning_rate: float = MISSING
     final_learning_rate: float = MISSING
     discounting: float = MISSING
+    final_discounting: float = MISSING
     entropy_cost: float = MISSING
     hidden_layers: list[int] = MISSING
     crossovers: int = MISSING
@@ -164,12 +180,12 @@ class PPOSettings(PPOConfig):
 
     def check(self, devices: int) -> None:
         """Raises a ValueError for numbers out of range, or batch sizes that the devices cannot divide."""
-        whole = ("num_timesteps", "num_envs", "unroll_length", "batch_size", "num_minibatches", "num_updates_per_batch")
-        _check_whole(self, *whole, "evaluations")
+        counts = "num_timesteps", "num_envs", "unroll_length", "batch_size", "num_minibatches", "num_updates_per_batch"
+        _check_counts(self, *counts, "evaluations")
         for key in ("learning_rate", "max_grad_norm", "reward_scaling", "clipping_epsilon"):
             if not 0 < getattr(self, key) < math.inf:
                 raise ValueError(f"trainer.{key}: expected a number above 0, got {getattr(self, key)}")
-        for key in ("discounting", "gae_lambda", "final_learning_rate"):
+        for key in ("discounting", "final_discounting", "gae_lambda", "final_learning_rate", "final_entropy_cost"):
             if not 0 <= getattr(self, key) <= 1:
                 raise ValueError(f"trainer.{key}: expected a number in [0, 1], got {getattr(self, key)}")
         for key in ("target_gap", "crossovers"):
@@ -190,17 +206,31 @@ class PPOSettings(PPOConfig):
 
     @property
     def total_steps(self) -> int:
-        """Environment steps."""
+        """Environment steps of the training."""
         return self.num_timesteps
+
+    def at(self, progress: Any) -> "PPOSettings":
+        """Returns the settings at a fraction of the training, with the entropy cost and the discount factor there.
+
+        Args:
+          progress: in [0, 1], a number or a scalar array.
+        """
+        if self.final_entropy_cost == 1 and self.final_discounting == self.discounting:
+            return self
+        return dataclasses.replace(
+            self,
+            entropy_cost=self.entropy_cost * (1 + progress * (self.final_entropy_cost - 1)),
+            discounting=self.discounting + progress * (self.final_discounting - self.discounting),
+        )
 
     @property
     def steps_per_batch(self) -> int:
-        """Environment steps between two updates of the policy that collects them."""
+        """Environment steps of a batch: one policy collects all of them."""
         return self.batch_size * self.num_minibatches * self.unroll_length
 
 
 MAPPER_PRESETS: dict[str, dict[str, Any]] = {
-    # Of the paper: network, training set and minibatches. What it leaves open: Adam, rate, epochs, patience.
+    # Network, training set and minibatches are the paper's. The paper does not state optimiser, rate, epochs, patience.
     "paper": {
         "inputs": "angles",
         "outputs": "tanh",
@@ -216,7 +246,7 @@ MAPPER_PRESETS: dict[str, dict[str, Any]] = {
         "patience": 10,
         "evaluations": 100,
     },
-    # By measurement, on a GPU and on two cores alike.
+    # The best by measurement, both on a GPU and on two cores.
     "large": {
         "inputs": "link_states",
         "outputs": "circle",
@@ -243,27 +273,29 @@ class PoseMapperConfig(TrainerConfig):
     Attributes:
       name: "pose_mapper".
       preset: "large", or "paper".
-      inputs: "angles" (paper) or "link_states" of the expert: positions and directions.
-      outputs: "tanh" of an angle within the joint's range (paper), or a point on the "circle" for joints that can do a
-        full turn.
-      heads: poses that the network proposes; the nearest is taken.
-      hidden_layers: widths.
+      inputs: "angles" of the expert (paper), or its "link_states": positions and directions.
+      outputs: "tanh", scaled to the joint's range (paper), or "circle": a point on the unit circle for joints whose
+        range is a full rotation.
+      heads: number of poses that the network proposes; the nearest one is the output.
+      hidden_layers: widths of the hidden layers.
       activation: "leaky_relu" (paper) or "gelu".
       samples: poses in an epoch.
-      batch_size: poses in a minibatch; divides samples.
-      fresh: whether each epoch has new random poses; else it has the same ones, shuffled.
-      epochs: how long to train.
-      learning_rate: of Adam, after a warm-up.
-      final_learning_rate: as a share of it at the end; the decay is a cosine. 1 is a constant rate without warm-up.
+      batch_size: poses in a minibatch; must divide samples.
+      fresh: whether each epoch draws new random poses; otherwise all epochs have the same poses, shuffled.
+      epochs: number of epochs.
+      learning_rate: Adam's learning rate after a warm-up.
+      final_learning_rate: learning rate at the end as a fraction of learning_rate; the decay is a cosine. With 1 the
+        rate is constant, without warm-up.
       dropout: fraction of the hidden units of each layer that is dropped for a training pose, in [0, 1). The paper
-        names it against overfitting and does without; so do the presets.
-      weight_decay: of AdamW: each update takes the fraction learning_rate * weight_decay from every weight, and nothing
-        from biases. As dropout.
-      patience: evaluations without a better distance on the validation poses after which training stops; 0 never.
-      target_quality: training ends early once the quality on validation poses is no larger; 0 never.
-      evaluations: how often the mapper is evaluated and saved.
-      validation_poses: that early stopping looks at.
-      held_out_poses: that the report is made on.
+        mentions it against overfitting and does not use it; the presets do not either.
+      weight_decay: AdamW's: each update subtracts the fraction learning_rate * weight_decay of every weight; biases do
+        not decay. The presets do not use it.
+      patience: training ends after this many evaluations without a smaller distance on the validation poses; 0 disables
+        it.
+      target_quality: training ends early when the quality on the validation poses is at most this; 0 disables it.
+      evaluations: number of evaluations and checkpoints.
+      validation_poses: number of poses that early stopping is decided on.
+      held_out_poses: number of poses that the report is computed on.
     """
 
     length_key: ClassVar[str] = "epochs"
@@ -294,7 +326,7 @@ class PoseMapperConfig(TrainerConfig):
         check_choice("trainer.name", self.name, ("pose_mapper",))
 
     def resolve(self) -> "PoseMapperSettings":
-        """The same with every field filled in.
+        """Returns the settings: every field has a value.
 
         Raises:
           ValueError: numbers out of range, or a batch size that does not divide the samples.
@@ -306,7 +338,7 @@ class PoseMapperConfig(TrainerConfig):
 
 @dataclasses.dataclass(frozen=True)
 class PoseMapperSettings(PoseMapperConfig):
-    """A pose mapper's config with every field filled in."""
+    """A pose mapper's config where every field has a value."""
 
     inputs: str = MISSING
     outputs: str = MISSING
@@ -327,7 +359,7 @@ class PoseMapperSettings(PoseMapperConfig):
         check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
         check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
         check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
-        _check_whole(
+        _check_counts(
             self, "heads", "samples", "batch_size", "epochs", "evaluations", "validation_poses", "held_out_poses"
         )
         _check_layers(self.hidden_layers)
@@ -353,7 +385,7 @@ class PoseMapperSettings(PoseMapperConfig):
 
     @property
     def total_steps(self) -> int:
-        """Poses to train on, each time anew."""
+        """Training poses, counted in every epoch."""
         return self.samples * self.epochs
 
 
@@ -361,12 +393,12 @@ TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig, "pose_mapper": Pos
 
 
 def _filled_in(config: TrainerConfig, preset: dict[str, Any]) -> dict[str, Any]:
-    """All fields; those that are None from the preset."""
+    """All fields; where one is None, the preset's value."""
     fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
     return {key: preset.get(key) if value is None else value for key, value in fields.items()}
 
 
-def _check_whole(config: TrainerConfig, *keys: str) -> None:
+def _check_counts(config: TrainerConfig, *keys: str) -> None:
     for key in keys:
         if getattr(config, key) < 1:
             raise ValueError(f"trainer.{key}: expected at least 1, got {getattr(config, key)}")
@@ -384,12 +416,12 @@ class TrainConfig:
     Attributes:
       env: see `EnvConfig`.
       trainer: one of `TRAINERS`.
-      seed: of networks, exploration and resets.
-      run_dir: where everything is written; runs/ENV-TRAINER-seedSEED-TIME where empty.
-      resume: a run directory to go on from.
-      logger: "local", "wandb", "mlflow", or a list of these: where metrics go beside the run directory, which has them
-        in any case.
-      compilation_cache: folder where JAX keeps compiled programs between runs; none where empty.
+      seed: random seed of networks, exploration and resets.
+      run_dir: folder that the run writes to; runs/ENV-TRAINER-seedSEED-TIME where empty.
+      resume: run directory of the run to continue.
+      logger: "local", "wandb", "mlflow", or a list of these: services that metrics are sent to. The run directory
+        always has the metrics.
+      compilation_cache: folder where JAX keeps compiled functions between runs; none where empty.
       distributed: see `DistributedConfig`.
     """
 
@@ -408,5 +440,5 @@ class TrainConfig:
 
     @property
     def loggers(self) -> list[str]:
-        """The services, as a list."""
+        """The names in `logger` as a list."""
         return [self.logger] if isinstance(self.logger, str) else list(map(str, self.logger or ()))

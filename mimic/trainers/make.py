@@ -1,4 +1,4 @@
-"""The trainer of a config, by its name."""
+"""Makes the trainer of a config, by its name."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,11 @@ if TYPE_CHECKING:
 
 
 def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
-    """What the trainer of a config does; with the inputs of a run directory where there is one.
+    """The trainer of a config.
+
+    Args:
+      config: the run's config.
+      run_dir: directory of an existing run, whose inputs are used; None for a new run.
 
     Raises:
       ValueError: a config that cannot be trained.
@@ -23,7 +27,7 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
 
 
 def make_ppo_trainer(config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None) -> "PPOTrainer":
-    """That of a config with trainer=ppo; see `PPOTrainer`."""
+    """The trainer of a config with trainer=ppo; see `PPOTrainer`."""
     compat.import_mjx()
     from mimic.trainers.ppo.trainer import PPOTrainer  # brax and MJX, which take seconds to import
 

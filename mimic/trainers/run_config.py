@@ -1,31 +1,30 @@
-"""The config of a run: where a new run goes, and reading what a run directory was trained with."""
+"""The config of a run: its directory, and saving and loading the config there."""
 
 import time
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.config import explain, schema, to_dict
+from mimic.config import check_new, explain, schema, to_dict
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, write_atomically
 from mimic.trainers.config import TRAINERS, TrainConfig
 
 
 def new_run_dir(config: TrainConfig) -> Path:
-    """The path of a new run; nothing is made yet.
+    """The directory of a new run, which is not created yet.
 
     Raises:
       ValueError: it exists.
     """
     if config.run_dir:
         path = Path(config.run_dir).expanduser()
-        if path.exists():
-            raise ValueError(f"run_dir: {str(path)!r} exists; name a new one, or go on with resume={path}")
+        check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
         return path
     stem = f"{config.env.name}-{config.trainer.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-    path, again = Path("runs") / stem, 1
+    path, number = Path("runs") / stem, 1
     while path.exists():
-        path, again = Path("runs") / f"{stem}-{again}", again + 1
+        path, number = Path("runs") / f"{stem}-{number}", number + 1
     return path
 
 
@@ -35,7 +34,7 @@ def save_config(run_dir: Path, config: TrainConfig) -> None:
 
 
 def run_schema(trainer: str) -> DictConfig:
-    """The typed node of a run with a trainer."""
+    """The typed OmegaConf node of a run with this trainer."""
     return OmegaConf.merge(schema(TrainConfig), {"trainer": schema(TRAINERS[trainer])})  # type: ignore[return-value]
 
 
@@ -52,27 +51,27 @@ def load_config(run_dir: Path) -> TrainConfig:
         name = OmegaConf.select(content, "trainer.name")
         if name not in TRAINERS:
             raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
-        merged = OmegaConf.merge(run_schema(name), _as_it_was(content))  # type: ignore[arg-type]
+        merged = OmegaConf.merge(run_schema(name), _with_old_default_metric(content))  # type: ignore[arg-type]
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
-    except Exception as error:  # OmegaConf, YAML and our own checks each have their own kinds
+    except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
 
 
-def _as_it_was(content: DictConfig) -> DictConfig:
-    """The config of a run from before links were kept: with the metric that was the default then."""
+def _with_old_default_metric(content: DictConfig) -> DictConfig:
+    """Completes the config of a run older than the field `metric.links` with the default metric of that time."""
     if OmegaConf.select(content, "env.metric.links") is not None:
         return content
-    was = {"translation": 0.0, "correspondence": "overlap", **(OmegaConf.select(content, "env.metric") or {})}
-    correspondence = "chord_overlap" if was["correspondence"] == "overlap" else was["correspondence"]
-    metric = {**was, "correspondence": correspondence, "links": "merged"}
+    old = {"translation": 0.0, "correspondence": "overlap", **(OmegaConf.select(content, "env.metric") or {})}
+    correspondence = "chord_overlap" if old["correspondence"] == "overlap" else old["correspondence"]
+    metric = {**old, "correspondence": correspondence, "links": "merged"}
     return OmegaConf.merge(content, {"env": {"metric": metric}})  # type: ignore[return-value]
 
 
 def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
-    """The directory and the config of a run whose policy shall be shown.
+    """The directory and the config of a run, for a command that shows its policy.
 
     Raises:
-      ValueError: no run directory of PPO, or no such checkpoint.
+      ValueError: no run directory, a run of another trainer than PPO, or no such checkpoint.
     """
     if not run:
         raise ValueError("run: expected the run directory to show, as in run=runs/NAME")

@@ -1,4 +1,4 @@
-"""What a trainer brings to a run: its inputs, its training, and how good the result is. The session does the rest."""
+"""The interface of a trainer: its inputs, its training and its evaluation. `mimic.commands.train` does the rest."""
 
 import abc
 from collections.abc import Callable, Mapping
@@ -10,20 +10,20 @@ from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainerConfig
 
 Params = Any  # pytree
-Figures = dict[str, Any]  # quality figures of a report, some by split
-OnEvaluation = Callable[[int, Params, Mapping[str, float]], bool]  # steps, metrics of the training; whether to stop
-OnUpdate = Callable[[int, str], None]
-Row = tuple[str, str, str]  # of the final table: label, on training data, on held-out data
+Metrics = dict[str, Any]  # quality metrics of a report, some by split
+OnEvaluation = Callable[[int, Params, Mapping[str, float]], bool]  # (steps, parameters, training metrics) -> stop?
+OnUpdate = Callable[[int, str], None]  # (updates, state of the search)
+Row = tuple[str, str, str]  # of the final table: label, value on training data, value on held-out data
 
 
 class Trainer(abc.ABC):
-    """A run as its trainer sees it.
+    """Trains and evaluates one run.
 
     Attributes:
       settings: the trainer's config, resolved.
-      headline: what is trained on what, for people.
-      total_steps: how long training goes on.
-      unit: what a step is; its key in the report.
+      headline: one line for people: the environment, the arms and the training data.
+      total_steps: training steps of the whole run.
+      unit: name of a training step, as its key in the report.
     """
 
     settings: TrainerConfig
@@ -33,79 +33,79 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def save_inputs(self, run_dir: Path) -> None:
-        """Writes what the run needs to be repeated, beside its config."""
+        """Writes the inputs that reproduce the run, in addition to its config."""
 
     @abc.abstractmethod
     def params_template(self) -> Params:
-        """Parameters of the right structure, to restore a checkpoint into."""
+        """Parameters, or their shapes, with the structure of a checkpoint."""
 
     @abc.abstractmethod
     def train(
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
     ) -> tuple[int, Params]:
-        """Trains; saves a checkpoint before each call of `on_evaluation`.
+        """Trains, and saves a checkpoint before each call of `on_evaluation`.
 
         Args:
-          run_dir: where checkpoints go.
-          on_evaluation: training ends where it returns True.
-          signals: training ends after the next checkpoint if one came.
-          restore: steps and parameters to go on from.
+          run_dir: folder of the checkpoints.
+          on_evaluation: called after each training epoch; training ends when it returns True.
+          signals: signals of the process; after one, training ends at the next checkpoint.
+          restore: steps and parameters to continue from.
 
         Returns:
           Steps and parameters of the result.
 
         Raises:
-          Interrupted: a signal came; a checkpoint is written.
+          Interrupted: a signal was received; a checkpoint has been written.
         """
 
     def follow(self, restore: tuple[int, Params] | None) -> None:
-        """Trains in step with the first process, which does all the rest; returns when that has trained to the end."""
+        """Trains in a process other than the first, which alone evaluates and writes; returns when training ends."""
         del restore
         raise NotImplementedError
 
     @abc.abstractmethod
     def evaluate(self, params: Params) -> Any:
-        """What `figures`, `details` and `save_outcome` are made of."""
+        """Evaluates parameters; the result is the argument of `metrics`, `details` and `save_outcome`."""
 
     def run_controller(
         self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate
     ) -> tuple[Any, dict[str, Any]]:
-        """The same for a controller in the place of what was trained.
+        """Evaluates a controller, which may be another one than the trained policy.
 
         Args:
-          name: "policy" is what was trained.
-          params: of that.
-          search: how long "searched" searches.
-          on_update: called with the number of updates of a search, from 0 on, and its state as text.
+          name: the controller; "policy" is the trained one.
+          params: parameters of the trained policy.
+          search: settings of the controller "searched".
+          on_update: called with the number of updates of a search, from 0 on, and the state of the search as text.
 
         Returns:
-          As `evaluate`; and what the report says of the controller.
+          The result of `evaluate`, and the controller's entries of the report.
         """
         del search, on_update
         assert name == "policy", name
         return self.evaluate(params), {}
 
     @abc.abstractmethod
-    def figures(self, outcome: Any) -> Figures:
-        """Quality figures of an evaluation."""
+    def metrics(self, outcome: Any) -> Metrics:
+        """Quality metrics of an evaluation."""
 
     @abc.abstractmethod
-    def status(self, figures: Figures) -> str:
-        """The figures that a person watches while it trains, in a few words."""
+    def status(self, metrics: Metrics) -> str:
+        """The most important metrics as a short text, for the progress display."""
 
     @abc.abstractmethod
-    def good_enough(self, figures: Figures) -> bool:
-        """Whether training may end."""
+    def good_enough(self, metrics: Metrics) -> bool:
+        """Whether the target of the config is reached, so that training may end."""
 
     @abc.abstractmethod
-    def rows(self, figures: Figures) -> list[Row]:
-        """The figures as rows of the final table."""
+    def rows(self, metrics: Metrics) -> list[Row]:
+        """Rows of the final table."""
 
-    def details(self, outcome: Any, controller: str = "policy") -> Figures:
-        """What a report says of a controller beyond the figures; `similarity` is shown as a table of its own."""
+    def details(self, outcome: Any, controller: str = "policy") -> Metrics:
+        """Entries of the final report beyond the metrics; `similarity` is shown as a separate table."""
         del outcome, controller
         return {}
 
     @abc.abstractmethod
     def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
-        """Writes plots and tables of an evaluation of a controller; in a run directory, of its training too."""
+        """Writes plots and tables of a controller's evaluation, and in a run directory of its training."""

@@ -14,8 +14,8 @@ from mimic.metric.config import CORRESPONDENCES
 from mimic.viewer.follower import home_angles
 from mimic.viewer.live_session import LiveSession
 
-_DEMONSTRATIONS = 8  # to choose from; recorded when the first is asked for
-_HEAVIEST, _WEIGHT_STEP = 2.0, 0.05
+_DEMONSTRATIONS = 8  # number to choose from; recorded when the first one is played
+_MAX_WEIGHT, _WEIGHT_STEP = 2.0, 0.05
 _ANGLE_STEP = 0.01  # rad
 
 
@@ -23,17 +23,17 @@ class LiveControls:
     """Widgets of a live view.
 
     Args:
-      server: where they are added.
-      session: what they act on.
-      env: the arms.
-      can_lock: whether the learner's joints can be locked; a trained mapper has the joints that it has.
+      server: server that shows the widgets.
+      session: session that the widgets control.
+      env: environment that defines the arms.
+      can_lock: whether the learner's joints can be locked; the joints of a trained pose mapper are fixed.
     """
 
     def __init__(self, server: viser.ViserServer, session: LiveSession, env: EnvConfig, can_lock: bool):
         self._server, self._session, self._env = server, session, env
         self._random = np.random.default_rng()
         self._demonstrations: Demonstrations | None = None
-        self._moved = False  # by itself, at the last update
+        self._was_moving = False  # whether the expert moved by itself at the last update
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Expert"):
             self._add_buttons()
@@ -44,26 +44,26 @@ class LiveControls:
             self._add_learner(can_lock)
 
     def update(self) -> None:
-        """Lets the sliders go with an expert that moves by itself.
+        """Updates the sliders of an expert that moves by itself.
 
-        Else they are left alone: what the user drags is ahead of the session, and setting it would pull it back.
+        Otherwise the sliders are not set: a slider that the user drags is ahead of the session and would jump back.
         """
         moving = self._session.moves_by_itself
-        if moving or self._moved:
+        if moving or self._was_moving:
             for slider, angle in zip(self._sliders, self._session.pose, strict=True):
                 slider.value = round(float(np.clip(angle, slider.min, slider.max)), 2)
-        self._moved = moving
+        self._was_moving = moving
 
     def undo_locks(self) -> None:
-        """Shows again which joints are locked, after a choice that was refused."""
+        """Restores the checkboxes of the locked joints after an invalid choice."""
         for name, box in self._locks.items():
             box.value = name in self._session.settings.locked
 
     def _add_buttons(self) -> None:
         gui, session = self._server.gui, self._session
         buttons = gui.add_button_group("go to", ("random pose", "home pose"))
-        self._which = gui.add_dropdown("demonstration", [str(i + 1) for i in range(_DEMONSTRATIONS)])
-        playing = gui.add_button_group("motion", ("play", "stop"))
+        self._selected = gui.add_dropdown("demonstration", [str(i + 1) for i in range(_DEMONSTRATIONS)])
+        playback = gui.add_button_group("motion", ("play", "stop"))
 
         @buttons.on_click
         def _(event: viser.GuiEvent) -> None:
@@ -71,11 +71,11 @@ class LiveControls:
             home = event.target.value == "home pose"
             session.glide(session.expert.home if home else self._random.uniform(lower, upper))
 
-        @playing.on_click
+        @playback.on_click
         def _(event: viser.GuiEvent) -> None:
             session.stop()
             if event.target.value == "play":
-                self._play(int(self._which.value) - 1)
+                self._play(int(self._selected.value) - 1)
 
     def _play(self, index: int) -> None:
         if self._demonstrations is None:
@@ -98,22 +98,22 @@ class LiveControls:
 
     def _add_metric(self) -> None:
         gui, session, settings = self._server.gui, self._session, self._session.settings
-        kind = gui.add_dropdown("correspondence", CORRESPONDENCES, initial_value=settings.correspondence)
-        kind.on_update(_by_user(lambda value: session.change(correspondence=value)))
-        for part in ("rotation", "translation"):
-            initial = getattr(settings, part)
+        correspondence = gui.add_dropdown("correspondence", CORRESPONDENCES, initial_value=settings.correspondence)
+        correspondence.on_update(_by_user(lambda value: session.change(correspondence=value)))
+        for term in ("rotation", "translation"):
+            initial = getattr(settings, term)
             weight = gui.add_slider(
-                part, 0.0, max(_HEAVIEST, initial), _WEIGHT_STEP, initial,
-                disabled=self._env.metric.adaptive, hint="weight of this part of the distance",
+                term, 0.0, max(_MAX_WEIGHT, initial), _WEIGHT_STEP, initial,
+                disabled=self._env.metric.adaptive, hint="weight of this term of the distance",
             )  # fmt: skip
-            weight.on_update(_by_user(lambda value, part=part: session.change(**{part: float(value)})))
-        gui.add_markdown("Another correspondence, and a first weight on translation, are compiled for some seconds.")
+            weight.on_update(_by_user(lambda value, term=term: session.change(**{term: float(value)})))
+        gui.add_markdown("A new correspondence, and a first weight on translation, take some seconds to compile.")
 
     def _add_learner(self, can_lock: bool) -> None:
         gui, session = self._server.gui, self._session
         escape = gui.add_checkbox(
             "leave local minima", session.escape, disabled=not can_lock,
-            hint="once the expert rests, go on to the best pose of many starts",
+            hint="when the expert rests, continue to the best pose of many initial guesses",
         )  # fmt: skip
         escape.on_update(_by_user(lambda value: setattr(session, "escape", value)))
         self._locks = {
@@ -129,11 +129,11 @@ class LiveControls:
         self._session.change(locked=tuple(name for name, box in self._locks.items() if box.value))
 
 
-def _by_user(act: Any) -> Any:
-    """A callback with the new value, for what the user changes, not the program."""
+def _by_user(callback: Any) -> Any:
+    """Calls back with the new value of a widget if the user changed it, not if the code did."""
 
     def on_update(event: viser.GuiEvent) -> None:
         if event.client is not None:
-            act(event.target.value)
+            callback(event.target.value)
 
     return on_update

@@ -1,4 +1,4 @@
-"""Numbers, heat maps and curves as HTML and SVG: small, sharp, and quick to replace many times a second."""
+"""Numbers, heat maps and curves as HTML and SVG, which are fast enough to replace at every frame."""
 
 import html
 import math
@@ -7,17 +7,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from mimic.evaluation.labels import SIMILARITY_HEADERS
-from mimic.metric.similarity import MEASURES
+from mimic.evaluation.labels import similarity_texts
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
 _BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 120, 34, 18, 8  # pixels of a chart and its margins
-_LEAST_TOP = 0.01  # of a chart's scale, so that an arm at distance 0 has a scale that can be read
+_MIN_TOP = 0.01  # of a chart's scale, so that the scale is readable at distance 0
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Link names without what they all begin with: link1, link2+link3 -> 1, 2+3."""
+    """Link names without the prefix "link": link1, link2+link3 -> 1, 2+3."""
     return [name.replace("link", "") or name for name in names]
 
 
@@ -28,21 +27,21 @@ def heat_map(
     title: str,
     *,
     name: str,
-    largest: float | None = None,
+    maximum: float | None = None,
     colour: tuple[int, int, int] = _BLUES,
 ) -> str:
-    """A matrix as a table of coloured cells.
+    """Returns a matrix as a table of coloured cells.
 
     Args:
-      values: at least 0.
-      rows: names, of the expert's links.
-      columns: names, of the learner's links.
-      title: above it.
-      name: id of the element.
-      largest: value of the full colour; the largest one where None.
-      colour: full colour, red, green, blue up to 255.
+      values: values of at least 0.
+      rows: names of the expert's links.
+      columns: names of the learner's links.
+      title: title above the table.
+      name: id of the HTML element.
+      maximum: value of the full colour. Default None: the maximum of `values`.
+      colour: full colour as red, green and blue from 0 to 255.
     """
-    scale = max(float(values.max()) if largest is None else largest, 1e-9)
+    scale = max(float(values.max()) if maximum is None else maximum, 1e-9)
     head = "".join(f"<th>{html.escape(column)}</th>" for column in columns)
     body = "".join(
         f"<tr><th>{html.escape(row)}</th>{''.join(_cell(float(value), scale, colour) for value in line)}</tr>"
@@ -56,9 +55,9 @@ def heat_map(
 
 
 def _cell(value: float, scale: float, colour: tuple[int, int, int]) -> str:
-    share = min(max(value / scale, 0.0), 1.0)
-    mixed = ",".join(str(round(255 + share * (channel - 255))) for channel in colour)
-    ink = "#fff" if share > 0.55 else "#333"
+    fraction = min(max(value / scale, 0.0), 1.0)
+    mixed = ",".join(str(round(255 + fraction * (channel - 255))) for channel in colour)
+    ink = "#fff" if fraction > 0.55 else "#333"
     text = "" if value < 0.005 else f"{value:.2f}" if value < 9.995 else f"{value:.1f}"  # four characters fit
     return f'<td style="background:rgb({mixed});color:{ink};text-align:center;height:15px">{text}</td>'
 
@@ -69,7 +68,7 @@ def heat_maps(
     expert_links: Sequence[str],
     learner_links: Sequence[str],
 ) -> str:
-    """Correspondence and distances of all pairs of links, beside each other."""
+    """Returns heat maps of the correspondence and of the distances of all pairs of links."""
     names = short_names(expert_links), short_names(learner_links)
     return (
         '<div style="display:flex;gap:10px;padding:0 12px">'
@@ -81,9 +80,9 @@ def heat_maps(
 
 
 def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[str, float] | None = None) -> str:
-    """Distance and bound, large; a note; and the measures of `mimic.metric.similarity`."""
+    """Returns distance and bound in large type, a note, and the measures of `mimic.metric.similarity`."""
 
-    def one(name: str, label: str, value: float, colour: str) -> str:
+    def cell(name: str, label: str, value: float, colour: str) -> str:
         return (
             f'<div><div style="font-size:11px;color:#777">{label}</div>'
             f'<div id="{name}" style="font-size:22px;font-variant-numeric:tabular-nums;color:{colour}">'
@@ -92,20 +91,19 @@ def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[s
 
     return (
         '<div style="display:flex;gap:22px;padding:4px 12px">'
-        + one("mimic-distance", "embodiment distance", distance, LEARNER)
-        + one("mimic-bound", "lower bound", bound, BOUND)
+        + cell("mimic-distance", "embodiment distance", distance, LEARNER)
+        + cell("mimic-bound", "kinematic bound", bound, BOUND)
         + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px">'
         f"{html.escape(note)}</div>{_measures(similarity or {})}"
     )
 
 
 def _measures(similarity: Mapping[str, float]) -> str:
-    """The measures of similarity in one line, each under its name."""
+    """The similarity measures in one line, each below its name."""
     cells = "".join(
-        f'<div><div style="font-size:10px;color:#777">{html.escape(SIMILARITY_HEADERS[name].replace(chr(10), " "))}'
-        f'</div><div id="mimic-{name}" style="font-size:13px;font-variant-numeric:tabular-nums">'
-        f"{f'{value:.0f}°' if name.endswith('_deg') else f'{value:.3f}'}</div></div>"
-        for name, value in ((name, similarity[name]) for name in MEASURES if name in similarity)  # jit sorts names
+        f'<div><div style="font-size:10px;color:#777">{html.escape(label)}</div>'
+        f'<div id="mimic-{name}" style="font-size:13px;font-variant-numeric:tabular-nums">{text}</div></div>'
+        for name, (label, text) in similarity_texts(similarity).items()
     )
     return f'<div style="display:flex;gap:14px;padding:4px 12px">{cells}</div>' if cells else ""
 
@@ -116,16 +114,16 @@ def chart(
     *,
     now: float | None = None,
 ) -> str:
-    """Curves over time, as SVG.
+    """Returns curves over time as SVG.
 
     Args:
-      time: [s], ascending.
-      curves: label, values of at least 0, colour; all but the first are dashed.
-      now: time to mark.
+      time: time of the samples [s], ascending.
+      curves: label, values of at least 0, and colour of each curve; all but the first are dashed.
+      now: time to mark [s].
     """
     first, last = (float(time[0]), float(time[-1])) if len(time) else (0.0, 1.0)
     span = max(last - first, 1e-6)
-    top = max([float(np.nanmax(values)) for _, values, _ in curves if np.isfinite(values).any()] + [_LEAST_TOP]) * 1.08
+    top = max([float(np.nanmax(values)) for _, values, _ in curves if np.isfinite(values).any()] + [_MIN_TOP]) * 1.08
     inner = _WIDTH - _LEFT - 6, _HEIGHT - _BOTTOM - _TOP
 
     def x(t: np.ndarray) -> np.ndarray:
@@ -134,26 +132,26 @@ def chart(
     def y(value: np.ndarray) -> np.ndarray:
         return _TOP + (1 - value / top) * inner[1]
 
-    parts = []
-    for share in (0.0, 0.5, 1.0):
-        height = float(y(np.array(share * top / 1.08)))
-        parts.append(
-            f'<line x1="{_LEFT}" x2="{_WIDTH - 6}" y1="{height:.1f}" y2="{height:.1f}" stroke="#e4e4e4"/>'
-            f'<text x="{_LEFT - 4}" y="{height + 3:.1f}" text-anchor="end">{share * top / 1.08:.3f}</text>'
-        )
+    parts = [_grid_line(float(tick), float(y(tick))) for tick in np.array([0.0, 0.5, 1.0]) * top / 1.08]
     for label, values, colour in curves:
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x(time), y(values), strict=True) if b == b)
         dashes = ' stroke-dasharray="4 3"' if label != curves[0][0] else ""
         parts.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.6"{dashes}/>')
     if now is not None:
-        at = float(x(np.array(now)))
-        parts.append(f'<line x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP}" y2="{_HEIGHT - _BOTTOM}" stroke="#d62728"/>')
+        mark = float(x(np.array(now)))
+        parts.append(f'<line x1="{mark:.1f}" x2="{mark:.1f}" y1="{_TOP}" y2="{_HEIGHT - _BOTTOM}" stroke="#d62728"/>')
     for index, (label, _, colour) in enumerate(curves):
-        parts.append(
-            f'<text x="{_LEFT + 6 + 78 * index}" y="{_HEIGHT - 3}" fill="{colour}">{html.escape(label)}</text>'
-        )
+        x_label = _LEFT + 6 + 78 * index
+        parts.append(f'<text x="{x_label}" y="{_HEIGHT - 3}" fill="{colour}">{html.escape(label)}</text>')
     parts.append(f'<text x="{_WIDTH - 6}" y="{_HEIGHT - 3}" text-anchor="end">{last:.1f} s</text>')
     return (
         f'<svg id="mimic-chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" style="width:100%;padding:0 8px" '
         f'font-size="9" fill="#666" font-family="sans-serif">{"".join(parts)}</svg>'
+    )
+
+
+def _grid_line(value: float, height: float) -> str:
+    return (
+        f'<line x1="{_LEFT}" x2="{_WIDTH - 6}" y1="{height:.1f}" y2="{height:.1f}" stroke="#e4e4e4"/>'
+        f'<text x="{_LEFT - 4}" y="{height + 3:.1f}" text-anchor="end">{value:.3f}</text>'
     )

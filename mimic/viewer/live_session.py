@@ -1,4 +1,4 @@
-"""The state of a live view: what the expert does, how the learner follows, what is shown of it. Knows no browser."""
+"""State of a live view: motion of the expert, motion of the learner, and the frames to show. Needs no browser."""
 
 import dataclasses
 import math
@@ -9,29 +9,38 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.arm import build_arm, rated_speed
+from mimic.arms.arm import build_arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
-from mimic.viewer.follower import Mapper, ProgramCache, Programs, Settings, home_angles, initial_settings, step_towards
+from mimic.viewer.follower import (
+    CompiledFunctions,
+    FunctionCache,
+    Mapper,
+    PoseComparison,
+    Settings,
+    home_angles,
+    initial_settings,
+    step_towards,
+)
 
-_GLIDE = 1.0  # s, that the expert takes to a pose that a button gives
-_STILL = 0.25  # s without a new pose of the expert, after which the learner may leave a local minimum
-_RESTS = 1e-4  # rad: a joint that moves less is at rest
-_WORTH_IT = 1e-3  # of the distance that another minimum must save
+_GLIDE = 1.0  # s, duration of the expert's motion to the pose of a button
+_REST_TIME = 0.25  # s that the expert rests before the learner may leave a local minimum
+_REST_ANGLE = 1e-4  # rad; a joint that moves less is at rest
+_MIN_GAIN = 1e-3  # fraction of the distance that another minimum must save
 
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """What is seen at one moment.
+    """Content of the view at one time.
 
     Attributes:
-      expert, learner: angle [rad] of all joints by name, locked ones included.
-      locked: the learner's locked joints.
+      expert, learner: angle of every joint by name, including locked joints [rad].
+      locked: locked joints of the learner.
       expert_links, learner_links: names of the links, base to tip.
       distance: embodiment distance.
-      bound: the least that the learner could have; NaN while it is not known.
-      matrix: correspondence W.
-      links: weighted distance of every pair of links D'.
+      bound: kinematic bound of the distance; NaN while it is unknown.
+      matrix: correspondence matrix W.
+      links: weighted distance D' of every pair of links.
       similarity: measures of `mimic.metric.similarity` by name.
     """
 
@@ -48,83 +57,83 @@ class Frame:
 
 
 class LiveSession:
-    """An expert that is moved, and a learner that follows. The methods may be called from any thread.
+    """An expert that the user moves, and a learner that follows it. The methods are thread-safe.
 
     Args:
-      env: the arms and the metric.
-      mapper: moves the learner instead of the optimiser.
+      env: environment that defines the arms and the metric.
+      mapper: pose mapper that moves the learner instead of the optimiser.
 
     Attributes:
-      expert: the arm.
-      settings: what is asked for; shown as soon as its programs are compiled.
+      expert: embodiment of the expert.
+      settings: requested settings; they take effect as soon as their functions are compiled.
 
     Raises:
-      ValueError: arms that cannot be built.
+      ValueError: an arm is invalid.
     """
 
     def __init__(self, env: EnvConfig, mapper: Mapper | None = None):
         self.expert: Embodiment = build_arm(env.expert, env.limits, env.metric.links).embodiment
         self.settings: Settings = initial_settings(env)
         self._escape = mapper is None
-        self._programs = ProgramCache(env, mapper)
+        self._functions = FunctionCache(env, mapper)
         self._lock = threading.RLock()
-        self._angles = dict(home_angles(env))  # of the learner, all joints
+        self._angles = dict(home_angles(env))  # of all joints of the learner [rad]
         self._pose = np.array(self.expert.home, np.float32)
-        self._motion: tuple[np.ndarray, np.ndarray] | None = None  # times [s] and poses that the expert goes through
-        self._time = 0.0  # s, of the motion
-        self._still = 0.0  # s since the expert moved
-        self._goal: np.ndarray | None = None  # the learner's pose to go to, past the optimiser
-        self._solved: tuple[Any, np.ndarray, float] | None = None  # for what; best pose and bound
-        self._working = self.settings  # the last ones whose programs were there
-        self._rested: Any = None  # for what the learner came to rest
+        self._motion: tuple[np.ndarray, np.ndarray] | None = None  # times [s] and poses [rad] of the expert
+        self._time = 0.0  # s, since the start of the motion
+        self._rest_time = 0.0  # s, since the expert moved
+        self._goal: np.ndarray | None = None  # pose of the learner to move to instead of following the optimiser
+        self._solved: tuple[Any, np.ndarray, float] | None = None  # request, best pose and bound
+        self._active = self.settings  # the last settings with compiled functions
+        self._rest_key: Any = None  # request for which the learner is at rest
 
     @property
     def pose(self) -> Float[np.ndarray, " joints"]:
-        """The expert's [rad]."""
+        """Pose of the expert [rad]."""
         return self._pose.copy()
 
     @property
     def moves_by_itself(self) -> bool:
-        """Whether the expert is on its way to a pose or through a demonstration."""
+        """Whether the expert moves to a pose or along a demonstration."""
         return self._motion is not None
 
     def move(self, joint: int, angle: float) -> None:
-        """Puts one of the expert's joints to an angle [rad], and ends what motion there was."""
+        """Sets one joint of the expert to an angle [rad] and stops any motion."""
         with self._lock:
             self._motion = None
             pose = self.pose
             pose[joint] = np.clip(angle, *self.expert.joint_range[joint])
-            self._pose, self._still, self._goal = pose, 0.0, None
+            self._pose, self._rest_time, self._goal = pose, 0.0, None
 
     def glide(self, pose: Float[np.ndarray, " joints"]) -> None:
-        """Lets the expert go to a pose [rad]."""
+        """Moves the expert to a pose [rad] within a second."""
         self.play(np.array([0.0, _GLIDE]), np.stack([self._pose, pose]))
 
     def play(self, times: Float[np.ndarray, " samples"], poses: Float[np.ndarray, "samples joints"]) -> None:
-        """Lets the expert go through poses [rad] at their times [s]."""
+        """Moves the expert along poses [rad] at times [s]."""
         with self._lock:
             self._motion, self._time, self._goal = (times, np.asarray(poses, np.float32)), 0.0, None
 
     def stop(self) -> None:
-        """Ends what motion there is."""
+        """Stops the motion of the expert."""
         with self._lock:
             self._motion = None
 
     @property
     def escape(self) -> bool:
-        """Whether a learner that rests in a local minimum goes on to the best pose."""
+        """Whether a learner at rest in a local minimum continues to the best pose."""
         return self._escape
 
     @escape.setter
     def escape(self, value: bool) -> None:
         with self._lock:
-            self._escape, self._rested = value, None
+            self._escape, self._rest_key = value, None
 
     def change(self, **settings: Any) -> None:
-        """Switches some of the `Settings`.
+        """Changes some of the `Settings`.
 
         Raises:
-          ValueError: a value that they cannot have.
+          ValueError: a value is invalid.
         """
         with self._lock:
             self.settings = dataclasses.replace(self.settings, **settings)
@@ -132,104 +141,118 @@ class LiveSession:
 
     @property
     def is_compiling(self) -> bool:
-        """Whether what is asked for is still being compiled, the lower bound included."""
-        return not self._programs.is_complete(self.settings)
+        """Whether the functions of the requested settings are still being compiled, including the kinematic bound."""
+        return not self._functions.is_complete(self.settings)
 
-    def compile(self) -> Programs:
-        """The programs of the settings, waiting for them."""
-        return self._programs.wait(self.settings)
+    def compile(self) -> CompiledFunctions:
+        """Waits for the compiled functions of the requested settings and returns them."""
+        return self._functions.wait(self.settings)
 
     def finish(self) -> None:
-        """Waits for what is being compiled."""
-        self._programs.finish()
+        """Waits for a running compilation."""
+        self._functions.finish()
 
     def advance(self, dt: float) -> Frame | None:
-        """The next moment, a time [s] later; None where nothing changed, or before the first programs are compiled.
+        """Advances the view by a time step [s].
+
+        Returns:
+          The frame to show; None if nothing has changed, or before the first functions are compiled.
 
         Raises:
-          ValueError: settings that the arms cannot have; those before are back.
+          ValueError: the requested settings are invalid; the previous settings are restored.
         """
         with self._lock:
-            settings = self.settings
-            try:
-                programs = self._programs.get(settings)
-            except ValueError:
-                self.settings = self._working
-                raise
-            if programs is None:  # the view goes on as it was
-                settings = self._working
-                programs = self._programs.get(settings)
-            if programs is None:
+            functions = self._activate_functions()
+            if functions is None:
                 return None
-            self._working = settings
-            self._go_on(dt)
-            arm, expert = programs.learner.embodiment, self._pose
-            present = np.array([self._angles[name] for name in arm.joint_names], np.float32)
-            asked = expert.tobytes(), settings
-            if self._rested == (asked, programs.best is None):
+            settings = self._active
+            self._advance_expert(dt)
+            arm, expert = functions.learner.embodiment, self._pose
+            current = np.array([self._angles[name] for name in arm.joint_names], np.float32)
+            request = expert.tobytes(), settings
+            if self._rest_key == (request, functions.best is None):
                 return None
-            best, bound = self._best(programs, asked)
-            pose = self._step(programs, present, best, bound, settings.weights, dt)
-            shown = programs.measure(expert, pose, settings.weights)
+            best, bound = self._best(functions, request)
+            pose = self._step(functions, current, best, bound, settings.weights, dt)
+            comparison = functions.compare(expert, pose, settings.weights)
             self._angles |= dict(zip(arm.joint_names, map(float, pose), strict=True))
-            self._angles |= programs.learner.locked
-            rests = self._goal is None and self._still > 2 * _STILL and bool(np.all(np.abs(pose - present) < _RESTS))
-            self._rested = (asked, programs.best is None) if rests else None
-        distance = float(shown.distance)
+            self._angles |= functions.learner.locked
+            is_at_rest = (
+                self._goal is None
+                and self._rest_time > 2 * _REST_TIME
+                and bool(np.all(np.abs(pose - current) < _REST_ANGLE))
+            )
+            self._rest_key = (request, functions.best is None) if is_at_rest else None
+            return self._frame(functions, comparison, bound)
+
+    def _activate_functions(self) -> CompiledFunctions | None:
+        """The functions of the requested settings, or until these are compiled, of the previous settings."""
+        try:
+            functions = self._functions.get(self.settings)
+        except ValueError:
+            self.settings = self._active
+            raise
+        if functions is None:
+            return self._functions.get(self._active)
+        self._active = self.settings
+        return functions
+
+    def _frame(self, functions: CompiledFunctions, comparison: PoseComparison, bound: float) -> Frame:
+        distance = float(comparison.distance)
         return Frame(
-            expert=dict(zip(self.expert.joint_names, map(float, expert), strict=True)),
+            expert=dict(zip(self.expert.joint_names, map(float, self._pose), strict=True)),
             learner=dict(self._angles),
-            locked=settings.locked,
+            locked=self._active.locked,
             expert_links=self.expert.link_names,
-            learner_links=arm.link_names,
+            learner_links=functions.learner.embodiment.link_names,
             distance=distance,
-            bound=min(bound, distance),  # many starts may miss what one path found
-            matrix=np.asarray(shown.matrix),
-            links=np.asarray(shown.links),
-            similarity={name: float(value) for name, value in shown.similarity.items()},
+            bound=min(bound, distance),  # many initial guesses may miss a minimum that the path has reached
+            matrix=np.asarray(comparison.matrix),
+            links=np.asarray(comparison.links),
+            similarity={name: float(value) for name, value in comparison.similarity.items()},
         )
 
-    def _go_on(self, dt: float) -> None:
-        self._still += dt
+    def _advance_expert(self, dt: float) -> None:
+        self._rest_time += dt
         if self._motion is None:
             return
         times, poses = self._motion
         self._time += dt
         self._pose = np.array([np.interp(self._time, times, angles) for angles in poses.T], np.float32)
-        self._still = 0.0
+        self._rest_time = 0.0
         if self._time >= times[-1]:
             self._motion = None
 
-    def _best(self, programs: Programs, asked: Any) -> tuple[np.ndarray, float]:
-        """The best pose and its distance, searched once for each pose of the expert."""
-        if programs.best is None:
+    def _best(self, functions: CompiledFunctions, request: Any) -> tuple[np.ndarray, float]:
+        """The best pose and its distance, computed once for each pose of the expert."""
+        if functions.best is None:
             return self._pose, math.nan
-        if self._solved is None or self._solved[0] != asked:
-            qpos, distance = programs.best(self._pose, asked[1].weights)
-            self._solved = asked, np.asarray(qpos), float(distance)
+        if self._solved is None or self._solved[0] != request:
+            qpos, distance = functions.best(self._pose, request[1].weights)
+            self._solved = request, np.asarray(qpos), float(distance)
         return self._solved[1:]
 
     def _step(
         self,
-        programs: Programs,
-        present: np.ndarray,
+        functions: CompiledFunctions,
+        current: np.ndarray,
         best: np.ndarray,
         bound: float,
         weights: np.ndarray,
         dt: float,
     ) -> np.ndarray:
-        """The learner's next pose: no joint goes faster than its rated speed."""
-        arm = programs.learner.embodiment
-        jump = rated_speed(arm).astype(np.float32) * dt
+        """The learner's next pose; no joint exceeds its velocity limit."""
+        arm = functions.learner.embodiment
+        jump = finite_velocity_limit(arm).astype(np.float32) * dt
         goal = self._goal
-        if goal is None or goal.shape != present.shape:
-            goal = np.asarray(programs.follow(self._pose, present, weights))
+        if goal is None or goal.shape != current.shape:
+            goal = np.asarray(functions.follow(self._pose, current, weights))
             self._goal = None
-        pose, is_there = step_towards(arm, present, goal, jump)
+        pose, is_there = step_towards(arm, current, goal, jump)
         if self._goal is not None:
             self._goal = None if is_there else self._goal
-        elif is_there and self._escape and self._still > _STILL:
-            left = float(programs.measure(self._pose, pose, weights).distance)
-            if left - bound > _WORTH_IT * max(left, _WORTH_IT):
+        elif is_there and self._escape and self._rest_time > _REST_TIME:
+            distance = float(functions.compare(self._pose, pose, weights).distance)
+            if distance - bound > _MIN_GAIN * max(distance, _MIN_GAIN):
                 self._goal = best
         return np.asarray(pose, np.float32)

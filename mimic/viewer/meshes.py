@@ -1,4 +1,4 @@
-"""The shapes of an arm's MuJoCo model as triangles, and where its bodies are in a pose."""
+"""Triangle meshes of an arm's MuJoCo model, and the poses of its bodies."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
 from mimic.arms.rendering import LOCKED, MARK, SPACING
 
-_VISIBLE_GROUPS = 3  # MuJoCo draws groups 0, 1 and 2; shapes for collisions are in those above
+_VISIBLE_GROUPS = 3  # MuJoCo draws groups 0, 1 and 2; collision geoms are in higher groups
 _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _CAPSULE, _ELLIPSOID = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_ELLIPSOID)
 _CYLINDER, _BOX = int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_BOX)
@@ -21,14 +21,14 @@ _MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One shape, in the frame of its body.
+    """One mesh, in the frame of its body.
 
     Attributes:
       body: index of the body.
-      vertices: [m].
-      faces: triangles.
-      rgba: colour and opacity, each up to 1.
-      locked_joint: the joint that it marks as locked; it is hidden while the joint is free.
+      vertices: vertex positions [m].
+      faces: vertex indices of the triangles.
+      rgba: colour and opacity, from 0 to 1.
+      locked_joint: joint that the mesh marks as locked; the mesh is hidden while the joint is free.
     """
 
     body: int
@@ -39,20 +39,20 @@ class Part:
 
 
 class ArmShape:
-    """What is drawn of an arm.
+    """Meshes of an arm and their forward kinematics.
 
     Args:
-      config: of the arm; all its joints can be moved, whatever is locked.
+      config: config of the arm; locked joints can be moved too.
       limits: see `EnvConfig`.
 
     Attributes:
-      joint_names: of the chain, base to tip.
-      parts: its shapes.
-      num_bodies: of the model, the world included.
+      joint_names: joints of the chain, base to tip.
+      parts: meshes of the arm.
+      num_bodies: number of bodies in the model, including the world.
       reach: length of the chain [m].
 
     Raises:
-      ValueError: an arm that cannot be built.
+      ValueError: the arm is invalid.
     """
 
     def __init__(self, config: ArmConfig, limits: str = "none"):
@@ -63,12 +63,12 @@ class ArmShape:
         self.num_bodies = int(self._model.nbody)
         self.reach = float(free.chain_length)
         marks = [_mark(self._model, name, self.reach) for name in free.joint_names]
-        self.parts: list[Part] = [*_drawn(self._model), *marks]
+        self.parts: list[Part] = [*_visible_parts(self._model), *marks]
 
     def bodies(
         self, angles: Mapping[str, float]
     ) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 4"]]:
-        """Positions [m] and quaternions (w, x, y, z) of all bodies, for angles [rad] by joint."""
+        """Positions [m] and quaternions (w, x, y, z) of all bodies for the angles of joints [rad] by name."""
         for name, angle in angles.items():
             self._data.joint(name).qpos[0] = angle
         mujoco.mj_kinematics(self._model, self._data)
@@ -76,14 +76,14 @@ class ArmShape:
 
 
 def places(shapes: Sequence[ArmShape]) -> list[Float[np.ndarray, "3"]]:
-    """Where the bases of arms stand, side by side as in a video [m]."""
+    """Base positions of arms side by side, as in a video [m]."""
     reach = max(shape.reach for shape in shapes)
     return [np.array([0.0, (index - 0.5 * (len(shapes) - 1)) * SPACING * reach, 0.0]) for index in range(len(shapes))]
 
 
-def _drawn(model: mujoco.MjModel) -> list[Part]:
-    """The visible shapes, those of one body and colour as one."""
-    groups: dict[tuple[int, tuple[float, ...]], list[Any]] = {}  # of meshes
+def _visible_parts(model: mujoco.MjModel) -> list[Part]:
+    """The visible geoms, merged by body and colour."""
+    groups: dict[tuple[int, tuple[float, ...]], list[Any]] = {}  # meshes by body and colour
     for geom in range(model.ngeom):
         mesh = _triangles(model, geom)
         material = int(model.geom_matid[geom])
@@ -102,7 +102,7 @@ def _part(body: int, mesh: Any, rgba: tuple[float, ...], locked_joint: str | Non
 
 
 def _triangles(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
-    """A shape in its own frame; None for what has no extent, as the ground."""
+    """Mesh of a geom in its own frame; None for geoms of infinite extent, such as planes."""
     kind, size = int(model.geom_type[geom]), model.geom_size[geom]
     if kind == _SPHERE:
         return trimesh.creation.icosphere(3, float(size[0]))
@@ -110,7 +110,7 @@ def _triangles(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
         mesh = trimesh.creation.icosphere(3, 1.0)
         mesh.apply_scale(size)
         return mesh
-    if kind == _CAPSULE:  # its frame is in the middle
+    if kind == _CAPSULE:  # its frame is at its centre
         return trimesh.creation.capsule(2 * float(size[1]), float(size[0]), count=[24, 24])
     if kind == _CYLINDER:
         return trimesh.creation.cylinder(float(size[0]), 2 * float(size[1]), sections=40)
@@ -125,7 +125,7 @@ def _triangles(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
 
 
 def _mark(model: mujoco.MjModel, joint_name: str, reach: float) -> Part:
-    """A red disc about a joint's axis."""
+    """A red disc around a joint's axis, which marks it as locked."""
     joint = model.joint(joint_name)
     disc = trimesh.creation.cylinder(MARK[0] * reach, 2 * MARK[1] * reach, sections=40)
     quaternion = np.zeros(4)

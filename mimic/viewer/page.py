@@ -1,4 +1,4 @@
-"""What every view shows in the browser, by viser: two arms in 3-D, numbers, heat maps, a chart."""
+"""The page of every view in viser: two arms in 3-D, numbers, heat maps and a chart."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,21 +12,21 @@ from mimic.viewer.live_session import Frame
 from mimic.viewer.meshes import ArmShape, Part, places
 
 _ROLES = ("expert", "learner")
-_GRID = 0.1, 0.5  # m, of a cell and of a section
-_STANCE = np.array([2.5, -0.1, 0.75])  # of the camera from what it looks at, in lengths of the arms
+_GRID = 0.1, 0.5  # m, sizes of a cell and of a section
+_STANCE = np.array([2.5, -0.1, 0.75])  # camera position relative to its target, in arm lengths
 _FROM_ABOVE = np.array([0.55, -0.01, 2.9])
 _FIELD_OF_VIEW = 0.75  # rad
 
 
 class Page:
-    """The parts of the page that change with each `Frame`.
+    """The elements of the page that change with each `Frame`.
 
     Args:
-      server: a fresh one.
-      shapes: expert and learner.
-      names: what they are called.
-      title: of the page.
-      is_flat: whether to look from above.
+      server: new server without elements.
+      shapes: meshes of expert and learner.
+      names: names of expert and learner.
+      title: title of the page.
+      is_flat: whether the camera looks from above.
     """
 
     def __init__(
@@ -44,17 +44,17 @@ class Page:
         self._maps = server.gui.add_html("")
 
     def show(self, frame: Frame, chart: str, note: str) -> None:
-        """Shows a moment, all of it at once."""
+        """Shows a frame; all elements change together."""
         with self.server.atomic():
-            self._arms[0].put(frame.expert, ())
-            self._arms[1].put(frame.learner, frame.locked)
+            self._arms[0].move_to(frame.expert, ())
+            self._arms[1].move_to(frame.learner, frame.locked)
             self._numbers.content = html.numbers(frame.distance, frame.bound, note, frame.similarity)
             self._maps.content = html.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
             self._chart.content = chart
 
 
 class _DrawnArm:
-    """The shapes of an arm in the scene."""
+    """The meshes of an arm in the scene."""
 
     def __init__(self, server: viser.ViserServer, path: str, shape: ArmShape, place: np.ndarray, label: str):
         self._shape = shape
@@ -63,15 +63,15 @@ class _DrawnArm:
         scene.add_label(
             f"{path}/label", label, position=(0.3 * shape.reach, 0.0, 0.0), anchor="top-center", font_screen_scale=1.1
         )
-        moving = sorted({part.body for part in shape.parts})
-        self._frames = {body: scene.add_frame(f"{path}/body{body}", show_axes=False) for body in moving}
+        bodies = sorted({part.body for part in shape.parts})
+        self._frames = {body: scene.add_frame(f"{path}/body{body}", show_axes=False) for body in bodies}
         self._marks: dict[str, Any] = {}
         for index, part in enumerate(shape.parts):
             mesh = _mesh(scene, f"{path}/body{part.body}/part{index}", part)
             if part.locked_joint is not None:
                 self._marks[part.locked_joint] = mesh
 
-    def put(self, angles: Mapping[str, float], locked: Sequence[str]) -> None:
+    def move_to(self, angles: Mapping[str, float], locked: Sequence[str]) -> None:
         positions, quaternions = self._shape.bodies(angles)
         for body, frame in self._frames.items():
             frame.position, frame.wxyz = positions[body], quaternions[body]
@@ -104,8 +104,8 @@ def _set_stage(server: viser.ViserServer, reach: float, is_flat: bool) -> None:
         cell_color=(225, 228, 232), section_color=(196, 201, 208), plane_color=(246, 247, 249), plane_opacity=1.0,
         position=(0.0, 0.0, -0.002),
     )  # fmt: skip
-    middle: Float[np.ndarray, "3"] = np.array([0.0, 0.0, 0.0 if is_flat else 0.38 * reach])
+    target: Float[np.ndarray, "3"] = np.array([0.0, 0.0, 0.0 if is_flat else 0.38 * reach])
     camera = server.initial_camera
-    camera.look_at = middle
-    camera.position = middle + reach * (_FROM_ABOVE if is_flat else _STANCE)
+    camera.look_at = target
+    camera.position = target + reach * (_FROM_ABOVE if is_flat else _STANCE)
     camera.fov = _FIELD_OF_VIEW

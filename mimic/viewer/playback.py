@@ -1,4 +1,4 @@
-"""A trained policy's rollouts, moment by moment. Knows no browser."""
+"""Frames of a trained policy's rollouts. Needs no browser."""
 
 import functools
 from pathlib import Path
@@ -19,19 +19,19 @@ from mimic.viewer import html
 from mimic.viewer.live_session import Frame
 
 FRAMES_PER_SECOND = 30
-_SAMPLES = 32  # of the centre lines that a frame is measured by: half the usual number, to be quick
+_SAMPLES = 32  # samples of the centre lines in a frame: half the default number, to be fast
 
 
 class Playback:
-    """What the policy of a run does on its demonstrations.
+    """Rollouts of the policy of a run on its demonstrations.
 
     Args:
       trained: config of the run.
-      run_dir: its directory.
-      checkpoint: environment steps; the last one where None.
+      run_dir: directory of the run.
+      checkpoint: environment steps of the checkpoint. Default None: the last checkpoint.
 
     Raises:
-      ValueError: a run that cannot be read.
+      ValueError: the run cannot be read.
     """
 
     def __init__(self, trained: TrainConfig, run_dir: Path, checkpoint: int | None):
@@ -41,38 +41,39 @@ class Playback:
         self._params = load_checkpoint(run_dir, trainer.params_template(), checkpoint)[1]
         self._rollouts: Any = None
         self._locked = dict(build_arm(self.env.learner, self.env.limits).locked)
-        self.story = functools.lru_cache(maxsize=16)(self._story)
+        self._rollout = functools.lru_cache(maxsize=16)(self._compute_rollout)
 
     def run(self) -> None:
-        """Runs the policy on all demonstrations, and computes their bounds."""
-        with Console().status("running the policy on all demonstrations, and computing the lower bound"):
+        """Runs the policy on all demonstrations and computes their kinematic bounds."""
+        with Console().status("running the policy on all demonstrations and computing the kinematic bound"):
             self._rollouts = self._trainer.evaluate(self._params)
             _ = self._evaluator.lower_bound
 
     def count(self, split: str) -> int:
-        """How many demonstrations of a split there are."""
+        """Number of demonstrations in a split."""
         return len(range(self._evaluator.env.demonstrations.count)[self._evaluator.parts[split]])
 
-    def _story(self, split: str, demonstration: int) -> RolloutFrames:
+    def _compute_rollout(self, split: str, demonstration: int) -> RolloutFrames:
         index = demonstration_index(self._evaluator, split, demonstration)
         return RolloutFrames(self._evaluator, self._rollouts, index, FRAMES_PER_SECOND)
 
     def frame(self, split: str, demonstration: int, time: float) -> Frame:
-        """A moment of an episode, a time [s] after its start."""
-        story, env = self.story(split, demonstration), self._evaluator.env
-        moment = int(np.clip(round(time * FRAMES_PER_SECOND), 0, story.num_frames - 1))
-        step = min(int(story.time[moment] / story.dt), len(story.distance) - 1)
+        """Frame of an episode at a time since its start [s]."""
+        rollout, env = self._rollout(split, demonstration), self._evaluator.env
+        frame_index = int(np.clip(round(time * FRAMES_PER_SECOND), 0, rollout.num_frames - 1))
+        step = min(int(rollout.time[frame_index] / rollout.dt), len(rollout.distance) - 1)
         return Frame(
-            expert=dict(zip(env.expert.joint_names, map(float, story.expert[moment]), strict=True)),
-            learner=dict(zip(env.learner.joint_names, map(float, story.learner[moment]), strict=True)) | self._locked,
+            expert=dict(zip(env.expert.joint_names, map(float, rollout.expert[frame_index]), strict=True)),
+            learner=dict(zip(env.learner.joint_names, map(float, rollout.learner[frame_index]), strict=True))
+            | self._locked,
             locked=tuple(self._locked),
             expert_links=env.expert.link_names,
             learner_links=env.learner.link_names,
-            distance=float(story.distance[step]),
-            bound=float(story.bound[step]),
-            matrix=story.matrix[step],
-            links=story.links[step],
-            similarity=self._similarity(story.expert[moment], story.learner[moment]),
+            distance=float(rollout.distance[step]),
+            bound=float(rollout.bound[step]),
+            matrix=rollout.matrix[step],
+            links=rollout.links[step],
+            similarity=self._similarity(rollout.expert[frame_index], rollout.learner[frame_index]),
         )
 
     def _similarity(self, expert_qpos: np.ndarray, learner_qpos: np.ndarray) -> dict[str, float]:
@@ -82,24 +83,24 @@ class Playback:
         return {name: float(value) for name, value in similarity(*lines).items()}
 
     def chart(self, split: str, demonstration: int, time: float) -> str:
-        """The distance over the episode, with its bound, and where the time is."""
-        story = self.story(split, demonstration)
-        times = story.dt * np.arange(1, len(story.distance) + 1)
+        """Distance and kinematic bound over the episode, with a mark at a time [s]."""
+        rollout = self._rollout(split, demonstration)
+        times = rollout.dt * np.arange(1, len(rollout.distance) + 1)
         curves = [
-            ("policy", story.distance, html.LEARNER),
-            ("bound", story.bound, html.BOUND),
-            ("holding start pose", story.hold, html.HOLD),
+            ("policy", rollout.distance, html.LEARNER),
+            ("bound", rollout.bound, html.BOUND),
+            ("holding start pose", rollout.hold, html.HOLD),
         ]
-        return html.chart(times, curves, now=max(time, story.dt))
+        return html.chart(times, curves, now=max(time, rollout.dt))
 
     def note(self, split: str, demonstration: int) -> str:
-        """How good the policy is on a demonstration as a whole."""
-        story = self.story(split, demonstration)
-        gap = float(gaps(*(x.mean(dtype=float) for x in (story.distance, story.bound, story.hold))))
+        """Optimality gap of the policy on a whole demonstration, as a sentence."""
+        rollout = self._rollout(split, demonstration)
+        gap = float(gaps(*(x.mean(dtype=float) for x in (rollout.distance, rollout.bound, rollout.hold))))
         if not np.isfinite(gap):
-            return "no optimality gap: the best motion is hardly nearer than holding the start pose"
+            return "no optimality gap: the best motion hardly reduces the distance of holding the start pose"
         return f"optimality gap of this demonstration: {gap:.1%}"
 
     def duration(self, split: str, demonstration: int) -> float:
-        """Of an episode [s]."""
-        return float(self.story(split, demonstration).time[-1])
+        """Duration of an episode [s]."""
+        return float(self._rollout(split, demonstration).time[-1])

@@ -1,4 +1,4 @@
-"""The other processes of a training on this host, which the first starts: one for each GPU."""
+"""Training processes on one host, one for each GPU: the first process starts the others."""
 
 import atexit
 import contextlib
@@ -12,41 +12,41 @@ import tempfile
 import time
 from typing import IO, NamedTuple
 
-_TOLD = "MIMIC_LOCAL_PROCESS"  # variable by which a process is told who it is
-_PATIENCE_S = 5  # they are given this long to end by themselves
-_DYING_S = 1  # between the end of its pipe and its exit code
-_SHOWN = 2000  # bytes of what one of them said
+_VARIABLE = "MIMIC_LOCAL_PROCESS"  # environment variable with the `LocalProcess` of a started process
+_PATIENCE_S = 5  # time for the processes to end by themselves
+_EXIT_S = 1  # maximum time between the end of a process's pipe and its exit code
+_OUTPUT_BYTES = 2000  # of the error output of a process in a message
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux's prctl
 
 
-class Told(NamedTuple):
-    """What the first process tells another.
+class LocalProcess(NamedTuple):
+    """The place of a started process among the training processes.
 
     Attributes:
-      address: HOST:PORT where all find each other.
-      count: of processes.
-      index: of this one.
-      first: the first one's process number in the system.
+      address: HOST:PORT where all processes connect.
+      count: number of processes.
+      index: number of this process.
+      first_pid: process ID of the first process.
     """
 
     address: str
     count: int
     index: int
-    first: int
+    first_pid: int
 
 
 class LocalProcesses:
-    """Copies of this process.
+    """Processes with the same command as this one.
 
     Attributes:
-      address: HOST:PORT where all find each other.
+      address: HOST:PORT where all processes connect.
     """
 
     def __init__(self, count: int):
-        """Starts them.
+        """Starts the processes.
 
         Args:
-          count: of processes, this one included, which is number 0.
+          count: number of processes, including this one, which is number 0.
         """
         self.address = f"127.0.0.1:{_free_port()}"
         self._processes: list[subprocess.Popen[bytes]] = []
@@ -54,42 +54,42 @@ class LocalProcesses:
         atexit.register(self.end)
         for index in range(1, count):
             self._stderr.append(tempfile.TemporaryFile())  # noqa: SIM115 (as long as the process)
-            told = " ".join(map(str, Told(self.address, count, index, os.getpid())))
+            value = " ".join(map(str, LocalProcess(self.address, count, index, os.getpid())))
             process = subprocess.Popen(
                 [sys.executable, *sys.orig_argv[1:]],
-                env={**os.environ, _TOLD: told},
+                env={**os.environ, _VARIABLE: value},
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,  # closed by `told`, which says with it that it got that far
+                stdout=subprocess.PIPE,  # `local_process` writes to it and closes it
                 bufsize=0,
                 stderr=self._stderr[-1],
-                start_new_session=True,  # Ctrl-C goes to the first alone, which tells them
+                start_new_session=True,  # Ctrl-C reaches only the first process, which announces it
             )
             self._processes.append(process)
 
-    def lost_at_start(self) -> int | None:
-        """Waits until all look for each other; number of one that ended before, None where all do."""
+    def ended_at_start(self) -> int | None:
+        """Waits until all processes run `local_process`; the number of one that ended before, or None."""
         for index, process in enumerate(self._processes, 1):
             if not process.stdout.read(1):  # type: ignore[union-attr]
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(_DYING_S)
+                    process.wait(_EXIT_S)
                 return index
         return None
 
-    def said(self, index: int) -> str:
-        """What one of them wrote to stderr, the end of it, and which signal ended it if one did."""
-        code = self._processes[index - 1].poll()  # before what it wrote, which is all of it then
+    def error_output(self, index: int) -> str:
+        """The end of a process's stderr, and the signal that ended the process if there was one."""
+        code = self._processes[index - 1].poll()  # before reading, so that the output of an ended process is complete
         file = self._stderr[index - 1].fileno()  # shared with the process, which may still write
-        start = max(0, os.fstat(file).st_size - _SHOWN)
-        wrote = os.pread(file, _SHOWN, start).decode(errors="replace").strip()
+        start = max(0, os.fstat(file).st_size - _OUTPUT_BYTES)
+        output = os.pread(file, _OUTPUT_BYTES, start).decode(errors="replace").strip()
         ended = f"ended by signal {-code} ({signal.strsignal(-code)})" if code is not None and code < 0 else ""
-        return "\n".join(filter(None, [wrote, ended]))
+        return "\n".join(filter(None, [output, ended]))
 
-    def gone(self) -> int | None:
-        """Number of one that has ended; None where all go on."""
+    def first_ended(self) -> int | None:
+        """The number of the first process that has ended; None while all run."""
         return next((index for index, process in enumerate(self._processes, 1) if process.poll() is not None), None)
 
     def end(self, patience_s: float = _PATIENCE_S) -> None:
-        """Waits for them, and kills those that do not end."""
+        """Waits for the processes, and kills those that do not end."""
         until = time.monotonic() + patience_s
         for process in self._processes:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -98,23 +98,23 @@ class LocalProcesses:
             process.wait()
 
 
-def told() -> Told | None:
-    """Who this process is, if another one started it, and it ends with that; None where it is the first."""
-    if _TOLD not in os.environ:
+def local_process() -> LocalProcess | None:
+    """The place of this process, which then ends with the first process; None if this is the first process."""
+    if _VARIABLE not in os.environ:
         return None
-    address, *numbers = os.environ.pop(_TOLD).split()
-    this = Told(address, *map(int, numbers))
+    address, *numbers = os.environ.pop(_VARIABLE).split()
+    this = LocalProcess(address, *map(int, numbers))
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
-    if os.getppid() != this.first:
+    if os.getppid() != this.first_pid:
         sys.exit(1)
     os.write(1, b".")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return this
 
 
-def gpus() -> int:
-    """NVIDIA GPUs that a process of this host would see, of which none is touched."""
+def gpu_count() -> int:
+    """The number of NVIDIA GPUs that a process of this host can use, without starting any."""
     try:
         cuda = ctypes.CDLL("libcuda.so.1")
     except OSError:

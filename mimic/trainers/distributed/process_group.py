@@ -1,8 +1,8 @@
-"""Training spread over several processes: they find each other, train in step, and end together.
+"""Training in several processes: they connect, train in step, and end together.
 
-The first process alone writes, evaluates and may stop early, while the others wait in their next training program for
-it. So the end of a training is told to them beside the programs, through JAX's coordination service; a failure, or a
-signal that only one of them got, is told in the same way.
+Only the first process writes, evaluates and may stop early, while the others wait for it in their next training epoch.
+So the first process announces the end of a training through JAX's coordination service. A failure, or a signal that
+only one process received, is announced in the same way.
 """
 
 import atexit
@@ -17,25 +17,25 @@ import jax
 
 from mimic import compat
 from mimic.runs.signals import STOPPED_BY_SIGNAL, Signals
-from mimic.trainers.distributed.local_processes import LocalProcesses, gpus, told
+from mimic.trainers.distributed.local_processes import LocalProcesses, gpu_count, local_process
 
 AUTO, LOCAL = "auto", "local"
 _ENDED, _SIGNAL = "mimic/ended", "mimic/signal"  # keys of the coordination service
-_LOOK_S = 0.5
-_LEAVE_S = 60  # the last process to leave is waited for this long
-_GRACE_S = 3  # a process may fail of what another failed of, this much later
+_POLL_S = 0.5
+_SHUTDOWN_S = 60  # timeout for the last process to disconnect
+_GRACE_S = 3  # the same error may occur in two processes with this delay
 _FAILED = 1
 
 
 @dataclasses.dataclass(frozen=True)
 class DistributedConfig:
-    """The processes that train together; each is started with the same command, but for its number.
+    """The processes of a distributed training; each is started with the same command, except for its number.
 
     Attributes:
-      coordinator: HOST:PORT of the first process, where all find each other; "auto" under Slurm and Open MPI, which
-        tell everything; "local" for processes on this host, which the first starts; one process alone where empty.
-      processes: how many; with "local" one for each GPU where None.
-      process: number of this one; the first, 0, evaluates and writes the run directory.
+      coordinator: HOST:PORT of the first process, where all connect; "auto" under Slurm and Open MPI, which set all
+        three fields; "local" for processes on this host, which the first process starts; empty for a single process.
+      processes: number of processes; with "local" one for each GPU where None.
+      process: number of this process; process 0 evaluates and writes the run directory.
     """
 
     coordinator: str = ""
@@ -43,10 +43,10 @@ class DistributedConfig:
     process: int | None = None
 
     def __post_init__(self) -> None:
-        given = {"processes": self.processes, "process": self.process}
-        takes = {"": (), AUTO: (), LOCAL: ("processes",)}.get(self.coordinator, tuple(given))
-        for key, value in given.items():
-            if value is not None and key not in takes:
+        numbers = {"processes": self.processes, "process": self.process}
+        allowed = {"": (), AUTO: (), LOCAL: ("processes",)}.get(self.coordinator, tuple(numbers))
+        for key, value in numbers.items():
+            if value is not None and key not in allowed:
                 raise ValueError(
                     f"distributed.{key}: not expected, got {value} with distributed.coordinator={self.coordinator!r}"
                 )
@@ -56,27 +56,27 @@ class DistributedConfig:
             return
         if not re.fullmatch(r"\S+:\d+", self.coordinator):
             raise ValueError(f"distributed.coordinator: expected HOST:PORT, auto or local, got {self.coordinator!r}")
-        for key, value in given.items():
-            if value is None:
-                raise ValueError(f"distributed.{key}: expected a number besides distributed.coordinator")
-        if not 0 <= self.process < self.processes:  # type: ignore[operator]
-            raise ValueError(f"distributed.process: expected 0 to {self.processes - 1}, got {self.process}")  # type: ignore[operator]
+        if self.processes is None or self.process is None:
+            key = "processes" if self.processes is None else "process"
+            raise ValueError(f"distributed.{key}: expected a number with distributed.coordinator")
+        if not 0 <= self.process < self.processes:
+            raise ValueError(f"distributed.process: expected 0 to {self.processes - 1}, got {self.process}")
 
 
 class ProcessGroup:
-    """The processes that train together, as one of them sees them; made by `join`.
+    """A process's view of the processes that train together; `join` creates it.
 
     Attributes:
       index: number of this process.
-      signals: what this process was sent; the first process gets the others' too.
+      signals: signals that this process received; in the first process, those of all processes.
     """
 
     def __init__(self, index: int, others: LocalProcesses | None = None):
-        """Watches over the others.
+        """Starts to watch the other processes.
 
         Args:
           index: number of this process.
-          others: those that this process started.
+          others: the processes that this process started.
         """
         self.index = index
         self._others = others
@@ -89,56 +89,56 @@ class ProcessGroup:
 
     @property
     def first(self) -> bool:
-        """Whether this process evaluates and writes."""
+        """Whether this is the first process, which evaluates and writes."""
         return self.index == 0
 
     def end(self, exit_code: int) -> None:
-        """Ends the other processes with an exit code, and goes on alone; nothing if that was done before."""
+        """Ends the other processes with an exit code, and disconnects; further calls do nothing."""
         if self._left.is_set():
             return
         self._left.set()
         self._watcher.join()
         self._end_if_one_is_lost()
-        with contextlib.suppress(jax.errors.JaxRuntimeError):  # another process was faster
+        with contextlib.suppress(jax.errors.JaxRuntimeError):  # another process has announced the end
             self._client.key_value_set(_ENDED, f"{self.index} {exit_code}")
-        _leave()
+        _disconnect()
 
     def wait(self) -> None:
-        """Until another process ends this one."""
+        """Waits until another process ends this one."""
         self._watcher.join()
 
     def _watch(self) -> None:
-        told = False
-        while not self._left.wait(_LOOK_S):
-            if self.first and not told and (sent := self._read(_SIGNAL)):
-                self.signals.caught.append(int(sent))
-                told = True
-            elif not self.first and not told and self.signals.caught:
+        signal_shared = False
+        while not self._left.wait(_POLL_S):
+            if self.first and not signal_shared and (number := self._read(_SIGNAL)):
+                self.signals.caught.append(int(number))
+                signal_shared = True
+            elif not self.first and not signal_shared and self.signals.caught:
                 with contextlib.suppress(jax.errors.JaxRuntimeError):
                     self._client.key_value_set(_SIGNAL, str(self.signals.caught[0]))
-                told = True
-            # The main thread may wait in a program that will never end.
+                signal_shared = True
+            # This thread ends the process, because the main thread may wait in an all-reduce that never ends.
             if ended := self._read(_ENDED):
                 process, exit_code = map(int, ended.split())
                 if 0 < exit_code < STOPPED_BY_SIGNAL:
                     if self._others and self._left.wait(_GRACE_S):
-                        return  # what failed there failed here too, and was said
+                        return  # the same error occurred here and has been reported
                     _report(process, self._others)
-                _leave()
+                _disconnect()
                 if self._others:
                     self._others.end()
                 _exit(exit_code)
             self._end_if_one_is_lost()
 
     def _end_if_one_is_lost(self) -> None:
-        """Of those that this process started: JAX would wait for it."""
-        if self._others and (gone := self._others.gone()):
-            _report(gone, self._others)
+        """Ends all if a process that this one started has ended: JAX would wait for it."""
+        if self._others and (ended := self._others.first_ended()):
+            _report(ended, self._others)
             self._others.end(patience_s=0)
             _exit(_FAILED)
 
     def _read(self, key: str) -> str:
-        """What the processes were told; nothing where they were not."""
+        """An announcement through the coordination service; empty if there is none."""
         try:
             return self._client.key_value_try_get(key)
         except jax.errors.JaxRuntimeError:
@@ -146,30 +146,30 @@ class ProcessGroup:
 
 
 def join(config: DistributedConfig) -> ProcessGroup | None:
-    """Waits for the other processes; must run before JAX starts its backend. None where this process is alone.
+    """Connects to the other processes; must run before JAX starts its backend. Returns None for a single process.
 
     Raises:
-      ValueError: they cannot be found.
+      ValueError: the processes cannot connect.
     """
     if not config.coordinator:
         return None
-    jax.config.update("jax_enable_preemption_service", False)  # would take SIGTERM, which is ours
+    jax.config.update("jax_enable_preemption_service", False)  # it would handle SIGTERM, which `Signals` handles
     address, count, index = config.coordinator, config.processes, config.process
-    others, how = None, {}
+    others, options = None, {}
     if address == LOCAL:
-        if this := told():
+        if this := local_process():
             address, count, index, _ = this
         else:
             others = LocalProcesses(count := processes_here(count))
             address, index = others.address, 0
-            if lost := others.lost_at_start():
-                _report(lost, others)
+            if ended := others.ended_at_start():
+                _report(ended, others)
                 others.end(patience_s=0)
                 _exit(_FAILED)
-        how = {"local_device_ids": [index], "coordinator_bind_address": address}
+        options = {"local_device_ids": [index], "coordinator_bind_address": address}
     try:
         jax.distributed.initialize(
-            None if address == AUTO else address, count, index, shutdown_timeout_seconds=_LEAVE_S, **how
+            None if address == AUTO else address, count, index, shutdown_timeout_seconds=_SHUTDOWN_S, **options
         )
     except (RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
@@ -177,25 +177,28 @@ def join(config: DistributedConfig) -> ProcessGroup | None:
     return ProcessGroup(compat.process_number(), others)
 
 
-def processes_here(asked: int | None) -> int:
-    """How many processes train on this host, with a GPU for each where there are GPUs.
+def processes_here(requested: int | None) -> int:
+    """The number of processes on this host; if it has GPUs, each process has one of them.
+
+    Args:
+      requested: the config's number; None for one process on each GPU.
 
     Raises:
-      ValueError: more than there are GPUs, or neither GPUs nor a number.
+      ValueError: more processes than GPUs, or neither GPUs nor a number.
     """
-    available = 0 if os.environ.get("JAX_PLATFORMS") == "cpu" else gpus()
-    if not (asked or available):
+    available = 0 if os.environ.get("JAX_PLATFORMS") == "cpu" else gpu_count()
+    if not (requested or available):
         raise ValueError("distributed.processes: expected a number with distributed.coordinator=local without GPUs")
-    if available and asked and asked > available:
-        raise ValueError(f"distributed.processes: expected at most {available}, a GPU for each, got {asked}")
-    return asked or available
+    if available and requested and requested > available:
+        raise ValueError(f"distributed.processes: expected at most {available}, a GPU for each, got {requested}")
+    return requested or available
 
 
 def _report(failed: int, others: LocalProcesses | None) -> None:
-    """Says which process failed, and what it said of it itself."""
+    """Prints which process failed, and its error output."""
     print(f"error: process {failed} of the training failed", file=sys.stderr)
-    if others and failed and (said := others.said(failed)):
-        print(said, file=sys.stderr)
+    if others and failed and (output := others.error_output(failed)):
+        print(output, file=sys.stderr)
 
 
 def _exit(exit_code: int) -> None:
@@ -204,6 +207,6 @@ def _exit(exit_code: int) -> None:
     os._exit(exit_code)
 
 
-def _leave() -> None:
-    with contextlib.suppress(jax.errors.JaxRuntimeError):  # one that is gone already is waited for in vain
+def _disconnect() -> None:
+    with contextlib.suppress(jax.errors.JaxRuntimeError):  # the timeout of a process that has ended already
         jax.distributed.shutdown()

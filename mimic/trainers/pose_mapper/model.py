@@ -1,4 +1,4 @@
-"""The pose mapper: a network from a pose of the expert to the learner's nearest pose (paper, eq. 23)."""
+"""The pose mapper: a network that maps a pose of the expert to the nearest pose of the learner (paper, eq. 23)."""
 
 import dataclasses
 import functools
@@ -21,16 +21,16 @@ from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
-from mimic.retargeting.pose import pose_limits
+from mimic.retargeting.pose import continuous_joints, pose_limits, wrap_angles
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings
 from mimic.trainers.run_config import load_config
 
 Params = Any
-PoseDistance = Callable[[Array, Array], Array]  # expert's pose, learner's pose
+PoseDistance = Callable[[Array, Array], Array]  # (expert's pose, learner's pose) -> distance
 
 _ACTIVATIONS = {"leaky_relu": nn.leaky_relu, "gelu": nn.gelu}
-_LIMIT_TOLERANCE = 1e-4  # rad: what rounding to float32 takes a pose over its limit
+_LIMIT_TOLERANCE = 1e-4  # rad: rounding to float32 moves a pose over its limit by less than this
 
 
 class _Network(nn.Module):
@@ -54,10 +54,10 @@ class MapperModel:
     """A mapper without its parameters: pure functions of one pose.
 
     Attributes:
-      expert: n joints.
-      learner: n_hat joints.
-      metric: what near means; chooses among the heads.
-      config: of the network.
+      expert: embodiment with n joints.
+      learner: embodiment with n_hat joints.
+      metric: config of the metric that defines the nearest pose and chooses among the heads.
+      config: settings of the network.
     """
 
     expert: Embodiment
@@ -74,7 +74,8 @@ class MapperModel:
     @functools.cached_property
     def built_metric(self) -> Metric:
         """The metric between the two arms."""
-        # It must not belong to the first program that asks for it, nor wait for the first work on a GPU.
+        # A cached value must not be a tracer of the first function that is traced with it. On the host because the
+        # first computation on a GPU takes seconds to start.
         with jax.ensure_compile_time_eval(), on_host():
             metric = self.metric.build(self.expert, self.learner)
             matrix = metric.correspondence
@@ -82,7 +83,7 @@ class MapperModel:
 
     @functools.cached_property
     def distance(self) -> PoseDistance:
-        """Embodiment distance between a pose of the expert and one of the learner."""
+        """Embodiment distance between a pose of the expert and a pose of the learner."""
         metric = self.built_metric
         return lambda qpos, learner_qpos: metric(
             link_states(self.expert, qpos), link_states(self.learner, learner_qpos)
@@ -95,12 +96,12 @@ class MapperModel:
     def candidates(
         self, params: Params, qpos: Float[Array, " joints"], *, dropout_key: Array | None = None
     ) -> Float[Array, "heads learner_joints"]:
-        """The pose that each head proposes.
+        """The poses that the heads propose.
 
         Args:
-          params: of the network.
+          params: parameters of the network.
           qpos: the expert's pose [rad].
-          dropout_key: of the hidden units that are dropped, in training; none is where None.
+          dropout_key: random key of the dropout in training; no dropout where None.
         """
         config = self.config
         training = dropout_key is not None
@@ -111,8 +112,8 @@ class MapperModel:
         within = (lower + upper) / 2 + (upper - lower) / 2 * jnp.tanh(outputs[..., 0])
         if config.outputs == "tanh":
             return within
-        around = jnp.arctan2(outputs[..., 1], outputs[..., 0])  # no seam at pi
-        return jnp.where(np.isinf(pose_limits(self.learner, qpos.dtype)[0]), around, within)
+        on_circle = jnp.arctan2(outputs[..., 1], outputs[..., 0])  # continuous in the outputs at pi
+        return jnp.where(continuous_joints(self.learner), on_circle, within)
 
     def __call__(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
         """The nearest of the poses that the heads propose."""
@@ -128,18 +129,17 @@ class MapperModel:
             assert states.direction is not None
             return jnp.concatenate([states.position.ravel(), states.direction.ravel()])
         lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.expert.joint_range).T)
-        full_turn = np.isinf(pose_limits(self.expert, qpos.dtype)[0])
-        qpos = jnp.where(full_turn, qpos - 2 * jnp.pi * jnp.round(qpos / (2 * jnp.pi)), qpos)
+        qpos = wrap_angles(qpos, continuous_joints(self.expert))
         return (2 * qpos - lower - upper) / (upper - lower)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PoseMapper:
-    """A trained mapper: call it with poses of the expert, one or a batch. Safe under `jax.jit` and `jax.vmap`.
+    """A trained mapper: call it with one pose of the expert or a batch of poses. Safe under `jax.jit` and `jax.vmap`.
 
     Attributes:
       model: network, arms and metric.
-      params: of the network.
+      params: parameters of the network.
     """
 
     model: MapperModel
@@ -147,14 +147,14 @@ class PoseMapper:
 
     @classmethod
     def load(cls, run_dir: str | os.PathLike[str], checkpoint: int | None = None) -> "PoseMapper":
-        """The mapper of a run of `python -m mimic.train trainer=pose_mapper`.
+        """Loads the mapper of a run of `python -m mimic.train trainer=pose_mapper`.
 
         Args:
           run_dir: the run directory.
-          checkpoint: training poses of the checkpoint; the last one where None.
+          checkpoint: number of training poses of the checkpoint; the last checkpoint where None.
 
         Raises:
-          ValueError: no run directory, one of another trainer, or no such checkpoint.
+          ValueError: no run directory, a run of another trainer, or no such checkpoint.
         """
         config = load_config(Path(run_dir))
         if not isinstance(config.trainer, PoseMapperConfig):
@@ -167,30 +167,33 @@ class PoseMapper:
 
     @property
     def expert(self) -> Embodiment:
-        """Whose poses it takes."""
+        """The arm of the input poses."""
         return self.model.expert
 
     @property
     def learner(self) -> Embodiment:
-        """Whose poses it gives."""
+        """The arm of the output poses."""
         return self.model.learner
 
     def __call__(self, qpos: Float[ArrayLike, "*batch joints"]) -> Float[Array, "*batch learner_joints"]:
-        """The learner's poses [rad].
+        """Maps poses of the expert to poses of the learner [rad].
 
         Args:
           qpos: [n] or [..., n] the expert's poses [rad].
 
+        Returns:
+          [n_hat] or [..., n_hat] the learner's poses [rad].
+
         Raises:
-          ValueError: poses of the wrong shape, not finite, or outside of the expert's range.
+          ValueError: poses of the wrong shape, not finite, or outside of the expert's joint range.
         """
         poses = check_poses(self.expert, qpos)
         flat = poses.reshape(-1, self.expert.num_joints)
-        found = jax.vmap(functools.partial(self.model, self.params))(flat)
-        return found.reshape(*poses.shape[:-1], self.learner.num_joints)
+        learner_poses = jax.vmap(functools.partial(self.model, self.params))(flat)
+        return learner_poses.reshape(*poses.shape[:-1], self.learner.num_joints)
 
     def check_fits(self, expert: Embodiment, learner: Embodiment) -> None:
-        """Raises `ValueError` where the mapper is not one from this expert to this learner."""
+        """Raises a ValueError unless the mapper maps poses of this expert to poses of this learner."""
         for role, arm, own in (("expert", expert, self.expert), ("learner", learner, self.learner)):
             if (arm.name, arm.joint_names) != (own.name, own.joint_names):
                 raise ValueError(
@@ -200,19 +203,19 @@ class PoseMapper:
 
 
 def make_model(env: EnvConfig, config: PoseMapperSettings) -> MapperModel:
-    """The mapper of an environment's arms and metric.
+    """The untrained mapper of an environment's arms and metric.
 
     Raises:
-      ValueError: arms that cannot be built.
+      ValueError: arms that cannot be loaded.
     """
     return MapperModel(*env.build_arms().embodiments, env.metric, config)
 
 
 def check_poses(arm: Embodiment, qpos: ArrayLike) -> Array:
-    """Poses as an array of floating point numbers; what is not known while JAX traces is not checked.
+    """Returns poses as a floating point array. Under `jax.jit` only the shape is checked.
 
     Raises:
-      ValueError: poses of the wrong shape, not finite, or outside of the arm's range.
+      ValueError: poses of the wrong shape, not finite, or outside of the arm's joint range.
     """
     poses = jnp.asarray(qpos)
     poses = poses if jnp.issubdtype(poses.dtype, jnp.floating) else poses.astype(float)

@@ -1,4 +1,4 @@
-"""`trainer=pose_mapper`: a network that maps poses of the expert to the learner's nearest poses."""
+"""`trainer=pose_mapper`: trains a network that maps poses of the expert to the nearest poses of the learner."""
 
 import functools
 from collections.abc import Callable
@@ -18,20 +18,21 @@ from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings, TrainConfig
 from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model
-from mimic.trainers.trainer import Figures, OnEvaluation, Params, Row, Trainer
+from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
 
-# Keys of the poses. A run's seed changes the network and what it trains on; what it is judged on stays the same.
-_TRAINING, _VALIDATION, _HELD_OUT, _CHANCE = range(4)
-_SIMILARITY_POSES = 500  # held-out poses that look is measured on: inverse kinematics takes a millisecond each
+# Numbers of the random keys of the poses. A run's seed changes the network and the training poses; the poses of the
+# evaluation are the same in all runs.
+_TRAINING, _VALIDATION, _HELD_OUT, _RANDOM = range(4)
+_SIMILARITY_POSES = 500  # held-out poses for the similarity: inverse kinematics takes a millisecond each
 
 
-class _Judged(NamedTuple):
-    """The learner's poses for all of the expert's, and what they are judged by.
+class _Evaluated(NamedTuple):
+    """The learner's poses for all evaluation poses, and their metrics.
 
     Attributes:
       qpos: [poses, learner_joints] [rad].
-      distance: [poses] to the expert's.
-      direction: [poses, links, 3] of the learner's links.
+      distance: [poses] embodiment distance to the expert's poses.
+      direction: [poses, links, 3] directions of the learner's links.
     """
 
     qpos: Any
@@ -40,25 +41,25 @@ class _Judged(NamedTuple):
 
 
 class _Reference(NamedTuple):
-    """What the poses allow.
+    """What the mapper is compared with.
 
     Attributes:
       optimum: the optimiser's poses.
-      random_distance: [poses] of random poses.
-      expert_direction: [poses, links, 3] of the expert's links.
+      random_distance: [poses] embodiment distance of random poses.
+      expert_direction: [poses, links, 3] directions of the expert's links.
     """
 
-    optimum: _Judged
+    optimum: _Evaluated
     random_distance: Any
     expert_direction: Any
 
 
 class PoseMapperTrainer(Trainer):
-    """Trains a mapper; tells how near to the optimum it gets on training poses and on unseen ones.
+    """Trains a mapper, and compares it with the optimum on training poses and on held-out poses.
 
     Args:
-      config: of the run.
-      run_dir: not needed: the poses follow from the seed.
+      config: the run's config.
+      run_dir: unused, because the poses follow from the seed.
 
     Raises:
       ValueError: settings or arms that cannot be used.
@@ -70,7 +71,7 @@ class PoseMapperTrainer(Trainer):
         del run_dir
         assert isinstance(config.trainer, PoseMapperConfig)
         self.settings: PoseMapperSettings = config.trainer.resolve()
-        self._name, self._seed = config.env.name, config.seed % 2**31  # what a 32-bit integer holds
+        self._name, self._seed = config.env.name, config.seed % 2**31  # the range of a 32-bit integer
         self.total_steps = self.settings.total_steps
         self._model = model = make_model(config.env, self.settings)
         kind = "fresh poses in each epoch" if self.settings.fresh else "training poses"
@@ -80,7 +81,7 @@ class PoseMapperTrainer(Trainer):
 
     @functools.cached_property
     def _poses(self) -> dict[str, Array]:
-        """By split; those of an epoch are repeated where training poses are not fresh."""
+        """The poses of each split. The training poses are those of all epochs, unless each epoch has fresh ones."""
         return jax.jit(self._draw)(self._seed)
 
     def _draw(self, seed: int) -> dict[str, Array]:
@@ -93,64 +94,66 @@ class PoseMapperTrainer(Trainer):
 
     @property
     def _counts(self) -> dict[str, int]:
-        """Poses of each split that the mapper is judged on."""
+        """Number of evaluation poses of each split."""
         few, many = self.settings.validation_poses, self.settings.held_out_poses
         return {"train": min(few, self.settings.samples), "validation": few, "held_out": many}
 
     @property
-    def _every_shape(self) -> jax.ShapeDtypeStruct:
+    def _poses_shape(self) -> jax.ShapeDtypeStruct:
         return training.poses_shape(self._model, sum(self._counts.values()))
 
     @functools.cached_property
-    def _every(self) -> np.ndarray:
-        """The poses that the mapper is judged on."""
+    def _evaluation_poses(self) -> np.ndarray:
+        """The evaluation poses of all splits."""
         return np.concatenate([self._poses[split][:count] for split, count in self._counts.items()])
 
     def _by_split(self, values: np.ndarray) -> dict[str, np.ndarray]:
         ends = np.cumsum(list(self._counts.values()))[:-1]
         return dict(zip(self._counts, np.split(values, ends), strict=True))
 
-    def _judge(self, expert_qpos: Array, qpos: Array) -> _Judged:
+    def _evaluated(self, expert_qpos: Array, qpos: Array) -> _Evaluated:
         direction = jax.vmap(lambda q: link_states(self._model.learner, q).direction)(qpos)
-        return _Judged(qpos, jax.vmap(self._model.distance)(expert_qpos, qpos), direction)
+        return _Evaluated(qpos, jax.vmap(self._model.distance)(expert_qpos, qpos), direction)
 
     @functools.cached_property
-    def _evaluation(self) -> Background[Callable[[Params, np.ndarray], _Judged]]:
-        def judged(params: Params, every: Array) -> _Judged:
-            return self._judge(every, jax.vmap(functools.partial(self._model, params))(every))
+    def _evaluation(self) -> Background[Callable[[Params, np.ndarray], _Evaluated]]:
+        def evaluated(params: Params, poses: Array) -> _Evaluated:
+            return self._evaluated(poses, jax.vmap(functools.partial(self._model, params))(poses))
 
-        return compiling(judged, self.params_template(), self._every_shape)
+        return compiling(evaluated, self.params_template(), self._poses_shape)
 
     @functools.cached_property
     def _optimisation(self) -> Background[Callable[[np.ndarray], _Reference]]:
         model = self._model
 
-        def reference(every: Array) -> _Reference:
-            kept = None  # compiled in half of the time
-            found = imitate_pose(model.expert, model.learner, every, kept=kept, **model.built_metric.arguments)
+        def reference(poses: Array) -> _Reference:
+            kept = None  # halves the time to compile
+            solution = imitate_pose(model.expert, model.learner, poses, kept=kept, **model.built_metric.arguments)
             lower, upper = jnp.asarray(model.learner.joint_range, jnp.float32).T
-            chance = jax.random.uniform(_key(_CHANCE), (len(every), len(lower)), minval=lower, maxval=upper)
-            direction = jax.vmap(lambda q: link_states(model.expert, q).direction)(every)
-            return _Reference(self._judge(every, found.qpos), jax.vmap(model.distance)(every, chance), direction)
+            random = jax.random.uniform(_key(_RANDOM), (len(poses), len(lower)), minval=lower, maxval=upper)
+            direction = jax.vmap(lambda q: link_states(model.expert, q).direction)(poses)
+            random_distance = jax.vmap(model.distance)(poses, random)
+            return _Reference(self._evaluated(poses, solution.qpos), random_distance, direction)
 
-        return compiling(reference, self._every_shape)
+        return compiling(reference, self._poses_shape)
 
     @functools.cached_property
     def _reference(self) -> _Reference:
-        return jax.device_get(self._optimisation()(self._every))
+        return jax.device_get(self._optimisation()(self._evaluation_poses))
 
     def save_inputs(self, run_dir: Path) -> None:
-        """Nothing: the poses follow from the seed."""
+        """Writes nothing, because the poses follow from the seed."""
 
     def params_template(self) -> Params:
-        """Of the network."""
+        """Shapes of the network's parameters."""
         return jax.eval_shape(lambda: self._model.init(jax.random.key(0)))
 
     def train(
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
     ) -> tuple[int, Params]:
-        """Through the metric, see `mapper_training`."""
-        _ = self._optimisation, self._evaluation  # compiled beside the training's programs; the longest is the first
+        """Trains with the metric as loss, see `mimic.trainers.pose_mapper.training.train`."""
+        # Starts to compile these in parallel with the training's functions, the slowest first.
+        _ = self._optimisation, self._evaluation
         return training.train(
             self._model,
             lambda: (self._poses["train"], self._poses["validation"]),
@@ -161,13 +164,13 @@ class PoseMapperTrainer(Trainer):
             restore=restore,
         )
 
-    def evaluate(self, params: Params) -> _Judged:
-        """The learner's poses, and how good they are."""
-        _ = self._optimisation  # compiled beside the evaluation where there was no training
-        return jax.device_get(self._evaluation()(params, self._every))
+    def evaluate(self, params: Params) -> _Evaluated:
+        """The learner's poses for the evaluation poses, and their distances."""
+        _ = self._optimisation  # starts to compile it in parallel with the evaluation, if there was no training
+        return jax.device_get(self._evaluation()(params, self._evaluation_poses))
 
-    def figures(self, outcome: _Judged) -> Figures:
-        """Quality and what it is made of, by split; angles on held-out poses."""
+    def metrics(self, outcome: _Evaluated) -> Metrics:
+        """Quality and the distances that define it, by split; angles on held-out poses."""
         reference = self._reference
 
         def means(distance: np.ndarray) -> dict[str, float]:
@@ -188,37 +191,39 @@ class PoseMapperTrainer(Trainer):
             "link_angle_to_optimum_deg_by_link": dict(zip(names, map(float, to_optimum), strict=True)),
         }
 
-    def _angles(self, outcome: _Judged) -> tuple[np.ndarray, np.ndarray]:
+    def _angles(self, outcome: _Evaluated) -> tuple[np.ndarray, np.ndarray]:
         """Median angles [deg] of each link on held-out poses: to the expert's corresponding links, to the optimum."""
         reference, model = self._reference, self._model
         directions = reference.expert_direction, outcome.direction, reference.optimum.direction
         expert, learner, optimum = (self._by_split(direction)["held_out"] for direction in directions)
         to_expert = np.einsum(
-            "ij,pij->pj", model.metric.shares(model.expert, model.learner), _angle(expert[:, :, None], learner[:, None])
+            "ij,pij->pj",
+            model.metric.link_fractions(model.expert, model.learner),
+            _angle(expert[:, :, None], learner[:, None]),
         )
         return np.median(to_expert, axis=0), np.median(_angle(learner, optimum), axis=0)
 
-    def details(self, outcome: _Judged, controller: str = "mapper") -> Figures:
-        """How alike held-out poses look, beside the optimiser's and the baselines'; of the first of them."""
+    def details(self, outcome: _Evaluated, controller: str = "mapper") -> Metrics:
+        """Similarity of the first held-out poses, for the mapper, the optimiser and the baselines."""
         model, count = self._model, min(_SIMILARITY_POSES, self.settings.held_out_poses)
         expert, mapped, optimum = (
             self._by_split(np.asarray(qpos))["held_out"][:count, None]  # motions of one sample
-            for qpos in (self._every, outcome.qpos, self._reference.optimum.qpos)
+            for qpos in (self._evaluation_poses, outcome.qpos, self._reference.optimum.qpos)
         )
         poses = {"mapper": mapped, "nearest_poses": optimum}
         return {"similarity": pose_similarity(model.expert, model.learner, expert, poses, split="held_out")}
 
-    def status(self, figures: Figures) -> str:
+    def status(self, metrics: Metrics) -> str:
         """Distance and quality."""
-        quality, distance = figures["quality"], figures["mean_distance"]["validation"]
+        quality, distance = metrics["quality"], metrics["mean_distance"]["validation"]
         return f"distance {distance:.4f}  above the optimum {quality['train']:.2%}, unseen {quality['validation']:.2%}"
 
-    def good_enough(self, figures: Figures) -> bool:
-        """At the target quality on validation poses."""
-        return figures["quality"]["validation"] <= self.settings.target_quality
+    def good_enough(self, metrics: Metrics) -> bool:
+        """Whether the target quality is reached on the validation poses."""
+        return metrics["quality"]["validation"] <= self.settings.target_quality
 
-    def rows(self, figures: Figures) -> list[Row]:
-        """Quality and what it is made of."""
+    def rows(self, metrics: Metrics) -> list[Row]:
+        """Rows of the quality, the distances that define it, and the angles."""
         by_split: tuple[tuple[str, str, str], ...] = (
             ("above the optimum (0 best, 1 a random pose)", "quality", "{:.2%}"),
             ("mean distance", "mean_distance", "{:.4f}"),
@@ -226,20 +231,20 @@ class PoseMapperTrainer(Trainer):
             ("  random poses", "random_distance", "{:.4f}"),
         )
         rows = [
-            (label, form.format(figures[key]["train"]), form.format(figures[key]["held_out"]))
+            (label, form.format(metrics[key]["train"]), form.format(metrics[key]["held_out"]))
             for label, key, form in by_split
         ]
-        to_optimum = max(figures["link_angle_to_optimum_deg_by_link"].values())
+        to_optimum = max(metrics["link_angle_to_optimum_deg_by_link"].values())
         return [
             *rows,
-            ("median angle to the expert's links", "", f"{figures['link_angle_error_deg']:.1f} deg"),
+            ("median angle to the expert's links", "", f"{metrics['link_angle_error_deg']:.1f} deg"),
             ("median angle to the optimum, worst link", "", f"{to_optimum:.1f} deg"),
         ]
 
     def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
-        """In a run directory, how it learned."""
+        """Writes a plot of the training, in a run directory."""
         del outcome, controller
-        from mimic.evaluation import plots  # matplotlib, a second; not before there is something to plot
+        from mimic.evaluation import plots  # imports matplotlib, which takes a second
 
         plots.plot_training(folder, "quality", "above the optimum [%]", of="poses", title=self._name)
 
@@ -249,5 +254,5 @@ def _key(purpose: int) -> jax.Array:
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Degrees between unit vectors along the last axis."""
+    """Angles [deg] between unit vectors along the last axis."""
     return np.degrees(np.arccos(np.clip((a * b).sum(axis=-1), -1, 1)))

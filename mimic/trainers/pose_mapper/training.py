@@ -1,28 +1,44 @@
-"""Trains a pose mapper through the metric: no labels, and the distance itself is the loss (paper, eq. 23)."""
+"""Training of a pose mapper: the embodiment distance is the loss, and there are no labels (paper, eq. 23)."""
 
 import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from mimic.compilation import compiling
+from mimic.compilation import Background, compiling
 from mimic.runs.checkpoints import delete_checkpoint, save_checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.pose_mapper.model import MapperModel, Params
 from mimic.trainers.trainer import OnEvaluation
 
-_WARM_UP = 0.02  # share of the updates over which the learning rate rises
-_SHARED = 0.1  # share of the loss that all heads bear alike, so that none is left behind; the nearest bears the rest
+_WARM_UP = 0.02  # fraction of the updates over which the learning rate rises
+# Fraction of the loss that is the mean over all heads, so that each head is trained; the rest is the nearest head's.
+_ALL_HEADS = 0.1
 
 Poses = Float[Array, "poses joints"]
 
 
+class _Functions(NamedTuple):
+    """The functions of a training, which compile in the background.
+
+    Attributes:
+      start: (seed, restored parameters) -> (parameters, optimiser state).
+      train: a training epoch, see `_training_epoch`.
+      validate: (parameters, poses) -> mean distance of the nearest head.
+    """
+
+    start: Background[Callable[..., Any]]
+    train: Background[Callable[..., Any]]
+    validate: Background[Callable[..., Any]]
+
+
+# Above 40 lines because of its docstring.
 def train(
     model: MapperModel,
     poses: Callable[[], tuple[Poses, Poses]],
@@ -33,79 +49,88 @@ def train(
     signals: Signals,
     restore: tuple[int, Params] | None = None,
 ) -> tuple[int, Params]:
-    """Trains, and goes back to the best parameters where the distance on the validation poses has risen since.
+    """Trains a mapper. If the distance on the validation poses rises, the result has the best parameters before.
 
     Args:
-      model: with a resolved config.
-      poses: those that every epoch goes through where they are not fresh, and the ones that tell when to stop; asked
-        for once the programs are being compiled.
-      run_dir: where checkpoints go; those after the best are deleted.
-      seed: of the network, the order and the fresh poses.
-      on_evaluation: called after each checkpoint; training ends where it returns True.
-      signals: training ends after the next checkpoint if one came.
-      restore: training poses so far, and parameters to go on from; the moments of the optimiser start anew.
+      model: the mapper.
+      poses: returns training poses, for epochs without fresh ones, and validation poses; called after the functions
+        of the training have started to compile.
+      run_dir: folder of the checkpoints; those after the best one are deleted.
+      seed: random seed of the network, the order and the fresh poses.
+      on_evaluation: called after each checkpoint; training ends when it returns True.
+      signals: signals of the process; after one, training ends at the next checkpoint.
+      restore: training poses so far, and parameters to continue from; the moments of the optimiser are reset.
 
     Returns:
-      Training poses, and parameters after these.
+      Training poses so far and parameters of the result.
 
     Raises:
-      Interrupted: a signal came; a checkpoint is written.
+      Interrupted: a signal was received; a checkpoint has been written.
     """
     config = model.config
-    samples, epochs = int(config.samples or 0), int(config.epochs or 0)
     steps, restored = restore or (0, None)
-    done = steps // samples
-    stretch = max(epochs // int(config.evaluations or 1), 1)
-    optimiser = _optimiser(model, done)
-
-    def begin(seed: int, restored: Params | None) -> Any:
-        params = model.init(_keys(seed)[0]) if restored is None else restored
-        return params, optimiser.init(params)
-
-    start = jax.eval_shape(begin, seed, restored)
-    shapes = poses_shape(model, samples), poses_shape(model, config.validation_poses)
-    run_stretch = compiling(_stretch(model, optimiser, stretch), start, seed, 0, shapes[0])
-    begins = compiling(begin, seed, restored)
-    validate = compiling(lambda *given: _distances(model, *given).min(axis=1).mean(), start[0], shapes[1])
-    params, optimiser_state = begins()(seed, restored)
+    done = steps // config.samples
+    interval = max(config.epochs // config.evaluations, 1)  # epochs between two evaluations
+    functions = _compile(model, done, interval, seed, restored)
+    state = functions.start()(seed, restored)
     training, validation = poses()
 
     def save(steps: int, params: Params, metrics: dict[str, float]) -> bool:
         save_checkpoint(run_dir, steps, params)
-        enough = on_evaluation(steps, params, metrics)
+        stop = on_evaluation(steps, params, metrics)
         signals.check()
-        return enough
+        return stop
 
-    save(steps, params, {})
-    best = float(validate()(params, validation)), steps, params
-    later: list[int] = []
-    for _ in range(math.ceil((epochs - done) / stretch)):
-        program = run_stretch()
+    save(steps, state[0], {})
+    best = float(functions.validate()(state[0], validation)), steps, state[0]
+    since_best: list[int] = []
+    for _ in range(math.ceil((config.epochs - done) / interval)):
+        run = functions.train()
         began = time.perf_counter()
-        (params, optimiser_state), loss = program((params, optimiser_state), seed, done, training)
+        state, loss = run(state, seed, done, training)
         loss = float(loss)
-        done += stretch
-        steps = done * samples
-        speed = stretch * samples / (time.perf_counter() - began)
-        value = float(validate()(params, validation))
-        enough = save(steps, params, {"loss": loss, "validation_distance": value, "sps": speed})
-        if value < best[0]:
-            best, later = (value, steps, params), []
+        done += interval
+        steps = done * config.samples
+        speed = interval * config.samples / (time.perf_counter() - began)
+        distance = float(functions.validate()(state[0], validation))
+        stop = save(steps, state[0], {"loss": loss, "validation_distance": distance, "sps": speed})
+        if distance < best[0]:
+            best, since_best = (distance, steps, state[0]), []
         else:
-            later.append(steps)
-        if enough or (config.patience and len(later) >= config.patience):
+            since_best.append(steps)
+        if stop or (config.patience and len(since_best) >= config.patience):
             break
-    for step in later:
+    for step in since_best:
         delete_checkpoint(run_dir, step)
     return best[1], best[2]
 
 
+def _compile(model: MapperModel, done: int, interval: int, seed: int, restored: Params | None) -> _Functions:
+    optimiser = _optimiser(model, done)
+
+    def start(seed: int, restored: Params | None) -> Any:
+        params = model.init(_keys(seed)[0]) if restored is None else restored
+        return params, optimiser.init(params)
+
+    def validation_distance(params: Params, poses: Poses) -> Array:
+        return _distances(model, params, poses).min(axis=1).mean()
+
+    state = jax.eval_shape(start, seed, restored)
+    training, validation = poses_shape(model, model.config.samples), poses_shape(model, model.config.validation_poses)
+    train = compiling(_training_epoch(model, optimiser, interval), state, seed, 0, training)  # first: it takes longest
+    return _Functions(
+        start=compiling(start, seed, restored),
+        train=train,
+        validate=compiling(validation_distance, state[0], validation),
+    )
+
+
 def _optimiser(model: MapperModel, done_epochs: int) -> optax.GradientTransformation:
-    """AdamW; its rate rises, then falls along a cosine where the config says so. Biases do not decay."""
+    """AdamW with a constant rate, or with a warm-up and a cosine decay. Biases do not decay."""
     config = model.config
-    updates_per_epoch = int(config.samples or 0) // int(config.batch_size or 1)
-    updates, rate = int(config.epochs or 0) * updates_per_epoch, float(config.learning_rate or 0.0)
-    warm_up, final = max(round(_WARM_UP * updates), 1), rate * float(config.final_learning_rate or 0.0)
+    updates_per_epoch = config.samples // config.batch_size
+    updates, rate = config.epochs * updates_per_epoch, config.learning_rate
+    warm_up, final = max(round(_WARM_UP * updates), 1), rate * config.final_learning_rate
     schedule = optax.warmup_cosine_decay_schedule(0.0, rate, warm_up, max(updates, warm_up + 1), final)
     if config.final_learning_rate == 1:
         schedule = optax.constant_schedule(rate)
@@ -120,20 +145,21 @@ def _is_matrix(params: Params) -> Any:
     return jax.tree.map(lambda x: x.ndim > 1, params)
 
 
-def _stretch(
+def _training_epoch(
     model: MapperModel, optimiser: optax.GradientTransformation, epochs: int
 ) -> Callable[[Any, Any, Any, Poses], tuple[Any, Array]]:
-    """Trains for some epochs: from (parameters, optimiser state), the seed, the epochs so far, and training poses.
+    """A function that trains for some epochs.
 
-    It gives the first as they are then, and the mean loss.
+    It maps the state (parameters, optimiser state), the seed, the number of epochs so far and the training poses to the
+    new state and the mean loss.
     """
     config = model.config
-    samples, batch_size = int(config.samples or 0), int(config.batch_size or 1)
+    samples, batch_size = config.samples, config.batch_size
 
     def loss(params: Params, poses: Poses, dropout_key: Array | None) -> Array:
         distances = _distances(model, params, poses, dropout_key)
         nearest = distances.min(axis=1).mean()
-        return (1 - _SHARED) * nearest + _SHARED * distances.mean()
+        return (1 - _ALL_HEADS) * nearest + _ALL_HEADS * distances.mean()
 
     def update(carry: Any, batch: tuple[Poses, Array]) -> tuple[Any, Array]:
         params, state = carry
@@ -146,9 +172,9 @@ def _stretch(
         _, key_epochs, key_dropout = _keys(seed)
 
         def epoch(carry: Any, number: Array) -> tuple[Any, Array]:
-            own = jax.random.fold_in(key_epochs, number)
+            key = jax.random.fold_in(key_epochs, number)
             poses = (
-                random_poses(model, own, samples) if config.fresh else training[jax.random.permutation(own, samples)]
+                random_poses(model, key, samples) if config.fresh else training[jax.random.permutation(key, samples)]
             )
             batches = poses.reshape(-1, batch_size, poses.shape[-1])
             keys = jax.random.split(jax.random.fold_in(key_dropout, number), len(batches))
@@ -162,29 +188,29 @@ def _stretch(
 
 
 def _keys(seed: Any) -> Array:
-    """For the network, for the epochs, and for dropout."""
+    """Random keys of the network, of the epochs, and of dropout."""
     return jax.random.split(jax.random.key(seed), 3)
 
 
 def random_poses(model: MapperModel, key: Array, count: int) -> Poses:
-    """Poses of the expert, uniform within its range."""
+    """Poses of the expert, uniform within its joint range."""
     lower, upper = jnp.asarray(model.expert.joint_range, jnp.float32).T
     return jax.random.uniform(key, (count, model.expert.num_joints), jnp.float32, minval=lower, maxval=upper)
 
 
 def poses_shape(model: MapperModel, count: int) -> jax.ShapeDtypeStruct:
-    """Of so many poses of the expert."""
+    """The shape of an array of poses of the expert."""
     return jax.ShapeDtypeStruct((count, model.expert.num_joints), jnp.float32)
 
 
 def _distances(
     model: MapperModel, params: Params, poses: Poses, dropout_key: Array | None = None
 ) -> Float[Array, "poses heads"]:
-    """Of what each head proposes; every pose drops its own hidden units where there is a key."""
+    """Distances of the poses that the heads propose; with a key, dropout is independent for each pose."""
 
-    def one(qpos: Array, key: Array | None) -> Array:
+    def head_distances(qpos: Array, key: Array | None) -> Array:
         candidates = model.candidates(params, qpos, dropout_key=key)
         return jax.vmap(lambda candidate: model.distance(qpos, candidate))(candidates)
 
     keys = None if dropout_key is None else jax.random.split(dropout_key, len(poses))
-    return jax.vmap(one, (0, None if keys is None else 0))(poses, keys)
+    return jax.vmap(head_distances, (0, None if keys is None else 0))(poses, keys)

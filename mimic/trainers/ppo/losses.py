@@ -1,8 +1,8 @@
-"""PPO's losses of a minibatch: clipped surrogate and entropy, error of the value (Schulman et al., 2017).
+"""PPO's losses of a minibatch: clipped surrogate and entropy, value error (Schulman et al., 2017).
 
-Together they equal brax's `compute_ppo_loss`, as far as our environments ask for it: episodes end, and are not cut off.
-Only the sample that the entropy is estimated by is drawn in another order. They are two, since policy and value have no
-parameter in common. On a GPU a training is many small kernels, so here is little that asks for one of its own: no loop
+Their sum equals brax's `compute_ppo_loss` for episodes that terminate and are never truncated, as those of our
+environments; only the random sample that estimates the entropy differs. There are two losses because policy and value
+network have no parameter in common. On a GPU a training is many small kernels, so the losses need few of them: no loop
 over a few steps, one pass of the value network, few metrics.
 """
 
@@ -17,17 +17,17 @@ from jaxtyping import Array, Float
 from mimic.trainers.config import PPOSettings
 
 METRICS = ("policy_loss", "entropy", "approx_kl", "clip_fraction", "action_std")  # of the policy
-_VALUE_SHARE = 0.25  # of the squared error of the value
-_UNROLLED = 32  # steps of the advantage estimate that become one kernel
+_VALUE_WEIGHT = 0.25  # of the squared value error in the loss
+_UNROLLED_STEPS = 32  # steps of the advantage estimate in one kernel
 
 
 class Unrolls(NamedTuple):
-    """Steps of arms, each unroll with what is seen after its last one: of that the observation alone counts.
+    """Unrolls: consecutive steps of arms. The last sample in time has the final observation; its other fields are zero.
 
     Attributes:
-      observation: [*unrolls, time + 1, n].
-      raw_action: [*unrolls, time + 1, m] sample of the policy's normal distribution, before it is squashed.
-      log_prob: [*unrolls, time + 1] of the action, when it was taken.
+      observation: [*unrolls, time + 1, n] before the step.
+      raw_action: [*unrolls, time + 1, m] sample of the policy's normal distribution, before the tanh.
+      log_prob: [*unrolls, time + 1] log-probability of the action under the policy that took it.
       reward: [*unrolls, time + 1].
       goes_on: [*unrolls, time + 1] 0 where the episode ended with the step, else 1.
     """
@@ -39,11 +39,11 @@ class Unrolls(NamedTuple):
     goes_on: Array
 
     def packed(self) -> Array:
-        """Side by side along the last axis, so that a minibatch is gathered by one kernel."""
+        """All fields, concatenated along the last axis, so that one kernel gathers a minibatch."""
         return jnp.concatenate([x if x.ndim == self.observation.ndim else x[..., None] for x in self], axis=-1)
 
     def unpacked(self, rows: Array) -> "Unrolls":
-        """The reverse, of as many rows as there are."""
+        """The unrolls of any number of rows of `packed`."""
         ends = self.observation.shape[-1], self.observation.shape[-1] + self.raw_action.shape[-1]
         observation, raw_action, rest = jnp.split(rows, ends, axis=-1)
         return Unrolls(observation, raw_action, *jnp.moveaxis(rest, -1, 0))
@@ -56,21 +56,21 @@ def value_loss(
     networks: ppo_networks.PPONetworks,
     config: PPOSettings,
 ) -> tuple[Array, Float[Array, "unrolls time"]]:
-    """The loss of the value, and the advantages, normalised, that the policy learns from.
+    """The loss of the value network, and the normalised advantages for the policy's loss.
 
     Args:
-      params: of the value.
-      statistics: of the observations.
+      params: parameters of the value network.
+      statistics: running statistics of the observations.
       unrolls: [unrolls, time + 1, ...].
-      networks: of the config.
-      config: resolved.
+      networks: policy and value network.
+      config: the trainer's settings.
     """
     values = networks.value_network.apply(statistics, params, unrolls.observation)
     reward, goes_on = unrolls.reward[:, :-1], unrolls.goes_on[:, :-1]
     targets, advantages = jax.lax.stop_gradient(
         compute_gae(config.reward_scaling * reward, config.discounting * goes_on, values, config.gae_lambda)
     )
-    loss = _VALUE_SHARE * jnp.square(targets - values[:, :-1]).mean()
+    loss = _VALUE_WEIGHT * jnp.square(targets - values[:, :-1]).mean()
     return loss, (advantages - advantages.mean()) / (advantages.std() + 1e-8)
 
 
@@ -83,32 +83,32 @@ def policy_loss(
     networks: ppo_networks.PPONetworks,
     config: PPOSettings,
 ) -> tuple[Array, Float[Array, " metrics"]]:
-    """The loss of the policy, entropy included, and `METRICS`.
+    """The loss of the policy network, including the entropy, and the values of `METRICS`.
 
     Args:
-      params: of the policy.
-      statistics: of the observations.
+      params: parameters of the policy network.
+      statistics: running statistics of the observations.
       unrolls: [unrolls, time + 1, ...].
-      advantages: of `value_loss`.
-      key: for the entropy, which is estimated by a sample.
-      networks: of the config.
-      config: resolved.
+      advantages: from `value_loss`.
+      key: for the sampled estimate of the entropy.
+      networks: policy and value network.
+      config: the trainer's settings.
     """
     logits = networks.policy_network.apply(statistics, params, unrolls.observation[:, :-1])
     raw_action, old_log_prob = unrolls.raw_action[:, :-1], unrolls.log_prob[:, :-1]
     actions = networks.parametric_action_distribution
     log_ratio = actions.log_prob(logits, raw_action) - old_log_prob
-    ratio, least, most = jnp.exp(log_ratio), 1 - config.clipping_epsilon, 1 + config.clipping_epsilon
-    surrogate = -jnp.minimum(ratio * advantages, jnp.clip(ratio, least, most) * advantages)
+    ratio, lower, upper = jnp.exp(log_ratio), 1 - config.clipping_epsilon, 1 + config.clipping_epsilon
+    surrogate = -jnp.minimum(ratio * advantages, jnp.clip(ratio, lower, upper) * advantages)
     entropy = actions.entropy(logits, key)
     loss = surrogate.mean() - config.entropy_cost * entropy.mean()
 
     approx_kl = ratio - 1 - log_ratio
-    clipped = (ratio < least) | (ratio > most)
+    clipped = (ratio < lower) | (ratio > upper)
     action_std = actions.create_dist(logits).scale.mean(axis=-1)  # type: ignore[attr-defined]
     terms = jax.lax.stop_gradient(jnp.stack([surrogate, entropy, approx_kl, clipped, action_std]))
-    # One mean of all terms, not one of each: 208 instead of 217 us an update on an H200. The barrier keeps XLA from
-    # fusing both in few threads, which costs 38 us where kernels run one after the other.
+    # One mean over all terms instead of one for each: an update takes 208 instead of 217 us on an H200. The barrier
+    # keeps XLA from fusing both into a kernel of few threads, which costs 38 us where kernels are not concurrent.
     return loss, jax.lax.optimization_barrier(terms).mean(axis=(1, 2))
 
 
@@ -118,27 +118,26 @@ def compute_gae(
     values: Float[Array, "unrolls time+1"],
     gae_lambda: float,
 ) -> tuple[Float[Array, "unrolls time"], Float[Array, "unrolls time"]]:
-    """Targets of the value and advantages, by generalised advantage estimation (Schulman et al., 2016).
+    """Value targets and advantages by generalised advantage estimation (Schulman et al., 2016).
 
-    The advantage is that of an action against the value, where the target of the next step is what comes of it.
+    As in brax, the advantage of a step is reward + discount * (target of the next step) - value.
 
     Args:
       reward: of each step.
-      discount: of what comes after it; 0 where the episode ended.
-      values: of what is seen before each step, and after the last one.
-      gae_lambda: 0 trusts the value after one step, 1 not at all.
+      discount: factor on the value after each step; 0 where the episode ended.
+      values: of the observation before each step, and after the last step.
+      gae_lambda: 0 bootstraps from the value after one step, 1 uses rewards up to the end of the unroll.
     """
     errors = reward + discount * values[:, 1:] - values[:, :-1]
 
-    def back(later: Array, step: Any) -> tuple[Array, Array]:
+    def accumulate(next_sum: Array, step: Any) -> tuple[Array, Array]:
         error, decay = step
-        now = error + decay * later
-        return now, now
+        error_sum = error + decay * next_sum
+        return error_sum, error_sum
 
     steps = errors.T, gae_lambda * discount.T
-    _, above = jax.lax.scan(
-        back, jnp.zeros_like(reward[:, 0]), steps, reverse=True, unroll=min(len(errors.T), _UNROLLED)
-    )
-    targets = above.T + values[:, :-1]
-    after = jnp.concatenate([targets[:, 1:], values[:, -1:]], axis=1)
-    return targets, reward + discount * after - values[:, :-1]
+    unroll = min(len(errors.T), _UNROLLED_STEPS)
+    _, error_sums = jax.lax.scan(accumulate, jnp.zeros_like(reward[:, 0]), steps, reverse=True, unroll=unroll)
+    targets = error_sums.T + values[:, :-1]
+    next_targets = jnp.concatenate([targets[:, 1:], values[:, -1:]], axis=1)
+    return targets, reward + discount * next_targets - values[:, :-1]

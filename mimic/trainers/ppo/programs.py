@@ -1,27 +1,27 @@
-"""PPO as two programs, one that begins and one that collects and learns, on all devices at once.
+"""PPO as two compiled functions over all devices: one starts a training, one runs a training epoch.
 
-Networks, running statistics and action distribution are brax's. Brax's own loop compiles its programs one after
-the other, each before it knows of the next; here all that they need is known from shapes, so that they compile side by
-side, with whatever else there is to compile or to import.
+Networks, running statistics and action distribution are brax's. Brax's own loop compiles its functions one after the
+other. Here their arguments' shapes are known in advance, so that both compile in parallel, and in parallel with imports
+and with the evaluation's functions.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from brax.envs.base import State
+from brax.envs.base import State, Wrapper
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from mimic.compilation import Background, a_process_for_each_gpu, compiler_options
+from mimic.compilation import Background, a_process_for_each_gpu, compiler_options, in_background
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import fresh_episodes
 from mimic.metric.kinematics import LinkStates
@@ -37,15 +37,15 @@ _AXIS = "devices"
 
 @struct.dataclass
 class TrainingState:
-    """What goes from one call of the program that learns to the next.
+    """The state of a training between two epochs.
 
     Attributes:
-      policy: its parameters, and the state of their optimizer.
-      value: its parameters, and the state of their optimizer.
+      policy: parameters of the policy network, and the state of their optimizer.
+      value: parameters of the value network, and the state of their optimizer.
       statistics: running mean and deviation of the observations.
-      episodes: of the environments, shared out among the devices.
+      episodes: states of the environments, distributed over the devices.
       expert_states: of the environment.
-      key: for exploration and shuffling.
+      key: random key for exploration and shuffling.
     """
 
     policy: updates.TrainState
@@ -57,140 +57,157 @@ class TrainingState:
 
     @property
     def params(self) -> Params:
-        """What a policy is made of, and what is saved."""
+        """The parameters that define a policy, as they are saved."""
         return self.statistics, self.policy.params, self.value.params
 
 
-def make_programs(
+# Above 40 lines because of its docstring.
+def compile_training(
     env: ImitationEnv,
     config: PPOSettings,
     networks: ppo_networks.PPONetworks,
     batches: int,
     learning_rate: optax.Schedule,
     restored: Params | None,
+    progress: optax.Schedule = lambda count: 0.0,
 ) -> tuple[
     Background[Callable[[int], TrainingState]], Background[Callable[[TrainingState], tuple[TrainingState, Metrics]]]
 ]:
-    """The programs of a training, being compiled in the background.
+    """Compiles the two functions of a training in the background.
 
     Args:
       env: the environment with its training demonstrations.
-      config: resolved.
-      networks: of the config.
-      batches: that one call of the second program collects and learns from.
-      learning_rate: of Adam, at each update from 0 on.
-      restored: parameters to go on from.
+      config: the trainer's settings.
+      networks: policy and value network.
+      batches: number of batches in a training epoch.
+      learning_rate: Adam's learning rate at each update from 0 on.
+      restored: parameters to continue from.
+      progress: fraction of the training that is done at each update, see `PPOSettings.at`.
 
     Returns:
-      What begins, of a seed; and what learns, which gives the means of the loss's metrics too.
+      The function that starts a training from a seed, and the function that runs a training epoch; it returns the new
+      state and the means of the training metrics.
     """
     mesh = Mesh(np.array(jax.devices()), (_AXIS,))
-    optimizer = optax.adam(learning_rate)
-    same, shared = PartitionSpec(), PartitionSpec(_AXIS)
-    learning = TrainingState(same, same, same, shared, same, same)  # type: ignore[arg-type]
-
-    def program(function: Any, inputs: Any, outputs: Any, **how: Any) -> Any:
-        spread = jax.shard_map(function, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
-        placed = [jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs) for specs in (inputs, outputs)]
-        return jax.jit(
-            spread, in_shardings=placed[0], out_shardings=placed[1], compiler_options=compiler_options(), **how
-        )
-
-    training = env, config, networks, optimizer, mesh.size
-    begin = program(functools.partial(_begin, *training), (same, same, same), learning)
-    learn = program(functools.partial(_learn, *training, batches), (learning,), (learning, same), donate_argnums=0)
+    training = _Training(env, config, networks, optax.adam(learning_rate), progress, mesh.size)
+    replicated, sharded = PartitionSpec(), PartitionSpec(_AXIS)
+    state = TrainingState(replicated, replicated, replicated, sharded, replicated, replicated)  # type: ignore[arg-type]
+    start = _over_devices(mesh, training.start, (replicated, replicated, replicated), state)
+    epoch = functools.partial(training.epoch, batches)
+    learn = _over_devices(mesh, epoch, (state,), (state, replicated), donate_argnums=0)
     expert_states = jax.device_get(env.expert_states)
-    start = jax.eval_shape(begin, 0, restored, expert_states)
-    lowered = learn.lower(start)
-    learns = Background(lowered.compile)
-    learns.start()
+    lowered = learn.lower(jax.eval_shape(start, 0, restored, expert_states))
+    compiled_learn = in_background(lowered.compile)  # before the other, because it takes longer
 
-    def compile_begin() -> Callable[[int], TrainingState]:
-        compiled = begin.lower(0, restored, expert_states).compile()
+    def compile_start() -> Callable[[int], TrainingState]:
+        compiled = start.lower(0, restored, expert_states).compile()
         return lambda seed: compiled(seed, restored, expert_states)
 
-    begins = Background(compile_begin)
-    begins.start()
-    return begins, learns
+    return in_background(compile_start), compiled_learn
+
+
+def _over_devices(mesh: Mesh, function: Any, inputs: Any, outputs: Any, **options: Any) -> Any:
+    """`jax.jit` of a function that runs on each device of the mesh, with partition specs of inputs and outputs."""
+    mapped = jax.shard_map(function, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False)
+    shardings = [jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs) for specs in (inputs, outputs)]
+    return jax.jit(
+        mapped, in_shardings=shardings[0], out_shardings=shardings[1], compiler_options=compiler_options(), **options
+    )
 
 
 def initial_params(networks: ppo_networks.PPONetworks, observation_size: int, key: Array) -> Params:
-    """What an untrained policy is made of."""
+    """The parameters of an untrained policy."""
     key_policy, key_value = jax.random.split(key)
     statistics = running_statistics.init_state(specs.Array((observation_size,), jnp.dtype("float32")))
     return statistics, networks.policy_network.init(key_policy), networks.value_network.init(key_value)
 
 
-def _begin(
-    env: ImitationEnv,
-    config: PPOSettings,
-    networks: ppo_networks.PPONetworks,
-    optimizer: optax.GradientTransformation,
-    devices: int,
-    seed: Int[Array, ""],
-    restored: Params | None,
-    expert_states: LinkStates,
-) -> TrainingState:
-    key_networks, key_episodes, key = jax.random.split(jax.random.PRNGKey(seed), 3)
-    statistics, policy, value = restored or initial_params(networks, env.observation_size, key_networks)
-    keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), config.num_envs // devices)
-    episodes = fresh_episodes(env.with_expert_states(expert_states)).reset(keys)
-    learners = updates.begin(policy, optimizer), updates.begin(value, optimizer)
-    return TrainingState(*learners, statistics, episodes, expert_states, key)  # type: ignore[arg-type]
+class _Training(NamedTuple):
+    """A training as pure functions on one device; `devices` is the number of devices."""
 
+    env: ImitationEnv
+    config: PPOSettings
+    networks: ppo_networks.PPONetworks
+    optimizer: optax.GradientTransformation
+    progress: optax.Schedule
+    devices: int
 
-def _learn(
-    env: ImitationEnv,
-    config: PPOSettings,
-    networks: ppo_networks.PPONetworks,
-    optimizer: optax.GradientTransformation,
-    devices: int,
-    batches: int,
-    learning: TrainingState,
-) -> tuple[TrainingState, Metrics]:
-    episodes_env = fresh_episodes(env.with_expert_states(learning.expert_states))
-    make_policy = ppo_networks.make_inference_fn(networks)
-    rounds = config.batch_size * config.num_minibatches // config.num_envs
-    minibatch = config.batch_size // devices
-    # A GPU pauses between CUDA graphs, and none goes beyond a pass of a loop. On one GPU compiling takes what it saves.
-    updates_in_a_pass = 2 if devices > 1 else 1
-    how = updates.UpdateConfig(
-        networks, config, optimizer, axis=_AXIS, staggered=a_process_for_each_gpu(), unroll=updates_in_a_pass
-    )
+    def start(self, seed: Int[Array, ""], restored: Params | None, expert_states: LinkStates) -> TrainingState:
+        """The state before the first update."""
+        key_networks, key_episodes, key = jax.random.split(jax.random.PRNGKey(seed), 3)
+        statistics, policy, value = restored or initial_params(self.networks, self.env.observation_size, key_networks)
+        num_envs = self.config.num_envs // self.devices
+        keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), num_envs)
+        episodes = fresh_episodes(self.env.with_expert_states(expert_states)).reset(keys)
+        states = updates.begin(policy, self.optimizer), updates.begin(value, self.optimizer)
+        return TrainingState(*states, statistics, episodes, expert_states, key)  # type: ignore[arg-type]
 
-    def unroll(learning: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
+    def epoch(self, batches: int, state: TrainingState) -> tuple[TrainingState, Metrics]:
+        """Collects batches and learns from them; returns the means of the metrics."""
+        env = fresh_episodes(self.env.with_expert_states(state.expert_states))
+        make_policy = ppo_networks.make_inference_fn(self.networks)
+
+        def unroll(state: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
+            return self._unroll(env, make_policy(state.params), state, key)
+
+        def batch(state: TrainingState, _: None) -> tuple[TrainingState, Array]:
+            return self._batch(unroll, state)
+
+        state, metrics = jax.lax.scan(batch, state, None, length=batches)
+        means = dict(zip(updates.METRICS, jax.lax.pmean(metrics.mean(axis=0), _AXIS), strict=True))
+        entropy_cost = self._settings_now(state).entropy_cost
+        loss = means["policy_loss"] + means["value_loss"] - entropy_cost * means["entropy"]
+        return state, {"loss": loss, **means}
+
+    def _unroll(self, env: Wrapper, policy: Any, state: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
         """Steps of all arms, [time + 1, arms, ...]."""
-        policy = make_policy(learning.params)
 
-        def step(state: State, key: Array) -> tuple[State, Unrolls]:
-            action, taken = policy(state.obs, key)
-            after = episodes_env.step(state, action)
-            return after, Unrolls(state.obs, taken["raw_action"], taken["log_prob"], after.reward, 1 - after.done)  # type: ignore[arg-type]
+        def step(episodes: State, key: Array) -> tuple[State, Unrolls]:
+            action, extras = policy(episodes.obs, key)
+            after = env.step(episodes, action)
+            return after, Unrolls(
+                episodes.obs,  # type: ignore[arg-type]
+                extras["raw_action"],
+                extras["log_prob"],
+                after.reward,
+                1 - after.done,
+            )
 
-        keys = jax.random.split(key, config.unroll_length)
-        episodes, steps = jax.lax.scan(step, learning.episodes, keys)
+        keys = jax.random.split(key, self.config.unroll_length)
+        episodes, steps = jax.lax.scan(step, state.episodes, keys)
         last = jax.tree.map(lambda x: jnp.zeros_like(x[:1]), steps)._replace(observation=episodes.obs[None])
         steps = jax.tree.map(lambda *x: jnp.concatenate(x), steps, last)
-        return dataclasses.replace(learning, episodes=episodes), steps
+        return dataclasses.replace(state, episodes=episodes), steps
 
-    def batch(learning: TrainingState, _: None) -> tuple[TrainingState, Array]:
+    def _batch(self, unroll: Callable[..., Any], state: TrainingState) -> tuple[TrainingState, Array]:
         """Collects unrolls, and learns from them."""
-        key, key_unroll, key_order, key_loss = jax.random.split(learning.key, 4)
+        config = self.config
+        rounds = config.batch_size * config.num_minibatches // config.num_envs
+        minibatch = config.batch_size // self.devices
+        key, key_unroll, key_order, key_loss = jax.random.split(state.key, 4)
         key_unroll, key_order, key_loss = (
             jax.random.fold_in(k, jax.lax.axis_index(_AXIS)) for k in (key_unroll, key_order, key_loss)
         )
-        learning, collected = jax.lax.scan(unroll, learning, jax.random.split(key_unroll, rounds))
+        state, collected = jax.lax.scan(unroll, state, jax.random.split(key_unroll, rounds))
         unrolls = jax.tree.map(lambda x: jnp.moveaxis(x, 2, 1).reshape(-1, x.shape[1], *x.shape[3:]), collected)
-        statistics = running_statistics.update(learning.statistics, unrolls.observation[:, :-1], pmap_axis_name=_AXIS)
+        statistics = running_statistics.update(state.statistics, unrolls.observation[:, :-1], pmap_axis_name=_AXIS)
         passes = jax.random.split(key_order, config.num_updates_per_batch)
         count = len(unrolls.observation)
         order = jax.vmap(lambda key: jax.random.permutation(key, count))(passes).reshape(-1, minibatch)
-        learners = learning.policy, learning.value
-        (policy, value), metrics = updates.updated(learners, statistics, unrolls, order, key_loss, how)
-        learning = dataclasses.replace(learning, policy=policy, value=value, statistics=statistics, key=key)
-        return learning, metrics
+        update_config = updates.UpdateConfig(
+            self.networks,
+            self._settings_now(state),
+            self.optimizer,
+            axis=_AXIS,
+            staggered=a_process_for_each_gpu(),
+            # A GPU pauses between CUDA graphs, and a graph spans at most one iteration of a loop. On one GPU the longer
+            # compilation takes as much time as this saves.
+            unroll=2 if self.devices > 1 else 1,
+        )
+        states = state.policy, state.value
+        (policy, value), metrics = updates.updated(states, statistics, unrolls, order, key_loss, update_config)
+        return dataclasses.replace(state, policy=policy, value=value, statistics=statistics, key=key), metrics
 
-    learning, metrics = jax.lax.scan(batch, learning, None, length=batches)
-    means = dict(zip(updates.METRICS, jax.lax.pmean(metrics.mean(axis=0), _AXIS), strict=True))
-    loss = means["policy_loss"] + means["value_loss"] - config.entropy_cost * means["entropy"]
-    return learning, {"loss": loss, **means}
+    def _settings_now(self, state: TrainingState) -> PPOSettings:
+        """The settings at the present update."""
+        return self.config.at(self.progress(state.policy.optimizer[0].count))

@@ -1,4 +1,4 @@
-"""`trainer=ppo`: a policy that moves the learner like the expert, by torques."""
+"""`trainer=ppo`: trains a policy that imitates the expert's motions by joint torques."""
 
 import dataclasses
 import math
@@ -15,24 +15,24 @@ from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
-from mimic.evaluation.rollout_metrics import LEAST_SPAN
+from mimic.evaluation.rollout_metrics import MIN_SPAN
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, PPOSettings, TrainConfig
 from mimic.trainers.ppo import training as ppo
-from mimic.trainers.trainer import Figures, OnEvaluation, OnUpdate, Params, Row, Trainer
+from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
 
 
 class PPOTrainer(Trainer):
-    """Trains a policy on training demonstrations; tells how good it is on these and on held-out ones.
+    """Trains a policy on the training demonstrations, and evaluates it on these and on held-out ones.
 
     Args:
-      config: of the run.
-      run_dir: of a run that exists, whose demonstrations count.
-      unseen: demonstrations to evaluate on in place of the held-out ones.
+      config: the run's config.
+      run_dir: directory of an existing run, whose demonstrations are used.
+      unseen: demonstrations to evaluate on instead of the held-out ones.
 
     Attributes:
-      evaluator: of controllers on the run's demonstrations.
+      evaluator: evaluates controllers on the run's demonstrations.
 
     Raises:
       ValueError: settings, arms or demonstrations that do not fit each other.
@@ -54,17 +54,17 @@ class PPOTrainer(Trainer):
         self._env = _with_crossovers(env, self.settings.crossovers, config.env.demonstrations.seed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
         self.headline = (
-            f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms at once, "
+            f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms in parallel, "
             f"{config.env.physics} physics"
         )
-        self._program = Background(self._compile)
+        self._rollouts = Background(self._compile)
 
     def save_inputs(self, run_dir: Path) -> None:
-        """The demonstrations."""
+        """Writes the demonstrations."""
         self._demonstrations.save(run_dir / DEMONSTRATIONS)
 
     def params_template(self) -> Params:
-        """Observation statistics, policy and value network."""
+        """Observation statistics and the parameters of policy and value network."""
         return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
 
     def controller(self, params: Params) -> Controller:
@@ -79,8 +79,8 @@ class PPOTrainer(Trainer):
         return compiling(rollouts, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template))()
 
     def _prepare(self) -> None:
-        """Begins to compile the evaluation, and to compute what it is measured against."""
-        self._program.start()
+        """Starts to compile the evaluation, and to compute the bound and the baselines."""
+        self._rollouts.start()
         self.evaluator.prepare()
 
     def train(
@@ -103,9 +103,9 @@ class PPOTrainer(Trainer):
         ppo.follow(self._env, self.settings, seed=self._seed, restore=restore)
 
     def evaluate(self, params: Params) -> Rollouts:
-        """Each demonstration once, without exploration."""
-        # From the host: each way of spreading the parameters over devices would ask for a program of its own.
-        return self._program()(jax.device_get(params))
+        """Runs the deterministic policy once on each demonstration."""
+        # Parameters come from the host: each sharding over devices would need a compiled function of its own.
+        return self._rollouts()(jax.device_get(params))
 
     def run_controller(
         self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate
@@ -123,29 +123,29 @@ class PPOTrainer(Trainer):
         outcome, frequency = run_controller(self.evaluator, name)
         return outcome, {"trainer": name, "frequency_rad_s": frequency}
 
-    def figures(self, outcome: Rollouts) -> Figures:
+    def metrics(self, outcome: Rollouts) -> Metrics:
         """See `Evaluator.summary`."""
         return self.evaluator.summary(outcome)
 
-    def status(self, figures: Figures) -> str:
+    def status(self, metrics: Metrics) -> str:
         """Distance and optimality gap."""
-        gap, distance = figures["optimality_gap"], figures["mean_distance"]["train"]
-        shown = {split: _text("{:.1%}", value) for split, value in gap.items()}
-        return f"distance {distance:.4f}  gap {shown['train']}, held out {shown['held_out']}"
+        gap, distance = metrics["optimality_gap"], metrics["mean_distance"]["train"]
+        percent = {split: _text("{:.1%}", value) for split, value in gap.items()}
+        return f"distance {distance:.4f}  gap {percent['train']}, held out {percent['held_out']}"
 
-    def good_enough(self, figures: Figures) -> bool:
-        """At the target gap."""
-        return figures["optimality_gap"]["train"] <= self.settings.target_gap
+    def good_enough(self, metrics: Metrics) -> bool:
+        """Whether the target gap is reached on the training demonstrations."""
+        return metrics["optimality_gap"]["train"] <= self.settings.target_gap
 
-    def details(self, outcome: Rollouts, controller: str = "policy") -> Figures:
-        """How alike the motions look, beside the baselines, and the demonstrations that went worst."""
+    def details(self, outcome: Rollouts, controller: str = "policy") -> Metrics:
+        """Similarity of the motions compared with the baselines, and the demonstrations with the largest gaps."""
         return {
             "similarity": self.evaluator.similarity_summary(outcome, controller),
             "worst_demonstrations": self.evaluator.worst(outcome),
         }
 
-    def rows(self, figures: Figures) -> list[Row]:
-        """The gap and what it is made of."""
+    def rows(self, metrics: Metrics) -> list[Row]:
+        """Rows of the gap, the distances that define it, and the other metrics."""
         by_split = (
             ("optimality gap", "optimality_gap", "{:.2%}"),
             ("mean distance", "mean_distance", "{:.4f}"),
@@ -153,25 +153,28 @@ class PPOTrainer(Trainer):
             ("  holding start pose (1)", "hold_distance", "{:.4f}"),
             ("angle to expert links", "link_angle_error_deg", "{:.1f} deg"),
             ("angular velocity error", "angular_velocity_error", "{:.2f} rad/s"),
-            ("torque / largest, rms", "torque_rms", "{:.1%}"),
+            ("torque / maximum, rms", "torque_rms", "{:.1%}"),
             ("  change in a step, rms", "torque_change", "{:.1%}"),
-            ("  steps at the largest", "torque_saturation", "{:.1%}"),
+            ("  steps at the maximum", "torque_saturation", "{:.1%}"),
             ("steps out of range", "position_violations", "{:.0f}"),
-            ("  above rated speed", "speed_violations", "{:.0f}"),
+            ("  above velocity limit", "speed_violations", "{:.0f}"),
             ("  above torque limit", "torque_violations", "{:.0f}"),
         )
-        rows = [(label, *(_text(form, figures[key][split]) for split in SPLITS)) for label, key, form in by_split]
-        if not all(math.isfinite(gap) for gap in figures["optimality_gap"].values()):
-            rows.insert(
-                1, ("  none: the best motion saves less than", f"{LEAST_SPAN:.0%} of holding", "the start pose")
-            )
-        worst = figures["worst_demonstrations"]
-        named = ("  ".join(f"{i}: {gap:.0%}" for i, gap in worst[split].items()) for split in SPLITS)
-        return [*rows, ("worst (number: gap)", *named)]  # type: ignore[list-item]
+        rows: list[Row] = [
+            (label, _text(form, metrics[key]["train"]), _text(form, metrics[key]["held_out"]))
+            for label, key, form in by_split
+        ]
+        if not all(math.isfinite(gap) for gap in metrics["optimality_gap"].values()):
+            rows.insert(1, ("  none: the best motion saves less than", f"{MIN_SPAN:.0%} of holding", "the start pose"))
+        train, held_out = (
+            "  ".join(f"{i}: {gap:.0%}" for i, gap in metrics["worst_demonstrations"][split].items())
+            for split in SPLITS
+        )
+        return [*rows, ("worst (number: gap)", train, held_out)]
 
     def save_outcome(self, folder: Path, outcome: Rollouts, controller: str = "policy") -> None:
-        """A table of all demonstrations, the distance over an episode, and in a run directory how it learned."""
-        from mimic.evaluation import plots  # matplotlib, a second; not before there is something to plot
+        """Writes tables and plots of the evaluation; in a run directory also a plot of the training."""
+        from mimic.evaluation import plots  # imports matplotlib, which takes a second
 
         self.evaluator.save_table(outcome, folder / "demonstrations.csv")
         self.evaluator.save_curves(outcome, folder / "quality.csv")
@@ -189,7 +192,7 @@ def _text(form: str, value: float) -> str:
 
 
 def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
-    """The environment on its training demonstrations, and the held-out ones; those of a run where there is one."""
+    """The environment with its training demonstrations, and the held-out ones; an existing run has its own."""
     if run_dir is not None:
         path = str(run_dir / DEMONSTRATIONS)
         stored = dataclasses.replace(config.demonstrations, path=path)
@@ -199,8 +202,8 @@ def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv,
 
 
 def _with_crossovers(env: ImitationEnv, count: int, seed: int) -> ImitationEnv:
-    """The environment that is trained on."""
-    given = env.demonstrations
-    if count == 0 or given.count == 1:  # one demonstration mixes with nothing
+    """The environment with additional training demonstrations."""
+    recorded = env.demonstrations
+    if count == 0 or recorded.count == 1:  # a single demonstration cannot be mixed
         return env
-    return env.with_demonstrations(concatenate(given, crossovers(given, count, seed)))
+    return env.with_demonstrations(concatenate(recorded, crossovers(recorded, count, seed)))

@@ -1,4 +1,4 @@
-"""PPO on an imitation environment: networks, training in stretches, checkpoints."""
+"""PPO on an imitation environment: networks, training epochs, checkpoints."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -15,13 +15,12 @@ from mimic.evaluation.evaluator import Controller
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOSettings
-from mimic.trainers.ppo.programs import Params, initial_params, make_programs
-
-OnEvaluation = Callable[[int, Params, dict[str, float]], bool]  # whether that is good enough to stop
+from mimic.trainers.ppo.programs import Params, compile_training, initial_params
+from mimic.trainers.trainer import OnEvaluation
 
 
 def make_networks(config: PPOSettings, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
-    """Policy and value network of a resolved config."""
+    """The policy and value network of the trainer's settings."""
     hidden = tuple(config.hidden_layers or ())
     return ppo_networks.make_ppo_networks(
         observation_size,
@@ -33,7 +32,7 @@ def make_networks(config: PPOSettings, observation_size: int, action_size: int) 
 
 
 def params_template(config: PPOSettings, observation_size: int, action_size: int) -> Params:
-    """Shapes of the parameters, to restore a checkpoint into."""
+    """The shapes of the parameters, with the structure of a checkpoint."""
     networks = make_networks(config, observation_size, action_size)
     return jax.eval_shape(lambda: initial_params(networks, observation_size, jax.random.PRNGKey(0)))
 
@@ -49,6 +48,7 @@ def make_controller(config: PPOSettings, observation_size: int, action_size: int
     return controller
 
 
+# Above 40 lines because of its docstring.
 def train(
     env: ImitationEnv,
     config: PPOSettings,
@@ -60,55 +60,54 @@ def train(
     restore: tuple[int, Params] | None = None,
     on_compiling: Callable[[], None] = lambda: None,
 ) -> tuple[int, Params]:
-    """Trains a policy; saves a checkpoint before each call of `on_evaluation`.
+    """Trains a policy, and saves a checkpoint before each call of `on_evaluation`.
 
     Args:
       env: the environment with its training demonstrations.
-      config: resolved.
-      run_dir: where checkpoints go.
-      seed: of networks, exploration and resets.
-      on_evaluation: called with the environment steps so far, the parameters and metrics of the training: means of the
-        loss's, environment steps per second (sps) and seconds of training (walltime); training ends where it returns
-        True. The first call is before the training, without metrics.
-      signals: training ends after the next checkpoint if one came.
-      restore: steps and parameters to go on from. Networks and observation statistics are kept; the moments of the
-        optimiser and the states of the environments start anew.
-      on_compiling: called when the training program begins to compile: time for work in other threads.
+      config: the trainer's settings.
+      run_dir: folder of the checkpoints.
+      seed: random seed of networks, exploration and resets.
+      on_evaluation: called for the initial parameters, without metrics, and after each training epoch; the metrics are
+        those of the losses, environment steps per second (sps) and seconds of training (walltime).
+      signals: signals of the process; after one, training ends at the next checkpoint.
+      restore: steps and parameters to continue from. Networks and observation statistics are kept; the moments of the
+        optimiser and the states of the environments are reset.
+      on_compiling: called when the functions of the training start to compile; it may start work in other threads.
 
     Returns:
       Environment steps and parameters at the end.
 
     Raises:
-      Interrupted: a signal came; a checkpoint is written.
+      Interrupted: a signal was received; a checkpoint has been written.
     """
-    results: list[_Stretch] = []
-    for result in _stretches(env, config, seed, restore, on_compiling):
-        save_checkpoint(run_dir, result.step, result.params)
-        results.append(result)
-        enough = False
-        if result.metrics:  # the start is looked at with the first result: until then the evaluation compiles
-            enough = [on_evaluation(*seen) for seen in results][-1]
-            results.clear()
-        if result.step < config.total_steps:  # else all is done, and there is nothing to resume
+    pending: list[_Checkpoint] = []
+    for checkpoint in _checkpoints(env, config, seed, restore, on_compiling):
+        save_checkpoint(run_dir, checkpoint.step, checkpoint.params)
+        pending.append(checkpoint)
+        stop = False
+        if checkpoint.metrics:  # the start is evaluated with the first epoch: the evaluation compiles until then
+            stop = [on_evaluation(*evaluated) for evaluated in pending][-1]
+            pending.clear()
+        if checkpoint.step < config.total_steps:  # a finished training is not interrupted: there is nothing to resume
             signals.check()
-        if enough:
+        if stop:
             break
-    return result.step, result.params
+    return checkpoint.step, checkpoint.params
 
 
 def follow(env: ImitationEnv, config: PPOSettings, *, seed: int, restore: tuple[int, Params] | None = None) -> None:
-    """Trains in step with the first process, where `train` runs."""
-    for _ in _stretches(env, config, seed, restore, lambda: None):
+    """Runs the same training epochs as the first process, where `train` runs."""
+    for _ in _checkpoints(env, config, seed, restore, lambda: None):
         pass
 
 
-class _Stretch(NamedTuple):
-    """What a training has come to after a call of its program.
+class _Checkpoint(NamedTuple):
+    """The result of a training epoch.
 
     Attributes:
       step: environment steps so far.
-      params: on the host.
-      metrics: of the call; empty before the first.
+      params: parameters on the host.
+      metrics: training metrics of the epoch; empty before the first epoch.
     """
 
     step: int
@@ -116,42 +115,47 @@ class _Stretch(NamedTuple):
     metrics: dict[str, float]
 
 
-def _stretches(
+def _checkpoints(
     env: ImitationEnv,
     config: PPOSettings,
     seed: int,
     restore: tuple[int, Params] | None,
     on_compiling: Callable[[], None],
-) -> Iterator[_Stretch]:
-    """The start of a training, and the end of each of its stretches."""
+) -> Iterator[_Checkpoint]:
+    """The start of a training, and the result of each training epoch."""
     step, restored = jax.device_get(restore) if restore else (0, None)
-    left = max(config.num_timesteps - step, 1)
-    evaluations = max(round(config.evaluations * left / config.num_timesteps), 1)
-    all_batches = -(-left // config.steps_per_batch)
+    remaining = max(config.num_timesteps - step, 1)
+    evaluations = max(round(config.evaluations * remaining / config.num_timesteps), 1)
+    all_batches = -(-remaining // config.steps_per_batch)
     batches = max(round(all_batches / evaluations), 1)
     networks = make_networks(config, env.observation_size, env.action_size)
-    begin, learn = make_programs(env, config, networks, batches, _learning_rate(config, step), restored)
+    progress = _progress(config, step)
+    learning_rate = _learning_rate(config, progress)
+    start, learn = compile_training(env, config, networks, batches, learning_rate, restored, progress)
     on_compiling()
-    learning = begin()((seed + step) % 2**31)  # what a 32-bit integer holds
-    yield _Stretch(step, jax.device_get(learning.params), {})
+    state = start()((seed + step) % 2**31)  # the range of a 32-bit integer
+    yield _Checkpoint(step, jax.device_get(state.params), {})
     walltime = 0.0
     for _ in range(-(-all_batches // batches)):
-        program = learn()
+        run_epoch = learn()
         began = time.perf_counter()
-        learning, means = program(learning)
+        state, means = run_epoch(state)
         metrics = {name: float(value) for name, value in jax.device_get(means).items()}
         seconds = time.perf_counter() - began
         walltime += seconds
         step += batches * config.steps_per_batch
         speed = {"sps": batches * config.steps_per_batch / seconds, "walltime": walltime}
-        yield _Stretch(step, jax.device_get(learning.params), {**speed, **metrics})
+        yield _Checkpoint(step, jax.device_get(state.params), {**speed, **metrics})
 
 
-def _learning_rate(config: PPOSettings, done_steps: int) -> optax.Schedule:
-    """A linear decay over the updates of the whole training, from those that are done."""
+def _progress(config: PPOSettings, done_steps: int) -> optax.Schedule:
+    """Fraction of the whole training that is done after `done_steps` and a number of updates."""
     updates_per_batch = config.num_minibatches * config.num_updates_per_batch
     updates = config.num_timesteps // config.steps_per_batch * updates_per_batch
     done_updates = done_steps // config.steps_per_batch * updates_per_batch
-    start = config.learning_rate
-    schedule = optax.linear_schedule(start, start * config.final_learning_rate, updates)
+    schedule = optax.linear_schedule(0.0, 1.0, updates)
     return lambda count: schedule(count + done_updates)
+
+
+def _learning_rate(config: PPOSettings, progress: optax.Schedule) -> optax.Schedule:
+    return lambda count: config.learning_rate * (1 + progress(count) * (config.final_learning_rate - 1))

@@ -1,4 +1,4 @@
-"""PPO's updates of policy and value from what the arms did, over all devices."""
+"""PPO's updates of the policy and value networks from unrolls, over all devices."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,18 +12,18 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from mimic.trainers.config import PPOSettings
-from mimic.trainers.ppo.losses import METRICS as OF_POLICY
+from mimic.trainers.ppo.losses import METRICS as POLICY_METRICS
 from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
 
-METRICS = ("value_loss", *OF_POLICY)
+METRICS = ("value_loss", *POLICY_METRICS)
 
 
 class TrainState(NamedTuple):
-    """Policy or value.
+    """The state of the policy network or of the value network.
 
     Attributes:
-      params: of the network.
-      optimizer: state of optax, of all parameters as one vector: a step is one kernel.
+      params: parameters of the network.
+      optimizer: optax's state for all parameters as one vector, so that a step is one kernel.
     """
 
     params: Any
@@ -34,26 +34,26 @@ TrainStates = tuple[TrainState, TrainState]  # policy, value
 
 
 def begin(params: Any, optimizer: optax.GradientTransformation) -> TrainState:
-    """A network that has not learned yet."""
+    """The state of a network before its first update."""
     return TrainState(params, optimizer.init(ravel_pytree(params)[0]))
 
 
 class UpdateConfig(NamedTuple):
-    """How policy and value are updated, the same for all of a run.
+    """The settings of an update.
 
     Attributes:
-      networks: of the config.
-      config: resolved.
-      optimizer: of both.
-      axis: over the devices.
-      staggered: whether the policy takes its step when the value has begun with the next minibatch. Each waits for the
-        mean of its gradients over the devices while the other computes, and what they learn is the same. Else both take
-        their steps at once, after one message.
-      unroll: updates in each pass of the compiled loop.
+      networks: policy and value network.
+      settings: the trainer's settings.
+      optimizer: optimizer of both networks.
+      axis: name of the axis over the devices.
+      staggered: whether the policy takes its step after the value network has started with the next minibatch. The
+        all-reduce of each network's gradient is then overlapped with the computation of the other; the result is the
+        same. Otherwise both networks take their steps together, after a single all-reduce.
+      unroll: updates in each iteration of the compiled loop.
     """
 
     networks: ppo_networks.PPONetworks
-    config: PPOSettings
+    settings: PPOSettings
     optimizer: optax.GradientTransformation
     axis: str
     staggered: bool
@@ -61,124 +61,128 @@ class UpdateConfig(NamedTuple):
 
 
 def updated(
-    learners: TrainStates,
+    states: TrainStates,
     statistics: RunningStatisticsState,
     unrolls: Unrolls,
     order: Int[Array, "updates minibatch"],
     key: Array,
-    how: UpdateConfig,
+    config: UpdateConfig,
 ) -> tuple[TrainStates, Float[Array, " metrics"]]:
-    """Policy and value after an update by each minibatch, and the means of `METRICS` on this device.
+    """Updates policy and value with each minibatch; returns their states and the means of `METRICS` on this device.
 
-    The policy's gradient is clipped by the norm of both, as by brax; the value's by its own norm, which is most of that
-    of both.
+    The policy's gradient is clipped by the joint norm of both gradients, as in brax; the value's gradient by its own
+    norm, which is most of the joint norm.
 
     Args:
-      learners: policy and value before.
-      statistics: of the observations.
+      states: states of policy and value before the updates.
+      statistics: running statistics of the observations.
       unrolls: [unrolls, time + 1, ...] of this device.
-      order: which unrolls each update learns from.
-      key: of this device, for the entropy, which is estimated by a sample.
-      how: what is the same for all of a run.
+      order: indices of the unrolls in the minibatch of each update.
+      key: of this device, for the sampled estimate of the entropy.
+      config: settings of an update.
     """
     rows = unrolls.packed()
     keys = jax.random.split(key, len(order))
 
-    def minibatch(chosen: Array) -> Unrolls:
-        return unrolls.unpacked(rows[chosen])
+    def minibatch(indices: Array) -> Unrolls:
+        return unrolls.unpacked(rows[indices])
 
-    return (_staggered if how.staggered else _at_once)(learners, statistics, minibatch, order, keys, how)
+    return (_staggered if config.staggered else _synchronous)(states, statistics, minibatch, order, keys, config)
 
 
-def _at_once(
-    learners: TrainStates,
+def _synchronous(
+    states: TrainStates,
     statistics: RunningStatisticsState,
     minibatch: Callable[[Array], Unrolls],
     order: Array,
     keys: Array,
-    how: UpdateConfig,
+    config: UpdateConfig,
 ) -> tuple[TrainStates, Array]:
-    def update(learners: TrainStates, inputs: tuple[Array, Array]) -> tuple[TrainStates, Array]:
-        policy, value = learners
-        chosen, key = inputs
-        seen = minibatch(chosen)
-        value_gradient, error, advantages = _value_gradient(value, statistics, seen, how)
-        policy_gradient, metrics = _policy_gradient(policy, statistics, seen, advantages, key, how)
-        mean = jax.lax.pmean(jnp.concatenate([policy_gradient, value_gradient]), how.axis)
+    def update(states: TrainStates, inputs: tuple[Array, Array]) -> tuple[TrainStates, Array]:
+        policy, value = states
+        indices, key = inputs
+        batch = minibatch(indices)
+        value_gradient, error, advantages = _value_gradient(value, statistics, batch, config)
+        policy_gradient, metrics = _policy_gradient(policy, statistics, batch, advantages, key, config)
+        mean = jax.lax.pmean(jnp.concatenate([policy_gradient, value_gradient]), config.axis)
         policy_mean, value_mean = mean[: len(policy_gradient)], mean[len(policy_gradient) :]
-        policy, value = _step(policy, policy_mean, _norm(mean), how), _step(value, value_mean, _norm(value_mean), how)
+        policy = _step(policy, policy_mean, _norm(mean), config)
+        value = _step(value, value_mean, _norm(value_mean), config)
         return (policy, value), jnp.append(error, metrics)
 
-    learners, metrics = jax.lax.scan(update, learners, (order, keys), unroll=how.unroll)
-    return learners, metrics.mean(axis=0)
+    states, metrics = jax.lax.scan(update, states, (order, keys), unroll=config.unroll)
+    return states, metrics.mean(axis=0)
 
 
 def _staggered(
-    learners: TrainStates,
+    states: TrainStates,
     statistics: RunningStatisticsState,
     minibatch: Callable[[Array], Unrolls],
     order: Array,
     keys: Array,
-    how: UpdateConfig,
+    config: UpdateConfig,
 ) -> tuple[TrainStates, Array]:
-    # NCCL must not be given two messages at once: each has the norm in it that comes of the one before.
+    # NCCL must not run two all-reduces concurrently. So each operand includes a norm that is computed from the result
+    # of the previous all-reduce.
     def update(carry: tuple[TrainState, TrainState, Array], inputs: tuple[Array, Array, Array]) -> Any:
-        policy, value, message = carry
-        chosen, key, first = inputs
-        seen = minibatch(chosen)
-        stepped, norm = policy_step(policy, message)
+        policy, value, policy_operand = carry
+        indices, key, first = inputs
+        batch = minibatch(indices)
+        stepped, norm = policy_step(policy, policy_operand)
         policy = jax.tree.map(lambda old, new: jnp.where(first, old, new), policy, stepped)
-        policy = jax.lax.optimization_barrier(policy)  # else XLA copies the message before it sends it
-        gradient, error, advantages = _value_gradient(value, statistics, seen, how)
-        advantages += 0 * gradient[0]  # after the gradient: beside its message the policy's is computed
-        mean = jax.lax.pmean(jnp.append(gradient, norm), how.axis)[:-1]
+        policy = jax.lax.optimization_barrier(policy)  # otherwise XLA copies the operand before the all-reduce
+        gradient, error, advantages = _value_gradient(value, statistics, batch, config)
+        # The policy's gradient comes after the value's, so that it is computed during the all-reduce of the value's.
+        advantages += 0 * gradient[0]
+        mean = jax.lax.pmean(jnp.append(gradient, norm), config.axis)[:-1]
         value_norm = _norm(mean)
-        gradient, metrics = _policy_gradient(policy, statistics, seen, advantages, key, how)
-        message = jnp.append(gradient, value_norm)
-        return (policy, _step(value, mean, value_norm, how), message), jnp.append(error, metrics)
+        gradient, metrics = _policy_gradient(policy, statistics, batch, advantages, key, config)
+        policy_operand = jnp.append(gradient, value_norm)
+        return (policy, _step(value, mean, value_norm, config), policy_operand), jnp.append(error, metrics)
 
-    def policy_step(policy: TrainState, message: Array) -> tuple[TrainState, Array]:
-        mean = jax.lax.pmean(message, how.axis)
+    def policy_step(policy: TrainState, operand: Array) -> tuple[TrainState, Array]:
+        mean = jax.lax.pmean(operand, config.axis)
         norm = _norm(mean[:-1])
-        return _step(policy, mean[:-1], jnp.hypot(norm, mean[-1]), how), norm
+        return _step(policy, mean[:-1], jnp.hypot(norm, mean[-1]), config), norm
 
-    none = 0 * ravel_pytree(learners[0].params)[0]
-    after = 0 * ravel_pytree(statistics.mean)[0].sum()  # the statistics were sent before
-    nothing = jnp.append(none, after.astype(none.dtype))
+    zeros = 0 * ravel_pytree(states[0].params)[0]
+    after_statistics = 0 * ravel_pytree(statistics.mean)[0].sum()  # orders the first all-reduce after the statistics'
+    start = jnp.append(zeros, after_statistics.astype(zeros.dtype))
     first = jnp.arange(len(order)) == 0
-    (policy, value, message), metrics = jax.lax.scan(
-        update, (*learners, nothing), (order, keys, first), unroll=how.unroll
+    (policy, value, policy_operand), metrics = jax.lax.scan(
+        update, (*states, start), (order, keys, first), unroll=config.unroll
     )
-    policy, norm = policy_step(policy, message)
-    return (policy, value), metrics.mean(axis=0) + 0 * norm  # they may be sent next
+    policy, norm = policy_step(policy, policy_operand)
+    return (policy, value), metrics.mean(axis=0) + 0 * norm  # orders an all-reduce of the metrics after the policy's
 
 
 def _value_gradient(
-    value: TrainState, statistics: RunningStatisticsState, seen: Unrolls, how: UpdateConfig
+    value: TrainState, statistics: RunningStatisticsState, batch: Unrolls, config: UpdateConfig
 ) -> tuple[Array, Array, Array]:
     differentiated = jax.value_and_grad(value_loss, has_aux=True)
-    (error, advantages), gradients = differentiated(value.params, statistics, seen, how.networks, how.config)
+    (error, advantages), gradients = differentiated(value.params, statistics, batch, config.networks, config.settings)
     return ravel_pytree(gradients)[0], error, advantages
 
 
 def _policy_gradient(
     policy: TrainState,
     statistics: RunningStatisticsState,
-    seen: Unrolls,
+    batch: Unrolls,
     advantages: Array,
     key: Array,
-    how: UpdateConfig,
+    config: UpdateConfig,
 ) -> tuple[Array, Array]:
     differentiated = jax.grad(policy_loss, has_aux=True)
-    gradients, metrics = differentiated(policy.params, statistics, seen, advantages, key, how.networks, how.config)
+    inputs = statistics, batch, advantages, key
+    gradients, metrics = differentiated(policy.params, *inputs, config.networks, config.settings)
     return ravel_pytree(gradients)[0], metrics
 
 
-def _step(learner: TrainState, gradient: Array, norm: Array, how: UpdateConfig) -> TrainState:
-    clipped = gradient * jnp.minimum(1, how.config.max_grad_norm / norm)
-    change, state = how.optimizer.update(clipped, learner.optimizer)
-    unravel = ravel_pytree(learner.params)[1]
-    return TrainState(optax.apply_updates(learner.params, unravel(change)), state)
+def _step(state: TrainState, gradient: Array, norm: Array, config: UpdateConfig) -> TrainState:
+    clipped = gradient * jnp.minimum(1, config.settings.max_grad_norm / norm)
+    change, optimizer_state = config.optimizer.update(clipped, state.optimizer)
+    unravel = ravel_pytree(state.params)[1]
+    return TrainState(optax.apply_updates(state.params, unravel(change)), optimizer_state)
 
 
 def _norm(vector: Array) -> Array:

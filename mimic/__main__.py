@@ -1,0 +1,24 @@
+"""`python -m mimic`: lists the commands, one line each."""
+
+import ast
+import re
+from pathlib import Path
+
+_ENTRY_POINT = re.compile(r"`python -m (mimic\.\w+)[^`]*`: (.*)\.")  # the docstring of an entry point
+
+
+def commands() -> dict[str, str]:
+    """Modules of the commands with what each does, read from the docstrings without importing the modules."""
+    summaries = {}
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
+        if match := _ENTRY_POINT.fullmatch(docstring):
+            summaries[match[1]] = match[2]
+    return summaries
+
+
+if __name__ == "__main__":
+    summaries = commands()
+    print("Commands; python -m COMMAND --help shows the keys of each:\n")
+    for module, summary in summaries.items():
+        print(f"  {module:{max(map(len, summaries))}}  {summary}")

@@ -1,0 +1,212 @@
+"""Arms from files: what is loaded moves and weighs as C MuJoCo says of the model as it was written."""
+
+import os
+import pathlib
+from importlib.util import find_spec
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+import mimic
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.model_files import MAX_FILE_SIZE, read_model, read_spec
+from tests.helpers import original_model
+
+POSES = 40
+# Arms that others wrote, in packages that need not be installed: their paths there, and where the last link ends.
+OTHERS = {
+    "Panda": ("robosuite/models/assets/robots/panda/robot.xml", "right_hand"),
+    "UR5e": ("robosuite/models/assets/robots/ur5e/robot.xml", "right_hand"),
+    "IIWA": ("robosuite/models/assets/robots/iiwa/robot.xml", "right_hand"),
+    "Kinova3": ("robosuite/models/assets/robots/kinova3/robot.xml", "right_hand"),
+    "Sawyer": ("robosuite/models/assets/robots/sawyer/robot.xml", "right_hand"),
+    "Jaco": ("robosuite/models/assets/robots/jaco/robot.xml", "right_hand"),
+    "Fetch": ("gymnasium_robotics/envs/assets/fetch/reach.xml", "robot0:grip"),
+    "Franka with hand, URDF": (
+        "robosuite/models/assets/bullet_data/panda_description/urdf/panda_arm_hand.urdf",
+        "panda_hand",
+    ),
+}
+
+
+def other(name):
+    """The file of an arm that others wrote: from the installed package, or from the folder MIMIC_ARMS."""
+    path, tip = OTHERS[name]
+    package, _, inside = path.partition("/")
+    found = find_spec(package)
+    folders = [pathlib.Path(os.environ["MIMIC_ARMS"]) / package] if "MIMIC_ARMS" in os.environ else []
+    folders += [pathlib.Path(folder) for folder in (found.submodule_search_locations or [] if found else [])]
+    file = next((folder / inside for folder in folders if (folder / inside).is_file()), None)
+    if file is None:
+        pytest.skip(f"no {path}: install {package}, or unpack its wheel in a folder and name that with MIMIC_ARMS")
+    return file, tip
+
+
+def largest_errors(file, original, tip, base=None):
+    """Of link states against `mj_forward`, and of the mass matrix and bias forces, over random poses and speeds."""
+    arm = build_arm(ArmConfig(model=str(file), tip=tip, base=base))
+    embodiment, simulated = arm.embodiment, mujoco.MjData(arm.model)
+    qpos_at, qvel_at = original_model.addresses(original, embodiment.joint_names)
+    original.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    states = jax.jit(lambda qpos, qvel: mimic.link_states(embodiment, qpos, qvel, normalized=False))
+    rng, kinematic, dynamic = np.random.default_rng(0), 0.0, 0.0
+    for _ in range(POSES):
+        qpos, qvel = rng.uniform(-np.pi, np.pi, len(qpos_at)), rng.normal(size=len(qpos_at))
+        data = mujoco.MjData(original)
+        data.qpos[:] = original_model.at_rest(original)
+        data.qpos[qpos_at], data.qvel[qvel_at] = qpos, qvel
+        mujoco.mj_forward(original, data)
+        names = embodiment.joint_names, embodiment.link_names
+        found = states(qpos, qvel)
+        for key, value in original_model.link_motion(original, data, *names, tip).items():
+            kinematic = max(kinematic, float(np.abs(np.asarray(getattr(found, key)) - value).max()))
+        simulated.qpos[:], simulated.qvel[:] = qpos, qvel
+        mujoco.mj_forward(arm.model, simulated)
+        masses = np.zeros((original.nv, original.nv)), np.zeros((arm.model.nv, arm.model.nv))
+        for model, state, mass in ((original, data, masses[0]), (arm.model, simulated, masses[1])):
+            mujoco.mj_fullM(model, state, mass)
+        scale = np.abs(masses[1]).max()
+        dynamic = max(dynamic, float(np.abs(masses[0][np.ix_(qvel_at, qvel_at)] - masses[1]).max() / scale))
+        dynamic = max(dynamic, float(np.abs(data.qfrc_bias[qvel_at] - simulated.qfrc_bias).max() / scale))
+    return kinematic, dynamic
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_an_arm_that_others_wrote_moves_as_its_model_says(x64, name):
+    file, tip = other(name)
+    # MuJoCo does not look up the meshes that a URDF names by their ROS package.
+    original = read_model(file) if name.endswith("URDF") else mujoco.MjModel.from_xml_path(str(file))
+    kinematic, dynamic = largest_errors(file, original, tip)
+    print(f"{name}: link states off by {kinematic:.1e}, dynamics by {dynamic:.1e}")
+    assert kinematic < 1e-9 and dynamic < 1e-9
+
+
+def test_the_arm_of_a_scene_is_its_longest_chain(x64):
+    """A kitchen around a Franka: it includes files outside its folder, so that MuJoCo itself must read it."""
+    reach, _ = other("Fetch")
+    file = reach.parents[1] / "kitchen_franka" / "kitchen_assets" / "kitchen_env_model.xml"
+    with pytest.raises(ValueError, match="outside its folder"):
+        mimic.load_mjcf(file)
+    model = mujoco.MjModel.from_xml_path(str(file))
+    arm = mimic.load_mjcf(model)
+    assert arm.joint_names == tuple(f"robot:panda0_joint{number}" for number in range(1, 8))
+
+
+@pytest.mark.parametrize("actuators", ["motor", "position", "none"])
+@pytest.mark.parametrize("tip", ["pinch", "palm", "wrist_3_link"])
+def test_an_arm_of_our_own_moves_as_its_model_says(x64, tmp_path, actuators, tip):
+    file = tmp_path / "arm.xml"
+    file.write_text(original_model.ur_like(actuators=actuators))
+    kinematic, dynamic = largest_errors(file, mujoco.MjModel.from_xml_path(str(file)), tip)
+    assert kinematic < 1e-9 and dynamic < 1e-9
+
+
+def test_a_urdf_moves_as_its_model_says(x64, tmp_path):
+    file = tmp_path / "arm.urdf"
+    file.write_text(original_model.urdf())
+    spec = mujoco.MjSpec.from_file(str(file))
+    spec.compiler.fusestatic = False  # else the tool has no name
+    kinematic, dynamic = largest_errors(file, spec.compile(), "tool")
+    assert kinematic < 1e-9 and dynamic < 1e-9
+    arm = mimic.load_mjcf(file)
+    assert arm.name == "four" and arm.torque_limit.tolist() == [39, 38, 37, 36]
+    assert arm.velocity_limit.tolist() == [0.5, 1, 1.5, 2]
+    assert arm.link_lengths[-1] == pytest.approx(0.15)
+
+
+def test_meshes_that_a_urdf_lacks_are_left_out_with_a_message(tmp_path, caplog):
+    file = tmp_path / "arm.urdf"
+    file.write_text(original_model.urdf(mesh="package://four/meshes/l.stl"))
+    assert mimic.load_mjcf(file).num_joints == 4
+    assert "that cannot be read, the first package://four/meshes/l.stl" in caplog.text
+
+
+def test_servos_and_motors_give_the_same_arm(tmp_path):
+    arms = []
+    for actuators in ("motor", "position"):
+        file = tmp_path / f"{actuators}.xml"
+        file.write_text(original_model.ur_like(actuators=actuators))
+        arms.append(build_arm(ArmConfig(model=str(file))))
+    motor, servo = arms
+    np.testing.assert_array_equal(motor.embodiment.torque_limit, servo.embodiment.torque_limit)
+    assert motor.model.nu == servo.model.nu == 0
+    np.testing.assert_array_equal(motor.model.dof_damping, servo.model.dof_damping)
+    assert any("6 servos on position" in note for note in servo.notes)
+    assert any("left (slide), right (slide)" in note for note in servo.notes)
+
+
+def test_unnamed_joints_are_named_and_can_be_simulated(tmp_path):
+    file = tmp_path / "nameless.xml"
+    file.write_text(original_model.ur_like(named=False, gripper=""))
+    arm = build_arm(ArmConfig(model=str(file), locked=["joint2"]))
+    assert arm.embodiment.joint_names == ("joint1", "joint3", "joint4", "joint5", "joint6")
+    assert arm.model.nq == 5
+    assert [joint.name for joint in read_spec(file).joints] == [f"joint{number}" for number in range(1, 7)]
+
+
+@pytest.mark.parametrize("kind", ["slides", "hinges", "a chain"])
+def test_the_arm_ends_before_its_hand(tmp_path, kind):
+    finger = '<body name="{0}" pos="{1} 0.1 0"><joint name="{0}" axis="0 0 1"/><geom size="0.01"/>{2}</body>'
+    hands = {
+        "slides": original_model.GRIPPER,
+        "hinges": finger.format("l", 0.1, "") + finger.format("r", -0.1, ""),
+        "a chain": finger.format("l", 0.1, finger.format("l2", 0.1, "")) + finger.format("r", -0.1, ""),
+    }
+    file = tmp_path / "arm.xml"
+    file.write_text(original_model.ur_like(gripper=hands[kind]))
+    assert mimic.load_mjcf(file).joint_names == ("pan", "lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+
+
+def test_rotor_inertia_and_damping_are_at_least_what_is_asked_for(tmp_path):
+    file = tmp_path / "arm.xml"
+    file.write_text(original_model.ur_like(armature=0.02))
+    model = build_arm(ArmConfig(model=str(file), armature=0.1, damping=0.1)).model
+    assert model.dof_armature.tolist() == [0.1] * 6 and model.dof_damping.tolist() == [0.2] * 6
+
+
+def test_a_model_is_found_from_any_folder(tmp_path, monkeypatch):
+    (tmp_path / "arm.xml").write_text(original_model.ur_like())
+    monkeypatch.chdir(tmp_path)
+    assert ArmConfig(model="arm.xml").model == str(tmp_path / "arm.xml")
+    assert mimic.env_config("pair", learner="arm.xml").learner.model == str(tmp_path / "arm.xml")
+
+
+# --- bad files --------------------------------------------------------------------------------------------------------
+
+LAUGHS = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
+BOMB = f'<?xml version="1.0"?><!DOCTYPE m [<!ENTITY l0 "ha">{LAUGHS}]><mujoco model="&l9;"/>'
+FILES = {
+    "an entity bomb": (BOMB, "'.*arm.xml' declares a document type or entities; expected plain MJCF or URDF$"),
+    "an include outside": (
+        '<mujoco><include file="../other.xml"/></mujoco>',
+        "'.*arm.xml' includes '../other.xml', which is outside its folder; expected files in ",
+    ),
+    "an absolute include": (
+        '<mujoco><include file="/etc/hosts"/></mujoco>',
+        "'.*arm.xml' includes '/etc/hosts', which is outside",
+    ),
+    "an include of itself": ('<mujoco><include file="arm.xml"/></mujoco>', "'.*arm.xml' is not an MJCF or URDF model"),
+    "a missing mesh": (
+        '<mujoco><asset><mesh name="a" file="a.stl"/></asset>'
+        '<worldbody><geom type="mesh" mesh="a"/></worldbody></mujoco>',
+        "'.*arm.xml' needs the file 'a.stl', which does not exist; expected all its files next to it$",
+    ),
+    "no inertia": (
+        "<mujoco><worldbody><body><joint/></body></worldbody></mujoco>",
+        "'.*arm.xml' has a moving body without inertia; expected an <inertial>",
+    ),
+    "huge": (" " * (MAX_FILE_SIZE + 1), "'.*arm.xml' has 32 MiB; expected a model of at most 32 MiB of XML$"),
+    "a broken URDF": ('<robot name="a"><link name="b"></robot>', "'.*arm.xml' is not an MJCF or URDF model"),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_bad_files_are_refused(tmp_path, case):
+    content, message = FILES[case]
+    file = tmp_path / "arm.xml"
+    file.write_text(content)
+    with pytest.raises(ValueError, match=f"^{message}") as error:
+        mimic.load_mjcf(file)
+    assert "\n" not in str(error.value)

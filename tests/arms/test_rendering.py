@@ -1,0 +1,57 @@
+"""Pictures of arms."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+
+from mimic.arms.arm import ArmConfig
+from mimic.arms.rendering import ArmScene
+
+
+def test_a_graphics_library_that_is_missing_is_said_when_something_is_drawn(tmp_path):
+    """PyOpenGL fails so where there is no libEGL."""
+    (tmp_path / "OpenGL").mkdir()
+    (tmp_path / "OpenGL" / "__init__.py").write_text("raise AttributeError('no eglQueryString')")
+    code = "import mimic, mujoco.mjx; from mimic import ArmScene; ArmScene([mimic.ArmConfig()])"
+    found = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}", "MUJOCO_GL": "egl"}
+    ended = subprocess.run([sys.executable, "-c", code], env=found, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1].startswith("ValueError: rendering: no OpenGL library works; expected EGL")
+
+
+def red_share(image):
+    red, green, blue = (image[..., channel].astype(int) for channel in range(3))
+    return np.mean((red > 120) & (green < 70) & (blue < 70))
+
+
+def test_locked_joints_are_red_and_arms_move():
+    free, locked = ArmConfig(), ArmConfig(locked=[3, 6, 7])
+    with ArmScene([free], width=160, height=120) as scene:
+        still, moved = (scene.image([np.full(7, angle)]) for angle in (0.3, -0.6))
+    assert still.shape == (120, 160, 3) and red_share(still) == 0
+    assert np.mean(np.any(still != moved, axis=-1)) > 0.02
+    with ArmScene([free, locked], width=160, height=120) as scene:
+        both = scene.image([np.full(7, 0.3), np.full(4, 0.3)])
+    left, right = both[:, :80], both[:, 80:]
+    assert red_share(left) == 0 and red_share(right) > 0.002  # the expert stands on the left
+
+
+def test_planar_arms_are_seen_from_above():
+    arm = ArmConfig(model="planar", link_lengths=[0.5, 0.5])
+    with ArmScene([arm], width=160, height=120) as scene:
+        straight, bent = (scene.image([np.array(pose)]) for pose in ([0.0, 0.0], [1.5, 0.0]))
+    assert np.mean(np.any(straight != bent, axis=-1)) > 0.005
+    with ArmScene([arm, arm], width=160, height=120) as scene:
+        straight, bent = (scene.image([np.array(pose), np.zeros(2)]) for pose in ([0.0, 0.0], [0.8, 0.0]))
+    changed = np.any(straight != bent, axis=-1)
+    assert changed[:, :80].any() and not changed[:, 80:].any()  # the expert stands on the left here too
+
+
+def test_points_as_the_camera_sees_them():
+    with ArmScene([ArmConfig()], width=32, height=32) as scene:
+        up, aside, ahead = scene.flattened(np.array([[0.0, 0, 1], [0, 1, 0], [1, 0, 0]]))
+    assert up[1] > 0.9 and abs(up[0]) < 1e-12  # seen from slightly above, upright
+    assert aside[0] > 0.9  # the camera looks against the x-axis, so that y is to its right
+    assert abs(ahead[0]) < 0.3 and ahead[1] < 0  # x comes towards it, and down as it looks from above

@@ -1,0 +1,163 @@
+"""`python -m mimic.evaluate`: every controller on every demonstration, and what it refuses."""
+
+import csv
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from mimic.commands.config import EvaluateConfig
+from mimic.commands.evaluate import prepare_evaluation
+from mimic.envs.imitation import training_and_held_out
+from mimic.runs.signals import Signals
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.make import make_trainer
+from mimic.trainers.ppo import training
+from mimic.trainers.ppo.trainer import PPOTrainer
+from mimic.trainers.run_config import save_config
+from tests.helpers.untrained_run import COUNT, HORIZON, environment, untrained_run
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    return untrained_run(tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture(scope="module")
+def unseen():
+    """Motions of the expert that the run does not hold."""
+    config = environment()
+    fresh = dataclasses.replace(config.demonstrations, seed=7)
+    return training_and_held_out(dataclasses.replace(config, demonstrations=fresh))[1]
+
+
+def evaluate(run_dir, out, **settings):
+    config = EvaluateConfig(str(run_dir), out=str(out), compilation_cache="", **settings)
+    prepare_evaluation(config, 0.0)()
+    with (out / "demonstrations.csv").open(newline="") as file:
+        return json.loads((out / "report.json").read_text()), list(csv.DictReader(file))
+
+
+def test_holding_still_has_a_gap_of_one(run_dir, tmp_path):
+    """On the physics that the run did not train with. 1e-5: float32, once from rollouts and once from the home pose."""
+    report, rows = evaluate(run_dir, tmp_path / "new", controller="hold", physics="mjx")
+    assert report["trainer"] == "hold"
+    assert report["optimality_gap"] == pytest.approx({"train": 1, "held_out": 1}, abs=1e-5)
+    assert [float(row["optimality_gap"]) for row in rows] == pytest.approx([1] * 6, abs=1e-5)
+    assert report["torque_rms"] == {"train": 0, "held_out": 0}
+    names = {path.name for path in (tmp_path / "new").iterdir()}
+    assert names == {
+        "config.yaml",
+        "report.json",
+        "demonstrations.csv",
+        "quality.csv",
+        "quality.png",
+        "demonstrations.png",
+        "similarity.png",
+    }
+
+
+def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_path):
+    """1e-5: float32, of the same distances in another program."""
+    unseen.of_length(HORIZON + 5).save(tmp_path / "unseen.npz")  # more steps than the run's demonstrations have
+    given = {"demonstrations": str(tmp_path / "unseen.npz")}
+    plain, rows = evaluate(run_dir, tmp_path / "plain", **given)
+    numbers = [(row["split"], int(row["demonstration"])) for row in rows]
+    assert numbers == [*(("train", i) for i in range(COUNT)), *(("held_out", i) for i in range(unseen.count))]
+    heavy, heavy_rows = evaluate(run_dir, tmp_path / "heavy", **given, mass=1.5, damping=2.0, torque_noise=0.1)
+    for row, other in zip(rows, heavy_rows, strict=True):
+        for key in ("hold_distance", "lower_bound"):
+            assert float(row[key]) == pytest.approx(float(other[key]), rel=1e-5)
+        assert float(row["mean_distance"]) != pytest.approx(float(other["mean_distance"]), rel=1e-3)
+    assert plain["mean_distance"] != heavy["mean_distance"]
+
+
+def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
+    trained = []
+    monkeypatch.setattr(training, "train", lambda env, *_, **__: trained.append(env))
+    trainer = PPOConfig(hidden_layers=[8], preset="cpu", crossovers=3)
+    job = make_trainer(TrainConfig(environment(), trainer), None)
+    assert isinstance(job, PPOTrainer)
+    job.train(tmp_path, lambda *_: False, Signals(), None)
+    (env,) = trained
+    assert env.demonstrations.count == COUNT + 3
+    assert job.evaluator.training_env.demonstrations.count == COUNT
+    np.testing.assert_array_equal(env.demonstrations.qpos[:COUNT], job.evaluator.env.demonstrations.qpos[:COUNT])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["controller=mpc"], "controller: expected one of policy, hold, pd, computed_torque, searched, got 'mpc'"),
+        (["physics=bullet"], "physics: expected one of mjx, fused, got 'bullet'"),
+        (["checkpoint=7"], "has no checkpoint 7; it has 0"),
+        (["out=."], "exists; name a new folder"),
+        (["out=no/new"], "there is no folder 'no'"),
+        (["mass=0"], "randomization.mass: expected [minimum, maximum] factor above 0, got [0.0, 0.0]"),
+        (["torque_noise=-1"], "randomization.torque_noise: expected at least 0, got -1"),
+        (["mass=[0,1]"], "mass"),
+        (["demonstrations=missing.npz"], "no file at 'missing.npz'"),
+    ],
+)
+def test_bad_evaluations(refused, run_dir, arguments, message):
+    assert message in refused("evaluate", f"run={run_dir}", "compilation_cache=", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("mass=[0,1]", "randomization.mass: expected [minimum, maximum] factor above 0, got [0.0, 1.0]"),
+        ("damping=[2,1]", "randomization.damping: expected [minimum, maximum] factor above 0, got [2.0, 1.0]"),
+        ("mass=[1]", "randomization.mass: expected [minimum, maximum] factor above 0, got [1.0]"),
+        ("torque_noise=-1", "randomization.torque_noise: expected at least 0, got -1"),
+        ("torque_noise=nan", "randomization.torque_noise: expected at least 0, got nan"),
+    ],
+)
+def test_bad_randomization(refused, override, message):
+    assert message in refused("train", "env=planar4dof", f"env.randomization.{override}")
+
+
+def too_fast(demonstrations):
+    qvel = demonstrations.qvel.copy()
+    qvel[1, 4, 2] = 100.0
+    return dataclasses.replace(demonstrations, qvel=qvel)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda given: dataclasses.replace(given, arm="panda"), "recorded with the joints joint1, joint2, joint3 of"),
+        (too_fast, "joint3 of demonstration 1 has a velocity of 100 rad/s at 0.4 s, but its velocity limit is"),
+    ],
+)
+def test_unfit_demonstrations(refused, run_dir, unseen, tmp_path, change, message):
+    path = tmp_path / "unfit.npz"
+    change(unseen).save(path)
+    arguments = [f"run={run_dir}", f"demonstrations={path}", "compilation_cache="]
+    assert message in refused("evaluate", *arguments)
+
+
+def test_a_checkpoint_of_another_environment(refused, run_dir, tmp_path):
+    other = untrained_run(tmp_path / "other", learner=[0.4, 0.3, 0.3])
+    shutil.rmtree(other / "checkpoints")
+    shutil.copytree(run_dir / "checkpoints", other / "checkpoints")
+    error = refused("evaluate", f"run={other}", "compilation_cache=")
+    # 12 numbers for each link seen: 3 of the learner and twice 3 of the expert, where the other learner has 2.
+    assert "does not fit the config of its run" in error and "expected shape (108,), got (96,)" in error
+
+
+def test_a_damaged_checkpoint(refused, run_dir, tmp_path):
+    damaged = tmp_path / "damaged"
+    shutil.copytree(run_dir, damaged)
+    (checkpoint,) = (damaged / "checkpoints").iterdir()
+    (checkpoint / "_METADATA").write_text("not JSON")
+    assert "cannot be read" in refused("evaluate", f"run={damaged}", "compilation_cache=")
+
+
+def test_a_mapper_has_no_controllers(refused, tmp_path):
+    (tmp_path / "run" / "checkpoints" / "0").mkdir(parents=True)
+    save_config(tmp_path / "run", TrainConfig(environment(), PoseMapperConfig()))
+    error = refused("evaluate", f"run={tmp_path / 'run'}", "controller=pd", "compilation_cache=")
+    assert "expected a run of trainer=ppo, got one of pose_mapper" in error

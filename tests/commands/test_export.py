@@ -1,0 +1,165 @@
+"""`python -m mimic.export`: what other programs run gives what JAX gives, and says what its numbers mean."""
+
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.metric.config import MetricConfig
+from mimic.runs.checkpoints import save_checkpoint
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.pose_mapper.model import PoseMapper, make_model
+from mimic.trainers.ppo import training
+from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.run_config import save_config
+
+pytest.importorskip("onnx")
+onnxruntime = pytest.importorskip("onnxruntime")
+TOLERANCE = 1e-5  # rad, or a share of the largest torque: float32, with sums in another order
+
+
+def policy_run(run_dir, name="panda4dof"):
+    """A run whose policy has random weights, and statistics that are not those of the start."""
+    env = mimic.make(name, demonstrations={"count": 1, "held_out": 1}, physics="fused")
+    config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
+    networks = training.make_networks(config, env.observation_size, env.action_size)
+    statistics, *networks = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
+    rng = np.random.default_rng(0)
+    statistics = statistics.replace(
+        mean=jnp.asarray(rng.normal(size=env.observation_size), jnp.float32),
+        std=jnp.asarray(rng.uniform(0.3, 2, env.observation_size), jnp.float32),
+    )
+    params = (statistics, *networks)
+    run_dir.mkdir()
+    save_config(run_dir, TrainConfig(env.config, config))
+    save_checkpoint(run_dir, 7, params)
+    return env, training.make_controller(config, env.observation_size, env.action_size)(params)
+
+
+def mapper_run(run_dir, name="panda4dof", preset="paper", metric=None):
+    """A run whose mapper has random weights."""
+    env = mimic.env_config(name, **({"metric": metric} if metric else {}))
+    config = PoseMapperConfig(preset=preset, hidden_layers=[16, 16]).resolve()
+    params = make_model(env, config).init(jax.random.key(3))
+    run_dir.mkdir()
+    save_config(run_dir, TrainConfig(env, config))
+    save_checkpoint(run_dir, 5, params)
+    return PoseMapper.load(run_dir)
+
+
+def session_of(path):
+    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+def random_poses(arm, count, seed=0):
+    lower, upper = np.asarray(arm.joint_range).T
+    return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
+
+
+@pytest.mark.parametrize("batch", [1, 33])
+def test_a_policy_in_onnx_is_the_policy(tmp_path, batch):
+    env, controller = policy_run(tmp_path / "run")
+    path = mimic.export_run(tmp_path / "run", tmp_path / "policy.onnx")
+    session = session_of(path)
+    observations = np.random.default_rng(1).normal(size=(batch, env.observation_size)).astype(np.float32)
+    action, torque = session.run(["action", "torque"], {"observation": observations})
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), batch)).replace(obs=jnp.asarray(observations))
+    expected = controller(state)
+    assert np.asarray(expected).std() > 0.1  # a check that can fail
+    np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(torque, expected * env.torque_scale, rtol=TOLERANCE, atol=1e-4)  # N m, up to 87
+
+
+def test_the_metadata_says_what_the_numbers_are(tmp_path):
+    env, _ = policy_run(tmp_path / "run")
+    session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "policy.onnx"))
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert metadata["env"] == "panda4dof" and metadata["mimic_version"] == mimic.__version__
+    assert json.loads(metadata["learner_joints"]) == ["joint1", "joint2", "joint4", "joint5"]
+    np.testing.assert_allclose(json.loads(metadata["torque_scale"]), env.torque_scale)
+    layout = {part["name"]: part for part in json.loads(metadata["observation_layout"])}
+    state = env.reset(jax.random.key(0))
+    own = mimic.link_states(env.learner, state.pipeline_state.qpos)
+    ahead = env.expert_at(state.pipeline_state.demonstration, jnp.array(1))
+    for whose, states in {"learner": own, "expert 1 steps ahead": ahead}.items():
+        for name, values in vars(states).items():
+            part = layout[f"{whose}: {name}"]
+            seen = state.obs[part["start"] : part["stop"]].reshape(part["shape"])
+            np.testing.assert_allclose(seen, values, atol=1e-6)
+    assert max(part["stop"] for part in layout.values()) == env.observation_size
+
+
+@pytest.mark.parametrize(
+    ("name", "preset", "metric"),
+    [
+        ("panda4dof", "paper", None),
+        ("panda4dof", "large", None),
+        ("planar4dof", "large", MetricConfig(adaptive=True)),
+        ("planar7dof", "large", MetricConfig(translation=1.0, correspondence="soft", rotation_measure="angle")),
+        ("panda3dof", "large", MetricConfig(translation=1.0, reduction="frobenius")),
+    ],
+)
+def test_a_pose_mapper_in_onnx_is_the_mapper(tmp_path, name, preset, metric):
+    mapper = mapper_run(tmp_path / "run", name, preset, metric)
+    session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "mapper.onnx"))
+    poses = random_poses(mapper.expert, 200)
+    (found,) = session.run(None, {"expert_qpos": poses})
+    expected = mapper(poses)
+    # Where two heads are equally good, rounding decides; where a point is near the seam of the circle, it does too.
+    off = np.abs(np.angle(np.exp(1j * (found - np.asarray(expected))))).max(axis=1)
+    assert np.mean(off < TOLERANCE) >= (1.0 if preset == "paper" else 0.99)
+    assert len(np.unique(np.round(found, 3), axis=0)) > 100
+
+
+def test_jax_reads_its_own_format(tmp_path):
+    pytest.importorskip("flatbuffers")
+    from jax import export
+
+    mapper = mapper_run(tmp_path / "run", preset="large")
+    path = mimic.export_run(tmp_path / "run", tmp_path / "mapper.jax", format="jax")
+    poses = random_poses(mapper.expert, 9)
+    found = export.deserialize(bytearray(path.read_bytes())).call(poses)["learner_qpos"]
+    np.testing.assert_allclose(found, mapper(poses), atol=TOLERANCE)
+    assert json.loads((tmp_path / "mapper.jax.json").read_text())["learner_joints"][2] == "joint4"
+
+
+def test_what_cannot_be_exported_is_refused(refused, tmp_path):
+    mapper_run(tmp_path / "run")
+    taken = tmp_path / "taken.onnx"
+    taken.write_text("")
+    run = f"run={tmp_path / 'run'}"
+    cases = [
+        ([], "out: expected a file"),
+        (["out=new.onnx"], "run: expected the run directory to export"),
+        (["out=new.onnx", "run=missing"], "'missing' is not a run directory"),
+        (["out=new.onnx", run, "checkpoint=6"], "has no checkpoint 6; it has 5"),
+        ([f"out={taken}", run], "exists; name a new file"),
+        (["out=no/new.onnx", run], "there is no folder 'no'"),
+        (["out=new.onnx", run, "format=tflite"], "expected one of onnx, jax, got 'tflite'"),
+        (
+            ["out=new.onnx", run, "learner=panda3dof"],
+            "but the run's is panda-joint3-joint6-joint7 with joints",
+        ),
+        (["out=new.onnx", run, "learner=panda9dof"], "unknown environment 'panda9dof'; valid are pair, panda3dof"),
+    ]
+    for arguments, message in cases:
+        assert message in refused("export", *arguments)
+        (tmp_path / "empty").rmdir()
+
+
+def test_a_mapper_of_other_arms_than_its_config_says_is_refused(refused, tmp_path):
+    mapper_run(tmp_path / "run")
+    config = PoseMapperConfig(preset="paper", hidden_layers=[16, 16]).resolve()
+    save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda3dof"), config))
+    assert "it has other arms or another network" in refused("export", f"run={tmp_path / 'run'}", "out=new.onnx")
+
+
+def test_a_missing_package_is_named(refused, tmp_path, monkeypatch):
+    mapper_run(tmp_path / "run")
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    message = refused("export", f"run={tmp_path / 'run'}", "out=new.onnx")
+    assert "format=onnx needs the package onnx: pip install 'mimic-mjx[export]'" in message

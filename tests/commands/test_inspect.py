@@ -1,0 +1,143 @@
+"""A learner from a file, by the commands: inspected, trained, evaluated, shown."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mimic
+from mimic import cli, inspect
+from mimic.commands.config import InspectConfig
+from mimic.commands.inspect import train_command
+from mimic.envs.config import EnvConfig
+from tests.helpers import original_model
+
+FEW = ["env.demonstrations.count=4", "env.demonstrations.held_out=2"]
+
+
+@pytest.fixture
+def arm_file(tmp_path):
+    file = tmp_path / "arm.xml"
+    file.write_text(original_model.ur_like(actuators="position"))
+    return file
+
+
+@pytest.fixture
+def inspected(monkeypatch, capsys):
+    """A function that inspects an arm, by the command, and returns what is said."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["mimic.inspect", *map(str, arguments)])
+        cli.run(inspect.prepare, "inspect")
+        return capsys.readouterr().out
+
+    return run
+
+
+def test_what_is_said_of_an_arm(inspected, arm_file, tmp_path):
+    said = inspected(arm_file, "bound=false", f"out={tmp_path / 'out'}")
+    for text in (
+        "ur_like: 6 joints, 6 links",
+        "expert panda: 7 joints",
+        "6 actuators (6 servos on position)",
+        "distal to the tip, fixed; their bodies stay as mass: left (slide), right (slide)",
+        "1 equality constraints",
+        "no velocity limit for pan, lift",
+        "no <inertial> in pan_link",
+    ):
+        assert text in said, said
+    found = json.loads((tmp_path / "out" / "inspection.json").read_text())
+    assert [joint["torque limit"] for joint in found["joints"]] == [150] * 6
+    shares = np.array([sum(link["compared with"].values()) for link in found["links"]])
+    np.testing.assert_allclose(shares, 1, rtol=1e-6)  # float32
+    assert Image.open(tmp_path / "out" / "arms.png").size == (1300, 560)
+    assert said.splitlines()[-1] == f"train it: {found['train']}"
+
+
+def test_the_command_that_is_proposed_trains_what_was_inspected(arm_file, monkeypatch):
+    learner = mimic.ArmConfig(model=str(arm_file), locked=["elbow", 6], tip="pinch", armature=0.2)
+    config = InspectConfig(learner=learner, expert=mimic.ArmConfig(locked={"joint2": 0.5}), limits="hardware")
+    words = shlex.split(train_command(config))
+    assert words[:4] == ["python", "-m", "mimic.train", "env=pair"]
+    prepared = []
+    monkeypatch.setattr(sys, "argv", ["mimic.train", *words[3:]])
+    cli.run(lambda config: prepared.append(config.env) or (lambda: 0), "train")
+    expected = EnvConfig(name="pair", expert=config.expert, learner=learner, limits="hardware", physics="fused")
+    assert prepared == [expected]
+
+
+def test_an_arm_that_runs_away_is_given_rotors(inspected, tmp_path):
+    file = tmp_path / "light.xml"
+    file.write_text(original_model.ur_like(armature=0.0))
+    said = inspected(file, "bound=false")
+    assert "warning: random torques accelerate a joint to" in said
+    assert re.search(r"train it: .* env.learner.armature=\S+ env.learner.damping=\S+ env.physics=fused", said)
+
+
+@pytest.mark.slow
+def test_how_near_an_equal_arm_can_come(inspected):
+    said = inspected("panda")
+    line = r"(\S+) for the best poses, (\S+) for holding the start pose; imitation can reduce it by (\d+)%"
+    ((bound, hold, percent),) = re.findall(line, said)
+    assert float(bound) < 0.01 < 0.1 < float(hold) and int(percent) > 95
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["missing.xml"], "no MJCF or URDF file at '"),
+        (["arm.xml", "learner.locked=[shoulder]"], "unknown joint 'shoulder'; valid are pan, lift, elbow, wrist_1"),
+        (["arm.xml", "learner.tip=hand"], "the model has no body 'hand'; valid are table, pan_link"),
+        (["arm.xml", "learner.base=foot"], "the model has no body 'foot'; valid are table, pan_link"),
+        (["arm.xml", "expert=missing.urdf"], "no MJCF or URDF file at '"),
+        (["arm.xml", "learner.armature=-1"], "armature: expected a finite number of at least 0, got -1"),
+        (["arm.xml", "limits=soft"], "limits: expected one of none, hardware, got 'soft'"),
+        (["arm.xml", "out=missing/out"], "there is no folder 'missing'"),
+        (["arm.xml", "tip=hand"], "tip"),
+    ],
+)
+def test_bad_input_of_an_inspection(refused, arm_file, arguments, message):
+    assert message in refused("inspect", *(str(arm_file) if word == "arm.xml" else word for word in arguments))
+
+
+@pytest.mark.parametrize("role", ["expert", "learner"])
+def test_bad_arms_of_a_pair(refused, arm_file, role):
+    assert "no MJCF or URDF file" in refused("train", "env=pair", f"env.{role}=missing.xml")
+
+
+def test_a_pair_takes_arms_by_file(arm_file):
+    env = mimic.make("pair", learner=str(arm_file), physics="fused", demonstrations={"count": 2, "held_out": 1})
+    assert env.action_size == 6 and env.learner.name == "ur_like" and env.expert.name == "panda"
+    swapped = mimic.make("pair", expert=str(arm_file), physics="fused", demonstrations={"count": 2, "held_out": 1})
+    assert swapped.action_size == 7 and swapped.demonstrations.arm == "ur_like"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)  # three commands that compile, on two cores
+def test_a_learner_from_a_file_is_trained_evaluated_and_shown(arm_file, tmp_path):
+    run_dir = tmp_path / "run"
+
+    elsewhere = tmp_path / "elsewhere"  # a run finds its arms from any folder
+    elsewhere.mkdir()
+
+    def command(name, *arguments, folder=elsewhere):
+        result = subprocess.run(
+            [sys.executable, "-m", f"mimic.{name}", *map(str, arguments)],
+            capture_output=True, text=True, check=False, cwd=folder,
+        )  # fmt: skip
+        assert result.returncode == 0, result.stderr[-2000:]
+
+    sizes = ["num_envs=64", "batch_size=32", "num_minibatches=4", "num_updates_per_batch=1", "num_timesteps=5000"]
+    small = [f"trainer.{size}" for size in (*sizes, "hidden_layers=[16]", "evaluations=1", "preset=cpu")]
+    pair = ["env=pair", "env.learner=arm.xml", "env.physics=fused", *FEW]
+    command("train", *pair, *small, f"run_dir={run_dir}", folder=tmp_path)
+    report = json.loads((run_dir / "report.json").read_text())
+    assert report["env_steps"] >= 5000 and np.isfinite(report["optimality_gap"]["held_out"])
+    command("evaluate", f"run={run_dir}", f"out={tmp_path / 'again'}")
+    command("render", f"run={run_dir}")
+    assert (run_dir / "videos" / "held_out-0.mp4").stat().st_size > 10_000

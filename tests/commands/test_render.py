@@ -1,0 +1,178 @@
+"""Videos of pose mappers and of retargeted motions: what they show, and what is rejected."""
+
+import dataclasses
+from typing import Any
+
+import imageio_ffmpeg
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import mimic
+from mimic.arms.arm import build_arm
+from mimic.arms.rendering import ArmScene
+from mimic.commands import train
+from mimic.commands.clips import prepare_clip
+from mimic.commands.config import RenderConfig
+from mimic.commands.render import draw_frames, prepare_video
+from mimic.envs import env_config
+from mimic.envs.demonstrations import Demonstrations
+from mimic.envs.recording import record_demonstrations
+from mimic.metric.similarity import centre_line, similarity
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
+
+STEPS = 4  # of a motion: 0.4 s, 13 frames
+EVERY = 3  # frames from one sample to the next, 0.1 s at 30 frames a second
+TINY = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1, "hidden_layers": [16], "heads": 2}
+ROUNDING = 1e-5  # of distances of about 1 in float32
+
+
+@pytest.fixture(scope="module")
+def mapper_run(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("mapper") / "run"
+    trainer = PoseMapperConfig(**TINY, validation_poses=16, held_out_poses=16)
+    env = env_config("planar4dof", horizon=STEPS)
+    config = TrainConfig(env, trainer, run_dir=str(run_dir), compilation_cache="")
+    assert train.prepare_training(config, 0.0)() == 0
+    return run_dir
+
+
+def swings(arm, count=2):
+    """Motions of an arm, each joint as a sine: angles and velocities belong together."""
+    time = 0.1 * np.arange(STEPS + 1)[:, None]
+    phase = np.arange(count)[:, None, None] + np.arange(arm.num_joints)
+    qpos, qvel = 0.8 * np.sin(2 * time + phase), 1.6 * np.cos(2 * time + phase)
+    return Demonstrations(qpos, qvel, qpos[:, -1], 0.1, arm.name, arm.joint_names)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """An expert's and a learner's motions, as keys of the command."""
+    folder = tmp_path_factory.mktemp("motions")
+    env = env_config("planar4dof")
+    arms = {"demonstrations": env.expert, "retargeted": env.learner}
+    for key, arm in arms.items():
+        swings(build_arm(arm).embodiment).save(folder / f"{key}.npz")
+    return {key: str(folder / f"{key}.npz") for key in arms} | {"learner": "planar4dof", "compilation_cache": ""}
+
+
+def curves(clip):
+    return {curve.label: curve.values for curve in clip.curves}
+
+
+def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
+    plan = prepare_clip(RenderConfig(run=str(mapper_run), demonstration=1, seed=5))
+    clip, mapper = plan.compute(), mimic.PoseMapper.load(mapper_run)
+    assert plan.out == mapper_run / "videos" / "pd-seed5-1.mp4"
+    expert, learner = clip.poses
+    recorded = record_demonstrations(build_arm(plan.env.expert), 2, seed=5, horizon=STEPS)
+    np.testing.assert_allclose(expert[::EVERY], recorded.qpos[1], atol=1e-6)
+    np.testing.assert_allclose(learner, mapper(expert.astype(np.float32)), atol=ROUNDING)
+    shown = curves(clip)
+    expected = jax.vmap(mapper.model.distance)(jnp.asarray(expert), jnp.asarray(learner))
+    np.testing.assert_allclose(shown["pose mapper"], expected, atol=ROUNDING)
+    np.testing.assert_allclose(clip.bars.sum(axis=1), shown["pose mapper"], atol=ROUNDING)
+    assert np.all(shown["optimal poses"] <= np.minimum(shown["pose mapper"], shown["holding the start pose"]) + 1e-3)
+    stretched = mapper.model.distance(jnp.zeros(7), jnp.zeros(4))
+    assert shown["holding the start pose"][0] == pytest.approx(float(stretched), abs=ROUNDING)
+
+
+def test_retargeted_motions_are_shown_as_they_are(files):
+    clip = prepare_clip(RenderConfig(**files, demonstration=1)).compute()
+    env = env_config("planar4dof")
+    for shown, arm in zip(clip.poses, (env.expert, env.learner), strict=True):
+        motions = swings(build_arm(arm).embodiment)
+        assert len(shown) == len(clip.time) == EVERY * STEPS + 1
+        np.testing.assert_allclose(shown[::EVERY], motions.qpos[1], atol=1e-12)
+    shown = curves(clip)
+    assert np.all(shown["optimal poses"] <= shown["retargeted"] + ROUNDING)
+    assert clip.bars.shape == (len(clip.time), 4) and np.all(np.isfinite(clip.bars))
+
+
+def test_each_frame_has_the_measures_of_similarity(files):
+    plan = prepare_clip(RenderConfig(**files))
+    clip = plan.compute()
+    arms = build_arm(plan.env.expert).embodiment, build_arm(plan.env.learner).embodiment
+    frame = 5
+    lines = (centre_line(arm, poses[frame]) for arm, poses in zip(arms, clip.poses, strict=True))
+    for name, expected in similarity(*lines).items():
+        assert clip.similarity[name].shape == clip.time.shape
+        assert clip.similarity[name][frame] == pytest.approx(float(expected), rel=1e-4)  # degrees in float32
+
+
+def test_a_frame_shows_the_moment(files):
+    plan = prepare_clip(RenderConfig(**files))
+    clip = plan.compute()
+    few = dataclasses.replace(clip, time=clip.time[:2], poses=tuple(poses[[0, -1]] for poses in clip.poses))
+    with ArmScene([plan.env.expert, plan.env.learner], width=160, height=120) as scene:
+        first, last = draw_frames(scene, few)
+    assert first.shape == last.shape == (640, 1280, 3)
+    changed = np.any(first != last, axis=-1)
+    assert changed[:, :380].any() and changed[:, 380:760].any()  # both arms
+    assert changed[:280, 760:].any() and changed[340:380, 760:].any()  # the line of the time; similarity
+
+
+def test_a_video_has_all_frames(files, tmp_path):
+    out = tmp_path / "swing.mp4"
+    prepare_video(RenderConfig(**files, out=str(out), gif=True))()
+    assert imageio_ffmpeg.count_frames_and_secs(str(out))[0] == EVERY * STEPS + 1
+    with Image.open(out.with_suffix(".gif")) as gif:
+        assert gif.n_frames == 5  # type: ignore[attr-defined]  # every third
+    with pytest.raises(ValueError, match="exists; name a new file"):
+        prepare_video(RenderConfig(**files, out=str(out)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({}, "out: expected a file, as in out=FILE.mp4"),
+        ({"out": "swing.gif"}, "expected a file that ends in .mp4"),
+        ({"learner": ""}, "learner: expected with retargeted=FILE"),
+        ({"retargeted": ""}, "retargeted: expected with retargeted=FILE"),
+        ({"demonstrations": ""}, "demonstrations: expected with retargeted=FILE"),
+        ({"demonstrations": "none.npz"}, "no file at 'none.npz'"),
+        ({"learner": "planar7dof"}, "demonstrations: expected motions of planar4 .* got planar7"),
+        ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
+        ({"demonstration": 2}, "demonstration: expected an index of the file from 0 to 1, got 2"),
+        ({"run": "runs/NAME"}, "run: has no effect with retargeted=FILE"),
+        ({"seed": 1}, "seed: has no effect with retargeted=FILE"),
+    ],
+)
+def test_bad_files_are_rejected_in_one_line(files, changes, message):
+    with pytest.raises(ValueError, match=message) as error:
+        prepare_video(RenderConfig(**{**files, **changes}))
+    assert "\n" not in str(error.value)
+
+
+def test_motions_of_another_length_are_rejected(files, tmp_path):
+    learner = build_arm(env_config("planar4dof").learner).embodiment
+    swings(learner, count=1).save(tmp_path / "one.npz")
+    with pytest.raises(ValueError, match="expected 2 motions of 4 steps of 0.1 s, as in demonstrations, got 1 motions"):
+        prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
+
+
+def test_what_a_mapper_cannot_show_is_rejected(mapper_run, files):
+    bad: list[tuple[dict[str, Any], str]] = [
+        ({"split": "train"}, "split: has no effect with a run of trainer=pose_mapper"),
+        ({"seed": -1}, "demonstration, seed: expected at least 0"),
+        ({"checkpoint": 7}, "checkpoint"),
+        ({"demonstrations": files["retargeted"]}, "demonstrations: expected motions of planar7"),
+        ({"demonstrations": files["demonstrations"], "demonstration": 3}, "from 0 to 1"),
+    ]
+    for changes, message in bad:
+        with pytest.raises(ValueError, match=message):
+            prepare_clip(RenderConfig(run=str(mapper_run), **changes))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "run: expected the run directory"),
+        (["run=missing"], "not a run directory"),
+        (["run=missing", "split=test"], "expected one of train, held_out, got 'test'"),
+    ],
+)
+def test_bad_input_of_the_command(refused, arguments, message):
+    assert message in refused("render", *arguments)

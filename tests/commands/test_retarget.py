@@ -1,0 +1,75 @@
+"""`python -m mimic.retarget`: motions that keep the velocity limits of the learner, and what is rejected."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import mimic
+from mimic.commands.retarget import retarget
+from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.pose_mapper.model import make_model
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("demonstrations") / "expert.npz"
+    env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
+    env.demonstrations.save(path)
+    return path
+
+
+def command(*arguments, **more):
+    arguments = [sys.executable, "-m", "mimic.retarget", *arguments]
+    return subprocess.run(arguments, capture_output=True, text=True, timeout=280, check=False, **more)
+
+
+def test_the_motions_load_and_do_not_jump(recorded, tmp_path):
+    out = tmp_path / "learner.npz"
+    result = command(f"demonstrations={recorded}", "learner=planar4dof", f"out={out}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert "maximum jump" in result.stdout
+    motions = mimic.load_demonstrations(out)
+    env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
+    motions.check_fits(env.learner, 0.1, 50)
+    assert motions.torque is None
+
+
+@pytest.mark.parametrize("with_mapper", [False, True], ids=["optimised", "mapped"])
+def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows(with_mapper):
+    """The expert's poses are random, so that the learner would jump at each step; the last joint's limit is unknown."""
+    env, dt, rng = mimic.env_config("planar4dof"), 0.1, np.random.default_rng(0)
+    expert, learner = (mimic.build_arm(arm).embodiment for arm in (env.expert, env.learner))
+    learner = dataclasses.replace(learner, velocity_limit=np.array([0.5, 1.0, 2.0, np.inf]))
+    qpos = rng.uniform(-3, 3, (2, 8, expert.num_joints))
+    leaps = mimic.Demonstrations(qpos, 0 * qpos, qpos[:, -1], dt, expert.name, expert.joint_names)
+    model = make_model(env, PoseMapperConfig(hidden_layers=[16]).resolve())
+    mapper = mimic.PoseMapper(model, model.init(jax.random.key(0))) if with_mapper else None
+    motions, report = retarget(leaps, expert, learner, env.metric, mapper=mapper)
+    jumps, largest = np.abs(np.diff(motions.qpos, axis=1)), dt * np.array([0.5, 1.0, 2.0, np.pi])
+    assert np.all(jumps <= largest + 1e-6)  # float32, of angles up to 6 rad
+    assert np.all(jumps.max(axis=(0, 1)) > largest - 1e-6)  # each joint reaches its bound
+    assert report["largest_jump"] == jumps.max()
+    assert np.all(np.abs(motions.qvel) <= largest / dt)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["learner=planar4dof"], "demonstrations: expected a file"),
+        (["demonstrations={recorded}", "learner=planar4dof"], "out: expected a file"),
+        (["demonstrations=missing.npz", "learner=planar4dof", "out=new.npz"], "no file"),
+        (["demonstrations={recorded}", "learner=panda5dof", "out=new.npz"], "unknown environment 'panda5dof'"),
+        (["demonstrations={recorded}", "learner=panda4dof", "out=new.npz"], "recorded with the joints"),
+        (["demonstrations={recorded}", "learner=planar4dof", "out={recorded}"], "exists; name a new file"),
+        (["demonstrations={recorded}", "learner=planar4dof", "out=no/new.npz"], "there is no folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(recorded, arguments, message, tmp_path):
+    result = command(*(argument.format(recorded=recorded) for argument in arguments), cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1 and message in result.stderr
+    assert not list(tmp_path.iterdir())

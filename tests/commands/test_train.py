@@ -1,0 +1,136 @@
+"""The commands, from the outside: what they write, refuse and survive."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import imageio_ffmpeg
+import pytest
+from PIL import Image
+
+from tests.helpers.tiny import TINY
+
+BY_SPLIT = {
+    "optimality_gap", "mean_distance", "lower_bound", "hold_distance", "link_angle_error_deg", "angular_velocity_error",
+    "torque_rms", "torque_change", "torque_saturation", "position_violations", "speed_violations", "torque_violations",
+    "worst_demonstrations",
+}  # fmt: skip
+REPORT_KEYS = {"env", "trainer", "seed", "wall_time_s", "env_steps", "steps_per_second", "hardware", "versions"}
+
+
+def command(module, *arguments, **more):
+    return subprocess.run(
+        [sys.executable, "-m", f"mimic.{module}", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+        **more,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """One tiny run, whose compiles are logged."""
+    run_dir = tmp_path_factory.mktemp("runs") / "tiny"
+    environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
+    result = command("train", *TINY, f"run_dir={run_dir}", "compilation_cache=", env=environment)
+    assert result.returncode == 0, result.stderr[-2000:]
+    return run_dir, result
+
+
+def test_a_run_directory_holds_everything(finished):
+    run_dir, _ = finished
+    names = {path.name for path in run_dir.iterdir()}
+    assert {"config.yaml", "report.json", "metrics.csv", "demonstrations.npz", "checkpoints", "tensorboard"} <= names
+    report = json.loads((run_dir / "report.json").read_text())
+    assert report.keys() >= REPORT_KEYS | BY_SPLIT
+    for key in BY_SPLIT:
+        assert report[key].keys() == {"train", "held_out"}
+    assert {"demonstrations.csv", "quality.png", "demonstrations.png", "training.png"} <= names
+    assert report["wall_time_s"].keys() == {"import", "build", "compile", "train", "evaluate", "total"}
+    assert report["env_steps"] >= 5000
+    assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 4
+
+
+def test_a_run_compiles_few_programs(finished):
+    """Each takes a tenth of a second and more on a GPU."""
+    _, result = finished
+    names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", result.stderr)
+    for program in ("_begin", "_learn", "rollouts", "closest"):
+        assert names.count(program) == 1
+    assert len(names) < 20  # 54 with brax's own training loop
+
+
+def test_evaluate_repeats_the_report(finished, tmp_path):
+    run_dir, _ = finished
+    out = tmp_path / "again"
+    result = command("evaluate", f"run={run_dir}", f"out={out}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    pictures = {"quality.png", "demonstrations.png", "similarity.png"}
+    tables = {"demonstrations.csv", "quality.csv"}
+    assert {path.name for path in out.iterdir()} == {"report.json", *tables, *pictures}
+    again, report = (json.loads((folder / "report.json").read_text()) for folder in (out, run_dir))
+    for key in BY_SPLIT - {"worst_demonstrations"}:
+        assert again[key] == pytest.approx(report[key], rel=1e-5)  # float32, in another process
+    for split, gaps in report["worst_demonstrations"].items():
+        assert again["worst_demonstrations"][split] == pytest.approx(gaps, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_video_shows_the_whole_motion(finished):
+    run_dir, _ = finished
+    result = command("render", f"run={run_dir}", "demonstration=1", "gif=true")
+    assert result.returncode == 0, result.stderr[-2000:]
+    video = run_dir / "videos" / "held_out-1.mp4"
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
+    assert frames == 151 and seconds == pytest.approx(5, abs=0.1)  # 5 s at 30 frames a second, both ends
+    with Image.open(video.with_suffix(".gif")) as gif:
+        assert gif.n_frames == 51 and gif.size == (640, 320)  # type: ignore[attr-defined]
+    again = command("render", f"run={run_dir}", "demonstration=1")
+    assert again.returncode == 2 and "exists; name a new file" in again.stderr
+    beyond = command("render", f"run={run_dir}", "demonstration=2")
+    assert beyond.returncode == 2 and "expected 0 to 1, the held_out ones of the run, got 2" in beyond.stderr
+
+
+def test_resume_goes_on_from_the_last_checkpoint(finished, tmp_path):
+    run_dir = shutil.copytree(finished[0], tmp_path / "run")
+    result = command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert json.loads((run_dir / "report.json").read_text())["env_steps"] >= 8000
+    again = command("train", f"resume={run_dir}")
+    assert again.returncode == 2 and "larger trainer.num_timesteps" in again.stderr
+
+
+@pytest.mark.slow
+def test_training_ends_at_the_target_gap(tmp_path):
+    run_dir = tmp_path / "early"
+    result = command("train", *TINY, f"run_dir={run_dir}", "trainer.target_gap=100")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 1
+    assert json.loads((run_dir / "report.json").read_text())["env_steps"] < 5000
+
+
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
+def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
+    run_dir = tmp_path / "stopped"
+    arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mimic.train", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    # SIGINT as soon as there is something to lose, SIGTERM in the midst of training.
+    awaited = "config.yaml" if number == signal.SIGINT else "checkpoints/0*[1-9]*"
+    until = time.monotonic() + 200
+    while time.monotonic() < until and not list(run_dir.glob(awaited)):
+        assert process.poll() is None, process.communicate()[1][-2000:]
+        time.sleep(0.2)
+    process.send_signal(number)
+    out, error = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, error[-2000:]
+    assert f"resume={run_dir}" in out.replace("\n", "") and "stopping at the next checkpoint" in error
+    assert list((run_dir / "checkpoints").iterdir())

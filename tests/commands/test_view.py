@@ -1,0 +1,78 @@
+"""`python -m mimic.view`: what it rejects, and how it ends."""
+
+import importlib.util
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from mimic.commands import view
+from mimic.commands.config import ViewConfig
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["port=0"], "port: expected 1 to 65535, got 0"),
+        (["host=nowhere.invalid"], "host: expected an address of this machine"),
+        (["env=panda5dof"], "unknown env 'panda5dof'; valid are"),
+        (["learner=missing.xml"], "learner: expected panda, an MJCF file, or an environment (pair, panda3dof,"),
+        (["run=missing"], "not a run directory"),
+        (["mapper=missing"], "not a run directory"),
+        (["run=a", "mapper=b"], "expected one of them"),
+        (["run=a", "expert=panda"], "expected neither with run= or mapper="),
+        (["split=test"], "expected one of train, held_out, got 'test'"),
+    ],
+)
+def test_bad_input(refused, arguments, message, monkeypatch):
+    monkeypatch.setattr(view, "is_installed", lambda: True)
+    assert message in refused("view", *arguments, *([] if "port=0" in arguments else [f"port={free_port()}"]))
+
+
+def test_a_port_that_is_taken_is_refused(refused, monkeypatch):
+    monkeypatch.setattr(view, "is_installed", lambda: True)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert f"port: expected a free port at 127.0.0.1, got {port}" in refused("view", f"port={port}")
+
+
+def test_without_viser_the_extra_is_named(refused, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "viser" else find(name, *more))
+    assert "pip install 'mimic-mjx[view]'" in refused("view")
+
+
+def test_nothing_of_the_view_but_its_page_needs_viser():
+    modules = ", ".join(
+        f"mimic.viewer.{name}" for name in ("html", "live_session", "playback", "meshes", "follower", "history")
+    )
+    code = f"import sys; sys.modules['viser'] = None; import {modules}"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_arms_by_name():
+    arms = ViewConfig(expert="planar4dof", learner="planar4dof").resolve_env()
+    assert len(arms.expert.link_lengths) == 7 and len(arms.learner.link_lengths) == 4
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-mjx[view]'")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_it_cleanly(number):
+    command = [sys.executable, "-m", "mimic.view", "env=planar4dof", f"port={free_port()}"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert "view: http://127.0.0.1:" in process.stdout.readline()
+    process.send_signal(number)  # most likely while it compiles
+    out, error = process.communicate(timeout=120)
+    assert process.returncode == 0 and "Traceback" not in error and "view: ended" in out

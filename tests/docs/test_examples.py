@@ -1,0 +1,186 @@
+"""The examples run as their readers run them, and what they say is so."""
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mimic
+from tests.helpers.repository import REPOSITORY
+
+EXAMPLES = REPOSITORY / "examples"
+NAMES = sorted(path.stem for path in EXAMPLES.glob("[0-9]*.py"))
+CACHE = REPOSITORY / ".jax_cache"
+ENVIRONMENT = {
+    **os.environ,
+    "HOME": str(CACHE),  # where the commands keep compiled programs by default
+    "JAX_PLATFORMS": "cpu",
+    "JAX_COMPILATION_CACHE_DIR": str(CACHE),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
+}
+patience = pytest.mark.timeout(900)
+
+
+@pytest.fixture
+def said(request, tmp_path):
+    """What the example of the test's mark says; it writes into the test's folder."""
+    name = request.param
+    CACHE.mkdir(exist_ok=True)
+    result = subprocess.run(
+        [sys.executable, str(EXAMPLES / f"{name}.py"), str(tmp_path)],
+        capture_output=True, text=True, check=False, cwd=tmp_path, env=ENVIRONMENT,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stdout[-1000:] + result.stderr[-2000:]
+    return result.stdout
+
+
+def example(name, *marks):
+    """The parameter of a test: what an example says."""
+    return pytest.mark.parametrize("said", [pytest.param(name, marks=marks)], indirect=True, ids=[name])
+
+
+def number(pattern, text):
+    """The one number that a pattern captures."""
+    (found,) = re.findall(pattern, text)
+    return float(found)
+
+
+def is_picture(path):
+    """Whether a picture shows something: more than ten colours are frequent."""
+    with Image.open(path) as image:
+        colours = image.convert("RGB").getcolors(2**24) or []
+    return len([count for count, _ in colours if count > 20]) > 10
+
+
+def test_there_are_eight_and_the_index_has_them_all():
+    index = (EXAMPLES / "README.md").read_text()
+    assert [name[:2] for name in NAMES] == [f"{n:02}" for n in range(1, 9)]
+    for name in NAMES:
+        assert f"]({name}.py)" in index
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_examples_use_what_is_public(name):
+    tree = ast.parse((EXAMPLES / f"{name}.py").read_text())
+    modules = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    modules += [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    own = {module for module in modules if module.split(".")[0] == "mimic"}
+    assert "mimic" in own and own <= {"mimic", "mimic.gymnasium"}
+    used = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "mimic"
+    }
+    assert used and used <= {*mimic.__all__, "gymnasium"}
+    assert all(hasattr(mimic, attribute) for attribute in used - {"gymnasium"})
+
+
+@example("01_metric")
+def test_metric(said, tmp_path):
+    pattern = r"holding the start pose: (\S+)   copied angles: (\S+)   kinematic bound: (\S+)"
+    ((rest, copied, bound),) = re.findall(pattern, said)
+    assert 0 < float(bound) < float(copied) < float(rest)
+    gap = (float(copied) - float(bound)) / (float(rest) - float(bound))
+    said_gap = number(r"1 for holding the start pose: (\S+)%", said) / 100
+    assert said_gap == pytest.approx(gap, abs=0.006)  # of four digits
+    shares = [float(share) for share in re.findall(r"^  link\S+ +(\S+)  \(", said, re.MULTILINE)]
+    assert len(shares) == 7 and sum(shares) == pytest.approx(float(copied), abs=3e-4)
+    parts = ("translation", "rotation", "linear_velocity", "angular_velocity")
+    by_part = {part: number(rf"\n  {part} +(\S+)(?=\n)", said) for part in parts}
+    weighted = sum(getattr(mimic.PAPER_WEIGHTS, part) * value for part, value in by_part.items())
+    assert weighted == pytest.approx(float(copied), abs=2e-4)
+    assert is_picture(tmp_path / "links.png")
+
+
+@example("02_batches_and_gradients")
+def test_batches_and_gradients(said):
+    rows = re.findall(r"(?:gradient \[1/rad\]|central differences): +\[(.*)\]", said)
+    gradient, differences = (np.array(row.split(), float) for row in rows)
+    np.testing.assert_allclose(gradient, differences, atol=2e-3)  # float32 over 0.02 rad, and four digits
+    assert np.abs(gradient).max() > 0.01
+    ((distance, slope),) = re.findall(r"same motion: distance (\S+), gradient (\S+)", said)
+    assert float(distance) < 1e-9 and float(slope) < 1e-2  # rounding, of a distance whose terms have a kink there
+    assert number(r"one by one differ by (\S+)", said) < 1e-5
+    rates = re.findall(r" s +\S+ ms +([\d,]+)$", said, re.MULTILINE)
+    assert len(rates) == 4 and all(int(rate.replace(",", "")) > 0 for rate in rates)
+    ((before, after),) = re.findall(r"mean distance (\S+) before, (\S+) after", said)
+    assert float(after) < 0.7 * float(before)
+
+
+@example("03_imitate_poses", patience)
+def test_imitate_poses(said, tmp_path):
+    methods = ("imitate_pose", "gradient descent, one start", "copied angles", "random")
+    shares = [number(rf"\n{method} +\S+ +(\S+)%", said) for method in methods]
+    assert shares == sorted(shares) and shares[0] < 1 and shares[-1] == 100
+    assert is_picture(tmp_path / "poses.png")
+
+
+@example("04_pose_mapper", patience)
+def test_pose_mapper(said, tmp_path):
+    assert number(r"for a random pose: (\S+)%", said) < 20
+    optimiser, mapper = (
+        number(rf"\n{name} +(\d+) poses a second", said.replace(",", "")) for name in ("optimiser", "mapper")
+    )
+    assert mapper > optimiser
+    names = "optimiser", "mapper", "zero pose"
+    distances = [number(rf"\n{name} +mean distance (\S+)", said) for name in names]
+    assert distances == sorted(distances)
+    for name in ("optimised", "mapped"):
+        motions = mimic.load_demonstrations(tmp_path / f"{name}.npz")
+        assert motions.joint_names == ("joint1", "joint2", "joint4", "joint5") and motions.count == 4
+    assert is_picture(tmp_path / "retargeted.png")
+
+
+@example("05_demonstrations")
+def test_demonstrations(said, tmp_path):
+    for line in re.findall(r"  largest .*: +(.*)", said):
+        assert all(0 < float(share) <= 100 for share in line.replace("%", "").split())
+    assert mimic.load_demonstrations(tmp_path / "recorded.npz").count == 20
+    waves = mimic.load_demonstrations(tmp_path / "waves.npz")
+    times = 0.1 * np.arange(51)
+    for number_of_wave, tempo in enumerate((1.0, 0.5)):
+        expected = 0.6 * np.sin(1.5 * tempo * times) ** 2
+        np.testing.assert_allclose(waves.qpos[number_of_wave, :, 0], expected, atol=1e-3)  # splines of 0.02 s
+    assert "velocities differentiated: True" in said
+    assert re.search(r"degrees.csv is refused: .* expected rad in", said)
+    assert re.search(r"clock.csv is refused: .* its velocity limit is", said)
+    assert 0 < number(r"mean kinematic bound over the first wave: (\S+)", said) < 0.5
+    assert is_picture(tmp_path / "waves_and_bound.png") and is_picture(tmp_path / "waves.png")
+
+
+@example("06_train_and_evaluate", patience)
+def test_train_and_evaluate(said, tmp_path):
+    gap = json.loads((tmp_path / "run" / "report.json").read_text())["optimality_gap"]
+    assert gap["train"] < 0.3  # it learns: the start is at 1.8
+    pattern = r"held-out gap: (\S+)% after training, (\S+)% from the checkpoint, (\S+)% with 20 % more mass"
+    ((trained, again, heavier),) = re.findall(pattern, said)
+    assert trained == again != heavier
+    assert float(trained) / 100 == pytest.approx(gap["held_out"], abs=1e-4)
+    assert (tmp_path / "policy.mp4").stat().st_size > 10_000
+
+
+@example("07_own_arm", patience)
+def test_own_arm(said, tmp_path):
+    assert mimic.load_mjcf(tmp_path / "arm.xml").joint_names == ("turn", "shoulder", "elbow", "bend", "roll")
+    findings = json.loads((tmp_path / "inspected" / "inspection.json").read_text())
+    assert findings["bound"] < findings["hold"] and f"to train it in earnest: {findings['train']}" in said
+    assert is_picture(tmp_path / "inspected" / "arms.png")
+    assert "exit code: 2" in said
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["env"] == "pair" and report["optimality_gap"]["train"] < 1  # better than to stay; the start is at 2
+
+
+@example("08_other_tools", patience)
+def test_other_tools(said, tmp_path):
+    pytest.importorskip("onnxruntime")
+    rewards = {name: number(rf"\n  {name} +(\S+)", said) for name in ("no torque", "the policy, by ONNX Runtime")}
+    assert rewards["no torque"] < rewards["the policy, by ONNX Runtime"] < 0
+    ((here, reported),) = re.findall(r"demonstrations: (\S+) by Gymnasium and ONNX Runtime, (\S+) in the report", said)
+    assert float(here) == pytest.approx(float(reported), rel=1e-3)  # 50 steps in float32, rounded in another order
+    assert (tmp_path / "policy.onnx").stat().st_size > 1000

@@ -1,0 +1,121 @@
+"""What the README and the pages in docs show, works: tests/helpers/pages.py says how blocks are checked and run."""
+
+import re
+
+import pytest
+
+import mimic
+from mimic.commands import train
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from tests.helpers.pages import PAGES, REPOSITORY, Block, check, commands, module, read_blocks, run_page
+
+DOCS = REPOSITORY / "docs"
+QUICK = ("install.md", "metric.md", "own_arm.md")  # run by `make test`; all by `make test-all`
+
+
+def named(page):
+    return page.name
+
+
+def python(page):
+    return [block.text for block in read_blocks(page.read_text()) if block.kind == "python"]
+
+
+def test_the_example_of_the_readme_runs():
+    scope: dict = {}
+    exec(python(REPOSITORY / "README.md")[0], scope)  # noqa: S102 - our own text
+    assert scope["solution"].qpos.shape == (4,)
+
+
+def test_the_readme_is_short():
+    assert len((REPOSITORY / "README.md").read_text().split()) <= 700
+
+
+def test_the_example_of_the_library_runs():
+    scope: dict = {}
+    exec(python(DOCS / "library.md")[0], scope)  # noqa: S102 - our own text
+    assert scope["bound"].shape == (scope["demonstrations"].horizon + 1,)
+    assert scope["gradient"].shape == (4,)
+
+
+@pytest.mark.slow
+def test_the_examples_on_poses_run(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    settings = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}
+    trainer = PoseMapperConfig(**settings, evaluations=1, validation_poses=32)
+    config = TrainConfig(mimic.env_config("panda4dof"), trainer, run_dir="runs/panda4dof", compilation_cache="")
+    assert train.prepare_training(config, 0.0)() == 0
+    scope: dict = {}
+    exec("\n".join(python(DOCS / "static_pose_imitation.md")), scope)  # noqa: S102 - our own text
+    assert scope["solution"].qpos.shape == (100, 4) and scope["learner_poses"].shape == (10, 4)
+    assert scope["followed"].qpos.shape == (50, 4)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_commands_and_code_are_valid(page, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for block in read_blocks(page.read_text()):
+        assert block.kind in ("bash", "python", "xml", "text"), block
+        assert block.title or block.kind != "xml", block
+        if block.kind == "python":
+            compile(block.text, str(page), "exec")
+        elif block.kind == "bash":
+            for words in commands(block):
+                check(words, monkeypatch)
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=() if page.name in QUICK else pytest.mark.slow) for page in PAGES],
+    ids=named,
+)
+def test_pages_run(page, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    run_page(page, tmp_path)
+
+
+def test_every_page_is_read_as_it_is_written():
+    """What the reader would not recognise as a block must not go unnoticed."""
+    page = "a\n\n    B=1 srun python -m m  # c\n    make x\n\n<!-- not run: no -->\n\n```python\n  d\n```\n"
+    page += '```xml title="e.xml"\n<f/>\n```'
+    assert read_blocks(page) == [
+        Block("bash", "B=1 srun python -m m  # c\nmake x", None, True),
+        Block("python", "  d", None, False),
+        Block("xml", "<f/>", "e.xml", True),
+    ]
+    for path in PAGES:
+        text = path.read_text()
+        blocks = read_blocks(text)
+        shown = [words for block in blocks if block.kind == "bash" for words in commands(block)]
+        written = re.findall(r"^\s*(?:srun )?(?:[A-Z_]+=\S+ )*(?:python -m|make|pip) ", text, re.MULTILINE)
+        assert len(written) == len([words for words in shown if module(words) != "."]), path
+        assert text.count("```python\n") == len([block for block in blocks if block.kind == "python"]), path
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["python -m mimic.train env=panda5dof", "python -m benchmarks.pose --pair x", "make nothing", "rm -r runs"],
+)
+def test_bad_commands_are_found(command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((SystemExit, AssertionError, pytest.fail.Exception)):
+        check(commands(Block("bash", command, None, True))[0], monkeypatch)
+
+
+def test_pages_name_every_environment_and_only_functions_that_exist():
+    for name in mimic.environments():
+        assert f"`{name}`" in (DOCS / "training.md").read_text()
+    table = (DOCS / "library.md").read_text().split("| to | call |")[1].split("\n\n")[0]
+    for name in re.findall(r"`(\w+)`", table):
+        assert hasattr(mimic, name), name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_links_lead_somewhere(page):
+    for link in re.findall(r"\]\(((?!http)[^)]+)\)", page.read_text()):
+        path, _, heading = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), link
+        headings = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE) if heading else []
+        assert not heading or heading in [text.lower().replace(" ", "-") for text in headings], link

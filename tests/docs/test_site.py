@@ -1,0 +1,76 @@
+"""The documentation site builds without a warning, is whole, and needs nothing from elsewhere."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+import mimic
+from tests.helpers.repository import REPOSITORY
+
+QUIET = {"NO_MKDOCS_2_WARNING": "1"}  # the theme's advertisement for its successor
+
+
+def build(out, config=REPOSITORY / "mkdocs.yml"):
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--config-file",
+        str(config),
+        "--site-dir",
+        str(out),
+    ]
+    return subprocess.run(
+        command, cwd=REPOSITORY, env={**os.environ, **QUIET}, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    out = tmp_path_factory.mktemp("site")
+    built = build(out)
+    assert built.returncode == 0, built.stderr
+    return {path.relative_to(out).as_posix(): path.read_text() for path in out.rglob("*.html")}, out
+
+
+def test_every_public_name_is_in_the_reference(site):
+    pages, _ = site
+    reference = "".join(text for name, text in pages.items() if name.startswith("api/"))
+    for name in mimic.__all__:
+        assert reference.count(f'id="mimic.{name}"') == 1, name
+    assert 'title="jaxtyping.Float">Float</span>' in reference  # shapes
+
+
+def test_every_page_is_there(site):
+    pages, _ = site
+    docs = REPOSITORY / "docs"
+    written = {path.relative_to(docs).with_suffix(".html").as_posix() for path in docs.rglob("*.md")}
+    assert set(pages) == written | {"404.html"}
+
+
+def test_what_pages_show_comes_along(site):
+    pages, out = site
+    for name, text in pages.items():
+        sources = re.findall(r'<(?:img|script|link)[^>]*?(?:src|href)="([^"]+)"', text)
+        assert sources, name
+        for source in sources:
+            if name != "404.html":  # which does not know where it is
+                assert not source.startswith(("http", "//")), (name, source)
+                assert ((out / name).parent / source.split("?")[0]).is_file(), (name, source)
+        for result in re.findall(r'href="((?:\.\./)*results/[^"]+)"', text):
+            assert ((out / name).parent / result).is_file(), (name, result)
+
+
+def test_a_link_that_leads_nowhere_stops_the_build(tmp_path):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "index.md").write_text("[lost](lost.md)")
+    settings = (REPOSITORY / "mkdocs.yml").read_text()
+    parts = re.sub(r"(?ms)^(nav|hooks|exclude_docs|plugins):.*?(?=^\S)", "", settings)
+    (tmp_path / "mkdocs.yml").write_text(parts)
+    built = build(tmp_path / "out", tmp_path / "mkdocs.yml")
+    assert built.returncode != 0 and "lost.md" in built.stderr

@@ -1,0 +1,127 @@
+"""The environment, its physics and its demonstrations."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.envs.imitation import training_and_held_out
+
+FEW = {"count": 6, "held_out": 2}
+
+
+@pytest.fixture(scope="module")
+def planar_env():
+    return mimic.make("planar4dof", demonstrations=FEW)
+
+
+QUICK = ("planar4dof", "panda3dof")  # the others have all their shapes checked
+
+
+@pytest.mark.parametrize("name", mimic.environments())
+def test_every_environment_has_its_shapes(name):
+    env = mimic.make(name, demonstrations=FEW, physics="fused")
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    assert state.obs.shape == (env.observation_size,)
+    after = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
+
+
+@pytest.mark.parametrize("limits", ["none", "hardware"])
+@pytest.mark.parametrize(
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in mimic.environments()]
+)
+def test_every_environment_resets_and_steps(name, limits):
+    # MJX takes longest to compile; other tests hold each arm's motion under it against MuJoCo's.
+    physics = "mjx" if name == "planar4dof" and limits == "none" else "fused"
+    env = mimic.make(name, demonstrations=FEW, limits=limits, physics=physics)
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
+    assert after.reward == pytest.approx(-float(after.metrics["distance"]))  # at rest at home, far from any limit
+    assert np.all(np.isfinite(after.obs)) and not after.done
+
+
+def test_reward_and_observation_follow_the_demonstration_step_by_step():
+    """Against its samples in the file: after i steps, sample i. 1e-5: float32, of a table made in double precision."""
+    env = mimic.make("planar4dof", preview=2, horizon=6, physics="fused", demonstrations=FEW)
+    motions, which = env.demonstrations, 3
+    expert = [
+        mimic.link_states(env.expert, *(np.asarray(x[which, sample], np.float32) for x in (motions.qpos, motions.qvel)))
+        for sample in range(7)
+    ]
+    actions = np.random.default_rng(0).uniform(-1, 1, (6, env.action_size)).astype(np.float32)
+    state, step = env.begin(env.start(jax.random.PRNGKey(0), which)), jax.jit(env.step)
+    for i in range(7):
+        arm = state.pipeline_state
+        learner = mimic.link_states(env.learner, arm.qpos, arm.qvel)
+        shown = [learner, *(expert[min(i + ahead, 6)] for ahead in range(3))]  # the last sample stays
+        leaves = [np.ravel(leaf) for states in shown for leaf in jax.tree.leaves(states)]
+        np.testing.assert_allclose(state.obs, np.concatenate(leaves), atol=1e-5)
+        assert state.done == (i == 6)
+        distances = [mimic.embodiment_distance(each, learner, env.correspondence, env.weights) for each in expert]
+        if i > 0:
+            assert state.reward == pytest.approx(-float(distances[i]), abs=1e-5)
+            others = np.delete(distances, i)
+            assert np.abs(others - distances[i]).min() > 1e-4  # another sample would be noticed
+        if i < 6:
+            state = step(state, actions[i])
+
+
+def test_a_runaway_ends_the_episode_and_never_pays(planar_env):
+    state = planar_env.reset(jax.random.PRNGKey(0))
+    fast = state.pipeline_state.replace(qvel=jnp.full(4, 100.0))
+    after = jax.jit(planar_env.step)(state.replace(pipeline_state=fast), jnp.zeros(4))
+    assert after.done == 1 and after.metrics["runaway"] == 1
+    worst_rest = -planar_env.config.horizon * float(after.metrics["distance"])
+    assert after.reward == pytest.approx(worst_rest, rel=1e-5)
+
+
+def test_hardware_limits_cost_where_they_are_near_and_beyond():
+    free, limited = (
+        mimic.make("panda4dof", physics="fused", demonstrations=FEW, limits=limits, limit_weight=2.0)
+        for limits in ("none", "hardware")
+    )
+    home, still = jnp.asarray(limited.learner.home, jnp.float32), jnp.zeros(4)
+    upper, rated = limited.learner.joint_range[:, 1], limited.learner.velocity_limit
+    assert limited.limit_excess(home, still) == 0
+    beyond = limited.limit_excess(home.at[0].set(upper[0] + 0.02), still)
+    assert beyond == pytest.approx(0.5 * (0.02 + 0.03) / 0.1 / 4, rel=1e-3)  # 3e-7 of an angle, over 0.05
+    assert limited.limit_excess(home.at[0].set(upper[0] + 9.0), still) == pytest.approx(0.5 / 4)
+    assert limited.limit_excess(home, still.at[1].set(-1.5 * rated[1])) == pytest.approx(0.5 / 4)
+    for env, weight in ((free, 0.0), (limited, 2.0)):
+        state = env.reset(jax.random.PRNGKey(0))
+        arm = state.pipeline_state.replace(qvel=still.at[1].set(1.2 * rated[1]))
+        after = jax.jit(env.step)(state.replace(pipeline_state=arm), still)
+        costs = after.metrics["distance"] + weight * after.metrics["limit_excess"]
+        assert after.metrics["limit_excess"] > 0
+        assert after.reward == pytest.approx(-float(costs), rel=1e-6)
+
+
+def test_training_and_held_out_are_apart():
+    training, held_out = training_and_held_out(mimic.env_config("planar4dof", demonstrations=FEW))
+    assert (training.count, held_out.count) == (6, 2)
+    assert not np.isin(held_out.goals, training.goals).any()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"previw": 1}, "unknown key 'previw'; valid are"),
+        ({"preview": "x"}, "could not be converted to Integer"),
+        ({"demonstrations": {"cont": 1}}, "unknown key 'demonstrations.cont'"),
+        ({"limits": "soft"}, "expected one of none, hardware"),
+        ({"demonstrations": {"kind": "dance"}}, "expected one of pd, reach"),
+        ({"metric": {"xi": 1.0}}, "below 0"),
+        ({"metric": {"xi": float("-inf")}}, "finite number below 0"),
+        ({"learner": {"locked": [9]}}, "unknown joint 9"),
+    ],
+)
+def test_bad_overrides_are_refused(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        mimic.make("panda4dof", **overrides)
+
+
+def test_unknown_environment_names_the_known():
+    with pytest.raises(ValueError, match="panda3dof, panda4dof, panda7dof, planar4dof"):
+        mimic.make("panda5dof")

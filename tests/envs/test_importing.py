@@ -1,0 +1,167 @@
+"""Motions from elsewhere: tables and LocoMuJoCo's files become demonstrations, or are refused in a line."""
+
+import importlib
+import sys
+
+import numpy as np
+import pytest
+
+import mimic
+from mimic import cli
+
+TIME = np.arange(0, 6.0, 0.02)  # s
+PHASE = np.arange(7)
+
+
+def swing(time):
+    """Angles and velocities of a Panda that swings."""
+    time = np.asarray(time)[:, None]
+    return 0.5 * np.sin(time + PHASE), 0.5 * np.cos(time + PHASE)
+
+
+def write_csv(path, header, columns):
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=",".join(header), comments="", fmt="%.9g")
+    return path
+
+
+def table(path, *, names, velocity_names=(), time=TIME, factor=1.0):
+    qpos, qvel = swing(time)
+    return write_csv(
+        path, ["time", *names, *velocity_names], [time, factor * qpos, *([qvel] if velocity_names else [])]
+    )
+
+
+def archive(path, **changes):
+    """As LocoMuJoCo writes it: a free joint first, two motions one after the other."""
+    qpos, qvel = swing(TIME)
+    free = np.zeros((len(TIME), 7))
+    content = {
+        "qpos": np.tile(np.hstack([free, qpos]), (2, 1)).astype(np.float32),
+        "qvel": np.tile(np.hstack([free[:, :6], qvel]), (2, 1)).astype(np.float32),
+        "joint_names": np.array(["root", *(f"joint{i}" for i in range(1, 8))]),
+        "jnt_type": np.array([0, *[3] * 7]),
+        "njnt": np.array(8),
+        "frequency": np.array(50.0),
+        "split_points": np.array([0, len(TIME), 2 * len(TIME)]),
+        "metadata": np.array(None, object),  # pickled, which is not read
+        **changes,
+    }
+    np.savez(path, **{key: value for key, value in content.items() if value is not None})
+    return path
+
+
+def run(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["mimic.demonstrations", *map(str, arguments)])
+    cli.run(importlib.import_module("mimic.demonstrations").prepare, "demonstrations")
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("spelling", ["joint{}", "q_{}", "q_joint{}"])
+def test_a_table_becomes_demonstrations_that_training_takes(tmp_path, monkeypatch, capsys, spelling):
+    numbers = range(1, 8)
+    source = table(tmp_path / "swing.csv", names=[spelling.format(i) for i in numbers],
+                   velocity_names=[f"qdot_{i}" for i in numbers])  # fmt: skip
+    out = tmp_path / "swing.npz"
+    said = run(monkeypatch, capsys, f"source={source}", f"out={out}")
+    assert "1 demonstrations, 50 steps of 0.1 s; velocities: from the file" in said
+    assert {path.name for path in tmp_path.iterdir()} == {"swing.csv", "swing.npz", "swing.png"}
+    loaded = mimic.load_demonstrations(out)
+    qpos, qvel = swing(0.1 * np.arange(51))
+    np.testing.assert_allclose(loaded.qpos[0], qpos, atol=1e-8)  # what the table rounds
+    np.testing.assert_allclose(loaded.qvel[0], qvel, atol=1e-8)
+    assert loaded.torque is None
+    loaded.check_fits(mimic.panda(), 0.1, 50)
+
+
+def test_velocities_are_differentiated_where_there_are_none(tmp_path, monkeypatch, capsys):
+    source = table(tmp_path / "swing.csv", names=[f"q_{i}" for i in range(1, 8)])
+    said = run(monkeypatch, capsys, f"source={source}", f"out={tmp_path / 'swing.npz'}")
+    assert "velocities: differentiated, since the file has none" in said
+    loaded = mimic.load_demonstrations(tmp_path / "swing.npz")
+    _, qvel = swing(0.1 * np.arange(51))
+    np.testing.assert_allclose(loaded.qvel[0, 1:], qvel[1:], atol=1e-4)  # central: 0.02^2 / 6 of the third derivative
+    np.testing.assert_allclose(loaded.qvel[0, 0], qvel[0], atol=1e-2)  # one-sided at the start
+
+
+def test_steps_between_samples_are_cubic(tmp_path):
+    """Samples at other times than the control steps, and not evenly: 4e-4, the error of a cubic over 0.17 s."""
+    time = np.sort(np.concatenate([[0, 5.5], np.random.default_rng(0).uniform(0, 5.5, 120)]))
+    source = table(tmp_path / "uneven.csv", names=[f"q_{i}" for i in range(1, 8)],
+                   velocity_names=[f"qdot_{i}" for i in range(1, 8)], time=time)  # fmt: skip
+    imported, differentiated = mimic.import_demonstrations(source, mimic.panda())
+    assert not differentiated
+    np.testing.assert_allclose(imported.qpos[0], swing(0.1 * np.arange(51))[0], atol=4e-4)
+
+
+def test_a_table_may_hold_several_demonstrations(tmp_path):
+    qpos, _ = swing(TIME)
+    which = np.repeat([1.0, 2.0], len(TIME))
+    header = ["demonstration", "t", *(f"joint{i}" for i in range(1, 8))]
+    source = write_csv(tmp_path / "two.csv", header, [which, np.tile(TIME, 2), np.concatenate([qpos, 0.5 * qpos])])
+    imported, _ = mimic.import_demonstrations(source, mimic.panda(), horizon=30)
+    assert imported.count == 2 and imported.horizon == 30
+    np.testing.assert_allclose(imported.qpos[1], 0.5 * imported.qpos[0], atol=1e-8)
+
+
+def test_locomujoco_files_are_split_and_their_free_joint_is_left_out(tmp_path):
+    imported, differentiated = mimic.import_demonstrations(archive(tmp_path / "loco.npz"), mimic.panda())
+    assert imported.count == 2 and not differentiated
+    qpos, qvel = swing(0.1 * np.arange(51))
+    for which in range(2):
+        np.testing.assert_allclose(imported.qpos[which], qpos, atol=1e-6)  # float32
+        np.testing.assert_allclose(imported.qvel[which], qvel, atol=1e-5)
+
+
+def test_joints_of_other_names_are_told(tmp_path):
+    names = [f"panda_{i}" for i in "abcdefg"]
+    source = archive(tmp_path / "loco.npz", joint_names=np.array(["root", *names]))
+    imported, _ = mimic.import_demonstrations(source, mimic.panda(), joints=names)
+    assert imported.joint_names == mimic.panda().joint_names
+
+
+NUMBERED = [f"q_{i}" for i in range(1, 8)]
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments", "message"),
+    [
+        (None, [], "no file at"),
+        (lambda path: table(path, names=NUMBERED[:6] + ["q_9"]), [], "lacks joint7; expected time and the"),
+        (lambda path: write_csv(path, ["time", "q_1"], [TIME, TIME]), [], "got the columns time, q_1"),
+        (lambda path: table(path, names=NUMBERED, factor=57.3), [], "expected rad in [-3.14"),
+        (lambda path: table(path, names=NUMBERED, time=TIME[:100]), [], "lasts 1.98 s, but an episode 5 s"),
+        (lambda path: table(path, names=NUMBERED, time=TIME[::-1]), [], "at times that increase"),
+        (lambda path: table(path, names=NUMBERED, factor=np.nan), [], "not finite"),
+        (lambda path: table(path, names=NUMBERED, factor=6.0, time=TIME), ["limits=none"], "has a velocity of"),
+        (lambda path: path.write_text("time,q_1\n0,a\n"), [], "is no table of numbers below a header"),
+        (lambda path: path.write_text(""), [], "is no table of numbers below a header"),
+        (lambda path: table(path, names=NUMBERED), ["kind=reach"], "kind: expected none with source=FILE"),
+        (lambda path: table(path, names=NUMBERED), ["joints=[a]"], "joints: expected 7 names"),
+    ],
+)  # fmt: skip
+def test_bad_tables(refused, tmp_path, make, arguments, message):
+    path = tmp_path / "motion.csv"
+    if make:
+        make(path)
+    assert message in refused("demonstrations", f"source={path}", "out=new.npz", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"joint_names": np.array(list("abcdefgh"))}, "lacks the joints joint1, joint2, joint3, joint4, joint5"),
+        ({"frequency": None}, "lacks frequency; expected qpos, joint_names, frequency or dt"),
+        ({"frequency": np.array(0.0)}, "frequency or dt in"),
+        ({"qpos": np.zeros(3)}, "qpos in"),
+        ({"jnt_type": None}, "qpos in"),
+        ({"split_points": np.array([0, 10])}, "must increase from 0 to 600"),
+        ({"qpos": np.zeros((3, 14), object)}, "cannot be read as an npz file of motions"),
+    ],
+)
+def test_bad_archives(refused, tmp_path, changes, message):
+    path = archive(tmp_path / "motion.npz", **changes)
+    assert message in refused("demonstrations", f"source={path}", "out=new.npz")
+
+
+def test_joints_without_a_file_are_refused(refused):
+    assert "joints: expected only with source=FILE" in refused("demonstrations", "out=new.npz", "joints=[a]")

@@ -1,0 +1,151 @@
+"""Learners that differ from their model: by mass, damping and noise on their torques."""
+
+import copy
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mimic
+from mimic.envs import imitation
+from mimic.envs.config import RandomizationConfig
+from mimic.envs.physics import Load
+from mimic.envs.wrappers import wrap_for_training
+
+RANGES = {"mass": [0.5, 2.0], "damping": [1.0, 3.0]}
+ACTION = jnp.array([0.6, -0.4])
+
+
+def make(**randomization):
+    arms = {"expert": {"link_lengths": [0.4, 0.3, 0.3]}, "learner": {"link_lengths": [0.6, 0.4]}}
+    few = {"count": 2, "held_out": 1}
+    return mimic.make("planar4dof", **arms, demonstrations=few, horizon=3, physics="fused", randomization=randomization)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return make()
+
+
+@pytest.fixture(scope="module")
+def varied():
+    return make(**RANGES)
+
+
+def stepped(env, load=None, action=ACTION, steps=1, key=0):
+    """Joint state after some steps of a learner that was given a load."""
+    state = env.reset(jax.random.PRNGKey(key))
+    if load is not None:
+        state = state.replace(pipeline_state=state.pipeline_state.replace(load=load))
+    step = jax.jit(env.step)
+    for _ in range(steps):
+        state = step(state, action)
+    return np.concatenate([state.pipeline_state.qpos, state.pipeline_state.qvel])
+
+
+def test_loads_differ_between_episodes_and_fill_their_range(varied):
+    """1000 draws come within 2 % of either end of the range, but for one case in 10^8."""
+    loads = jax.vmap(lambda key: varied.start(key).load)(jax.random.split(jax.random.PRNGKey(0), 1000))
+    for drawn, (least, largest) in zip(loads, RANGES.values(), strict=True):
+        assert least <= drawn.min() < least + 0.02 * (largest - least)
+        assert largest - 0.02 * (largest - least) < drawn.max() <= largest
+    assert abs(np.corrcoef(np.stack(loads))[0, 1]) < 0.15  # more than 4 standard deviations of chance
+
+
+def test_one_range_leaves_the_other_factor_as_it_is():
+    load = make(mass=[0.5, 2.0], damping=[1.5, 1.5]).start(jax.random.PRNGKey(0)).load
+    assert load is not None and load.damping == 1.5 and 0.5 < load.mass < 2
+
+
+def test_a_load_stays_for_an_episode_and_changes_with_the_next(varied):
+    count, horizon = 8, varied.config.horizon
+    env = wrap_for_training(varied, horizon + 1)
+
+    @jax.jit
+    def run(state):
+        def step(state, _):
+            state = env.step(state, jnp.zeros((count, 2)))
+            return state, (state.done, state.pipeline_state.load.mass)
+
+        return jax.lax.scan(step, state, None, length=3 * horizon)[1]
+
+    state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), count))
+    done, mass = map(np.asarray, run(state))
+    before = np.concatenate([np.asarray(state.pipeline_state.load.mass)[None], mass[:-1]])
+    np.testing.assert_array_equal(mass != before, done.astype(bool))
+
+
+def test_equal_bounds_are_a_fixed_load(plain, varied):
+    """1e-6: the factors are constants in one program and arguments of the other, in float32."""
+    fixed = make(mass=[1.2, 1.2], damping=[0.5, 0.5])
+    assert fixed.start(jax.random.PRNGKey(0)).load is None and plain.start(jax.random.PRNGKey(0)).load is None
+    drawn = Load(jnp.float32(1.2), jnp.float32(0.5))
+    np.testing.assert_allclose(stepped(fixed), stepped(varied, load=drawn), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(stepped(plain), stepped(varied, load=Load(*jnp.ones(2))), rtol=1e-6, atol=1e-6)
+    assert not np.allclose(stepped(fixed), stepped(plain), rtol=0.01)
+
+
+@pytest.mark.parametrize("physics", ["mjx", "fused"])
+def test_a_heavier_arm_moves_as_in_mujoco(plain, physics):
+    """1e-5 rad and rad/s: 0.1 s in float32."""
+    heavier = RandomizationConfig(mass=[1.2, 1.2], damping=[2.0, 2.0])
+    config = dataclasses.replace(plain.config, physics=physics, randomization=heavier)
+    env = mimic.ImitationEnv(config, plain.demonstrations)
+    model = copy.copy(env.arm.model)
+    model.body_mass *= 1.2
+    model.body_inertia *= 1.2
+    model.dof_damping *= 2.0
+    model.opt.timestep = config.control_dt / config.substeps
+    data = mujoco.MjData(model)
+    data.qfrc_applied[:] = ACTION * env.torque_scale
+    mujoco.mj_step(model, data, config.substeps)
+    np.testing.assert_allclose(stepped(env), [*data.qpos, *data.qvel], atol=1e-5)
+
+
+def test_noise_moves_the_arm_anew_in_each_step_and_episode(plain):
+    noisy, silent = make(torque_noise=0.2), make(torque_noise=0.0)
+    np.testing.assert_array_equal(stepped(silent), stepped(plain))
+    np.testing.assert_array_equal(stepped(noisy), stepped(noisy))
+    for a, b in ((stepped(noisy), stepped(plain)), (stepped(noisy, key=1), stepped(noisy))):
+        assert np.abs(a - b).max() > 1e-3
+
+
+@pytest.fixture
+def noisy(monkeypatch):
+    """An environment with noise, and an arm whose velocity becomes the torque [N m] that it was given."""
+    monkeypatch.setattr(imitation, "make_advance", lambda *_: lambda qpos, qvel, torque, load: (qpos, torque))
+    return make(torque_noise=0.1)
+
+
+def test_noise_is_of_the_given_size_and_within_the_largest_torque(noisy):
+    """5000 draws: their standard deviation is known to 1 %, and 5 % is five times that."""
+    env = noisy
+
+    @jax.jit
+    @jax.vmap
+    def torques(key):
+        start = env.reset(key)
+        first = env.step(start, ACTION)
+        second, beyond = env.step(first, ACTION), env.step(start, 1 + ACTION)
+        return [state.pipeline_state.qvel / env.torque_scale for state in (first, second, beyond)]  # type: ignore[union-attr]
+
+    first, second, beyond = map(np.asarray, torques(jax.random.split(jax.random.PRNGKey(0), 5000)))
+    for drawn in (first, second):
+        np.testing.assert_allclose(drawn.mean(axis=0), ACTION, atol=0.01)
+        np.testing.assert_allclose(drawn.std(axis=0), 0.1, rtol=0.05)
+    assert abs(np.corrcoef(first[:, 0], second[:, 0])[0, 1]) < 0.06  # more than 4 standard deviations of chance
+    assert np.abs(beyond).max() <= 1
+
+
+def test_noise_shares_no_key_with_the_next_episode(noisy):
+    """Folding a small number into a key gives what splitting it does."""
+    env = noisy
+    state = env.reset(jax.random.PRNGKey(0))
+    keys = jax.random.split(state.pipeline_state.key, 3)
+    for _ in range(3):
+        state = env.step(state, jnp.zeros(2))
+        noise = state.pipeline_state.qvel / env.torque_scale / 0.1
+        assert not any(np.allclose(noise, jax.random.normal(key, (2,)), atol=1e-3) for key in keys)

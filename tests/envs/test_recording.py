@@ -1,0 +1,78 @@
+"""Recorded demonstrations: simulated, within the limits of the expert, and reproducible."""
+
+import dataclasses
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+import mimic
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.envs.recording import KINDS
+
+SUBSTEPS = 10  # of MuJoCo, a control step
+
+
+def test_demonstrations_are_reproducible_and_within_limits():
+    arm = build_arm(ArmConfig(), "hardware")
+    few, more = (mimic.record_demonstrations(arm, count, seed=3) for count in (2, 3))
+    np.testing.assert_array_equal(few.qpos, more.qpos[:2])
+    lower, upper = arm.embodiment.joint_range.T
+    assert np.all((more.qpos >= lower) & (more.qpos <= upper))
+    assert np.all(np.abs(more.qvel) <= arm.embodiment.velocity_limit)
+    assert np.all(more.qvel[:, 0] == 0)
+
+
+@pytest.mark.parametrize("limits", ["none", "hardware"])
+def test_reaches_end_where_they_should_and_within_limits(limits):
+    arm = build_arm(ArmConfig(), limits)
+    reaches = mimic.record_demonstrations(arm, 4, kind="reach", seed=1)
+    embodiment = arm.embodiment
+    assert np.all(np.abs(reaches.qvel) <= embodiment.velocity_limit)
+    hand = jax.vmap(lambda qpos: mimic.forward_kinematics(embodiment, qpos).position[-1])
+    np.testing.assert_allclose(hand(reaches.qpos[:, -1]), hand(reaches.goals), atol=5e-3)  # 5 mm: feedback, not fit
+    other = mimic.record_demonstrations(arm, 4, kind="pd", seed=1)
+    assert not np.allclose(other.qpos, reaches.qpos, atol=0.1)
+
+
+def panda():
+    return mimic.build_arm(mimic.ArmConfig())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_torques_of_a_file_make_its_motion(kind, tmp_path):
+    """1e-9 rad: the same double precision, on another run of the simulator."""
+    mimic.record_demonstrations(panda(), 2, kind=kind).save(tmp_path / "demonstrations.npz")
+    loaded = mimic.load_demonstrations(tmp_path / "demonstrations.npz")
+    assert loaded.torque is not None and loaded.torque.shape == (2, 50, 7)
+    model = panda().model
+    model.opt.timestep = loaded.dt / SUBSTEPS
+    for qpos, qvel, torque in zip(loaded.qpos, loaded.qvel, loaded.torque, strict=True):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = qpos[0], qvel[0]
+        for held, expected_qpos, expected_qvel in zip(torque, qpos[1:], qvel[1:], strict=True):
+            data.qfrc_applied[:] = held
+            mujoco.mj_step(model, data, SUBSTEPS)
+            np.testing.assert_allclose(data.qpos, expected_qpos, rtol=0, atol=1e-9)
+            np.testing.assert_allclose(data.qvel, expected_qvel, rtol=0, atol=1e-8)  # rad/s, over a step of 0.1 s
+
+
+def test_a_recording_counts_the_goals_that_it_drew_anew():
+    """Below the peak speeds of PD control, some goals must be turned down."""
+    arm = panda()
+    slow = dataclasses.replace(arm, embodiment=dataclasses.replace(arm.embodiment, velocity_limit=np.full(7, 1.0)))
+    redrawn = []
+    recorded = mimic.record_demonstrations(slow, 4, on_recorded=redrawn.append)
+    assert len(redrawn) == 4 and sum(redrawn) > 0
+    assert np.abs(recorded.qvel).max() <= 1.0
+    mimic.check_effort(recorded, slow.embodiment)
+
+
+def test_what_diverges_is_no_demonstration(tmp_path, monkeypatch):
+    """Steps of 0.4 s blow up within one control step; MuJoCo would set the arm back to rest, which breaks no limit."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of what diverges
+    arm = panda()
+    unlimited = dataclasses.replace(arm.embodiment, velocity_limit=np.full(7, np.inf))
+    with pytest.raises(ValueError, match="exceed its limits"):
+        mimic.record_demonstrations(dataclasses.replace(arm, embodiment=unlimited), 1, dt=2.0)

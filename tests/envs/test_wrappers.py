@@ -1,0 +1,53 @@
+"""Episodes that begin anew while others go on."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.envs.wrappers import wrap_for_training
+
+
+def test_observations_of_fresh_episodes_fit_their_states():
+    """In a batch of which some episodes end: the wrapper puts the observations together by itself."""
+    env = mimic.make("planar4dof", demonstrations={"count": 3}, physics="fused")
+    wrapped = wrap_for_training(env, env.config.horizon + 1)
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
+    step, observe = jax.jit(wrapped.step), jax.jit(jax.vmap(env.observe))
+    ended = 0.0
+    for _ in range(12):
+        np.testing.assert_allclose(state.obs, observe(state.pipeline_state), atol=1e-5)
+        state = step(state, jnp.full((16, env.action_size), 0.3))
+        ended += float(state.done.sum())
+    assert ended > 0
+
+
+FEW = {"count": 6, "held_out": 2}
+
+
+@pytest.fixture(scope="module")
+def planar_env():
+    return mimic.make("planar4dof", demonstrations=FEW)
+
+
+def test_episodes_end_at_the_horizon_and_draw_fresh_demonstrations(planar_env):
+    env = wrap_for_training(planar_env, planar_env.config.horizon + 1)
+    count, horizon = 32, planar_env.config.horizon
+
+    @jax.jit
+    def rollout(state):
+        def step(state, _):
+            state = env.step(state, jnp.zeros((count, planar_env.action_size)))
+            arm = state.pipeline_state
+            return state, (state.done, state.info["truncation"], arm.demonstration, arm.step)
+
+        return jax.lax.scan(step, state, None, length=3 * horizon)[1]
+
+    state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), count))
+    assert len(np.unique(state.pipeline_state.step)) > 10  # the first episodes are out of step with each other
+    done, truncation, demonstration, step = map(np.asarray, rollout(state))
+    assert np.all(done.sum(axis=0) == 3)
+    assert not truncation.any()
+    assert np.all(step[done.astype(bool)] == 0)
+    assert all(len(np.unique(demonstration[:, i])) > 1 for i in range(count) if i % 8 == 0)

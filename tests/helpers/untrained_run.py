@@ -1,0 +1,45 @@
+"""A run directory of a policy with its initial parameters."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import mimic
+from mimic.envs.config import EnvConfig
+from mimic.runs.checkpoints import save_checkpoint
+from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.trainers.ppo import training
+from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.ppo.trainer import PPOTrainer
+from mimic.trainers.run_config import save_config
+
+COUNT, HELD_OUT, HORIZON = 4, 2, 20
+
+
+def environment(learner: Sequence[float] = (0.5, 0.5)) -> EnvConfig:
+    """A planar pair that compiles quickly."""
+    return mimic.env_config(
+        "planar4dof",
+        expert={"link_lengths": [0.4, 0.3, 0.3]},
+        learner={"link_lengths": list(learner)},
+        demonstrations={"count": COUNT, "held_out": HELD_OUT},
+        horizon=HORIZON,
+        physics="fused",
+    )
+
+
+def untrained_run(folder: Path, **settings: Any) -> Path:
+    """What a training run leaves, but with its initial parameters: no training is compiled."""
+    ppo = PPOConfig(hidden_layers=[8], preset="cpu")
+    config = TrainConfig(environment(**settings), ppo, compilation_cache="")
+    trainer = PPOTrainer(config, None)
+    folder.mkdir()
+    save_config(folder, dataclasses.replace(config, trainer=trainer.settings))
+    trainer.save_inputs(folder)
+    env = trainer.evaluator.env
+    networks = training.make_networks(trainer.settings, env.observation_size, env.action_size)
+    save_checkpoint(folder, 0, initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
+    return folder

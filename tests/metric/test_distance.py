@@ -1,0 +1,251 @@
+import dataclasses
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mimic.arms.embodiment import panda, planar_arm
+from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
+from mimic.metric.distance import (
+    PAPER_WEIGHTS,
+    DistanceWeights,
+    RotationMeasure,
+    adaptive_weights,
+    embodiment_distance,
+    link_distances,
+    rotation_distance,
+)
+from mimic.metric.kinematics import candidate_points, link_states
+from tests.helpers.metric_cases import (
+    ALL_WEIGHTS,
+    CORRESPONDENCES,
+    EXPERT,
+    LEARNER,
+    MEASURES,
+    REDUCTIONS,
+    WEIGHTS,
+    states,
+)
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+
+def worked_example():
+    """Two arms with two links of 1 m, so L = 2. Positions and velocities by hand, divided by L.
+
+    Expert at (0, pi/2), with both joints at 1 rad/s: link 1 points along x and turns at 1 rad/s, link 2 along y at 2.
+    Middles (1/2, 0) and (1, 1/2), velocities (0, 1/2) and (0, 1) + 2 (-1/2, 0) = (-1, 1).
+    Learner stretched along x and at rest: middles (1/2, 0) and (3/2, 0).
+    """
+    arm = planar_arm([1.0, 1.0])
+    expert = link_states(arm, jnp.asarray([0.0, np.pi / 2]), jnp.asarray([1.0, 1.0]))
+    learner = link_states(arm, jnp.zeros(2), jnp.zeros(2))
+    r = 2**0.5
+    d_tr = np.array([[0, 1 / 2], [r / 4, r / 4]])  # (1/2, 1/2) / L and (-1/2, 1/2) / L for link 2
+    d_rot = np.array([[0, 0], [np.pi / 2, np.pi / 2]])  # a right angle: pi/2 by both measures
+    d_v = np.array([[1 / 4, 1 / 4], [r / 2, r / 2]])  # |(0, 1/2)| / L and |(-1, 1)| / L
+    d_w = np.array([[1, 1], [2, 2]])
+    return expert, learner, d_tr, d_rot, d_v, d_w
+
+
+@pytest.mark.parametrize("rotation", MEASURES)
+def test_link_distances_by_hand(x64, rotation: RotationMeasure):
+    expert, learner, d_tr, d_rot, d_v, d_w = worked_example()
+    per_pair = np.array([[1.0, 2.0], [3.0, 4.0]])
+    for weights, expected in (
+        (ALL_WEIGHTS, 2 * d_tr + d_rot + 3 * d_v + 0.5 * d_w),
+        (PAPER_WEIGHTS, d_rot + 0.001 * d_v + 0.01 * d_w),
+        (adaptive_weights, d_tr * d_tr + 2 / np.pi * (2 - d_tr) * d_rot),
+        (DistanceWeights(translation=per_pair, rotation=0), per_pair * d_tr),
+    ):
+        actual = link_distances(expert, learner, weights, rotation=rotation)
+        np.testing.assert_allclose(actual, expected, atol=1e-15, rtol=1e-14)  # a few roundings
+
+
+def test_embodiment_distance_by_hand(x64):
+    expert, learner, *_ = worked_example()
+    # D' = 2 d_tr + d_rot + 3 d_v + d_w / 2 = [[1.25, 2.25], [5.3992, 5.3992]]
+    link_2 = 2 * 2**0.5 / 4 + np.pi / 2 + 3 * 2**0.5 / 2 + 1
+    assert round(link_2, 4) == 5.3992
+    distance = functools.partial(embodiment_distance, expert, learner, weights=ALL_WEIGHTS)
+    arm = planar_arm([1.0, 1.0])
+    overlap = overlap_correspondence(arm, arm)  # 2 I
+    assert distance(overlap) == pytest.approx((2 * 1.25 + 2 * link_2) / 4, rel=1e-14)  # a few roundings
+    assert distance(overlap, reduction="frobenius") == pytest.approx(np.hypot(2.5, 2 * link_2), rel=1e-14)
+    # rows: link 1 to 1, link 2 to 1 (first of a tie); columns: 1 to link 1, 2 to link 1
+    nudged = dataclasses.replace(learner, position=learner.position.at[1, 1].add(-1e-9))  # breaks the tie for link 1
+    hard = embodiment_distance(expert, nudged, hard_correspondence, ALL_WEIGHTS)
+    assert hard == pytest.approx((2 * 1.25 + 2.25 + link_2) / 4, rel=1e-8)  # as far as the tie was broken
+    assert distance(np.diag([1, 0])) == pytest.approx(1.25 / 4, rel=1e-14)
+
+
+def test_rotation_measures():
+    x, y = jnp.asarray([1.0, 0, 0]), jnp.asarray([0.0, 1, 0])
+    for angle in np.linspace(0, np.pi, 9):
+        turned = np.cos(angle) * x + np.sin(angle) * y
+        assert rotation_distance(x, turned, "angle") == pytest.approx(angle, abs=1e-6)  # float32
+        expected = np.pi / 2 * (1 - np.cos(angle))
+        assert rotation_distance(x, turned) == pytest.approx(expected, abs=1e-6)  # float32
+    assert rotation_distance(x, -x, "angle") == pytest.approx(np.pi, abs=1e-6)
+
+
+@pytest.mark.parametrize("rotation", MEASURES)
+@pytest.mark.parametrize("weights", [ALL_WEIGHTS, PAPER_WEIGHTS, adaptive_weights])
+@pytest.mark.parametrize("arm", [panda(), planar_arm([0.5, 0.2, 0.3])], ids=lambda arm: arm.name)
+def test_zero_exactly_at_a_match_and_only_there(arm, weights, rotation):
+    here, elsewhere = states(arm), states(arm, seed=1)
+    itself = link_distances(here, here, weights, rotation=rotation)
+    if rotation == "cosine":
+        assert not np.diag(itself).any()
+    else:
+        np.testing.assert_allclose(np.diag(itself), 0, atol=1e-6)  # |e x e| rounds to 1e-7 in float32
+    for reduction in REDUCTIONS:
+        overlap = overlap_correspondence(arm, arm)
+        distance = functools.partial(embodiment_distance, here, weights=weights, rotation=rotation, reduction=reduction)
+        assert distance(here, overlap) == pytest.approx(0, abs=0 if rotation == "cosine" else 1e-5)  # as above, 7 links
+        assert distance(elsewhere, overlap) > 0.01
+
+
+@pytest.mark.parametrize("rotation", MEASURES)
+def test_swapping_the_arms_transposes_the_distances(x64, rotation):
+    a, b = states(panda(), 0, np.float64), states(planar_arm([0.1, 0.2]), 1, np.float64)
+    forth, back = (link_distances(*pair, ALL_WEIGHTS, rotation=rotation) for pair in ((a, b), (b, a)))
+    assert forth.shape == (7, 2)
+    np.testing.assert_allclose(forth, back.T, atol=1e-15)  # the order of two factors
+
+
+def test_arms_of_equal_shape_and_different_size_match():
+    lengths = np.array([0.5, 0.25, 0.125])  # powers of two: scaling is exact
+    small, large = planar_arm(lengths), planar_arm(8 * lengths)
+    a, b = states(small), states(large)
+    for rotation, reduction in itertools.product(MEASURES, REDUCTIONS):
+        distance = embodiment_distance(
+            a, b, overlap_correspondence(small, large), ALL_WEIGHTS, rotation=rotation, reduction=reduction
+        )
+        assert distance == pytest.approx(0, abs=1e-6)  # float32
+
+
+def test_turning_both_arms_together_changes_nothing(x64):
+    """Distances do not depend on the direction of the base frame: joint 1 of both arms turns everything about z."""
+    a, b = panda(), panda(locked=(3, 6, 7))
+    rng = np.random.default_rng(0)
+    (qa, va), (qb, vb) = (rng.uniform(-2, 2, (2, arm.num_joints)) for arm in (a, b))
+    before, after = [
+        link_distances(
+            link_states(a, qa + turn * np.eye(7)[0], va), link_states(b, qb + turn * np.eye(4)[0], vb), ALL_WEIGHTS
+        )
+        for turn in (0.0, 2.0)
+    ]
+    np.testing.assert_allclose(after, before, atol=1e-12)  # rounding, 1e-15 a step
+
+
+def test_candidate_points_are_compared_by_place_and_velocity():
+    a, b = states(EXPERT), states(LEARNER, 1)
+    weights = dataclasses.replace(ALL_WEIGHTS, rotation=0.0, angular_velocity=0.0)
+    points = candidate_points(a), candidate_points(b)
+    np.testing.assert_array_equal(link_distances(*points, weights), link_distances(a, b, weights))
+    np.testing.assert_array_equal(link_distances(points[0], b, weights), link_distances(a, b, weights))
+    alone = embodiment_distance(points[0], points[0], 2 * np.eye(3), weights)
+    assert alone == 0
+    square = link_distances(*points, DistanceWeights(translation=1.0, rotation=0.0)) ** 2
+    np.testing.assert_allclose(link_distances(*points, adaptive_weights), square, rtol=1e-6)  # float32
+    traced = jax.jit(link_distances)(*points, weights)
+    np.testing.assert_allclose(traced, link_distances(a, b, weights), rtol=1e-6)  # float32
+
+
+def test_weights_of_zero_cost_nothing():
+    a, b = states(EXPERT), states(LEARNER, 1)
+    program = jax.make_jaxpr(functools.partial(link_distances, weights=DistanceWeights(rotation=1.0)))(a, b)
+    used = jax.jit(functools.partial(link_distances, weights=DistanceWeights(rotation=1.0))).lower(a, b).as_text()
+    assert "sqrt" in str(program)  # the distances are written down, and
+    assert "sqrt" not in used  # XLA is not given those that nothing uses
+    assert not link_distances(a, b, DistanceWeights(rotation=0.0)).any()
+
+
+# --- batches and dtypes -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("correspondence", CORRESPONDENCES)
+def test_a_batch_is_a_vmap_is_a_loop(correspondence):
+    distance = functools.partial(
+        embodiment_distance, correspondence=CORRESPONDENCES[correspondence], weights=adaptive_weights
+    )
+    pairs = [(states(EXPERT, seed), states(LEARNER, seed + 9)) for seed in range(4)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *pairs)
+    one_by_one = [distance(*pair) for pair in pairs]
+    np.testing.assert_allclose(jax.vmap(distance)(*stacked), one_by_one, rtol=1e-6)  # float32, in another order
+    np.testing.assert_allclose(jax.jit(jax.vmap(distance))(*stacked), one_by_one, rtol=1e-6)
+    per_expert = jax.vmap(distance, in_axes=(None, 0))(pairs[0][0], stacked[1])
+    np.testing.assert_allclose(per_expert, [distance(pairs[0][0], pair[1]) for pair in pairs], rtol=1e-6)
+
+
+@pytest.mark.parametrize("weights", WEIGHTS)
+@pytest.mark.parametrize("correspondence", CORRESPONDENCES)
+def test_float32_stays_float32_under_x64(x64, correspondence, weights):
+    args = {"correspondence": CORRESPONDENCES[correspondence], "weights": WEIGHTS[weights]}
+    for dtype, reduction in ((np.float32, "mean"), (np.float32, "frobenius"), (np.float64, "mean")):
+        function = functools.partial(embodiment_distance, reduction=reduction, **args)
+        pair = jax.tree.map(
+            lambda x, dtype=dtype: jax.ShapeDtypeStruct(x.shape, dtype), (states(EXPERT), states(LEARNER))
+        )
+        assert jax.eval_shape(function, *pair).dtype == dtype
+    double = dataclasses.replace(ALL_WEIGHTS, rotation=np.float64(1.0))
+    assert link_distances(states(EXPERT), states(LEARNER), double).dtype == np.float32
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    "matrix",
+    [np.ones((2, 3)), np.ones((3, 3)), np.ones(6), np.ones((1, 3, 2)), 1.0, lambda distances: distances.T],
+    ids=lambda matrix: str(np.shape(matrix)),
+)
+def test_a_correspondence_of_another_shape_is_refused(matrix):
+    expected = r"^correspondence: expected shape \(3, 2\) \(expert links, learner links\), got \(.*\)$"
+    with pytest.raises(ValueError, match=expected):
+        embodiment_distance(states(EXPERT), states(LEARNER), matrix, PAPER_WEIGHTS)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_unknown_measures_and_reductions_are_refused():
+    pair = states(EXPERT), states(LEARNER)
+    options = {"rotation": ("cosine, angle", "euler"), "reduction": ("mean, frobenius", "sum")}
+    for option, (valid, bad) in options.items():
+        with pytest.raises(ValueError, match=f"^{option}: expected one of {valid}, got '{bad}'$"):
+            wrong: dict = {option: bad}
+            embodiment_distance(*pair, hard_correspondence, PAPER_WEIGHTS, **wrong)
+    for call in (
+        lambda: link_distances(*pair, adaptive_weights, rotation="Angle"),  # pyright: ignore[reportArgumentType]
+        lambda: rotation_distance(jnp.ones(3), jnp.ones(3), "Angle"),  # pyright: ignore[reportArgumentType]
+    ):
+        with pytest.raises(ValueError, match="^rotation: expected one of cosine, angle, got 'Angle'$"):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("part", "field"), [("rotation", "direction"), ("angular_velocity", "angular_velocity")], ids=lambda x: x
+)
+def test_candidate_points_refuse_weights_on_what_they_lack(part, field):
+    weights = dataclasses.replace(DistanceWeights(translation=1.0, rotation=0.0), **{part: 0.5})
+    message = f"^weights: candidate points have no {field}, so {part} must weigh 0, got 0.5$"
+    a, b = states(EXPERT), states(LEARNER)
+    for pair in ((candidate_points(a), b), (a, candidate_points(b))):
+        with pytest.raises(ValueError, match=message):
+            link_distances(*pair, weights)
+    for_one_pair = dataclasses.replace(weights, **{part: np.eye(3, 2)})
+    with pytest.raises(ValueError, match=message.split(", got")[0]):
+        link_distances(candidate_points(a), b, for_one_pair)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_weights_of_another_shape_are_refused():
+    expected = (
+        r"^weights: expected rotation to broadcast to \(3, 2\) \(expert links, learner links\), got shape \(3, 3\)$"
+    )
+    with pytest.raises(ValueError, match=expected):
+        link_distances(states(EXPERT), states(LEARNER), DistanceWeights(rotation=np.ones((3, 3))))

@@ -1,0 +1,272 @@
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+
+import mimic
+from mimic.arms.embodiment import load_mjcf, panda, panda_path, planar_arm
+from mimic.arms.model_files import read_model
+from mimic.metric.kinematics import (
+    LONG,
+    body_twists,
+    candidate_points,
+    forward_kinematics,
+    link_state_table,
+    link_states,
+)
+from tests.helpers import random_arms
+
+# Against MuJoCo, in m, m/s and rad/s. Arms are up to 3 m long and move at up to 10 rad/s and 10 m/s.
+TOLERANCE = {
+    "float64": 1e-9,  # both sides round at 1e-15; the constants of the arms are exact to 1e-12
+    "float32": 1e-5,  # rounding of 6e-8 a step, times 10 m/s, over the 10 to 20 steps from base to tip
+}
+POSES = 3
+
+PANDA_LOCKED = {
+    "free": (),
+    "4dof": (3, 6, 7),
+    "3dof": ("joint2", "joint3", "joint6", "joint7"),
+    "base": (1, 2),
+    "angles": {3: 0.4, "joint6": -0.7, 7: 1.1},
+    "tip only": {"joint1": -0.3, 2: 0.5, 3: 2.0, 4: -1.5, 5: 0.1, 6: 1.0},
+}
+
+
+def motions(num_joints, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-np.pi, np.pi, (POSES, num_joints)), rng.uniform(-1, 1, (POSES, num_joints))
+
+
+def full_motion(model, arm, qpos, qvel, locked=None):
+    """Angles and velocities of all joints of a model, from those of the arm's free ones."""
+    full = np.zeros((2, model.njnt))
+    for joint, angle in (locked or {}).items():
+        full[0, model.joint(joint if isinstance(joint, str) else joint - 1).id] = angle
+    free = [model.joint(name).id for name in arm.joint_names]
+    full[0, free], full[1, free] = qpos, qvel
+    return full
+
+
+def assert_moves_as_in_mujoco(arm, model, dtype, locked=None):
+    qpos, qvel = (x[0].astype(dtype) for x in motions(arm.num_joints))  # MuJoCo gets the rounded numbers too
+    states = link_states(arm, qpos, qvel, normalized=False)
+    frames = forward_kinematics(arm, qpos)
+    twists = np.asarray(body_twists(arm, qpos, qvel))
+    data = random_arms.posed(model, *full_motion(model, arm, qpos, qvel, locked))
+    rest = random_arms.posed(model, full_motion(model, arm, 0, 0, locked)[0])
+    expected = random_arms.links(model, data, arm.link_names)
+    body_rotation, body_rest_rotation = (random_arms.link_rotations(model, d, arm.link_names) for d in (data, rest))
+    close = {"atol": TOLERANCE[dtype.name], "rtol": 0}
+    for field, values in expected.items():
+        np.testing.assert_allclose(getattr(states, field), values, err_msg=field, **close)
+    rotation = np.asarray(frames.rotation)
+    np.testing.assert_allclose(frames.position, expected["position"], **close)
+    np.testing.assert_allclose(rotation[:, :, 0], expected["direction"], **close)
+    turn = body_rotation @ np.swapaxes(body_rest_rotation, 1, 2)
+    np.testing.assert_allclose(rotation, turn @ arm.link_rotation, **close)
+    for part, field in ((slice(0, 3), "angular_velocity"), (slice(3, 6), "linear_velocity")):
+        in_link_frame = np.einsum("nji,nj->ni", rotation, expected[field])
+        np.testing.assert_allclose(twists[:, part], in_link_frame, err_msg=f"body twist, {field}", **close)
+
+
+@pytest.mark.parametrize("seed", random_arms.SEEDS)
+def test_random_arms_move_as_in_mujoco(dtype, seed):
+    model = random_arms.random_arm(seed)
+    arm = load_mjcf(model)
+    assert arm.num_joints == model.njnt
+    assert_moves_as_in_mujoco(arm, model, dtype)
+
+
+@pytest.mark.parametrize("locked", [{}, {"hinge1": 0.3, "hinge7": -0.5}], ids=["free", "locked"])
+@pytest.mark.parametrize("seed", [3, 4])
+def test_long_arms_move_as_in_mujoco(x64, seed, locked):
+    model = random_arms.random_arm(seed, hinges=LONG + 8)
+    arm = load_mjcf(model, locked=locked, links="kept")
+    assert arm.num_joints == LONG + 8 - len(locked) > LONG
+    assert (-1 in arm.link_joint) == bool(locked)
+    assert_moves_as_in_mujoco(arm, model, np.dtype("float64"), locked)
+
+
+def test_long_arms_take_both_precisions_in_one_process():
+    arm = planar_arm([0.1] * (LONG + 1))
+    (qpos, *_), (qvel, *_) = motions(arm.num_joints)
+    for wide in (False, True, False):
+        dtype = np.dtype(np.float64 if wide else np.float32)
+        with jax.enable_x64(wide):
+            found = jax.jit(lambda *motion: link_states(arm, *motion))(qpos.astype(dtype), qvel.astype(dtype))
+            assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {dtype}
+
+
+@pytest.mark.parametrize("links", ["merged", "kept"])
+@pytest.mark.parametrize("locked", PANDA_LOCKED.values(), ids=PANDA_LOCKED)
+def test_panda_moves_as_in_mujoco(dtype, locked, links):
+    model = read_model(panda_path())
+    arm = panda(locked=locked, links=links)
+    assert_moves_as_in_mujoco(arm, model, dtype, dict(locked) if isinstance(locked, dict) else None)
+
+
+@pytest.mark.parametrize("seed", [4, 6, 17])
+@pytest.mark.parametrize("links", ["merged", "kept"])
+def test_locked_random_arm_moves_as_in_mujoco(x64, seed, links):
+    model = random_arms.random_arm(seed)
+    rng = np.random.default_rng(seed)
+    locked = {f"hinge{i + 1}": rng.uniform(-3, 3) for i in rng.permutation(model.njnt)[: model.njnt // 2]}
+    arm = load_mjcf(model, locked=locked, links=links)
+    assert arm.num_joints == model.njnt - len(locked)
+    if links == "kept":
+        assert_moves_as_in_mujoco(arm, model, jnp.dtype("float64"), locked)
+        return
+    qpos, qvel = motions(arm.num_joints)
+    apart = load_mjcf(model, locked=locked, links="kept")
+    merged, separate = (link_states(a, qpos[0], qvel[0], normalized=False) for a in (arm, apart))
+    first = [apart.link_names.index(name.split("+")[0]) for name in arm.link_names]
+    last = [apart.link_names.index(name.split("+")[-1]) for name in arm.link_names]
+    half = 0.5 * apart.link_lengths[:, None] * separate.direction
+    start, end = (separate.position - half)[np.array(first)], (separate.position + half)[np.array(last)]
+    np.testing.assert_allclose(merged.position, (start + end) / 2, atol=1e-12)  # rounding of a 1 m arm
+    np.testing.assert_allclose(merged.direction * arm.link_lengths[:, None], end - start, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "arm",
+    [panda(), panda(locked=(3, 6, 7)), planar_arm([0.3, 0.2, 0.4], frame_at=1.0), load_mjcf(random_arms.random_arm(7))],
+    ids=lambda arm: arm.name,
+)
+def test_body_twists_are_the_derivative_of_the_frames(x64, arm):
+    """V = T^-1 dT/dt, by forward-mode differentiation of the homogeneous matrix."""
+
+    def matrix(qpos):
+        frames = forward_kinematics(arm, qpos)
+        upper = jnp.concatenate([frames.rotation, frames.position[:, :, None]], axis=2)
+        lower = jnp.broadcast_to(jnp.asarray([0.0, 0, 0, 1]), (arm.num_links, 1, 4))
+        return jnp.concatenate([upper, lower], axis=1)
+
+    (qpos, *_), (qvel, *_) = motions(arm.num_joints)
+    T, dT = jax.jvp(matrix, (jnp.asarray(qpos),), (jnp.asarray(qvel),))
+    V = jnp.linalg.inv(T) @ dT
+    expected = jnp.stack([V[:, 2, 1], V[:, 0, 2], V[:, 1, 0], V[:, 0, 3], V[:, 1, 3], V[:, 2, 3]], axis=1)
+    np.testing.assert_allclose(body_twists(arm, qpos, qvel), expected, atol=1e-12)  # rounding, 1e-15 a step
+
+
+@pytest.mark.parametrize("frame_at", [0.5, 1.0, 0.0])
+@pytest.mark.parametrize("lengths", [[0.7], [1.0, 0.5], [0.2, 0.1, 0.4, 0.3], np.linspace(0.1, 0.3, LONG + 2)], ids=len)
+def test_planar_arm_has_the_closed_form(x64, lengths, frame_at):
+    arm = planar_arm(lengths, frame_at=frame_at)
+    (qpos, *_), (qvel, *_) = motions(arm.num_joints)
+    states, twists = link_states(arm, qpos, qvel), body_twists(arm, qpos, qvel)
+    joint, velocity, angle, rate = np.zeros(2), np.zeros(2), 0.0, 0.0
+    rounding = 1e-14 * max(1, arm.num_joints / 4) ** 2  # 10 roundings of speeds, which add up along the arm
+    for i, length in enumerate(lengths):
+        angle, rate = angle + qpos[i], rate + qvel[i]
+        along, across = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+        reach = frame_at * length
+        expected = {
+            "position": [*(joint + reach * along) / sum(lengths), 0],
+            "direction": [*along, 0],
+            "linear_velocity": [*(velocity + reach * rate * across) / sum(lengths), 0],
+            "angular_velocity": [0, 0, rate],
+        }
+        for field, values in expected.items():
+            np.testing.assert_allclose(getattr(states, field)[i], values, atol=rounding, err_msg=field)
+        in_link_frame = [velocity @ along, velocity @ across + reach * rate, 0]
+        np.testing.assert_allclose(twists[i], [0, 0, rate, *in_link_frame], atol=rounding)
+        joint, velocity = joint + length * along, velocity + length * rate * across
+
+
+def test_states_at_rest_and_unnormalized():
+    arm = panda()
+    qpos = motions(7)[0][0].astype(np.float32)
+    rest, still = link_states(arm, qpos), link_states(arm, qpos, np.zeros(7, np.float32))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-7), rest, still)  # one rounding
+    assert not any(np.any(velocity) for velocity in (rest.linear_velocity, rest.angular_velocity))
+    metres = link_states(arm, qpos, normalized=False)
+    np.testing.assert_allclose(rest.position * arm.chain_length, metres.position, atol=1e-6)  # float32, 1 m
+    points = candidate_points(rest)
+    assert points.direction is None and points.angular_velocity is None
+    np.testing.assert_array_equal(points.position, rest.position)
+
+
+def test_a_batch_is_a_vmap_is_a_loop():
+    arm = panda(locked=(3, 6, 7))
+    qpos, qvel = (x.astype(np.float32) for x in motions(4))
+    batch = jax.vmap(link_states, in_axes=(None, 0, 0))(arm, qpos, qvel)
+    for k in range(POSES):
+        one = link_states(arm, qpos[k], qvel[k])
+        jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k], b), batch, one)
+
+
+@pytest.mark.parametrize("function", [forward_kinematics, link_states, body_twists])
+@pytest.mark.parametrize("joints", [3, LONG + 2])
+def test_jit_takes_the_arm_as_an_argument(function, joints):
+    arm = load_mjcf(random_arms.random_arm(11, joints))
+    (qpos, *_), (qvel, *_) = (x.astype(np.float32) for x in motions(joints))
+    inputs = (qpos,) if function is forward_kinematics else (qpos, qvel)
+    traced = []
+
+    @jax.jit
+    def jitted(arm, *inputs):
+        traced.append(arm)
+        return function(arm, *inputs)
+
+    known, given = function(arm, *inputs), jitted(arm, *inputs)
+    # other constants, folded or not, and fused or not: a few float32 roundings of numbers up to 3
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), known, given)
+    longer = dataclasses.replace(arm, link_lengths=2 * arm.link_lengths)
+    other = jitted(longer, *inputs)
+    assert len(traced) == 1  # arms that differ in numbers share what was compiled
+    if function is link_states:
+        np.testing.assert_allclose(2 * other.position, known.position, atol=2e-6)  # as above
+
+
+@pytest.mark.parametrize("arm", [planar_arm([0.4, 0.6]), panda(locked=(2, 3, 4, 5, 6, 7))], ids=lambda arm: arm.name)
+def test_float32_stays_float32_under_x64(x64, arm):
+    q32 = jnp.ones(arm.num_joints, jnp.float32)
+    results = forward_kinematics(arm, q32), link_states(arm, q32, q32), body_twists(arm, q32, q32)
+    assert {x.dtype for x in jax.tree.leaves(results)} == {jnp.dtype("float32")}
+    assert link_states(arm, q32.astype(jnp.float64)).position.dtype == jnp.float64
+
+
+def test_whole_numbers_are_angles_too(unchecked):
+    arm = planar_arm([0.4, 0.6])
+    assert link_states(arm, np.array([0, 1])).position.dtype == jnp.float32  # pyright: ignore[reportArgumentType]
+
+
+def test_annotated_shapes_are_checked_while_testing():
+    with pytest.raises(jaxtyping.TypeCheckError, match="qpos"):
+        link_states(planar_arm([0.4, 0.6]), np.zeros((5, 2), np.float32))
+
+
+@pytest.mark.parametrize("shape", [(), (6,), (8,), (7, 1), (5, 7)])
+def test_wrong_shapes_are_refused(unchecked, shape):
+    arm, good, bad = panda(), np.zeros(7, np.float32), np.zeros(shape, np.float32)
+    for what, call in {
+        "qpos": [
+            lambda: forward_kinematics(arm, bad),
+            lambda: link_states(arm, bad),
+            lambda: body_twists(arm, bad, good),
+        ],
+        "qvel": [lambda: link_states(arm, good, bad), lambda: body_twists(arm, good, bad)],
+    }.items():
+        for function in call:
+            with pytest.raises(ValueError, match=rf"^{what}: expected shape \(7,\).* panda, got .*$") as error:
+                function()
+            assert "\n" not in str(error.value)
+            assert ("jax.vmap" in str(error.value)) == (len(shape) > 1)
+
+
+def test_the_table_of_link_states_is_what_they_are():
+    arm = mimic.panda(locked=[3])
+    qpos, qvel = np.random.default_rng(0).normal(size=(2, 3, 4, arm.num_joints))
+    table = link_state_table(arm, qpos, qvel)
+    one_by_one = jax.vmap(jax.vmap(lambda *motion: mimic.link_states(arm, *motion)))(
+        jnp.asarray(qpos), jnp.asarray(qvel)
+    )
+    for name, values in vars(one_by_one).items():
+        found = getattr(table, name)
+        assert isinstance(found, np.ndarray) and found.dtype == np.float32
+        np.testing.assert_allclose(found, values, atol=1e-5)  # float32 against float64 that is rounded

@@ -1,0 +1,209 @@
+"""Pose imitation finds global minima, respects limits, and makes motions that do not jump."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from mimic.arms.embodiment import panda, planar_arm
+from mimic.metric.config import MetricConfig
+from mimic.metric.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
+from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance
+from mimic.metric.kinematics import link_states
+from mimic.retargeting.closed_form import SMOOTHING
+from mimic.retargeting.pose import imitate_pose, imitate_trajectory
+from tests.helpers.metric_cases import planar_optimum
+
+DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.0)
+DEFAULT = MetricConfig()
+METRICS = {
+    "directions": (overlap_correspondence, DIRECTIONS),
+    "default": (DEFAULT.make_correspondence, DEFAULT.make_weights()),
+}
+PAIRS = {
+    "planar 7->4": (planar_arm([1 / 7] * 7), planar_arm([1 / 4] * 4)),
+    "planar 4->7": (planar_arm([1 / 4] * 4), planar_arm([1 / 7] * 7)),
+    "panda 7->7": (panda(), panda()),
+    "panda 7->4": (panda(), panda(locked=(3, 6, 7))),
+    "panda 7->3": (panda(), panda(locked=(2, 3, 6, 7))),
+}
+
+
+def poses(arm, count, seed=0):
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, arm.num_joints)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ["planar 7->4", "planar 4->7"])
+def test_planar_arms_reach_the_closed_form(name):
+    expert, learner = PAIRS[name]
+    qpos = poses(expert, 64)
+    found = imitate_pose(expert, learner, qpos, overlap_correspondence(expert, learner), DIRECTIONS)
+    np.testing.assert_allclose(found.distance, planar_optimum(expert, learner, qpos), atol=2e-6)  # float32
+    assert np.all(found.converged) and np.all(np.abs(found.qpos) <= np.pi + 1e-6)
+
+
+@pytest.mark.parametrize(("metric", "tolerance"), [("directions", 1e-9), ("default", 1e-6)])
+def test_an_equal_arm_finds_the_pose_itself(metric, tolerance):
+    """Directions count by the square of their error, positions by the error itself: float32 rounds it to 1e-7."""
+    arm, (correspond, weights) = panda(), METRICS[metric]
+    found = imitate_pose(arm, arm, poses(arm, 32), correspond(arm, arm), weights)
+    assert np.all(found.distance < tolerance) and np.all(found.converged)
+
+
+@pytest.mark.parametrize("weights", [(0.5, 1.0), pytest.param((2.0, 1.0), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["panda 7->4", pytest.param("panda 7->3", marks=pytest.mark.slow), "planar 7->4"])
+def test_no_descent_of_the_distance_itself_gets_lower(name, weights, dtype):
+    """By SciPy's simplex, which knows no derivative, from where the smoothed distance has its minimum.
+
+    The distance there is above its own minimum by a_tr SMOOTHING at most, where a link matches exactly.
+    """
+    expert, learner = PAIRS[name]
+    matrix, alpha = arc_length_correspondence(expert, learner), DistanceWeights(*weights)
+    qpos = poses(expert, 64).astype(dtype)
+    found = imitate_pose(expert, learner, qpos, matrix, alpha)
+    assert found.distance.dtype == dtype
+    assert np.mean(found.converged) > 0.9  # 0.94 to 1 of 256 poses
+    distance = jax.jit(
+        lambda pose, q: embodiment_distance(link_states(expert, pose), link_states(learner, q), matrix, alpha)
+    )
+    for pose, start, left, _ in zip(qpos, found.qpos, found.distance, range(6), strict=False):
+        nearby = minimize(lambda q, pose=pose: float(distance(pose, q.astype(dtype))), start, method="Nelder-Mead")
+        assert left <= nearby.fun + weights[0] * SMOOTHING + 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("weights", [(0.5, 1.0), (2.0, 1.0)])
+@pytest.mark.parametrize("name", ["panda 7->4", "panda 7->3", "planar 7->4"])
+def test_the_closed_form_ends_no_higher_than_automatic_derivatives(name, weights):
+    """On the mean of 256 poses: single ones may end in another minimum, or a smoothing higher.
+
+    Weights that are a function of the distances, be it a constant one, have no closed form.
+    """
+    expert, learner = PAIRS[name]
+    qpos, matrix = poses(expert, 256), arc_length_correspondence(expert, learner)
+    closed = imitate_pose(expert, learner, qpos, matrix, DistanceWeights(*weights))
+    automatic = imitate_pose(expert, learner, qpos, matrix, lambda distances: DistanceWeights(*weights))
+    assert np.mean(closed.distance) <= np.mean(automatic.distance) + 1e-5  # float32, and a smoothing here and there
+    assert np.mean(closed.converged) >= np.mean(automatic.converged)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PAIRS)
+def test_the_minimum_is_global(name):
+    """Against 512 random starts with a long descent: within 1e-3, on at least 99.5 % of the poses."""
+    expert, learner = PAIRS[name]
+    qpos, correspondence = poses(expert, 400, seed=1), overlap_correspondence(expert, learner)
+    found = imitate_pose(expert, learner, qpos, correspondence, DIRECTIONS)
+    options = {"starts": 512, "iterations": 60, "key": jax.random.key(1)}
+    best = jax.lax.map(lambda pose: imitate_pose(expert, learner, pose, correspondence, DIRECTIONS, **options), qpos)
+    assert np.mean(found.distance <= best.distance * 1.001 + 1e-6) >= 0.995
+
+
+def test_joint_limits_are_kept():
+    expert, learner = panda(), panda(locked=(3, 6, 7), limits="hardware")
+    correspondence = overlap_correspondence(expert, learner)
+    found = imitate_pose(expert, learner, poses(expert, 32), correspondence, DIRECTIONS)
+    lower, upper = learner.joint_range.T
+    assert np.all((found.qpos >= lower - 1e-6) & (found.qpos <= upper + 1e-6))
+    held = np.isclose(found.qpos, lower, atol=1e-6) | np.isclose(found.qpos, upper, atol=1e-6)
+    assert held.any() and np.mean(found.converged) > 0.95
+
+
+def test_distances_are_those_of_the_poses_and_no_nearby_pose_is_nearer():
+    expert, learner = PAIRS["panda 7->4"]
+    qpos = poses(expert, 8)
+    for weights, correspondence, tolerance in (
+        # 1e-4: the nearest link, and with it the slope, changes within the 1e-2 rad (found here: 5e-5 lower).
+        (adaptive_weights, hard_correspondence, 1e-4),
+        (DistanceWeights(1.0, 1.0), hard_correspondence, 1e-6),
+        (DEFAULT.make_weights(), DEFAULT.make_correspondence(expert, learner), 1e-6),
+    ):
+        found = imitate_pose(expert, learner, qpos, correspondence, weights)
+
+        def distance(qpos, learner_qpos, weights=weights, correspondence=correspondence):
+            states = link_states(expert, qpos), link_states(learner, learner_qpos)
+            return embodiment_distance(*states, correspondence, weights)
+
+        batched = jax.vmap(distance)
+        np.testing.assert_allclose(batched(qpos, found.qpos), found.distance, atol=1e-6)
+        for seed in range(10):
+            near = found.qpos + 1e-2 * np.random.default_rng(seed).normal(size=found.qpos.shape)
+            assert np.all(batched(qpos, near) > found.distance - tolerance)
+
+
+def test_newton_beats_plain_descent():
+    expert, learner = PAIRS["panda 7->4"]
+    qpos, correspondence = poses(expert, 32), overlap_correspondence(expert, learner)
+    newton, plain = (
+        imitate_pose(expert, learner, qpos, correspondence, DIRECTIONS, method=method)
+        for method in ("newton", "gradient_descent")
+    )
+    assert np.all(newton.distance <= plain.distance + 1e-5)
+    assert np.mean(plain.distance - newton.distance) < 1e-2  # the paper's way gets near
+
+
+def test_descents_that_are_given_up_are_not_missed():
+    expert, learner = PAIRS["planar 7->4"]
+    arguments = expert, learner, poses(expert, 64), overlap_correspondence(expert, learner), DIRECTIONS
+    few, every = (imitate_pose(*arguments, kept=kept) for kept in (2, None))
+    assert np.all(every.converged) and np.all(few.converged)
+    np.testing.assert_allclose(few.distance, every.distance, atol=1e-5)
+
+
+def test_shapes_and_warm_starts():
+    expert, learner = PAIRS["planar 7->4"]
+    correspondence = overlap_correspondence(expert, learner)
+    qpos = poses(expert, 6)
+    one = imitate_pose(expert, learner, qpos[0], correspondence, DIRECTIONS)
+    many = imitate_pose(expert, learner, qpos.reshape(2, 3, 7), correspondence, DIRECTIONS)
+    assert one.qpos.shape == (4,) and many.qpos.shape == (2, 3, 4) and many.distance.shape == (2, 3)
+    np.testing.assert_allclose(one.distance, many.distance[0, 0], atol=1e-6)
+    warm = imitate_pose(
+        expert, learner, qpos, correspondence, DIRECTIONS, warm_start=many.qpos.reshape(6, 4), iterations=2
+    )
+    np.testing.assert_allclose(warm.distance, many.distance.reshape(6), atol=1e-6)
+    mapped = jax.jit(jax.vmap(lambda pose: imitate_pose(expert, learner, pose, correspondence, DIRECTIONS)))(qpos)
+    np.testing.assert_allclose(mapped.distance, warm.distance, atol=1e-6)
+
+
+@pytest.mark.parametrize("limits", ["none", "hardware"])
+@pytest.mark.parametrize(
+    "metric", [MetricConfig(translation=0.0, correspondence="overlap"), DEFAULT], ids=["directions", "default"]
+)
+def test_trajectories_do_not_jump(metric, limits):
+    expert, learner = panda(limits=limits), panda(locked=(3, 6, 7), limits=limits)
+    times = np.linspace(0, 1, 51)[:, None]
+    lower, upper = expert.joint_range.T
+    goal = np.random.default_rng(3).uniform(lower, upper)
+    qpos = (expert.home + (goal - expert.home) * (3 * times**2 - 2 * times**3)).astype(np.float32)
+    correspondence, weights = metric.make_correspondence(expert, learner), metric.make_weights()
+    motion = imitate_trajectory(expert, learner, qpos, correspondence, weights, largest_jump=0.2)
+    assert np.abs(np.diff(motion.qpos, axis=0)).max() <= 0.2 + 1e-6
+    best = imitate_pose(expert, learner, qpos, correspondence, weights)
+    # A best pose may be above the minimum by the smoothing.
+    assert np.all(motion.distance > best.distance - 1e-5 - metric.translation * SMOOTHING)
+    assert motion.distance.mean() < 1.3 * best.distance.mean()  # six such motions: at most 1.24 times
+    lower, upper = learner.joint_range.T
+    if limits == "hardware":
+        assert np.all((motion.qpos >= lower - 1e-6) & (motion.qpos <= upper + 1e-6))
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("qpos", "options", "message"),
+    [
+        (np.zeros(6), {}, r"qpos: expected shape \[..., 7\] for planar7, got \(6,\)"),
+        (np.full(7, np.nan), {}, "qpos: expected finite angles"),
+        (np.zeros(7), {"method": "magic"}, "method: expected one of newton, gradient_descent, got 'magic'"),
+        (np.zeros(7), {"starts": -1}, "starts, iterations"),
+        (np.zeros(7), {"kept": 0}, "kept: expected at least 1, or None for all, got 0"),
+        (np.zeros(7), {"warm_start": np.zeros(7)}, r"warm_start: expected shape \[..., 4\]"),
+    ],
+)
+def test_bad_input_is_refused(qpos, options, message):
+    expert, learner = PAIRS["planar 7->4"]
+    with pytest.raises(ValueError, match=message):
+        imitate_pose(expert, learner, qpos, jnp.ones((7, 4)), DIRECTIONS, **options)
+    with pytest.raises(ValueError, match="largest_jump"):
+        imitate_trajectory(expert, learner, np.zeros((3, 7)), jnp.ones((7, 4)), DIRECTIONS, largest_jump=0.0)

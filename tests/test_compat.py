@@ -1,0 +1,75 @@
+"""What mimic makes good in the packages that it uses."""
+
+import copy
+import logging
+import os
+import subprocess
+import sys
+
+import pytest
+from hydra.core.config_store import ConfigStore
+
+from mimic import compat
+
+
+def test_what_is_imported_later_runs_once_and_may_be_missing(tmp_path, monkeypatch):
+    (tmp_path / "waiting").mkdir()
+    (tmp_path / "waiting" / "__init__.py").write_text("raise SystemExit('the parent was imported')")
+    (tmp_path / "waiting" / "part.py").write_text("import sys\nsys.modules['runs'].append(__name__)\nvalue = 3")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "runs", [])
+    for name in ("waiting.part", "waiting.missing", "missing"):
+        compat._import_later(name)
+    part = sys.modules.pop("waiting.part")
+    assert sys.modules["runs"] == []
+    assert part.value == part.value == 3
+    assert sys.modules["runs"] == ["waiting.part"] and not {"waiting.missing", "missing"}.intersection(sys.modules)
+
+
+def test_tensorboard_does_not_bring_torch(tmp_path):
+    (tmp_path / "torch.py").write_text("raise SystemExit('torch was imported')")
+    code = "import sys\nfrom mimic import compat\ncompat.import_tensorboard().SummaryWriter"
+    code += "\nassert 'torch' not in sys.modules"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+
+
+def test_hydra_shares_what_is_registered_and_copies_what_it_loads(monkeypatch):
+    monkeypatch.setattr(ConfigStore, "__deepcopy__", None, raising=False)  # to be put back
+    compat.share_config_store()
+    store = ConfigStore.instance()
+    assert copy.deepcopy(store) is store
+    monkeypatch.setattr(store, "repo", {})
+    store.store(name="tried", node={"list": [1]})
+    store.load("tried.yaml").node["list"].append(2)
+    assert store.load("tried.yaml").node == {"list": [1]}
+
+
+@pytest.mark.parametrize(("version", "needed"), [("0.10.2", True), ("0.11.0", False), ("0.12.0.1", False)])
+def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
+    assert compat.needs_cpu_flag(version) is needed
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not compat.needs_cpu_flag(), reason="this jax does not need the flag and aborts on it")
+def test_the_cpu_flag_speeds_up_kinematics(capsys):
+    """Times MJX's kinematics of 64 Pandas with and without it, each in a process of its own."""
+    code = (
+        "import time, jax, jax.numpy as jnp, mujoco\nfrom mujoco import mjx\n"
+        "from mimic.arms.embodiment import panda_path\n"
+        "model = mujoco.MjModel.from_xml_path(panda_path())\nmx = mjx.put_model(model)\ndata = mjx.make_data(model)\n"
+        "f = jax.jit(jax.vmap(lambda q: mjx.kinematics(mx, data.replace(qpos=q)).xpos))\nq = jnp.zeros((64, 7))\n"
+        "f(q).block_until_ready()\nstart = time.perf_counter()\n"
+        "for _ in range(3): f(q).block_until_ready()\nprint((time.perf_counter() - start) / 3)\n"
+    )
+    seconds = []
+    for flag in ("false", "true"):
+        environment = {**os.environ, "XLA_FLAGS": f"--xla_cpu_use_fusion_emitters={flag}", "JAX_PLATFORMS": "cpu"}
+        out = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
+        ).stdout
+        seconds.append(float(out.splitlines()[-1]))
+    logging.getLogger(__name__).info("speed-up by the flag: %.0f", seconds[1] / seconds[0])
+    with capsys.disabled():
+        print(f"\nspeed-up of MJX kinematics by the CPU flag: {seconds[1] / seconds[0]:.0f} times")
+    assert seconds[1] > 5 * seconds[0]  # several hundred times where it was measured first; 5 tells it from noise

@@ -1,0 +1,62 @@
+"""Compilation in the background, and the options of the compiler."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from mimic import compilation
+from mimic.compilation import Background, compiler_options
+
+
+def test_what_is_prepared_is_made_once():
+    made = []
+    lazy, started = Background(lambda: made.append("lazy")), Background(lambda: made.append("started"))
+    started.start()
+    started.start()
+    for program in (started, started, lazy, lazy):
+        program()
+    assert made == ["started", "lazy"]
+    failing = Background(lambda: 1 / 0)
+    failing.start()
+    with pytest.raises(ZeroDivisionError):
+        failing()
+
+
+@pytest.mark.parametrize(("a_process_for_each", "count"), [(False, 2), (True, 3)])
+def test_options_for_gpus_are_known_to_jaxlib(monkeypatch, a_process_for_each, count):
+    """Which takes them on CPUs too, and refuses a wrong name or value."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(compilation, "a_process_for_each_gpu", lambda: a_process_for_each)
+    options = compiler_options()
+    assert len(options) == count
+    assert jax.jit(lambda x: x + 1, compiler_options=options)(1.0) == 2.0
+
+
+def test_what_is_compiled_beside_a_training_is_compiled_with_them(monkeypatch):
+    monkeypatch.setattr(compilation, "compiler_options", lambda: {"no_option_of_xla": True})
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
+        compilation.compiling(lambda x: x + 1, jnp.zeros(3))()
+
+
+def test_xla_flags_of_the_user_stay(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    boolean, scheduling = compiler_options()
+    monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to=/tmp --{scheduling}=LHS")
+    assert list(compiler_options()) == [boolean]
+    monkeypatch.setenv("XLA_FLAGS", f"--{boolean}")
+    assert list(compiler_options()) == [scheduling]
+
+
+@pytest.mark.parametrize(
+    ("backend", "processes", "devices", "expected"),
+    [("gpu", 4, 4, True), ("gpu", 1, 4, False), ("gpu", 1, 1, False), ("gpu", 2, 8, False), ("cpu", 2, 2, False)],
+)
+def test_messages_go_beside_computation_where_each_gpu_has_a_process(
+    monkeypatch, backend, processes, devices, expected
+):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(jax, "process_count", lambda: processes)
+    monkeypatch.setattr(jax, "device_count", lambda: devices)
+    assert compilation.a_process_for_each_gpu() == expected
+    given = compilation.compiler_options().get("xla_gpu_enable_command_buffer", "")
+    assert ("COLLECTIVES" in given) == expected

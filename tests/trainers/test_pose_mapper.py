@@ -1,0 +1,246 @@
+"""The pose mapper: what it learns, keeps, repeats and refuses."""
+
+import json
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.commands import retarget
+from mimic.commands import train as session
+from mimic.commands.config import EvaluateConfig, RetargetConfig
+from mimic.commands.evaluate import prepare_evaluation
+from mimic.envs import env_config
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from mimic.trainers.pose_mapper import training
+from mimic.trainers.pose_mapper.model import make_model
+from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
+
+SMALL = {"samples": 8192, "batch_size": 256, "epochs": 40, "evaluations": 2, "hidden_layers": [64, 64]}
+SHORT: dict[str, Any] = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1}
+FEW = {"validation_poses": 64, "held_out_poses": 256}
+REPORT_KEYS = {
+    "env", "trainer", "seed", "quality", "mean_distance", "optimal_distance", "random_distance",
+    "link_angle_error_deg", "link_angle_to_optimum_deg_by_link", "wall_time_s", "training_poses", "steps_per_second",
+    "hardware", "versions",
+}  # fmt: skip
+
+
+def run_config(run_dir, *, env="planar4dof", seed=0, limits="none", **settings):
+    trainer = PoseMapperConfig(**{**SMALL, **FEW, **settings})
+    environment = env_config(env, limits=limits)
+    return TrainConfig(environment, trainer, seed=seed, run_dir=str(run_dir), compilation_cache="")
+
+
+def train(run_dir, **settings):
+    assert session.prepare_training(run_config(run_dir, **settings), 0.0)() == 0
+    return json.loads((run_dir / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("mapper") / "run"
+    return run_dir, train(run_dir)
+
+
+def poses(mapper, count, seed=0):
+    lower, upper = mapper.expert.joint_range.T
+    return np.random.default_rng(seed).uniform(lower, upper, (count, len(lower))).astype(np.float32)
+
+
+def test_it_learns(trained):
+    """A small network, a third of a million poses; the preset gets below 0.1 %."""
+    run_dir, report = trained
+    assert report.keys() >= REPORT_KEYS
+    assert report["quality"]["held_out"] < 0.05
+    learned_by_heart = report["quality"]["held_out"] - report["quality"]["train"]
+    assert abs(learned_by_heart) < 0.02  # fresh poses cannot be
+    assert report["training_poses"] == SMALL["samples"] * SMALL["epochs"]
+    assert {"config.yaml", "report.json", "metrics.csv", "training.png"} <= {path.name for path in run_dir.iterdir()}
+
+
+def test_evaluate_repeats_the_report(trained, tmp_path):
+    run_dir, report = trained
+    out = tmp_path / "again"
+    prepare_evaluation(EvaluateConfig(str(run_dir), out=str(out), compilation_cache=""), 0.0)()
+    again = json.loads((out / "report.json").read_text())
+    for key in ("quality", "mean_distance", "optimal_distance"):
+        assert again[key] == pytest.approx(report[key], rel=1e-5)
+
+
+def test_a_loaded_mapper_takes_one_pose_or_many(trained):
+    run_dir, report = trained
+    mapper = mimic.PoseMapper.load(run_dir)
+    qpos = poses(mapper, 12)
+    batch = mapper(qpos)
+    assert batch.shape == (12, mapper.learner.num_joints) and np.all(np.abs(batch) <= np.pi + 1e-6)
+    np.testing.assert_allclose(batch[3], mapper(qpos[3]), atol=1e-5)
+    np.testing.assert_allclose(batch, jax.jit(mapper)(qpos), atol=1e-5)
+    np.testing.assert_allclose(batch, jax.vmap(mapper)(qpos), atol=1e-5)
+    np.testing.assert_allclose(mapper(qpos.reshape(3, 4, 7)), batch.reshape(3, 4, 4), atol=1e-5)
+    np.testing.assert_allclose(mapper(qpos + 2 * np.pi), batch, atol=1e-3)  # a full turn is the same pose
+    distance = jax.vmap(mapper.model.distance)(jnp.asarray(qpos), batch)
+    assert np.mean(distance) < report["random_distance"]["held_out"]
+
+
+def test_the_nearest_head_is_taken(trained):
+    mapper = mimic.PoseMapper.load(trained[0])
+    qpos = jnp.asarray(poses(mapper, 5)[2])
+    candidates = mapper.model.candidates(mapper.params, qpos)
+    distances = [float(mapper.model.distance(qpos, candidate)) for candidate in candidates]
+    np.testing.assert_allclose(mapper(qpos), candidates[int(np.argmin(distances))], atol=1e-6)
+
+
+def test_retargeted_motions_do_not_jump(trained, tmp_path):
+    mapper = mimic.PoseMapper.load(trained[0])
+    env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
+    out = tmp_path / "learner.npz"
+    env.demonstrations.save(tmp_path / "expert.npz")
+    config = RetargetConfig(str(tmp_path / "expert.npz"), "planar4dof", str(trained[0]), out=str(out))
+    retarget.prepare_retargeting(config)()
+    motions = mimic.load_demonstrations(out)
+    motions.check_fits(env.learner, 0.1, 50)
+    assert np.all(np.abs(np.diff(motions.qpos, axis=1)) <= env.learner.velocity_limit * 0.1 + 1e-5)
+    metric, arms = env.config.metric, (env.expert, env.learner)
+    mapped, optimised = (retarget.retarget(env.demonstrations, *arms, metric, mapper=way)[1] for way in (mapper, None))
+    assert optimised["distance"] < mapped["distance"] < optimised["distance"] + 0.05
+
+
+def test_resume_goes_on(tmp_path):
+    run_dir = tmp_path / "run"
+    short = train(run_dir, epochs=4)
+    config = TrainConfig(resume=str(run_dir), compilation_cache="")
+    with pytest.raises(ValueError, match="give a larger trainer.epochs"):
+        session.prepare_training(config, 0.0)
+    assert session.prepare_training(config, 0.0, [f"resume={run_dir}", "trainer.epochs=8"])() == 0
+    report = json.loads((run_dir / "report.json").read_text())
+    assert report["training_poses"] == 2 * short["training_poses"]
+    assert report["quality"]["held_out"] < short["quality"]["held_out"]
+
+
+@pytest.mark.slow
+def test_the_paper_overfits_and_early_stopping_goes_back_to_the_best(tmp_path):
+    run_dir = tmp_path / "run"
+    settings = {"samples": 64, "batch_size": 32, "epochs": 400, "evaluations": 40, "patience": 3}
+    report = train(run_dir, env="planar4dof", preset="paper", hidden_layers=[32, 32, 32], **settings)
+    assert report["quality"]["train"] < report["quality"]["held_out"] - 0.05
+    lines = (run_dir / "metrics.csv").read_text().splitlines()
+    column = lines[0].split(",").index("training/validation_distance")
+    rows = [line.split(",") for line in lines[1:]]
+    best = min(rows, key=lambda row: float(row[column]))
+    assert len(rows) < 40 and rows.index(best) == len(rows) - 4  # stopped by patience
+    steps = [int(path.name) for path in (run_dir / "checkpoints").iterdir()]
+    assert max(steps) == int(best[0]) == report["training_poses"]
+
+
+def test_what_is_judged_is_not_what_is_learned(tmp_path):
+    jobs = [PoseMapperTrainer(run_config(tmp_path, seed=seed)) for seed in (0, 1)]
+    for job in jobs:
+        seen = np.asarray(job._poses["train"])
+        for split in ("validation", "held_out"):
+            unseen = np.asarray(job._poses[split])
+            assert not (unseen[:, None] == seen[None, :512]).all(axis=-1).any()
+    np.testing.assert_array_equal(jobs[0]._poses["held_out"], jobs[1]._poses["held_out"])
+    assert not np.array_equal(jobs[0]._poses["train"], jobs[1]._poses["train"])
+
+
+def test_limited_joints_stay_within_their_limits():
+    model = make_model(env_config("panda4dof", limits="hardware"), PoseMapperConfig(**SMALL).resolve())
+    large = jax.tree.map(lambda x: 10 * x, model.init(jax.random.key(0)))  # most outputs near their ends
+    mapper = mimic.PoseMapper(model, large)
+    lower, upper = mapper.learner.joint_range.T
+    found = mapper(poses(mapper, 64))
+    assert np.any(found < lower + 1e-3) and np.any(found > upper - 1e-3)
+    assert np.all((found >= lower - 1e-5) & (found <= upper + 1e-5))
+    with pytest.raises(ValueError, match="joint1 at 3.0000 rad is outside of its range"):
+        mapper(np.array([3.0, 0, 0, -1, 0, 1, 0]))
+
+
+def test_weights_decay_and_biases_do_not():
+    settings = {**SMALL, "learning_rate": 1e-2, "final_learning_rate": 1.0, "weight_decay": 0.5}
+    model = make_model(env_config("planar4dof"), PoseMapperConfig(**settings).resolve())
+    params = jax.tree.map(jnp.ones_like, model.init(jax.random.key(0)))
+    optimiser = training._optimiser(model, 0)
+    change, _ = optimiser.update(jax.tree.map(jnp.zeros_like, params), optimiser.init(params), params)
+    for path, value in jax.tree_util.tree_leaves_with_path(change):
+        expected = -1e-2 * 0.5 if "kernel" in jax.tree_util.keystr(path) else 0.0
+        np.testing.assert_allclose(value, expected, rtol=1e-6)  # float32
+
+
+def test_units_are_dropped_in_training_alone():
+    models = [
+        make_model(env_config("planar4dof"), PoseMapperConfig(**SMALL, dropout=dropout).resolve())
+        for dropout in (0.0, 0.5)
+    ]
+    whole, dropping = models
+    params, qpos = whole.init(jax.random.key(0)), jnp.full(7, 0.3)
+    np.testing.assert_array_equal(dropping(params, qpos), whole(params, qpos))  # evaluation, and the same parameters
+    key, other = jax.random.split(jax.random.key(1))
+    trained = [np.asarray(dropping.candidates(params, qpos, dropout_key=k)) for k in (key, key, other)]
+    np.testing.assert_array_equal(trained[0], trained[1])
+    assert not np.allclose(trained[0], trained[2]) and not np.allclose(trained[0], dropping.candidates(params, qpos))
+    np.testing.assert_array_equal(
+        whole.candidates(params, qpos, dropout_key=key), whole.candidates(params, qpos)
+    )  # none at 0
+
+
+def test_a_regularised_run_differs_in_training_and_repeats_its_report(tmp_path):
+    plain, regularised = (
+        train(tmp_path / name, **SHORT, **settings)
+        for name, settings in (("plain", {}), ("regularised", {"dropout": 0.3, "weight_decay": 0.1}))
+    )
+    assert plain["quality"] != regularised["quality"]
+    job = PoseMapperTrainer(run_config(tmp_path, dropout=0.3, **SHORT))
+    mapper = mimic.PoseMapper.load(tmp_path / "regularised")
+    assert job.metrics(job.evaluate(mapper.params))["quality"] == pytest.approx(regularised["quality"], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"dropout": 1.0}, r"trainer.dropout: expected a fraction in \[0, 1\), got 1.0"),
+        ({"dropout": float("nan")}, "trainer.dropout"),
+        ({"weight_decay": -0.1}, "trainer.weight_decay: expected a finite number of at least 0, got -0.1"),
+        ({"weight_decay": float("inf")}, "trainer.weight_decay"),
+    ],
+)
+def test_bad_regularisation_is_rejected(settings, message):
+    with pytest.raises(ValueError, match=message):
+        PoseMapperConfig(**settings).resolve()
+
+
+@pytest.mark.parametrize(
+    ("qpos", "message"),
+    [
+        (np.zeros(6), r"expected shape \[\.\.\., 7\] for planar7, got \(6,\)"),
+        (np.full(7, np.nan), "expected finite angles"),
+        (np.zeros(()), "expected shape"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_bad_poses_are_refused(trained, qpos, message):
+    with pytest.raises(ValueError, match=message):
+        mimic.PoseMapper.load(trained[0])(qpos)
+
+
+def test_a_mapper_of_other_arms_or_of_no_run_is_refused(trained, tmp_path):
+    mapper = mimic.PoseMapper.load(trained[0])
+    mapper.check_fits(mapper.expert, mapper.learner)
+    with pytest.raises(ValueError, match="its learner is planar4"):
+        mapper.check_fits(mapper.expert, mimic.panda())
+    with pytest.raises(ValueError, match="not a run directory"):
+        mimic.PoseMapper.load(tmp_path)
+    (tmp_path / "config.yaml").write_text("trainer: {name: ppo}\n")
+    with pytest.raises(ValueError, match="expected a run of trainer=pose_mapper, got one of ppo"):
+        mimic.PoseMapper.load(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env", ["planar4dof", "planar7dof", "panda7dof", "panda4dof", "panda3dof"])
+def test_the_large_preset_is_within_2_percent_of_the_optimum(env, tmp_path):
+    config = TrainConfig(env_config(env), PoseMapperConfig(), run_dir=str(tmp_path / "run"), compilation_cache="")
+    assert session.prepare_training(config, 0.0)() == 0
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["quality"]["held_out"] <= 0.02

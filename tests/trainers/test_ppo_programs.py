@@ -1,0 +1,217 @@
+"""The programs of the training: what they collect, and what they learn from."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from brax.training.agents.ppo import losses
+from brax.training.types import Transition
+
+import mimic
+from mimic.compilation import compiler_options
+from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo import losses as ppo_loss
+from mimic.trainers.ppo import programs, training, updates
+
+UNROLLS, ARMS, PASSES = 2, 4, 3
+_SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
+
+
+@pytest.fixture(scope="module")
+def one_batch():
+    """Before and after a batch, with a loss that changes nothing and tells what it was shown, as seen along `along`."""
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
+    config = PPOConfig(
+        num_envs=ARMS, unroll_length=1, batch_size=UNROLLS * ARMS // 2, num_minibatches=2, num_updates_per_batch=PASSES,
+        hidden_layers=[8],
+    ).resolve("cpu")  # fmt: skip
+    networks = training.make_networks(config, env.observation_size, env.action_size)
+    along = np.random.default_rng(0).normal(size=env.observation_size).astype(np.float32)
+
+    def of_value(params, statistics, unrolls, *_):
+        assert unrolls.observation.shape == (config.batch_size, 1 + 1, env.observation_size)
+        now, after = (unrolls.observation @ along).mean(axis=0)
+        return now + 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), after
+
+    def of_policy(params, statistics, unrolls, after, *_):
+        return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), jnp.full(len(ppo_loss.METRICS), after)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(updates, "value_loss", of_value)
+        patch.setattr(updates, "policy_loss", of_policy)
+        begin, learn = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+        start = begin()(7)
+        before = jax.device_get(start)
+        after, metrics = jax.device_get(learn()(start))
+    shown = {"now": metrics["value_loss"], "next": metrics["policy_loss"]}
+    return before, after, shown, along
+
+
+def test_each_pass_shows_the_loss_each_transition(one_batch):
+    _, after, shown, along = one_batch
+    assert int(after.statistics.count.lo) == UNROLLS * ARMS
+    assert shown["now"] == pytest.approx(along @ after.statistics.mean, abs=1e-5)
+
+
+def test_what_is_seen_next_belongs_to_its_transition(one_batch):
+    """Of unrolls of one step, what follows the first is what the second begins with."""
+    before, after, shown, along = one_batch
+    seen = UNROLLS * ARMS * after.statistics.mean - before.episodes.obs.sum(0) + after.episodes.obs.sum(0)
+    assert shown["next"] == pytest.approx(along @ seen / (UNROLLS * ARMS), abs=1e-5)
+
+
+def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
+    before, after, *_ = one_batch
+    assert jax.tree.all(jax.tree.map(np.array_equal, before.params[1:], after.params[1:]))
+    np.testing.assert_array_equal(before.expert_states.position, after.expert_states.position)
+    assert not np.array_equal(before.key, after.key)
+    assert not np.array_equal(before.episodes.obs, after.episodes.obs)
+
+
+@pytest.mark.parametrize(("time", "entropy_cost"), [(7, 0.0), (40, 0.0), (1, 0.3)])
+def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
+    """The entropy is that of a sample, whose numbers are drawn in the same order for one step alone."""
+    sizes, unrolls = (5, 3), 6
+    config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), entropy_cost=entropy_cost)
+    networks = training.make_networks(config, *sizes)
+    rng = np.random.default_rng(time)
+
+    def normal(*shape):
+        return jnp.asarray(rng.normal(size=shape))
+
+    statistics, *params = programs.initial_params(networks, sizes[0], jax.random.PRNGKey(1))
+    statistics = statistics.replace(mean=normal(5), std=jnp.exp(normal(5)))
+    params = jax.tree.map(lambda x: x + 0.1 * normal(*x.shape), losses.PPONetworkParams(*params))
+    observation, raw_action = normal(unrolls, time + 1, 5), normal(unrolls, time + 1, 3)
+    log_prob, reward = normal(unrolls, time + 1), normal(unrolls, time + 1)
+    goes_on = jnp.asarray(rng.random((unrolls, time + 1)) < 0.8, float)
+    ours = ppo_loss.Unrolls(observation, raw_action, log_prob - 4, reward, goes_on)
+    np.testing.assert_array_equal(ours.unpacked(ours.packed()).raw_action, raw_action)
+    now = jax.tree.map(lambda x: x[:, :-1], ours.unpacked(ours.packed()))
+    extras = {"raw_action": now.raw_action, "log_prob": now.log_prob}
+    extras["distribution_params"] = normal(unrolls, time, 6)
+    theirs = Transition(
+        now.observation, now.raw_action, now.reward, now.goes_on, observation[:, 1:],
+        {"policy_extras": extras, "state_extras": {"truncation": jnp.zeros((unrolls, time))}},
+    )  # fmt: skip
+    key = jax.random.PRNGKey(2)
+
+    def own(params):
+        value, advantages = ppo_loss.value_loss(params.value, statistics, ours, networks, config)
+        policy, metrics = ppo_loss.policy_loss(params.policy, statistics, ours, advantages, key, networks, config)
+        return value + policy, dict(zip(ppo_loss.METRICS, metrics, strict=True), value_loss=value)
+
+    def of_brax(params):
+        names = "entropy_cost", "discounting", "reward_scaling", "gae_lambda", "clipping_epsilon"
+        settings = {name: getattr(config, name) for name in names}
+        return losses.compute_ppo_loss(params, statistics, theirs, key, networks, **settings)
+
+    (loss, shown), gradient = jax.jit(jax.value_and_grad(own, has_aux=True))(params)
+    (expected, named), expected_gradient = jax.jit(jax.value_and_grad(of_brax, has_aux=True))(params)
+    assert loss == pytest.approx(float(expected), rel=1e-12)
+    for found, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    assert -entropy_cost * shown["entropy"] == pytest.approx(float(named["entropy_loss"]), rel=1e-12, abs=1e-12)
+    assert shown["policy_loss"] == pytest.approx(float(named["policy_loss"]), rel=1e-12)
+    assert shown["value_loss"] == pytest.approx(float(named["v_loss"]), rel=1e-12)
+    assert shown["action_std"] == pytest.approx(float(named["policy_dist_mean_std"]), rel=1e-12)
+    logits = networks.policy_network.apply(statistics, params.policy, now.observation)
+    log_ratio = networks.parametric_action_distribution.log_prob(logits, now.raw_action) - now.log_prob
+    assert shown["approx_kl"] == pytest.approx(float((jnp.expm1(log_ratio) - log_ratio).mean()), rel=1e-9)
+    clipped = np.abs(np.exp(log_ratio) - 1) > config.clipping_epsilon
+    assert shown["clip_fraction"] == pytest.approx(clipped.mean()) and 0 < clipped.mean() < 1
+
+
+ON_TWO_DEVICES = """
+import sys, jax, numpy as np, optax, mimic
+from mimic.trainers.ppo import programs, training
+from mimic.trainers.config import PPOConfig
+env = mimic.make("planar4dof", physics=sys.argv[1], demonstrations={"count": 3, "held_out": 1})
+config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
+                   hidden_layers=[8]).resolve("cpu", 2)
+networks = training.make_networks(config, env.observation_size, env.action_size)
+begin, learn = programs.compile_training(env, config, networks, 2, optax.constant_schedule(1e-3), None)
+start = begin()(7)
+before = jax.device_get(start.params)
+after, metrics = learn()(start)
+changed = jax.tree.map(lambda x, y: not np.array_equal(x, y), before, jax.device_get(after.params))
+assert any(jax.tree.leaves(changed))
+for x in jax.tree.leaves((after.policy, after.value, after.statistics, metrics)):
+    shards = [np.asarray(shard.data) for shard in x.addressable_shards]
+    assert len(shards) == 2 and np.array_equal(*shards)
+observed = [np.asarray(shard.data) for shard in after.episodes.obs.addressable_shards]
+assert not np.array_equal(*observed)
+"""
+
+
+@pytest.mark.parametrize("physics", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_devices_see_different_arms_and_learn_the_same(physics):
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    settings = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    ended = subprocess.run(
+        [sys.executable, "-c", ON_TWO_DEVICES, physics], env=settings, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stderr[-2000:]
+
+
+def test_entropy_cost_and_discount_change_with_the_progress():
+    config = PPOConfig(entropy_cost=0.2, final_entropy_cost=0.1, discounting=0.9, final_discounting=0.5).resolve("cpu")
+    assert config.at(0.0) == config
+    assert config.at(0.5).entropy_cost == pytest.approx(0.11) and config.at(0.5).discounting == pytest.approx(0.7)
+    assert config.at(1.0).entropy_cost == pytest.approx(0.02) and config.at(1.0).discounting == pytest.approx(0.5)
+    constant = PPOConfig(discounting=0.4).resolve("cpu")
+    assert constant.at(0.5) is constant and constant.final_discounting == 0.4
+
+
+def test_a_batch_learns_by_the_settings_of_its_progress():
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    small = {"num_envs": 4, "batch_size": 4, "num_minibatches": 1, "num_updates_per_batch": 1, "hidden_layers": [8]}
+
+    def after(batches, **settings):
+        config = PPOConfig(**small, **settings).resolve("cpu")  # type: ignore[arg-type]
+        networks = training.make_networks(config, env.observation_size, env.action_size)
+        rate = optax.constant_schedule(1e-3)
+        begin, learn = programs.compile_training(env, config, networks, 1, rate, None, lambda count: count / 2)
+        state, learn = begin()(7), learn()
+        for _ in range(batches):
+            state, _ = learn(state)
+        return jax.device_get(state.params)
+
+    constant, decayed = {"entropy_cost": 0.2}, {"entropy_cost": 0.2, "final_entropy_cost": 0.0}
+    rounding = {"rtol": 1e-5, "atol": 1e-7}  # other programs, in float32
+    jax.tree.map(lambda *x: np.testing.assert_allclose(*x, **rounding), after(1, **constant), after(1, **decayed))
+    policies = after(2, **constant)[1], after(2, **decayed)[1]
+    apart = jax.tree.map(lambda *x: float(np.abs(x[0] - x[1]).max()), *policies)
+    assert max(jax.tree.leaves(apart)) > 1e-4  # Adam moves by 1e-3 an update, whatever the gradient's size
+
+
+def test_both_programs_are_compiled_with_the_options_of_a_run(monkeypatch):
+    monkeypatch.setattr(programs, "compiler_options", lambda: {"no_option_of_xla": True})
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
+    networks = training.make_networks(config, env.observation_size, env.action_size)
+    for program in programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None):
+        with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
+            program()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("physics", ["fused", "mjx"])
+def test_kernels_side_by_side_learn_the_same_as_in_order(physics, monkeypatch):
+    """To the bit, where XLA picks the same matrix products and adds in the same order."""
+    env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
+    config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")
+    networks = training.make_networks(config, env.observation_size, env.action_size)
+    given, learned = compiler_options(), []
+    for scheduling in ("SERIALIZE", given[_SCHEDULING]):
+        options = {**given, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
+        monkeypatch.setattr(programs, "compiler_options", lambda options=options: options)
+        begin, learn = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
+        learned.append(jax.device_get(learn()(begin()(7))))
+    assert jax.tree.all(jax.tree.map(np.array_equal, *learned))

@@ -1,0 +1,129 @@
+"""PPO's updates of policy and value, over devices that JAX makes of one."""
+
+import dataclasses
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from mimic.trainers.config import PPOConfig, PPOSettings
+from mimic.trainers.ppo import programs, training, updates
+from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
+
+DEVICES, UNROLLS, TIME, UPDATES, MINIBATCH = 2, 6, 3, 5, 4
+LIMIT = 1.5  # of gradients: the policy's norm is below it, that of both above
+SIZES = OBSERVED, ACTIONS = 5, 2
+
+
+@dataclasses.dataclass
+class Case:
+    """What there is to learn from, and with what; of each array the first axis is the devices."""
+
+    config: PPOSettings
+    unrolls: Unrolls
+    order: jax.Array
+    keys: jax.Array
+
+    def __post_init__(self):
+        self.networks = training.make_networks(self.config, *SIZES)
+        self.statistics, *self.params = programs.initial_params(self.networks, OBSERVED, jax.random.PRNGKey(1))
+        self.optimizer = optax.adam(0.01)
+
+    def on_device(self, staggered, unroll, unrolls, order, key):
+        """By mimic: policy and value, metrics."""
+        policy, value = (updates.begin(params, self.optimizer) for params in self.params)
+        of_run = self.networks, self.config, self.optimizer
+        config = updates.UpdateConfig(*of_run, axis="devices", staggered=staggered, unroll=unroll)
+        return updates.updated((policy, value), self.statistics, unrolls, order, key, config)
+
+    def expected(self):
+        """One update after the other, array by array, the means over the devices by hand."""
+        params = list(self.params)
+        states = [self.optimizer.init(network) for network in params]
+        metrics = []
+        keys = jnp.stack([jax.random.split(key, UPDATES) for key in self.keys])
+        for i in range(UPDATES):
+            gradients, shown = [], []
+            for device in range(DEVICES):
+                minibatch = jax.tree.map(lambda x, at=self.order[device, i], device=device: x[device][at], self.unrolls)
+                given = self.statistics, minibatch
+                of = self.networks, self.config
+                (error, advantages), of_value = jax.value_and_grad(value_loss, has_aux=True)(params[1], *given, *of)
+                of_policy, of_loss = jax.grad(policy_loss, has_aux=True)(
+                    params[0], *given, advantages, keys[device, i], *of
+                )
+                gradients.append((of_policy, of_value))
+                shown.append(jnp.append(error, of_loss))
+            metrics.append(shown)
+            means = jax.tree.map(lambda *x: sum(x) / DEVICES, *gradients)
+            norms = optax.global_norm(means), optax.global_norm(means[1])
+            for j, norm in enumerate(norms):
+                mean = jax.tree.map(lambda x, norm=norm: x * min(1, LIMIT / norm), means[j])
+                change, states[j] = self.optimizer.update(mean, states[j])
+                params[j] = optax.apply_updates(params[j], change)
+        return params, np.mean(metrics, axis=0)
+
+
+@pytest.fixture
+def case(x64):
+    rng = np.random.default_rng(0)
+
+    def normal(*shape):
+        return jnp.asarray(rng.normal(size=(DEVICES, UNROLLS, TIME + 1, *shape)))
+
+    goes_on = jnp.asarray(rng.random((DEVICES, UNROLLS, TIME + 1)) < 0.8, float)
+    unrolls = Unrolls(normal(OBSERVED), normal(ACTIONS), normal() - 3, normal(), goes_on)
+    order = jnp.asarray([[rng.permutation(UNROLLS)[:MINIBATCH] for _ in range(UPDATES)] for _ in range(DEVICES)])
+    config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), max_grad_norm=LIMIT)
+    return Case(config, unrolls, order, jax.random.split(jax.random.PRNGKey(2), DEVICES))
+
+
+@pytest.mark.parametrize(("staggered", "unroll"), [(False, 1), (True, 1), (True, 2)])
+def test_updates_are_those_of_each_minibatch_in_turn(case, staggered, unroll):
+    on_all = jax.jit(jax.vmap(functools.partial(case.on_device, staggered, unroll), axis_name="devices"))
+    learners, metrics = on_all(case.unrolls, case.order, case.keys)
+    params, expected_metrics = case.expected()
+    np.testing.assert_allclose(metrics, expected_metrics, rtol=1e-5, atol=1e-7)
+    for learner, expected, before in zip(learners, params, case.params, strict=True):
+        for found, wanted, old in zip(*map(jax.tree.leaves, (learner.params, expected, before)), strict=True):
+            np.testing.assert_array_equal(found[0], found[1])  # on both devices
+            np.testing.assert_allclose(found[0], wanted, rtol=1e-5, atol=1e-7)
+            assert not np.array_equal(wanted, old)
+        assert set(np.ravel(learner.optimizer[0].count)) == {UPDATES}
+
+
+def test_each_message_waits_for_the_one_before(case, monkeypatch):
+    """Else NCCL could get two at once, on each GPU in an order of its own."""
+    scan = jax.lax.scan
+
+    def in_a_row(body, carry, inputs, **how):
+        if how.get("reverse"):  # the advantages
+            return scan(body, carry, inputs, **how)
+        outputs = []
+        for i in range(UPDATES):
+            carry, output = body(carry, jax.tree.map(lambda x, i=i: x[i], inputs))
+            outputs.append(output)
+        return carry, jnp.stack(outputs)
+
+    monkeypatch.setattr(jax.lax, "scan", in_a_row)
+    of_one = jax.tree.map(lambda x: x[0], (case.unrolls, case.order, case.keys))
+    on_one = functools.partial(case.on_device, True, 1)
+    program = jax.make_jaxpr(on_one, axis_env=[("devices", DEVICES)])(*of_one).jaxpr
+    messages = [equation for equation in program.eqns if equation.primitive.name.startswith("psum")]
+    assert len(messages) == 2 * UPDATES + 1
+    for before, message in itertools.pairwise(messages):
+        assert message.outvars[0] in _made_of(before.outvars, program)
+    *_, metrics = program.outvars  # whose mean is sent next
+    assert metrics in _made_of(messages[-1].outvars, program)
+
+
+def _made_of(variables, program):
+    made = set(variables)
+    for equation in program.eqns:
+        if made.intersection(v for v in equation.invars if not hasattr(v, "val")):
+            made.update(equation.outvars)
+    return made
