@@ -4,16 +4,15 @@
 
 The reference of a step is the minimum of three searches: the bound itself, Adam from 64 random poses and from the
 expert's own angles (200 iterations; the best four refined by 300 more), and `closest_motion` with more starts, more
-iterations and another seed. A step is missed where the bound is above its reference by more than 1e-3 chain lengths or
-radians (the metric's own unit), or by more than 0.1 % and 1e-5. "paper" is the paper's metric with merged links, "hard"
-has hard correspondence and adaptive weights. The cost is that of 156 demonstrations, as at the start of a training, in
-seconds of wall time and of all cores together.
+iterations and another seed. A step is missed if the bound exceeds its reference by 1e-3 in the metric's unit, or by
+0.1 % and 1e-5. "paper" is the paper's metric with merged links, "hard" has hard correspondence and adaptive weights.
+The cost is that of 156 demonstrations, as at the start of a training.
 """
 
 import dataclasses
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,8 @@ import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.pose import planar
-from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arm import ArmConfig
+from mimic.envs.config import EnvConfig
 from mimic.envs.recording import record_demonstrations
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.pose import pose_limits, shared_joints
@@ -40,60 +40,49 @@ COUNTS = "steps", "missed_absolute", "missed_relative"
 COLUMNS = "case steps missed_absolute missed_relative largest_excess:.1e mean_reference:.4f"
 
 
-class Case(NamedTuple):
-    """Two arms and the metric between them."""
-
-    expert: ArmConfig
-    learner: ArmConfig
-    metric: MetricConfig
-    demonstrations: int = 4
-
-
-def _cases() -> dict[str, Case]:
-    panda, four, three = ArmConfig(), ArmConfig(locked=[3, 6, 7]), ArmConfig(locked=[2, 3, 6, 7])
-    default, cases = MetricConfig(), {}
-    paper = MetricConfig(links="merged", correspondence="overlap", translation=0.0)
-    for name, metric in (("paper", paper), ("default", default)):
+def _cases() -> dict[str, EnvConfig]:
+    four, cases = ArmConfig(locked=[3, 6, 7]), {}
+    default, paper = MetricConfig(), MetricConfig(links="merged", correspondence="overlap", translation=0.0)
+    for name, metric in {"paper": paper, "default": default}.items():
         hard = dataclasses.replace(metric, correspondence="hard", adaptive=True)
-        cases[f"joint 5 locked, {name}"] = Case(panda, ArmConfig(locked=[5]), metric)
-        cases[f"joint 1 locked, {name}"] = Case(panda, ArmConfig(locked=[1]), metric)
-        cases[f"planar 7->4, {name}"] = Case(planar(7), planar(4), metric, 6)
-        cases[f"panda4dof hard, {name}"] = Case(panda, four, hard)
-    return cases | {"panda4dof, default": Case(panda, four, default), "panda3dof, default": Case(panda, three, default)}
+        cases[f"joint 5 locked, {name}"] = EnvConfig(learner=ArmConfig(locked=[5]), metric=metric)
+        cases[f"joint 1 locked, {name}"] = EnvConfig(learner=ArmConfig(locked=[1]), metric=metric)
+        cases[f"planar 7->4, {name}"] = EnvConfig(expert=planar(7), learner=planar(4), metric=metric)
+        cases[f"panda4dof hard, {name}"] = EnvConfig(learner=four, metric=hard)
+    cases["panda4dof, default"] = EnvConfig(learner=four)
+    return cases | {"panda3dof, default": EnvConfig(learner=ArmConfig(locked=[2, 3, 6, 7]))}
 
 
 CASES = _cases()
 
 
-class Problem:
-    def __init__(self, case: Case):
-        self.recorded, learner = build_arm(case.expert), build_arm(case.learner, links=case.metric.links)
-        self.expert, self.learner = self.recorded.embodiment, learner.embodiment
-        self.metric = case.metric.build(self.expert, self.learner)
-
-    def motions(self, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """[count, STEPS, joints] angles and velocities of demonstrations."""
-        recorded = record_demonstrations(self.recorded, count, seed=seed, horizon=STEPS)
-        return recorded.qpos[:, 1:].astype(np.float32), recorded.qvel[:, 1:].astype(np.float32)
-
-    def bound(self, qpos: Any, qvel: Any, **options: Any) -> jax.Array:
-        arms, options = (self.expert, self.learner), {**self.metric.arguments, **options}
-        return jax.vmap(lambda qpos, qvel: mimic.kinematic_bound(*arms, qpos, qvel, **options))(qpos, qvel)
+def motions(case: EnvConfig, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """[count, STEPS, joints] angles and velocities of demonstrations."""
+    recorded = record_demonstrations(case.build_arms().expert, count, seed=seed, horizon=STEPS)
+    return recorded.qpos[:, 1:].astype(np.float32), recorded.qvel[:, 1:].astype(np.float32)
 
 
-def adam_reference(problem: Problem, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+def bound_function(case: EnvConfig, **options: Any) -> Any:
+    """A function of such angles and velocities to the kinematic bound, [count, STEPS]."""
+    arms = case.build_arms().embodiments
+    options |= case.metric.build(*arms).arguments
+    return jax.jit(jax.vmap(lambda qpos, qvel: mimic.kinematic_bound(*arms, qpos, qvel, **options)))
+
+
+def adam_reference(case: EnvConfig, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     """[steps] minimum distance by Adam from many random poses, for [steps, joints] angles and velocities."""
-    learner = problem.learner
+    expert, learner = case.build_arms().embodiments
+    metric = case.metric.build(expert, learner)
     limits = pose_limits(learner, qpos.dtype)
     lower, upper = np.asarray(learner.joint_range).T
     poses = np.random.default_rng(11).uniform(lower, upper, (len(qpos), STARTS, learner.num_joints))
 
     def solve(qpos: jax.Array, qvel: jax.Array, poses: jax.Array) -> jax.Array:
-        states = mimic.link_states(problem.expert, qpos, qvel)
+        states = mimic.link_states(expert, qpos, qvel)
         speed = jnp.maximum(jnp.abs(qvel).max(), MINIMUM_SPEED)  # unit of the learner's velocities
 
         def distance(motion: Any) -> jax.Array:
-            return problem.metric(states, mimic.link_states(learner, motion[0], speed * motion[1]))
+            return metric(states, mimic.link_states(learner, motion[0], speed * motion[1]))
 
         def descend(start: Any, step_size: float, count: int) -> Any:
             optimiser = optax.adam(optax.cosine_decay_schedule(step_size, count))
@@ -109,7 +98,7 @@ def adam_reference(problem: Problem, qpos: np.ndarray, qvel: np.ndarray) -> np.n
             first = start, optimiser.init(start), start, jnp.asarray(jnp.inf, qpos.dtype)
             return jax.lax.scan(iterate, first, None, length=count)[0][2:]
 
-        own_qpos, own_qvel = (shared_joints(problem.expert, learner, x) for x in (qpos, qvel / speed))
+        own_qpos, own_qvel = (shared_joints(expert, learner, x) for x in (qpos, qvel / speed))
         guesses = jnp.concatenate([own_qpos[None], poses])
         starts = guesses, jnp.broadcast_to(own_qvel, guesses.shape)
         ends, minima = jax.vmap(lambda *start: descend(start, STEP_SIZES[0], ITERATIONS))(*starts)
@@ -121,18 +110,17 @@ def adam_reference(problem: Problem, qpos: np.ndarray, qvel: np.ndarray) -> np.n
 
 def missed(bound: np.ndarray, reference: np.ndarray) -> Row:
     excess = bound - reference
-    absolute, relative = excess > ABSOLUTE, excess > RELATIVE * reference + ROUNDING
-    counts = {"missed_absolute": int(absolute.sum()), "missed_relative": int(relative.sum())}
-    return {**counts, "largest_excess": float(excess.max()), "mean_excess": float(excess.mean())}
+    counts = {"missed_absolute": excess > ABSOLUTE, "missed_relative": excess > RELATIVE * reference + ROUNDING}
+    sizes = {"largest_excess": float(excess.max()), "mean_excess": float(excess.mean())}
+    return {name: int(np.sum(is_missed)) for name, is_missed in counts.items()} | sizes
 
 
 def run_case(name: str, seeds: Sequence[int]) -> Row:
     """The bound against the reference, on the demonstrations of some seeds."""
-    problem, count = Problem(CASES[name]), CASES[name].demonstrations
-    motions = [np.concatenate(x) for x in zip(*(problem.motions(count, seed) for seed in seeds), strict=True)]
-    bound = np.ravel(jax.jit(problem.bound)(*motions))
-    more = np.ravel(jax.jit(lambda *motions: problem.bound(*motions, **MORE))(*motions))
-    adam = adam_reference(problem, *(x.reshape(-1, x.shape[-1]) for x in motions))
+    case, count = CASES[name], 6 if name.startswith("planar") else 4
+    qpos, qvel = (np.concatenate(x) for x in zip(*(motions(case, count, seed) for seed in seeds), strict=True))
+    bound, more = (np.ravel(bound_function(case, **options)(qpos, qvel)) for options in ({}, MORE))
+    adam = adam_reference(case, *(x.reshape(-1, x.shape[-1]) for x in (qpos, qvel)))
     reference = np.minimum(np.minimum(bound, more), adam)
     row = {"case": name, "seeds": list(seeds), "steps": len(bound), "mean_reference": float(reference.mean())}
     searches = {"adam": missed(adam, reference), "more": missed(more, reference)}
@@ -140,13 +128,12 @@ def run_case(name: str, seeds: Sequence[int]) -> Row:
 
 
 def measure_cost() -> Row:
-    """Cost of the bound at the start of a training."""
-    problem = Problem(CASES[COST_CASE])
-    motions = problem.motions(COST_DEMONSTRATIONS, 0)
+    """Cost of the bound at the start of a training: wall time, and that of all cores together."""
+    motion = motions(CASES[COST_CASE], COST_DEMONSTRATIONS, 0)
     clocks = [(time.perf_counter(), time.process_time())]
-    program = jax.jit(problem.bound).lower(*motions).compile()
+    function = bound_function(CASES[COST_CASE]).lower(*motion).compile()
     clocks.append((time.perf_counter(), time.process_time()))
-    jax.block_until_ready(program(*motions))
+    jax.block_until_ready(function(*motion))
     clocks.append((time.perf_counter(), time.process_time()))
     seconds = np.diff(clocks, axis=0).round(2).ravel().tolist()
     costs = dict(zip(("compile_s", "compile_cpu_s", "run_s", "run_cpu_s"), seconds, strict=True))

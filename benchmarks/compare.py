@@ -9,7 +9,6 @@ relative change. The spread is that of the times in the file, or the standard de
 import json
 import math
 import statistics
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,15 +34,14 @@ class Value(NamedTuple):
 
 def read_values(results: dict[str, Any]) -> dict[str, Value]:
     """All values of a file by their paths: names of cases and entries, separated by ` / `."""
-    entries = defaultdict(list)
+    entries: dict[str, list[Value]] = {}
     for path, value in _walk(results, ()):
-        entries[" / ".join(path)].append(value)
-    values = {}
-    for path, seeds in entries.items():
-        means = [value.mean for value in seeds]
-        over_seeds = statistics.stdev(means) if len(means) > 1 else 0.0
-        values[path] = Value(statistics.fmean(means), max(over_seeds, *(value.spread for value in seeds)))
-    return values
+        entries.setdefault(" / ".join(path), []).append(value)
+    for path, values in entries.items():
+        means, spreads = zip(*values, strict=True)
+        deviation = statistics.stdev(means) if len(means) > 1 else 0.0
+        entries[path] = [Value(statistics.fmean(means), max(deviation, *spreads))]
+    return {path: value for path, (value,) in entries.items()}
 
 
 def _walk(value: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Value]]:

@@ -15,7 +15,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import yaml
@@ -34,10 +34,6 @@ from mimic.sweeps.sweeper import path_override
 
 STUDY = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
 UNSEEN_SEED, UNSEEN = 1000, 32  # demonstrations that no run is trained on, the same for all
-ENTRIES = (  # of a report
-    "optimality_gap", "mean_distance", "lower_bound", "hold_distance", "link_angle_error_deg", "angular_velocity_error",
-    "torque_rms", "torque_change", "torque_saturation", "position_violations", "speed_violations", "torque_violations",
-)  # fmt: skip
 
 
 class Case(NamedTuple):
@@ -95,11 +91,13 @@ def evaluations(chosen: Sequence[Case], folder: Path, unseen: dict[str, str]) ->
 
 def unseen_demonstrations(folder: Path) -> dict[str, str]:
     """Overrides with the files of demonstrations that no run is trained on, by their placeholders."""
-    files = {kind: folder / f"unseen-{kind}.npz" for kind in KINDS}
-    for kind, path in files.items():
+    overrides = {}
+    for kind in KINDS:
+        path = folder / f"unseen-{kind}.npz"
+        overrides[f"{{{kind}}}"] = path_override("demonstrations", str(path))
         if not path.exists():
             record_demonstrations(build_arm(ArmConfig()), UNSEEN, kind=kind, seed=UNSEEN_SEED).save(path)
-    return {f"{{{kind}}}": path_override("demonstrations", str(path)) for kind, path in files.items()}
+    return overrides
 
 
 def run(chosen: Sequence[Case], folder: Path, jobs: int) -> list[Path]:
@@ -124,29 +122,18 @@ def collect(folder: Path) -> dict[str, list[Row]]:
     for run in find_runs(folder)[0]:
         run_dir = folder / run.name
         report = json.loads((run_dir / REPORT).read_text())
-        entry = {"seed": run.seed, **{key: report[key] for key in ENTRIES}}
+        entry = {"seed": run.seed, **{key: report[key] for key in STUDY["entries"]}}
         if gaps := list(run.curves["train"].values()):
             entry |= {"best_gap": min(gaps), "final_gap": gaps[-1], "env_steps": report["env_steps"]}
-        entry |= {key: report[key] for key in ("frequency_rad_s", "starts") if report.get(key)}
-        if "similarity" in report:
-            entry["similarity"] = _rounded(report["similarity"])
+        entry |= {key: report[key] for key in ("frequency_rad_s", "starts", "similarity") if report.get(key)}
         case = run_dir.parent.name
         curves = run_dir / "quality.csv"
         if case.partition("--")[0] in study_figures.CURVES and run.seed == 0 and curves.is_file():
-            entry["curves"] = _curves(curves)
+            with curves.open(newline="") as file:
+                rows = [row for row in csv.DictReader(file) if row.pop("split") == "held_out"]
+            entry["curves"] = {key: [round(float(row[key]), 6) for row in rows] for key in rows[0]}
         results[case].append(entry)
     return dict(results)
-
-
-def _rounded(values: Any) -> Any:
-    """Nested numbers with four digits after the point, which is beyond the accuracy of the measures."""
-    return round(values, 4) if isinstance(values, float) else {key: _rounded(value) for key, value in values.items()}
-
-
-def _curves(path: Path) -> dict[str, list[float]]:
-    with path.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row.pop("split") == "held_out"]
-    return {key: [round(float(row[key]), 6) for row in rows] for key in rows[0]}
 
 
 def main() -> None:

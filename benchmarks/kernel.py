@@ -2,12 +2,11 @@
 
     python -m benchmarks.kernel [--out FILE] [--batches 1e2 ... 1e8] [--links 3 ... 64] [--methods mimic ...]
 
-All methods compute the same: forward kinematics with velocities, link distances in the default metric with a static
-correspondence, and their mean; "gradient" also the gradient with respect to the learner's qpos and qvel, "all" to those
-of both arms. Batches are of the Panda with 7 joints and the one with 4; links are those of two planar arms. `mimic` is
-`motion_distance`, `composition` its parts called separately, `matrices` a straightforward JAX program on 4x4 matrices,
-`torch` the same in PyTorch, where it is installed. Limits of the device, from the same run: memory traffic of a copy,
-and the rate of fused multiply-adds.
+All methods compute the embodiment distance of joint positions and velocities in the default metric; "gradient" also
+its gradient with respect to the learner's motion, "all" to that of both arms. Batches are of the Panda with 7 joints
+and the one with 4; links are those of two planar arms. `mimic` is `motion_distance`, `composition` its parts called
+separately, `matrices` a straightforward JAX program on 4x4 matrices, `torch` the same in PyTorch, where it is
+installed. Limits of the device are the memory traffic of a copy, and the rate of fused multiply-adds.
 """
 
 import dataclasses
@@ -25,7 +24,6 @@ import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect, failure, print_table
 from benchmarks.common.timing import time_call, time_program
-from benchmarks.figures.kernel_figure import plot
 from benchmarks.peers import kernel_peers
 from mimic.metric.config import MetricConfig
 
@@ -38,25 +36,18 @@ METRIC = MetricConfig()
 WEIGHTS = cast(mimic.DistanceWeights, METRIC.make_weights())  # constants, in the default metric
 LONGEST = 1.0  # s a call; the next case is about ten times as large
 CHECKED = 1000  # pairs that are compared with double precision
-TWO_TO = {"copy": 26, "multiply_add": 22}  # length of the arrays that measure the limits
 COLUMNS = (
     "sweep size:g method quantity pairs_per_s:.3g spread:.1% compile_s:.1f largest_error[value]:.1e "
     "largest_error[gradient]:.1e"
 )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)  # compared by identity, as the key of a cache
 class Arms:
-    expert: mimic.Embodiment
-    learner: mimic.Embodiment
+    """Two arms and their correspondence; compared by identity, as the key of a cache."""
 
-    @property
-    def correspondence(self) -> np.ndarray:
-        return np.asarray(METRIC.make_correspondence(self.expert, self.learner))
-
-
-def panda_pair() -> Arms:
-    return Arms(mimic.panda(), mimic.panda(locked=(3, 6, 7)))
+    def __init__(self, expert: mimic.Embodiment, learner: mimic.Embodiment):
+        self.expert, self.learner = expert, learner
+        self.correspondence = np.asarray(METRIC.make_correspondence(expert, learner))
 
 
 def planar_pair(links: int) -> Arms:
@@ -71,12 +62,8 @@ def jax_function(method: str, arms: Arms, quantity: str) -> Callable[..., Any]:
         states = mimic.link_states(arms.expert, *motion[:2]), mimic.link_states(arms.learner, *motion[2:])
         return mimic.embodiment_distance(*states, *case[2:])
 
-    make = {
-        "mimic": mimic.motion_distance,
-        "matrices": kernel_peers.jax_distance,
-        "composition": lambda *_: composition,
-    }
-    distance, by = make[method](*case), QUANTITIES[quantity]
+    make = {"mimic": mimic.motion_distance, "matrices": kernel_peers.jax_distance}
+    distance, by = make.get(method, lambda *_: composition)(*case), QUANTITIES[quantity]
     return jax.vmap(jax.value_and_grad(distance, by) if by else distance)
 
 
@@ -89,15 +76,15 @@ def random_motions(arms: Arms, batch: int) -> list[jax.Array]:
 
 
 @functools.cache
-def reference_function(arms: Arms, quantity: str) -> Callable[..., Any]:
+def _compiled_reference(arms: Arms, quantity: str) -> Callable[..., Any]:
     return jax.jit(jax_function("composition", arms, quantity))
 
 
 def reference(arms: Arms, motions: Sequence[jax.Array], quantity: str) -> Any:
     """Value and gradients of the first pairs in double precision, on the CPU."""
-    numbers = [np.asarray(x[:CHECKED], np.float64) for x in motions]
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        return jax.tree.map(np.asarray, reference_function(arms, quantity)(*numbers))
+        values = _compiled_reference(arms, quantity)(*(np.asarray(x[:CHECKED], np.float64) for x in motions))
+        return jax.tree.map(np.asarray, values)
 
 
 def torch_call(method: str, arms: Arms, quantity: str, motions: list[jax.Array]) -> tuple[Callable, Callable]:
@@ -151,11 +138,10 @@ def sweep(name: str, cases: dict[int, tuple[Arms, int]], method: str) -> Iterato
 
 def limits() -> dict[str, float]:
     """Bytes per second of a copy, read and written, and floating point operations per second."""
-    numbers, length = jnp.zeros(2 ** TWO_TO["copy"], jnp.float32), 512
-    copy = time_program(lambda x: x + 1, numbers).median
-    few = jnp.ones(2 ** TWO_TO["multiply_add"], jnp.float32)
+    many, few, length = jnp.zeros(2**26, jnp.float32), jnp.ones(2**22, jnp.float32), 512
+    copy = time_program(lambda x: x + 1, many).median
     added = time_program(lambda x: functools.reduce(lambda y, _: y * 0.999 + x, range(length), x), few).median
-    return {"copy_bytes_per_second": 2 * numbers.nbytes / copy, "flops": 2 * length * few.size / added}
+    return {"copy_bytes_per_second": 2 * many.nbytes / copy, "flops": 2 * length * few.size / added}
 
 
 def main() -> None:
@@ -164,17 +150,15 @@ def main() -> None:
     lists = {"batches": list(BATCHES if on_gpu else BATCHES[:5]), "links": [*LINKS], "methods": METHODS}
     options = make_parser("kernel", __doc__, link_batch=1e6 if on_gpu else 1e3, **lists).parse_args()
     missing = {} if importlib.util.find_spec("torch") else dict.fromkeys(TORCH, "PyTorch is not installed")
-    panda, link_batch = panda_pair(), int(options.link_batch)
+    panda = Arms(mimic.panda(), mimic.panda(locked=(3, 6, 7)))
     sweeps = {
         "batch": {int(batch): (panda, int(batch)) for batch in sorted(options.batches)},
-        "links": {links: (planar_pair(links), link_batch) for links in sorted(options.links)},
+        "links": {links: (planar_pair(links), int(options.link_batch)) for links in sorted(options.links)},
     }
     methods = [method for method in METHODS if method in options.methods and method not in missing]
     rows = (row for method in methods for name, cases in sweeps.items() for row in sweep(name, cases, method))
     device = limits()
-    measured = collect(options, rows, "results", COLUMNS, limits=device, absent=missing)
-    if options.out:
-        plot(measured, device, options.out.with_suffix(".png"))
+    collect(options, rows, "results", COLUMNS, limits=device, absent=missing)
     print_table([device], "copy_bytes_per_second:.3g flops:.3g")
 
 

@@ -1,7 +1,7 @@
 """Waiting times on a fresh clone: `python -m benchmarks.newcomer [--out FILE] [--default] [--note TEXT]`.
 
-Install, first trained policy, first video and first own arm, as in the README. The compilation cache is empty: the home
-folder is a new one, and pip downloads what it installs. Needs git, make and a package index.
+Install, first trained policy, first video and first own arm, as in the README, in a new home folder without a
+compilation cache; pip downloads what it installs. Needs git, make and a package index.
 """
 
 import json
@@ -17,7 +17,6 @@ from benchmarks.common.record import Row, collect
 from mimic.runs.files import REPORT
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-PYTHON = ".venv/bin/python"
 SHORT = "ARGS=env=planar4dof env.physics=fused trainer.num_timesteps=500000 run_dir=short"
 COLUMNS = "stage wall_s:.0f load_at_start:.1f optimality_gap[held_out]:.1%"
 
@@ -35,8 +34,8 @@ DEFAULT = Stage("first policy, by default", ("make", "train", "ARGS=env.physics=
 STAGES = (
     INSTALL,
     Stage("first policy, short", ("make", "train", SHORT), "short"),
-    Stage("first video", (PYTHON, "-m", "mimic.render", "run=short")),
-    Stage("first own arm", (PYTHON, "examples/07_own_arm.py", "own_arm"), "own_arm/run"),
+    Stage("first video", (".venv/bin/python", "-m", "mimic.render", "run=short")),
+    Stage("first own arm", (".venv/bin/python", "examples/07_own_arm.py", "own_arm"), "own_arm/run"),
 )
 
 

@@ -2,11 +2,10 @@
 
     python -m benchmarks.physics --out FILE [--envs panda7dof ...] [--seeds 100]
 
-The learner starts at home at rest; for 5 s a new random torque, uniform within the environment's torque scale, is held
-for each control step. The error is the distance of the tip, the end of the last link, from that of C MuJoCo with RK4 in
-steps of 0.1 ms, in double precision. Candidates are C MuJoCo's integrators in double precision, and the environments'
-own physics in single precision. Sequences in which a joint of the reference reaches the speed bound are counted and
-left out. A state that is not finite has an infinite error, null in the file.
+The learner starts at home at rest; for 5 s a new random torque within the environment's torque scale is held for each
+control step. The error is the distance of the tip from that of C MuJoCo with RK4 in steps of 0.1 ms. Candidates are C
+MuJoCo's integrators in double precision, and the environments' own physics in single precision. Sequences in which the
+reference reaches the speed bound are counted and left out. A state that is not finite has an infinite error, null.
 """
 
 import os
@@ -61,16 +60,13 @@ def own_motion(env: ImitationEnv, torques: np.ndarray, physics: str, substeps: i
     """The environments' own physics, in single precision."""
     advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
 
+    home = jnp.asarray(env.learner.home, jnp.float32)
+
     def step(state: tuple[jax.Array, jax.Array], torque: jax.Array) -> Any:
         state = advance(*state, torque, Load())
         return state, state
 
-    @jax.jit
-    @jax.vmap
-    def sequence(torques: jax.Array) -> Any:
-        home = jnp.asarray(env.learner.home, jnp.float32)
-        return jax.lax.scan(step, (home, jnp.zeros_like(home)), torques)[1]
-
+    sequence = jax.jit(jax.vmap(lambda torques: jax.lax.scan(step, (home, jnp.zeros_like(home)), torques)[1]))
     qpos, qvel = sequence(jnp.asarray(torques, jnp.float32))
     return np.asarray(qpos, float), np.asarray(qvel, float)
 
@@ -91,15 +87,6 @@ def tip_positions(arm: mimic.Embodiment) -> Callable[[np.ndarray], np.ndarray]:
     return tips
 
 
-def quantiles(errors: np.ndarray) -> dict[str, dict[str, float]]:
-    """Quantiles of errors [sequences, steps], at the end of the sequences, and of the largest within each."""
-    errors = np.where(np.isfinite(errors), errors, np.inf)
-    return {
-        when: {name: float(np.quantile(values, q, method="inverted_cdf")) for name, q in QUANTILES.items()}
-        for when, values in {"end": errors[:, -1], "largest": errors.max(axis=1)}.items()
-    }
-
-
 def run_env(name: str, sequences: int) -> Row:
     env = mimic.make(name, demonstrations={"count": 1, "held_out": 1})
     bound, scale, tips = env.config.speed_bound, np.asarray(env.torque_scale, float), tip_positions(env.learner)
@@ -115,26 +102,24 @@ def run_env(name: str, sequences: int) -> Row:
     reference = tips(qpos[kept])
 
     def candidate(engine: str, integrator: str, substeps: int, motion: Motion) -> Row:
-        metres = np.linalg.norm(tips(motion[0][kept]) - reference, axis=-1)
-        row = {"engine": engine, "integrator": integrator, "substeps": substeps}
-        costs = {"evaluations": EVALUATIONS[integrator] * substeps}
-        return {
-            **row,
-            **costs,
-            "false_runaways": int(runaways(motion[1])[kept].sum()),
-            "error_mm": quantiles(1e3 * metres),
+        errors = 1e3 * np.linalg.norm(tips(motion[0][kept]) - reference, axis=-1)  # [sequences, steps]
+        errors = np.where(np.isfinite(errors), errors, np.inf)
+        quantiles = {
+            when: {name: float(np.quantile(values, q, method="inverted_cdf")) for name, q in QUANTILES.items()}
+            for when, values in {"end": errors[:, -1], "largest": errors.max(axis=1)}.items()
         }
+        costs = {"substeps": substeps, "evaluations": EVALUATIONS[integrator] * substeps}
+        false = {"false_runaways": int(runaways(motion[1])[kept].sum())}
+        return {"engine": engine, "integrator": integrator, **costs, **false, "error_mm": quantiles}
 
     candidates = [
         candidate("mujoco", integrator, substeps, mujoco_motion(env, torques, integrator, substeps))
         for integrator in EVALUATIONS
         for substeps in SUBSTEPS
     ]
-    candidates += [
-        candidate(physics, "rk4", substeps, own_motion(env, torques, physics, substeps))
-        for substeps in OWN_SUBSTEPS
-        for physics in ("mjx", "fused")
-    ]
+    for substeps in OWN_SUBSTEPS:
+        for physics in ("mjx", "fused"):
+            candidates.append(candidate(physics, "rk4", substeps, own_motion(env, torques, physics, substeps)))
     counts = {"sequences": sequences, "runaways": int((~kept).sum())}
     peak = float(np.median(np.abs(qvel[kept]).max(axis=(1, 2))))
     scales = {"action_scale": env.config.action_scale, "torque_scale": scale.tolist(), "speed_bound": bound}

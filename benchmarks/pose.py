@@ -2,11 +2,10 @@
 
     python -m benchmarks.pose --out FILE [--poses 1000] [--batch 1000] [--mink-poses 100]
 
-Quality is (d - d_best) / (d_random - d_best), where d_best is the minimum distance of a pose over all methods and a
-search from 512 random starts with 60 Newton steps each: 0 is the best known pose, 1 a random one. "Global" is the
-fraction of poses within 0.1 % of d_best. Poses of the expert are uniform in [-pi, pi]; the metric is the default one.
-"One start" is the paper's method, from the angles of the joints that both arms share. mink drives the learner's links
-to the full orientations of the expert's links that they overlap most, which constrains more than directions.
+Quality is (d - d_best) / (d_random - d_best), where d_best is the minimum distance over all methods and a search from
+512 random starts with 60 Newton steps each; the global share is that of poses within 0.1 % of d_best. "One start" is
+the paper's method, from the angles of the joints that both arms share. mink drives the learner's links to the full
+orientations of the expert's links that they overlap most, which constrains more than directions.
 """
 
 from collections.abc import Callable
@@ -20,7 +19,7 @@ import numpy as np
 
 import mimic
 from benchmarks.common.parser import make_parser
-from benchmarks.common.record import Row, print_table, write_results
+from benchmarks.common.record import Row, collect, print_table
 from benchmarks.common.timing import time_call
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.metric.config import MetricConfig
@@ -29,7 +28,7 @@ METRIC = MetricConfig()
 CHUNK = 500  # poses of the longest search in parallel
 NEAR, ROUNDING = 1e-3, 1e-6  # tolerance of the global minimum: relative, and absolute for float32
 MINK_STEPS, MINK_DT = 100, 0.1  # steps of inverse kinematics for a pose, and the time that each integrates over [s]
-COLUMNS = "pair method quality:.2% global_share:.2% distance:.4f poses_per_second:,.0f first_call_s:.1f"
+COLUMNS = "method quality:.2% global_share:.2% distance:.4f poses_per_second:,.0f first_call_s:.1f"
 
 Solver = Callable[[np.ndarray], np.ndarray]  # expert's poses -> learner's poses
 
@@ -85,22 +84,19 @@ def with_mink(expert: Arm, learner: Arm) -> Solver:
 def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
     expert, learner = map(build_arm, PAIRS[name])
     metric = METRIC.build(expert.embodiment, learner.embodiment)
+    joints = expert.embodiment.num_joints, learner.embodiment.num_joints
 
     @jax.jit
     @jax.vmap
     def distances(qpos: jax.Array, learner_qpos: jax.Array) -> jax.Array:
         return metric(mimic.link_states(expert.embodiment, qpos), mimic.link_states(learner.embodiment, learner_qpos))
 
-    rng = np.random.default_rng(0)
-    qpos, chance, many = (
-        rng.uniform(-np.pi, np.pi, (count, arm.embodiment.num_joints)).astype(np.float32)
-        for arm, count in ((expert, poses), (learner, poses), (expert, batch))
-    )
-    plain: dict[str, Any] = {"method": "gradient_descent"}
+    rng, shapes = np.random.default_rng(0), [(poses, joints[0]), (poses, joints[1]), (batch, joints[0])]
+    qpos, chance, many = (rng.uniform(-np.pi, np.pi, shape).astype(np.float32) for shape in shapes)
     solvers = {
         "newton": imitate(expert, learner),
-        "gradient_descent": imitate(expert, learner, **plain),
-        "gradient_descent, one start": imitate(expert, learner, starts=0, **plain),
+        "gradient_descent": imitate(expert, learner, method="gradient_descent"),
+        "gradient_descent, one start": imitate(expert, learner, method="gradient_descent", starts=0),
         "mink": with_mink(expert, learner),
     }
     methods, left = {}, {}
@@ -116,24 +112,19 @@ def run_pair(name: str, poses: int, batch: int, mink_poses: int) -> Row:
         best[: len(values)] = np.minimum(best[: len(values)], values)
     random = float(np.mean(np.asarray(distances(qpos, chance))))
     for method, values in left.items():
-        minimum = best[: len(values)]
-        methods[method] |= {
-            "poses": len(values),
-            "distance": float(values.mean()),
-            "quality": float((values.mean() - minimum.mean()) / (random - minimum.mean())),
-            "global_share": float(np.mean(values <= minimum * (1 + NEAR) + ROUNDING)),
-        }
+        minimum, distance = best[: len(values)], float(values.mean())
+        quality = float((distance - minimum.mean()) / (random - minimum.mean()))
+        is_global = values <= minimum * (1 + NEAR) + ROUNDING
+        methods[method] |= {"poses": len(values), "distance": distance, "quality": quality}
+        methods[method]["global_share"] = float(np.mean(is_global))
     return {"pair": name, "best_distance": float(best.mean()), "random_distance": random, "methods": methods}
 
 
 def main() -> None:
     options = make_parser("pose", __doc__, pair=PAIRS, poses=1000, batch=1000, mink_poses=100).parse_args()
-    rows = []
-    for name in options.pair:
-        rows.append(run_pair(name, options.poses, options.batch, options.mink_poses))
-        write_results(options, results=rows)
-    shown = ({"pair": row["pair"], "method": key, **values} for row in rows for key, values in row["methods"].items())
-    print_table(shown, COLUMNS)
+    rows = (run_pair(name, options.poses, options.batch, options.mink_poses) for name in options.pair)
+    for row in collect(options, rows, "results", "pair best_distance:.4f random_distance:.4f"):
+        print_table(({"method": name, **values} for name, values in row["methods"].items()), COLUMNS, row["pair"])
 
 
 if __name__ == "__main__":

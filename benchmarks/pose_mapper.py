@@ -3,9 +3,8 @@
     python -m benchmarks.pose_mapper --out FILE [--seeds 0 1 2] [--plot FILE]
     python -m benchmarks.pose_mapper --out FILE --regularisation --preset paper --env panda4dof --seeds 0 1
 
-Each run is a process of its own. "Within 2 %" is the time from its start until the mean distance of unseen poses is
-that near to the optimum. The file contains the report of each run, its curves, and the mapper's speed on a batch; the
-plot shows training and unseen poses over training. `--regularisation` trains each also with dropout and weight decay.
+The time to the goal is from the start of the process until the mean distance of unseen poses is within 2 % of the
+optimum. `--regularisation` trains each also with dropout and weight decay.
 """
 
 import itertools

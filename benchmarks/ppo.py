@@ -2,11 +2,10 @@
 
     python -m benchmarks.ppo --out FILE [--env panda4dof] [--only CASE ...] [--num-envs N]
 
-PPO as `mimic.train` runs it, with the settings of the preset, on the environment with the physics `fused` and `mjx`;
-brax's own training loop on the same environment, and on the same task as brax and MuJoCo Playground environments
-usually implement it, with `mjx.Data` carried and brax's own wrappers. PPO of stable-baselines3 runs on C MuJoCo on the
-CPU, where it is installed, with the same networks, minibatches and passes, and an arm for each core. A training is a
-number of epochs; the speed is the median of all but the first, which compiles, with the quartiles as spread.
+PPO as `mimic.train` runs it, with the settings of the preset; brax's own training loop on the same environment, and on
+the same task as brax and MuJoCo Playground environments usually implement it; and, where it is installed, PPO of
+stable-baselines3 on C MuJoCo on the CPU, with the same networks, minibatches and passes, and an arm for each core. The
+speed is the median of all epochs but the first, which compiles, with the quartiles as spread.
 """
 
 import time
@@ -55,9 +54,7 @@ def settings(config: PPOSettings) -> dict[str, Any]:
     return {name: getattr(config, name) for name in SETTINGS}
 
 
-def training_epoch(
-    env: ImitationEnv, config: PPOSettings, batches: int
-) -> tuple[Callable[..., Any], Callable[..., Any]]:
+def training_epoch(env: ImitationEnv, config: PPOSettings, batches: int) -> Any:
     """The compiled functions of `mimic.train` that begin a training, and that train for so many batches."""
     networks = training.make_networks(config, env.observation_size, env.action_size)
     schedule = optax.constant_schedule(config.learning_rate)
@@ -125,7 +122,7 @@ def run(name: str, config: PPOSettings, case: str, batches: int) -> Row:
 
 
 def main() -> None:
-    numbers = {"num_envs": int, "batch_size": int, "batches": int}  # default: of the preset
+    numbers: Any = {"num_envs": int, "batch_size": int, "batches": int}  # default: of the preset
     options = make_parser("ppo", __doc__, env="panda4dof", only=CASES, **numbers).parse_args()
     config = PPOConfig(num_envs=options.num_envs, batch_size=options.batch_size)
     config = config.resolve(jax.default_backend(), jax.device_count())

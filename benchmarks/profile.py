@@ -2,17 +2,18 @@
 
     python -m benchmarks.profile [--out FILE] [--env panda4dof] [--batches 10]
 
-Profiles one training epoch, after another that compiles: so many batches collected and learned from. The times of
-kernels that run concurrently are added up, so that their sum exceeds the epoch. There should be no copies between host
-and device but those that start the epoch. "Busy" is the fraction of the wall time in which a kernel ran.
+Profiles one training epoch of so many batches, after another that compiles. The times of concurrent kernels are added
+up, so that their sum exceeds the epoch; "busy" is the time in which a kernel ran.
 """
 
 import re
+import sys
 import tempfile
 import time
+from collections import namedtuple
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
@@ -22,42 +23,32 @@ from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.ppo import training_epoch
 from mimic.trainers.config import PPOConfig
 
-KINDS = (  # of kernels, by patterns of their names; the first that matches
-    ("copy, host to device", r"memcpy.?h2d|memcpyhtod"),
-    ("copy, device to host", r"memcpy.?d2h|memcpydtoh"),
-    ("copy on the device", r"memcpy|memset"),
-    ("matrix products", r"gemm|cublas|cutlass|nvjet|xmma|dot"),
-    ("physics", r"^kernel$|kernel_call|_kernel\b|pallas"),
-    ("sorting", r"sort|cub::"),
-    ("random numbers", r"threefry"),
-    ("other fusions", r""),
-)
+KINDS = {  # of kernels, by patterns of their names; the first that matches
+    "copy, host to device": r"memcpy.?h2d|memcpyhtod",
+    "copy, device to host": r"memcpy.?d2h|memcpydtoh",
+    "copy on the device": r"memcpy|memset",
+    "matrix products": r"gemm|cublas|cutlass|nvjet|xmma|dot",
+    "physics": r"^kernel$|kernel_call|_kernel\b|pallas",
+    "sorting": r"sort|cub::",
+    "random numbers": r"threefry",
+    "other fusions": r"",
+}
 _LONGEST = 12  # kernels that the file lists
 
-
-class Event(NamedTuple):
-    """A kernel or copy on a device: name, start and duration [ns]."""
-
-    name: str
-    start: float
-    duration: float
+Event = namedtuple("Event", "name start duration")  # a kernel or copy on a device; [ns]
 
 
 def device_events(folder: Path) -> list[Event]:
     """Kernels and copies of the devices, in a folder of JAX's profiler."""
     (file,) = folder.glob("**/*.xplane.pb")
-    return [
-        Event(event.name, event.start_ns, event.duration_ns)
-        for plane in jax.profiler.ProfileData.from_file(str(file)).planes
-        if plane.name.startswith("/device:GPU")
-        for line in plane.lines
-        if line.name.startswith("Stream")
-        for event in line.events
-    ]
+    planes = jax.profiler.ProfileData.from_file(str(file)).planes
+    lines = [line for plane in planes if plane.name.startswith("/device:GPU") for line in plane.lines]
+    events = [event for line in lines if line.name.startswith("Stream") for event in line.events]
+    return [Event(event.name, event.start_ns, event.duration_ns) for event in events]
 
 
 def kind(name: str) -> str:
-    return next(label for label, pattern in KINDS if re.search(pattern, name, re.IGNORECASE))
+    return next(kind for kind, pattern in KINDS.items() if re.search(pattern, name, re.IGNORECASE))
 
 
 def by_name(events: Iterable[Event], naming: Callable[[str], str]) -> list[Row]:
@@ -94,10 +85,9 @@ def profile(name: str, batches: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = make_parser("profile", __doc__, env="panda4dof", batches=10)
-    options = parser.parse_args()
+    options = make_parser("profile", __doc__, env="panda4dof", batches=10).parse_args()
     if jax.default_backend() != "gpu":
-        parser.error(f"expected a GPU, whose kernels the profiler records, got {jax.default_backend()}")
+        sys.exit(f"error: expected a GPU, whose kernels the profiler records, got {jax.default_backend()}")
     content = profile(options.env, options.batches)
     print_table(content["kinds"], "what count:, ms:.2f")
     print_table([content], "env_steps:, wall_s:.3f busy_s:.3f")

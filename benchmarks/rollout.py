@@ -1,14 +1,13 @@
 """Simulation speed: steps per second of the physics, of whole environment steps, and of their parts.
 
-    python -m benchmarks.rollout --out FILE [--envs panda7dof ...] [--arms 64 512 ...] [--peer-arms 512 ...]
-                                [--cases fused MJX-Warp ...]
+    python -m benchmarks.rollout --out FILE [--envs panda7dof ...] [--arms 512 8192 ...] [--cases fused MJX-Warp ...]
 
-Every case makes control steps of 0.1 s under random torques, with the environment's own 10 Runge-Kutta steps. The
-physics of the environments, `fused` and `mjx`, is compared with a loop that carries `mjx.Data`, as is usual, MJX-Warp,
-where it is installed, and C MuJoCo's threaded rollout on the CPU. Environment steps add the reward, the observation and
-new episodes; the stock environment carries and resets `mjx.Data`, as brax environments usually do.
+Every case makes control steps of 0.1 s under random torques. The physics of the environments, `fused` and `mjx`, is
+compared with a loop that carries `mjx.Data`, MJX-Warp, where it is installed, and C MuJoCo's threaded rollout on the
+CPU; whole environment steps with the stock one, which carries and resets `mjx.Data`, as brax environments usually do.
 """
 
+import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -31,8 +30,7 @@ from mimic.envs.physics import Load, make_advance
 from mimic.envs.wrappers import wrap_for_training
 
 ENVS = ("panda7dof", "panda4dof", "panda3dof")
-ARMS = (64, 512, 4096, 8192, 32768, 65536, 131072)
-PEER_ARMS = (512, 8192, 65536)  # for cases that are slow to compile and to run
+ARMS = [512, 8192, 65536]
 STEPS = 10  # control steps in a call
 COLUMNS = "env group case arms:, steps_per_s:,.0f spread:.0% compile_s:.1f bytes_per_arm:,.0f"
 
@@ -55,7 +53,7 @@ def own_physics(physics: str, env: ImitationEnv, arms: int) -> Timing:
     substeps = env.config.substeps
     advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
     qpos, qvel, torques = random_motion(env, arms)
-    many = jax.vmap(lambda qpos, qvel, torque: advance(qpos, qvel, torque, Load()))
+    many: Any = jax.vmap(lambda qpos, qvel, torque: advance(qpos, qvel, torque, Load()))
     return time_steps(lambda state, torques: (many(*state, torques), None), (qpos, qvel), torques)
 
 
@@ -106,14 +104,10 @@ def part(name: str, env: ImitationEnv, arms: int) -> Timing:
     qpos, qvel, torques = random_motion(env, arms)
     started = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), arms))
 
-    def new_episode(arm: Any) -> jax.Array:
-        fresh = env.start(arm.key)
-        return jnp.sum(fresh.qpos) + fresh.demonstration + fresh.key[0]
-
     functions = {
         "reward": lambda arm: env.distance(arm.qpos, arm.qvel, arm.demonstration, arm.step),
         "observation": lambda arm: jnp.sum(env.observe(arm)),
-        "new episode": new_episode,
+        "new episode": lambda arm: jax.tree.reduce(lambda total, x: total + jnp.sum(x), env.start(arm.key)),
     }
 
     def step(state: Any, torque: jax.Array) -> Any:
@@ -135,32 +129,28 @@ CASES: dict[str, dict[str, Case]] = {
     "part": {name: partial(part, name) for name in ("reward", "observation", "new episode")},
 }
 NAMES = tuple(dict.fromkeys(case for cases in CASES.values() for case in cases))
-OWN = {("physics", "fused"), ("environment", "fused"), ("part", "reward")}  # quick to compile: for all numbers of arms
 
 
-def run(envs: Sequence[str], sizes: Sequence[int], peer_sizes: Sequence[int], names: Sequence[str]) -> Iterator[Row]:
+def run(envs: Sequence[str], sizes: Sequence[int], names: Sequence[str]) -> Iterator[Row]:
     """The measurements of the named cases; a case that fails is a row with the reason."""
     for name in envs:
         env = mimic.make(name, physics="fused")
-        for group, case in [(group, case) for group, cases in CASES.items() for case in cases if case in names]:
-            for arms in sorted({*peer_sizes, *(sizes if (group, case) in OWN else ())}):
-                row: Row = {"env": name, "group": group, "case": case, "arms": arms}
-                try:
-                    timing = CASES[group][case](env, arms)
-                    steps = arms * STEPS * (env.config.substeps if group == "physics" else 1)
-                    rates = {"steps_per_s": steps / timing.median, "bytes_per_arm": timing.bytes / arms}
-                    yield {**row, **timing.summary(), **rates}
-                except Exception as error:  # a peer that is not installed or out of memory
-                    yield {**row, **failure(error)}
+        cases = [(group, case) for group, named in CASES.items() for case in named if case in names]
+        for (group, case), arms in itertools.product(cases, sizes):
+            row: Row = {"env": name, "group": group, "case": case, "arms": arms}
+            try:
+                timing = CASES[group][case](env, arms)
+                steps = arms * STEPS * (env.config.substeps if group == "physics" else 1)
+                rates = {"steps_per_s": steps / timing.median, "bytes_per_arm": timing.bytes / arms}
+                yield {**row, **timing.summary(), **rates}
+            except Exception as error:  # a peer that is not installed or out of memory
+                yield {**row, **failure(error)}
 
 
 def main() -> None:
-    lists = {"envs": ENVS, "arms": [*ARMS], "peer_arms": [*PEER_ARMS], "cases": NAMES}
-    parser = make_parser("rollout", __doc__, **lists)
-    options = parser.parse_args()
-    rows = run(options.envs, options.arms, options.peer_arms, options.cases)
-    if not collect(options, rows, "rows", COLUMNS, control_steps=STEPS):
-        parser.error("--arms, --peer-arms: expected a number of arms for the cases of --cases, got none")
+    options = make_parser("rollout", __doc__, envs=ENVS, arms=ARMS, cases=NAMES).parse_args()
+    rows = run(options.envs, options.arms, options.cases)
+    collect(options, rows, "rows", COLUMNS, control_steps=STEPS)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,7 @@
 
     python -m benchmarks.run [all|NAME ...] --out DIR
 
-Each benchmark is a process of its own and writes DIR/NAME_DEVICE.json. The table of targets is of all files in DIR;
-without a name it is all that is done.
+Each benchmark writes DIR/NAME_DEVICE.json. The table of targets is of all files in DIR, also without a name.
 """
 
 import os
@@ -56,7 +55,7 @@ def main() -> None:
         arguments = command(name, out, backend, devices, options.commit)
         if subprocess.run(arguments, env=environment, check=False).returncode:
             failed.append(name)
-    print_table(targets.table(targets.read_folder(options.out)), "quantity on measured target met from")
+    print_table(targets.table(targets.read_folder(options.out)), "quantity on measured:,.4g target met from")
     if failed:
         sys.exit(f"error: failed: {', '.join(failed)}")
 

@@ -3,11 +3,11 @@
     python -m benchmarks.scaling --out FILE [--devices 1 2 4 8] [--processes one each] [--env panda4dof] [--seeds 0 1]
 
 Weak scaling gives each device as many arms, samples and steps as one device alone has; strong scaling distributes
-those. A run is one process that sees all devices, or a process for each; without GPUs, of devices that XLA makes of the
-CPU, which shows that it runs and not how fast. The speed is that of training between two evaluations, the median of all
-but the first, which compiles. Strong scaling changes the random numbers alone: its gaps must agree within their noise.
+those, so that its gaps must agree within their noise. A run is one process that sees all devices, or a process for
+each; without GPUs, of devices that XLA makes of the CPU. The speed is the median between two evaluations.
 """
 
+import argparse
 import itertools
 import os
 import statistics
@@ -32,12 +32,6 @@ _PREALLOCATE = "XLA_PYTHON_CLIENT_PREALLOCATE"
 COLUMNS = "scaling devices processes steps_per_s:,.0f efficiency:.1% gap:.2% gap_deviation:.2% seeds"
 
 
-def arguments(kind: str, devices: int, of_one: dict[str, int]) -> list[str]:
-    """Arguments of `mimic.train` for weak or strong scaling of num_envs, batch_size and num_timesteps of one device."""
-    factor = devices if kind == "weak" else 1
-    return [f"trainer.{key}={factor * value}" for key, value in of_one.items()]
-
-
 def environment(devices: int, processes: int, backend: str) -> dict[str, str]:
     """Variables of a run that sees so many GPUs, or whose processes together have so many devices made of the CPU."""
     inherited = {key: value for key, value in os.environ.items() if key != _PREALLOCATE}
@@ -51,7 +45,8 @@ def environment(devices: int, processes: int, backend: str) -> dict[str, str]:
 
 def measure(kind: str, devices: int, processes: int, seed: int, common: Sequence[str], of_one: dict[str, int]) -> Row:
     local = ["distributed.coordinator=local", f"distributed.processes={processes}"] if processes > 1 else []
-    training = [*common, *arguments(kind, devices, of_one), f"seed={seed}", *local]
+    sizes = [f"trainer.{key}={value * devices if kind == 'weak' else value}" for key, value in of_one.items()]
+    training = [*common, *sizes, f"seed={seed}", *local]
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
         result = train(run_dir, training, env=environment(devices, processes, jax.default_backend()))
@@ -62,10 +57,7 @@ def measure(kind: str, devices: int, processes: int, seed: int, common: Sequence
 
 
 def summary(runs: Sequence[Row]) -> list[Row]:
-    """Medians over the seeds and spread of the gaps, for each kind and number of processes and devices.
-
-    Efficiency is the speed of a device relative to that with the fewest devices, in as few processes.
-    """
+    """Medians over the seeds; efficiency is the speed of a device relative to that with the fewest, in one process."""
     groups: dict[tuple[int, int, int], list[Row]] = {}
     for run in runs:
         groups.setdefault((KINDS.index(run["scaling"]), run["processes"], run["devices"]), []).append(run)
@@ -81,26 +73,22 @@ def summary(runs: Sequence[Row]) -> list[Row]:
     return rows
 
 
-def run(
-    kinds: Sequence[str],
-    devices: Sequence[int],
-    processes: Sequence[str],
-    seeds: Sequence[int],
-    common: Sequence[str],
-    of_one: dict[str, int],
-) -> Iterator[Row]:
+def run(options: argparse.Namespace) -> Iterator[Row]:
     """Each run as it ends; a run on one device counts for all kinds."""
-    for count, seed, division, kind in itertools.product(devices, seeds, processes, kinds):
-        if count > 1 or (division, kind) == (processes[0], kinds[0]):
-            result = measure(kind, count, count if division == "each" else 1, seed, common, of_one)
-            yield from ({**result, "scaling": counted} for counted in (kinds if count == 1 else [kind]))
+    of_one = {"num_envs": options.num_envs, "batch_size": options.batch_size, "num_timesteps": options.steps}
+    common = [f"env={options.env}", "env.physics=fused", f"trainer.evaluations={_EVALUATIONS}", *options.arguments]
+    cases = itertools.product(sorted(options.devices), options.seeds, options.processes, options.kinds)
+    for devices, seed, division, kind in cases:
+        if devices > 1 or (division, kind) == (options.processes[0], options.kinds[0]):
+            result = measure(kind, devices, devices if division == "each" else 1, seed, common, of_one)
+            yield from ({**result, "scaling": counted} for counted in (options.kinds if devices == 1 else [kind]))
 
 
 def draw(rows: Sequence[Row], title: str, out: Path) -> None:
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     for kind, each in itertools.product(KINDS, (False, True)):
         line = [r for r in rows if r["scaling"] == kind and (r["devices"] == 1 or (r["processes"] > 1) == each)]
-        label = f"{kind}, {'a process for each' if each else 'one process'}"
+        label = f"{kind}, {'a process for each' if each else 'one process'}" if len(line) > 1 else None
         for axes, entry in zip(panels, ("steps_per_s", "efficiency"), strict=True):
             axes.plot([row["devices"] for row in line], [row[entry] for row in line], "o-", label=label)
             axes.set(xlabel="devices", ylabel=entry, title=title)
@@ -119,10 +107,8 @@ def main() -> None:
     options = parser.parse_args()
     if backend == "gpu" and max(options.devices) > jax.device_count():
         parser.error(f"--devices: this host has {jax.device_count()}, got {max(options.devices)}")
-    of_one = {"num_envs": options.num_envs, "batch_size": options.batch_size, "num_timesteps": options.steps}
-    common = [f"env={options.env}", "env.physics=fused", f"trainer.evaluations={_EVALUATIONS}", *options.arguments]
     runs = []
-    for row in run(options.kinds, sorted(options.devices), options.processes, options.seeds, common, of_one):
+    for row in run(options):
         runs.append(row)  # a run that fails loses none of those before
         write_results(options, env=options.env, rows=summary(runs), runs=runs)
     print_table(summary(runs), COLUMNS)

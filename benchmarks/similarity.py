@@ -2,19 +2,17 @@
 
     python -m benchmarks.similarity --out FILE [--arms FOLDER] [--plot FILE.png] [--pair NAME ...]
 
-For every pair of arms and set of expert poses, the learner takes the pose of minimum distance under each candidate
-metric (links kept or merged, correspondence, translation weight; the rotation weight is 1), and the five measures of
-`mimic.metric.similarity` compare the arms, as they do for the baselines of `mimic.retargeting.pose_baselines`.
-FOLDER holds an unpacked wheel of robosuite, for arms other than the Panda; without it they are left out.
-
-`imitate_pose` is compiled for each pair, links and correspondence, which takes about 10 s.
+The learner takes the pose of minimum distance under each candidate metric (links kept or merged, correspondence,
+translation weight; the rotation weight is 1); baselines are those of `mimic.retargeting.pose_baselines`. FOLDER holds
+an unpacked wheel of robosuite, for arms other than the Panda. Each pair, links and correspondence compiles for 10 s.
 """
 
+import dataclasses
 import itertools
 import logging
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +23,7 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, write_results
 from benchmarks.figures import similarity_front
 from mimic.arms.arm import ArmConfig, build_arm
+from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.retargeting.pose_baselines import BASELINES
@@ -38,37 +37,25 @@ MERGED = {("merged", name): SOME_TRANSLATIONS for name in ("overlap", "arc_lengt
 STATE_DEPENDENT = {("kept", name): SOME_TRANSLATIONS for name in ("hard", "soft")}
 SUBSET = ("panda -3,6,7", "panda -5")  # of state-dependent correspondence, which is slow
 EVERY = 10  # samples of a demonstration of which one is taken
-FULL = "panda -3,6,7"  # the environment panda4dof: on more demonstrations and samples
-FULL_DEMONSTRATIONS, FULL_EVERY = 40, 5
-ROBOSUITE = ("UR5e", "IIWA", "Kinova3", "Sawyer", "Jaco", "xArm7")
+FULL, FULL_DEMONSTRATIONS = "panda -3,6,7", 40  # the environment panda4dof: on more demonstrations and samples
+ROBOSUITE = ("UR10e", "UR5e", "IIWA", "Kinova3", "Sawyer", "Jaco", "xArm7")
 
 
-class Pair(NamedTuple):
-    """Two arms: "panda -3,6,7" for a Panda with joints locked, else "EXPERT to LEARNER"."""
-
-    name: str
-    expert: ArmConfig
-    learner: ArmConfig
-
-
-def locked_pandas() -> list[Pair]:
+def locked_pandas() -> list[EnvConfig]:
     """All single and double locks, and two of the environments."""
     locks = [lock for count in (1, 2) for lock in itertools.combinations(range(1, 8), count)]
     locks += [(3, 6, 7), (2, 3, 6, 7)]
-    return [Pair(f"panda -{','.join(map(str, x))}", ArmConfig(), ArmConfig(locked=list(x))) for x in locks]
+    return [EnvConfig(f"panda -{','.join(map(str, x))}", learner=ArmConfig(locked=list(x))) for x in locks]
 
 
-def other_arms(folder: Path | None) -> tuple[list[Pair], list[str]]:
+def other_arms(folder: Path) -> tuple[list[EnvConfig], list[str]]:
     """Pairs of the Panda with arms in a folder, both directions, and the names of arms that are not in it."""
-    pairs, missing = [], ["UR10e"]
-    for name in ROBOSUITE:
-        file = (folder or Path()) / f"robosuite/models/assets/robots/{name.lower()}/robot.xml"
-        if folder is None or not file.is_file():
-            missing.append(name)
-            continue
-        arm = ArmConfig(model=str(file), tip="right_hand", armature=0.3, damping=3.0)  # as docs/own_arm.md proposes
-        pairs += [Pair(f"panda to {name}", ArmConfig(), arm), Pair(f"{name} to panda", arm, ArmConfig())]
-    return pairs, missing
+    files = {name: folder / f"robosuite/models/assets/robots/{name.lower()}/robot.xml" for name in ROBOSUITE}
+    pairs = []
+    for name in (name for name, file in files.items() if file.is_file()):
+        arm = ArmConfig(str(files[name]), tip="right_hand", armature=0.3, damping=3.0)  # as docs/own_arm.md proposes
+        pairs += [EnvConfig(f"panda to {name}", learner=arm), EnvConfig(f"{name} to panda", expert=arm)]
+    return pairs, [name for name, file in files.items() if not file.is_file()]
 
 
 def expert_motions(config: ArmConfig, count: int, random: int) -> dict[str, Any]:
@@ -86,11 +73,12 @@ def expert_motions(config: ArmConfig, count: int, random: int) -> dict[str, Any]
 
 
 def optimal_poses(
-    pair: Pair, links: str, correspondence: str, translations: tuple[float, ...], qpos: np.ndarray
+    pair: EnvConfig, links: str, correspondence: str, translations: tuple[float, ...], qpos: np.ndarray
 ) -> Iterator[tuple[str, mimic.Embodiment, np.ndarray]]:
     """Name, learner and its poses for each translation weight; compiled once for all weights."""
-    expert, learner = build_arm(pair.expert).embodiment, build_arm(pair.learner, links=links).embodiment
-    matrix = MetricConfig(correspondence=correspondence, links=links).make_correspondence(expert, learner)
+    pair = dataclasses.replace(pair, metric=MetricConfig(correspondence=correspondence, links=links))
+    expert, learner = pair.build_arms().embodiments
+    matrix = pair.metric.make_correspondence(expert, learner)
 
     @jax.jit
     def solve(qpos: jax.Array, translation: jax.Array) -> jax.Array:
@@ -102,10 +90,9 @@ def optimal_poses(
         yield f"{links} {correspondence} {translation:g}", learner, poses
 
 
-def run_pair(pair: Pair, demonstrations: int, random: int) -> list[Row]:
-    expert, learner = build_arm(pair.expert).embodiment, build_arm(pair.learner).embodiment
-    is_full = pair.name == FULL
-    count, every = (max(FULL_DEMONSTRATIONS, demonstrations), FULL_EVERY) if is_full else (demonstrations, EVERY)
+def run_pair(pair: EnvConfig, demonstrations: int, random: int) -> list[Row]:
+    expert, learner = pair.build_arms().embodiments
+    count, every = (max(FULL_DEMONSTRATIONS, demonstrations), 5) if pair.name == FULL else (demonstrations, EVERY)
     rows: list[Row] = []
     motions = expert_motions(pair.expert, count, random)
     for kind in [kind for kind, motion in motions.items() if isinstance(motion, str)]:
@@ -118,15 +105,13 @@ def run_pair(pair: Pair, demonstrations: int, random: int) -> list[Row]:
         means = {name: [round(float(x), 5) for x in (v.mean(), np.quantile(v, 0.9))] for name, v in values.items()}
         rows.append({"pair": pair.name, "set": kind, "poses": len(qpos), "method": method, "measures": means})
 
-    for kind, motion in motions.items():
-        for baseline, function in BASELINES.items():
-            posed = function(expert, learner, motion)
-            if posed is not None:
-                add(baseline, kind, learner, posed[:, ::every].reshape(-1, learner.num_joints))
-    ends = np.cumsum([len(qpos) for qpos in sets.values()])
+    for (kind, motion), (baseline, function) in itertools.product(motions.items(), BASELINES.items()):
+        posed = function(expert, learner, motion)
+        if posed is not None:
+            add(baseline, kind, learner, posed[:, ::every].reshape(-1, learner.num_joints))
+    everything, ends = np.concatenate([*sets.values()]), np.cumsum([len(qpos) for qpos in sets.values()])
     candidates = KEPT | (MERGED if pair.learner.locked else {}) | (STATE_DEPENDENT if pair.name in SUBSET else {})
     for (links, correspondence), translations in candidates.items():
-        everything = np.concatenate([*sets.values()])
         for method, arm, poses in optimal_poses(pair, links, correspondence, translations, everything):
             for kind, part in zip(sets, np.split(poses, ends[:-1]), strict=True):
                 add(method, kind, arm, part)
@@ -134,8 +119,10 @@ def run_pair(pair: Pair, demonstrations: int, random: int) -> list[Row]:
 
 
 def main() -> None:
-    paths = {"arms": Path, "plot": Path}
-    parser = make_parser("similarity", __doc__, **paths, demonstrations=20, random=120)
+    parser = make_parser("similarity", __doc__, plot=Path, demonstrations=20, random=120)
+    parser.add_argument(
+        "--arms", type=Path, default="robosuite", metavar="FOLDER", help="of an unpacked robosuite wheel"
+    )
     parser.add_argument("--pair", nargs="+", metavar="NAME", help="these pairs alone")
     options = parser.parse_args()
     logging.getLogger("mimic").setLevel(logging.ERROR)

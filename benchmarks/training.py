@@ -20,25 +20,22 @@ from benchmarks.common.record import Row, collect
 
 
 class Case(NamedTuple):
-    """A training run: arguments of `python -m mimic.train`, and the optimality gap to reach."""
+    """The optimality gap to reach, arguments of `python -m mimic.train`, and further ones by backend."""
 
-    arguments: tuple[str, ...]
     goal: float
-    on: dict[str, tuple[str, ...]] = {}  # further arguments, by backend
+    arguments: str
+    on: dict[str, str] = {}
 
 
+SHORT = {
+    "gpu": "trainer.num_timesteps=15000000 trainer.evaluations=15",
+    "cpu": "trainer.num_timesteps=800000 trainer.evaluations=8",
+}
 CASES = {
-    "one_demonstration": Case(
-        ("env=panda7dof", "env.physics=fused", "env.demonstrations.count=1"),
-        0.02,
-        {
-            "gpu": ("trainer.num_timesteps=15000000", "trainer.evaluations=15"),
-            "cpu": ("trainer.num_timesteps=800000", "trainer.evaluations=8"),
-        },
-    ),
-    "panda7dof": Case(("env=panda7dof", "env.physics=fused"), 0.02),
-    "panda4dof": Case(("env=panda4dof", "env.physics=fused"), 0.03),
-    "panda3dof": Case(("env=panda3dof", "env.physics=fused"), 0.03),
+    "one_demonstration": Case(0.02, "env=panda7dof env.physics=fused env.demonstrations.count=1", SHORT),
+    "panda7dof": Case(0.02, "env=panda7dof env.physics=fused"),
+    "panda4dof": Case(0.03, "env=panda4dof env.physics=fused"),
+    "panda3dof": Case(0.03, "env=panda3dof env.physics=fused"),
 }
 COLUMNS = (
     "case start report[seed] report[optimality_gap][train]:.2% report[optimality_gap][held_out]:.2% to_goal_s:.1f "
@@ -48,7 +45,7 @@ COLUMNS = (
 
 def run_case(name: str, seed: int, starts: Sequence[str]) -> Iterator[Row]:
     case = CASES[name]
-    arguments = (*case.arguments, *case.on.get(jax.default_backend(), ()), f"seed={seed}")
+    arguments = [*f"{case.arguments} {case.on.get(jax.default_backend(), '')}".split(), f"seed={seed}"]
     with tempfile.TemporaryDirectory() as folder:
         for start in starts:
             run_dir = Path(folder) / start

@@ -1,7 +1,6 @@
 """The command line of every benchmark."""
 
 import argparse
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,12 @@ def make_parser(name: str, doc: str | None, out: str = "FILE", **options: Any) -
       name: of the benchmark.
       doc: docstring of its module; the first line is shown by `--help`.
       out: "FILE", "DIR" for a folder, which is required, or "" without results.
-      options: defaults by name. False is a flag, a type an option of that type without default, a list several numbers,
-        any other collection some of its names (all by default).
+      options: defaults by name: False for a flag, a type for an option without default, a list for several numbers, any
+        other collection for some of its names.
     """
-    summary = (doc or "").split("\n")[0]
     show_defaults = argparse.ArgumentDefaultsHelpFormatter
-    parser = argparse.ArgumentParser(f"python -m benchmarks.{name}", description=summary, formatter_class=show_defaults)
+    parser = argparse.ArgumentParser(f"python -m benchmarks.{name}", formatter_class=show_defaults)
+    parser.description = (doc or "").split("\n")[0]
     parser.set_defaults(benchmark=name)
     if out:
         parser.add_argument("--out", type=Path, metavar=out, required=out == "DIR", help="results, figures beside them")
@@ -33,8 +32,8 @@ def _arguments(default: Any) -> dict[str, Any]:
         return {"action": "store_true"}
     if isinstance(default, type):
         return {"type": default}
+    if isinstance(default, str | int | float):
+        return {"type": type(default), "default": default}
     if isinstance(default, list):
         return {"nargs": "*", "type": type(default[0]), "default": default, "metavar": "N"}
-    if isinstance(default, Collection) and not isinstance(default, str):
-        return {"nargs": "+", "choices": list(default), "default": list(default)}
-    return {"type": type(default), "default": default}
+    return {"nargs": "+", "choices": list(default), "default": list(default)}

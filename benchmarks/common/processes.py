@@ -27,14 +27,7 @@ def run_process(command: Sequence[str], **options: Any) -> float:
 
 
 def train(run_dir: Path, arguments: Sequence[str], cache: Path | str = "", **options: Any) -> dict[str, Any]:
-    """Report of one training run in a new folder, and wall time of its process [s].
-
-    Args:
-      run_dir: the new folder.
-      arguments: of `python -m mimic.train`.
-      cache: compilation cache; none if empty.
-      options: of `subprocess.run`.
-    """
+    """Report of `python -m mimic.train` in a new folder, and wall time of its process [s]; options of `subprocess`."""
     paths = f"run_dir={run_dir}", f"compilation_cache={cache}"
     wall = run_process([sys.executable, "-m", "mimic.train", *arguments, *paths], **options)
     report = json.loads((run_dir / REPORT).read_text())
@@ -49,23 +42,14 @@ def read_metrics(run_dir: Path, *columns: str) -> list[tuple[float, ...]]:
 
 
 def time_to_goal(run_dir: Path, quality: str, goal: float) -> float | None:
-    """Time since the start of the process [s] of the first of three successive evaluations at or below a goal.
-
-    Of all that remain, if the training ends before; None if the goal is never reached.
-    """
+    """Time since the start of the process [s] of the first of three successive evaluations, or all last, at a goal."""
     rows = read_metrics(run_dir, f"quality/{quality}", "wall_time_s")
     times = (wall for i, (_, wall) in enumerate(rows) if all(value <= goal for value, _ in rows[i : i + _HELD]))
     return next(times, None)
 
 
 def run_parallel(commands: Mapping[Path, Sequence[str]], jobs: int, devices: int) -> list[Path]:
-    """Runs commands in parallel; the logs of those that failed. Ctrl-C reaches those that run and starts no others.
-
-    Args:
-      commands: by their log files.
-      jobs: processes on each device.
-      devices: number of GPUs; 0 for the CPU.
-    """
+    """Runs commands, so many jobs on each GPU or on the CPU; commands and those that failed are named by their logs."""
     slots: queue.Queue[int] = queue.Queue()
     for slot in range(jobs * max(devices, 1)):
         slots.put(slot % max(devices, 1))

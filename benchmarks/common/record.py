@@ -49,13 +49,7 @@ def failure(error: Exception) -> Row:
 
 
 def print_table(rows: Iterable[Mapping[str, Any]], columns: str, title: str | None = None) -> None:
-    """Prints rows as a table; of a row that failed, the last column has the reason.
-
-    Args:
-      rows: the results.
-      columns: entries of a row with their formats, as in "case steps_per_s:,.0f gap[train]:.2%".
-      title: of the table.
-    """
+    """Prints entries of rows in formats as "case steps_per_s:,.0f gap[train]:.2%"; or the reason, if a row failed."""
     table = Table(*(column.partition(":")[0] for column in columns.split()), title=title)
     for row in rows:
         cells = [_cell(column, row) for column in columns.split()]

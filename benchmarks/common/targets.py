@@ -5,7 +5,7 @@ import json
 import math
 import operator
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +35,7 @@ class Target:
         return _RELATIONS[relation](value, float(target))
 
     def value(self, results: Mapping[str, Any]) -> float:
-        """The value in a results file.
-
-        Raises:
-          LookupError, TypeError, ValueError: the file does not contain it.
-        """
+        """The value in a results file; a `LookupError`, `TypeError` or `ValueError` if it is not there."""
         value, *subtracted = (
             _REDUCTIONS[self.reduce](list(_entries(results, self.entry.split("."), where)))
             for where in (self.where, self.minus)
@@ -51,7 +47,7 @@ class Target:
 def _entries(value: Any, path: Sequence[str], where: Mapping[str, Any]) -> Iterator[float]:
     if isinstance(value, list):
         for row in value:
-            if "failed" not in row and all(row.get(key, wanted) == wanted for key, wanted in where.items()):
+            if "failed" not in row and all(row.get(key, chosen) == chosen for key, chosen in where.items()):
                 yield from _entries(row, path, where)
     elif path:
         yield from _entries(value[path[0]], path[1:], where)
@@ -62,38 +58,34 @@ def _entries(value: Any, path: Sequence[str], where: Mapping[str, Any]) -> Itera
 TARGETS = [Target(**fields) for fields in yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())]
 
 
-def read_folder(folder: Path) -> dict[Path, Row]:
-    """The results files of a folder, the newest last; other files are ignored."""
-    files = {}
+def read_folder(folder: Path) -> list[tuple[str, Row]]:
+    """Names and contents of the results files of a folder, the newest first; other files are ignored."""
+    files = []
     for path in folder.glob("*.json"):
         try:
-            results = json.loads(path.read_text())
+            files.append((path.name, json.loads(path.read_text())))
         except ValueError:
             continue
-        if isinstance(results, dict) and "benchmark" in results:
-            files[path] = results
-    return dict(sorted(files.items(), key=lambda file: (file[1].get("date", ""), file[0])))
+    results = [file for file in files if isinstance(file[1], dict) and "benchmark" in file[1]]
+    return sorted(results, key=lambda file: (file[1].get("date", ""), file[0]), reverse=True)
 
 
-def find(target: Target, files: Mapping[Path, Row]) -> tuple[float, Path] | None:
-    """The value in the newest file that contains it, and that file."""
-    for path, results in reversed(list(files.items())):
+def find(target: Target, files: Iterable[tuple[str, Row]]) -> tuple[float, str] | None:
+    """The value in the newest file that contains it, and the name of that file."""
+    for name, results in files:
         backend = results.get("hardware", {}).get("backend")
         if results["benchmark"] == target.benchmark and target.backend in ("", backend):
             try:
-                return target.value(results), path
+                return target.value(results), name
             except (LookupError, TypeError, ValueError):  # another case of the benchmark, or null
                 continue
     return None
 
 
-def table(files: Mapping[Path, Row]) -> list[Row]:
+def table(files: Sequence[tuple[str, Row]]) -> Iterator[Row]:
     """A row for each target with the file of its value, or with the command that measures it."""
-    rows = []
     for target in TARGETS:
         row = {"quantity": target.quantity, "on": target.backend or "any", "target": target.target}
-        if known := find(target, files):
-            value, path = known
-            row |= {"measured": f"{value:,.4g}", "met": "met" if target.met(value) else "missed", "from": path.name}
-        rows.append({"from": f"python -m benchmarks.run {target.benchmark}", **row})
-    return rows
+        value, name = find(target, files) or (math.nan, f"python -m benchmarks.run {target.benchmark}")
+        met = "" if math.isnan(value) else "met" if target.met(value) else "missed"
+        yield {**row, "measured": value, "met": met, "from": name}

@@ -14,23 +14,15 @@ _SHORTEST_S = 0.02  # a repeat makes as many calls as fill this time, so that th
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Time of a call.
+    """Time of a call [s]: median and quartiles of the repeats."""
 
-    Attributes:
-      result: of the last call.
-      first: the first call [s].
-      median, low, high: median and quartiles of the repeats [s].
-      compile: tracing and compiling [s]; 0 for what is not compiled by JAX.
-      bytes: device memory of the compiled function with its arguments and results; 0 where unknown.
-    """
-
-    result: Any
-    first: float
+    result: Any  # of the last call
+    first: float  # the first call
     median: float
     low: float
     high: float
-    compile: float = 0.0
-    bytes: int = 0
+    compile: float = 0.0  # tracing and compiling; 0 for what is not compiled by JAX
+    bytes: int = 0  # device memory of the compiled function with its arguments and results; 0 where unknown
 
     def summary(self) -> dict[str, float]:
         """Entries of a results file; the spread is the interquartile range relative to the median."""

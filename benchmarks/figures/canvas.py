@@ -8,8 +8,6 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
-__all__ = ["plt", "save"]
-
 
 def save(figure: Any, out: Path) -> None:
     figure.savefig(out, dpi=150)

@@ -1,6 +1,6 @@
 """The rows of `benchmarks.similarity`: ratios to a baseline, cases lost, the Pareto front, tables and figure."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,7 @@ DEMONSTRATIONS = "pd", "reach"
 
 
 def to_lines(rows: Sequence[Row]) -> list[str]:
-    """Rows as lines of a table, a quarter of the size of nested JSON; the first names the columns.
-
-    Each measure has its mean and 90 % quantile; a set of poses that could not be made has the reason as its method.
-    """
+    """Rows as lines of a table, a quarter of the size of JSON; a set that failed has the reason as its method."""
     columns = [f"{name}{suffix}" for name in MEASURES for suffix in ("", " q90")]
     lines = [";".join(["pair", "set", "poses", "method", *columns])]
     for row in rows:
@@ -37,27 +34,19 @@ def is_lock(row: Row) -> bool:
     return row["pair"].startswith("panda -") and row["pair"].count(",") <= 1
 
 
-def is_other(row: Row) -> bool:
-    return " to " in row["pair"]
-
-
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     """`compare` for the locks and for the other arms, on demonstrations and on random poses."""
-    return {
-        f"{arms}, {poses}, to {baseline}": compare(rows, select, baseline, sets)
-        for arms, select, baseline in (("locks", is_lock, "copy_joints"), ("other arms", is_other, "hand_ik"))
-        for poses, sets in (("demonstrations", DEMONSTRATIONS), ("random poses", ("random",)))
-    }
+    summary = {}
+    for poses, sets in {"demonstrations": DEMONSTRATIONS, "random poses": ("random",)}.items():
+        others = [row for row in rows if " to " in row["pair"]]
+        summary[f"locks, {poses}, to copy_joints"] = compare([*filter(is_lock, rows)], "copy_joints", sets)
+        summary[f"other arms, {poses}, to hand_ik"] = compare(others, "hand_ik", sets)
+    return summary
 
 
-def compare(
-    rows: Sequence[Row], select: Callable[[Row], bool], baseline: str, sets: Sequence[str]
-) -> dict[str, dict[str, Any]]:
-    """By method: ratio of each measure to a baseline's (geometric mean over the cases), cases lost, and cases.
-
-    Methods that were not run on all cases are left out.
-    """
-    chosen = [row for row in rows if "failed" not in row and row["set"] in sets and select(row)]
+def compare(rows: Sequence[Row], baseline: str, sets: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """By method run on all cases: ratio of each measure to a baseline's (geometric mean), cases lost, and cases."""
+    chosen = [row for row in rows if "failed" not in row and row["set"] in sets]
     cases: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
     for row in chosen:
         means = {name: mean for name, (mean, _) in row["measures"].items()}
@@ -83,10 +72,8 @@ def pareto_front(compared: dict[str, dict[str, Any]]) -> list[str]:
         if method not in BASELINES and all(result[name]["ratio"] is not None for name in FRONT)
     }
 
-    def is_beaten(own: np.ndarray) -> bool:
-        return any(np.all(other <= own) and np.any(other < own) for other in ratios.values())
-
-    return [method for method, own in ratios.items() if not is_beaten(own)]
+    others = ratios.values()
+    return [key for key, own in ratios.items() if not any(np.all(x <= own) and np.any(x < own) for x in others)]
 
 
 def print_tables(rows: Sequence[Row]) -> None:
@@ -99,7 +86,7 @@ def print_tables(rows: Sequence[Row]) -> None:
 
 def plot(rows: Sequence[Row], path: Path) -> None:
     """The candidates on the 28 locked Pandas relative to copying: the whole arm on the left, the hand on the right."""
-    compared = compare(rows, is_lock, "copy_joints", DEMONSTRATIONS)
+    compared = compare([*filter(is_lock, rows)], "copy_joints", DEMONSTRATIONS)
     front = pareto_front(compared)
     families: dict[str, list[str]] = {}
     for method in compared:

@@ -62,34 +62,25 @@ def _distance(
 
 
 def _link_states(lib: Any, array: Function, arm: mimic.Embodiment) -> Function:
-    """A function to positions, directions and both velocities of the links, each [..., links, 3].
-
-    Twists are matrices too: with T = exp(q1 S1) ... exp(qn Sn) M, dT/dt T^-1 is the sum of the joints' velocities times
-    their adjoint axes. S^3 = -S, as all joints are revolute.
-    """
+    """Positions, directions and velocities of the links, [..., links, 3], by T = exp(q1 S1) ... exp(qn Sn) M."""
     screws, homes = np.zeros((arm.num_joints, 4, 4)), np.tile(np.eye(4), (arm.num_links, 1, 1))
     screws[:, :3, :3] = np.cross(np.eye(3), np.asarray(arm.joint_axis)[:, None, :])
     screws[:, :3, 3] = np.cross(arm.joint_anchor, arm.joint_axis)
     homes[:, :3, :3], homes[:, :3, 3] = arm.link_rotation, arm.link_position
-    axes, squares, zero_poses, identity = (array(x) for x in (screws, screws @ screws, homes, np.eye(4)))
+    axes, squares, zero_poses, identity = (array(x) for x in (screws, screws @ screws, homes, np.eye(4)))  # S^3 = -S
     parents, length = np.add(arm.link_joint, 1).tolist(), float(arm.chain_length)
-
-    def inverse(transform: Any) -> Any:
-        back = lib.swapaxes(transform[..., :3, :3], -1, -2)
-        rows = lib.concatenate([back, -back @ transform[..., :3, 3:]], -1)
-        return lib.concatenate([rows, transform[..., 3:, :]], -2)
 
     def states(qpos: Any, qvel: Any) -> tuple[Any, ...]:
         transform = lib.broadcast_to(identity, (*qpos.shape[:-1], 4, 4))
-        transforms, twists = [transform], [lib.zeros_like(transform)]
+        transforms, rates = [transform], [lib.zeros_like(transform)]
         for joint in range(arm.num_joints):
             angle, speed = (x[..., joint, None, None] for x in (qpos, qvel))
-            twists.append(twists[-1] + speed * (transform @ axes[joint] @ inverse(transform)))
-            transform = transform @ (identity + lib.sin(angle) * axes[joint] + (1 - lib.cos(angle)) * squares[joint])
-            transforms.append(transform)
-        twist = lib.stack([twists[parent] for parent in parents], -3)
-        frames = lib.stack([transforms[parent] for parent in parents], -3) @ zero_poses
-        angular = lib.stack([twist[..., 2, 1], twist[..., 0, 2], twist[..., 1, 0]], -1)
-        return frames[..., :3, 3] / length, frames[..., :3, 0], (twist @ frames)[..., :3, 3] / length, angular
+            rotation = identity + lib.sin(angle) * axes[joint] + (1 - lib.cos(angle)) * squares[joint]
+            transforms.append(transforms[-1] @ rotation)
+            rates.append(rates[-1] @ rotation + speed * (transforms[-1] @ axes[joint]))
+        frames, rates = (lib.stack([x[parent] for parent in parents], -3) @ zero_poses for x in (transforms, rates))
+        spin = rates[..., :3, :3] @ lib.swapaxes(frames[..., :3, :3], -1, -2)
+        angular = lib.stack([spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]], -1)
+        return frames[..., :3, 3] / length, frames[..., :3, 0], rates[..., :3, 3] / length, angular
 
     return states

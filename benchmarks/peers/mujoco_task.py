@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.peers.stock import model_with_substeps
-from mimic.envs.imitation import ArmState, ImitationEnv
+from mimic.envs.imitation import ImitationEnv
 
 
 class MujocoTask(gymnasium.Env):
@@ -20,23 +20,18 @@ class MujocoTask(gymnasium.Env):
         self._model = model_with_substeps(imitation)
         self._data = mujoco.MjData(self._model)
         self._torque_scale, self._home = np.asarray(imitation.torque_scale, float), np.asarray(imitation.learner.home)
-        self._device = jax.local_devices(backend="cpu")[0]
-        with jax.default_device(self._device):
-            self._state = jax.device_get(dataclasses.replace(imitation.start(jax.random.PRNGKey(0)), load=None))
-        self._look = jax.jit(self._observation_and_reward)
+        self._state = jax.device_get(dataclasses.replace(imitation.start(jax.random.PRNGKey(0)), load=None))
+        distance = lambda arm: imitation.distance(arm.qpos, arm.qvel, arm.demonstration, arm.step)  # noqa: E731
+        self._look = jax.jit(lambda arm: (imitation.observe(arm), -distance(arm)))
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (imitation.observation_size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (imitation.action_size,), np.float32)
-
-    def _observation_and_reward(self, state: ArmState) -> tuple[jax.Array, jax.Array]:
-        distance = self._imitation.distance(state.qpos, state.qvel, state.demonstration, state.step)
-        return self._imitation.observe(state), -distance
 
     def _advanced(self, **changes: int) -> tuple[np.ndarray, float]:
         """Observation and reward of MuJoCo's state, with a new step or demonstration."""
         joints = {"qpos": self._data.qpos.astype(np.float32), "qvel": self._data.qvel.astype(np.float32)}
         numbers = {name: np.int32(value) for name, value in changes.items()}
         self._state = dataclasses.replace(self._state, **joints, **numbers)  # type: ignore[arg-type]
-        with jax.default_device(self._device):
+        with jax.default_device(jax.local_devices(backend="cpu")[0]):
             observation, reward = jax.device_get(self._look(self._state))
         return observation, float(reward)
 

@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-from brax.envs.base import Env, State, Wrapper
-from brax.envs.wrappers import training
+from brax.envs.base import State, Wrapper
+from brax.envs.wrappers.training import wrap as wrap
 from mujoco import mjx
 
 from mimic.envs.imitation import ArmState, ImitationEnv
@@ -21,10 +21,7 @@ def model_with_substeps(env: ImitationEnv) -> mujoco.MjModel:
 
 
 class StockEnv(Wrapper):
-    """Carries `mjx.Data` from step to step; reward, observation and torques are the imitation environment's.
-
-    Brax's own wrappers reset each arm to its first state, and so to its first demonstration.
-    """
+    """Reward, observation and torques are the imitation environment's; brax resets each arm to its first state."""
 
     def __init__(self, imitation: ImitationEnv):
         super().__init__(imitation)
@@ -54,7 +51,3 @@ class StockEnv(Wrapper):
             metrics={**state.metrics, "distance": distance},
             info={**state.info, "arm_state": after},
         )
-
-
-def wrap(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn: Any = None) -> Wrapper:
-    return training.wrap(env, episode_length, action_repeat, randomization_fn)

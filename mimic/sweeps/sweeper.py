@@ -159,7 +159,7 @@ def path_of(override: str) -> str:
 
 
 def _remaining(folder: Path, planned: Sequence[PlannedRun]) -> dict[int, list[str]]:
-    """The overrides that start each run, or resume it in a folder that has this sweep; by number, without those done."""
+    """By number, the overrides that start each run, or resume it if the folder has this sweep; none for runs done."""
     if not (folder / SWEEP).exists():
         return {number: run.overrides for number, run in enumerate(planned)}
     try:

@@ -98,7 +98,7 @@ def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
 
 
 def test_results_are_grouped_by_case_and_seed(tmp_path):
-    entries = {key: {"train": 0.5, "held_out": 0.6} for key in study.ENTRIES}
+    entries = {key: {"train": 0.5, "held_out": 0.6} for key in study.STUDY["entries"]}
 
     def add(name, gaps, seed, **more):
         run = write_run(tmp_path / name / str(seed), gaps, seed=seed)

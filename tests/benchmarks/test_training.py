@@ -30,7 +30,7 @@ def test_a_case_runs_cold_and_warm(monkeypatch):
         "trainer.preset=cpu", "trainer.num_timesteps=5000", "trainer.num_envs=16", "trainer.batch_size=16",
         "trainer.num_minibatches=2", "trainer.num_updates_per_batch=1", "trainer.evaluations=1",
     )  # fmt: skip
-    monkeypatch.setitem(training.CASES, "small", training.Case(small, goal=1e9))
+    monkeypatch.setitem(training.CASES, "small", training.Case(1e9, " ".join(small)))
     cold, warm = training.run_case("small", 1, ("cold", "warm"))
     assert (cold["start"], warm["start"]) == ("cold", "warm")
     assert 0 < cold["to_goal_s"] < cold["process_wall_s"] + 1
@@ -46,6 +46,6 @@ def test_cases_have_arguments_that_the_command_takes():
     cli._register_schemas()
     with hydra.initialize_config_module("mimic.conf", version_base="1.3"):
         for case in training.CASES.values():
-            for on in case.on.values() or [()]:
-                hydra.compose("train", [*case.arguments, *on])
+            for on in case.on.values() or [""]:
+                hydra.compose("train", f"{case.arguments} {on}".split())
     assert jax.default_backend() in training.CASES["one_demonstration"].on
