@@ -22,7 +22,7 @@ import yaml
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.processes import run_parallel
-from benchmarks.common.record import Row, write_results
+from benchmarks.common.record import WIDTH, Row, write_results
 from benchmarks.figures import study_figures
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.collect import prepare_collection
@@ -145,6 +145,7 @@ def main() -> None:
     chosen = [case for case in cases(options.preset) if case.group in options.only]
     options.runs.mkdir(parents=True, exist_ok=True)
     failed = [] if options.collect else run(chosen, options.runs, options.jobs)
+    os.environ.setdefault("COLUMNS", str(WIDTH))  # also without a terminal
     prepare_collection(CollectConfig(str(options.runs)))()
     results = collect(options.runs)
     write_results(options, preset=options.preset, results=results)

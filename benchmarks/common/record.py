@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from mimic.runs.files import finite, write_atomically
@@ -50,7 +51,7 @@ def failure(error: Exception) -> Row:
 
 def print_table(rows: Iterable[Mapping[str, Any]], columns: str, title: str | None = None) -> None:
     """Prints entries of rows in formats as "case steps_per_s:,.0f gap[train]:.2%"; or the reason, if a row failed."""
-    table = Table(*(column.partition(":")[0] for column in columns.split()), title=title)
+    table = Table(*(escape(column.partition(":")[0]) for column in columns.split()), title=title)
     for row in rows:
         cells = [_cell(column, row) for column in columns.split()]
         table.add_row(*([*cells[:-1], row["failed"]] if "failed" in row else cells))
