@@ -1,220 +1,158 @@
-"""The paper's dynamic motion imitation, and what lies beyond it: every number of docs/dynamic_imitation.md.
+"""The paper's dynamic motion imitation and experiments beyond it: all numbers of docs/dynamic_imitation.md.
 
     python -m benchmarks.dynamic_imitation --runs DIR --out FILE [--preset paper] [--only GROUP ...] [--jobs N]
 
-Trains and evaluates every case as a user does, by `python -m mimic.train` and `python -m mimic.evaluate`, several at
-once. What is in DIR is not done again, so that an interrupted study goes on where it was. Prints tables, writes a file
-of results, and figures beside it.
+Trains each case by `python -m mimic.train -m` over its seeds, and evaluates runs by `python -m mimic.evaluate`, several
+in parallel. What DIR contains is not repeated, so that an interrupted study can be continued. Prints the table of
+`python -m mimic.collect DIR`, writes a results file, and figures beside it.
 """
 
-import argparse
-import dataclasses
+import csv
 import itertools
 import json
 import os
-from collections.abc import Mapping, Sequence
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
-from rich.console import Console
+import yaml
 
-from benchmarks import study_results
-from benchmarks.processes import Task, run_tasks
-from benchmarks.record import write_results
+from benchmarks.common.parser import make_parser
+from benchmarks.common.processes import run_parallel
+from benchmarks.common.record import WIDTH, Row, write_results
+from benchmarks.figures import study_figures
 from mimic.arms.arm import ArmConfig, build_arm
+from mimic.commands.collect import prepare_collection
+from mimic.commands.config import CollectConfig
 from mimic.envs.recording import KINDS, record_demonstrations
-from mimic.metric.config import MetricConfig
+from mimic.runs.files import REPORT
+from mimic.sweeps.finished_runs import find_runs
+from mimic.sweeps.sweeper import path_override
 
-ARMS = ("panda7dof", "panda4dof", "panda3dof")
-_PAPER = ("metric=paper", "env.preview=0", "trainer.discounting=0.4", "trainer.crossovers=0")
-_ONE = ("env=panda7dof", "env.demonstrations.count=1")
-_RANDOM = (
-    "env.randomization.mass=[0.8,1.2]",
-    "env.randomization.damping=[0.8,1.2]",
-    "env.randomization.torque_noise=0.1",
-)
-_LOADS = {
-    "nominal": ("mass=1", "damping=1", "torque_noise=0"),
-    "mass-20": ("mass=0.8", "damping=1", "torque_noise=0"),
-    "mass+20": ("mass=1.2", "damping=1", "torque_noise=0"),
-    "damping-20": ("mass=1", "damping=0.8", "torque_noise=0"),
-    "damping+20": ("mass=1", "damping=1.2", "torque_noise=0"),
-    "noise10": ("mass=1", "damping=1", "torque_noise=0.1"),
-}
-_UNSEEN_SEED, _UNSEEN = 1000, 32  # demonstrations that no run has trained on, the same for all
+STUDY = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
+UNSEEN_SEED, UNSEEN = 1000, 32  # demonstrations that no run is trained on, the same for all
 
 
-@dataclasses.dataclass(frozen=True)
-class Preset:
-    """How much of it.
-
-    Attributes:
-      arguments: of all training runs.
-      short: of the many runs of the sweeps, besides.
-      seeds: of the paper's simulations.
-    """
-
-    arguments: tuple[str, ...]
-    short: tuple[str, ...]
-    seeds: int
-
-
-PRESETS = {
-    "paper": Preset(("env.physics=fused",), ("trainer.num_timesteps=30000000",), 3),
-    # Of no value but to see that everything runs.
-    "quick": Preset(
-        (
-            "env.physics=fused", "env.demonstrations.count=4", "env.demonstrations.held_out=2", "trainer.preset=cpu",
-            "trainer.num_timesteps=20000", "trainer.num_envs=32", "trainer.batch_size=32", "trainer.num_minibatches=4",
-            "trainer.evaluations=2", "trainer.crossovers=8",
-        ),
-        (), 1,
-    ),
-}  # fmt: skip
-
-
-@dataclasses.dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """Training runs that differ in their seed alone."""
 
     group: str
     name: str
-    arguments: tuple[str, ...]
+    arguments: list[str]
     seeds: int
 
+    def command(self, folder: Path) -> list[str]:
+        """The sweep that trains them, each in folder/NAME/SEED."""
+        seeds, sweep = ",".join(map(str, range(self.seeds))), folder / self.name
+        paths = path_override("run_dir", f"{sweep}/${{seed}}"), path_override("hydra.sweep.dir", str(sweep))
+        return [sys.executable, "-m", "mimic.train", "-m", *self.arguments, f"seed={seeds}", *paths]
 
-def cases(preset: Preset) -> list[Case]:
-    """Everything that is trained."""
-    many, short = preset.seeds, preset.short
-    learner = "env=panda7dof"
-    locked = [*itertools.combinations(range(1, 8), 1), *itertools.combinations(range(1, 8), 2)]
-    variants = {
-        "preview0": ("env.preview=0",),
-        "discount0.4": ("trainer.discounting=0.4",),
-        "discount0.8": ("trainer.discounting=0.8",),
-        "discount0.9": ("trainer.discounting=0.9",),
-        "no_velocities": ("env.metric.linear_velocity=0", "env.metric.angular_velocity=0"),
-        "no_positions": ("env.metric.translation=0",),
-        "positions_x4": (f"env.metric.translation={4 * MetricConfig().translation}",),
-        "velocities_x10": ("env.metric.linear_velocity=0.01", "env.metric.angular_velocity=0.1"),
-        "adaptive": ("env.metric.adaptive=true",),
-        "overlap": ("env.metric.correspondence=overlap",),
-        "hard": ("env.metric.correspondence=hard",),
-        "soft": ("env.metric.correspondence=soft",),
-        "paper_metric": ("metric=paper",),  # links merged, W by overlap, directions and velocities
-        "reference": (),
-    }
+    def done(self, folder: Path) -> bool:
+        return all((folder / self.name / str(seed) / REPORT).is_file() for seed in range(self.seeds))
+
+
+def cases(preset: str) -> list[Case]:
+    extent = STUDY["presets"][preset]
     return [
-        Case("simulations", "one_demonstration", (*_ONE, *short), many),
-        Case("simulations", "panda7dof", ("env=panda7dof",), many),
-        Case("simulations", "panda4dof", ("env=panda4dof",), many),
-        Case("simulations", "panda3dof", ("env=panda3dof",), many),
-        Case("paper_setting", "one_demonstration-paper", (*_ONE, *_PAPER, *short), many),
-        *(Case("paper_setting", f"{arm}-paper", (f"env={arm}", *_PAPER, *short), many) for arm in ARMS),
-        *(Case("given_only", f"{arm}-given", (f"env={arm}", "trainer.crossovers=0"), 1) for arm in ARMS),
-        *(Case("hardware", f"{arm}-hardware", (f"env={arm}", "env.limits=hardware"), 1) for arm in ARMS),
-        *(Case("reaches", f"{arm}-reach", (f"env={arm}", "env.demonstrations.kind=reach"), 1) for arm in ARMS),
-        Case("loads", "panda4dof-random", ("env=panda4dof", *_RANDOM), 1),
-        Case("mjx", "panda4dof-mjx", ("env=panda4dof", "env.physics=mjx", *short), 1),
-        *(
-            Case("variants", f"variant-{name}", ("env=panda4dof", *short, *change), 1)
-            for name, change in variants.items()
-        ),
-        *(
-            Case("locked", f"locked-{'-'.join(map(str, joints))}", (learner, *short, _locked(joints), _SCALE), 1)
-            for joints in locked
-        ),
-    ]  # fmt: skip
-
-
-_SCALE = "env.action_scale=2"  # between the 7-joint arm's and the 4-joint arm's
-
-
-def _locked(joints: Sequence[int]) -> str:
-    return f"env.learner.locked=[{','.join(map(str, joints))}]"
-
-
-def training_tasks(chosen: Sequence[Case], preset: Preset, folder: Path) -> list[Task]:
-    """One for each seed of each case."""
-    return [
-        Task(folder / f"{case.name}-{seed}", (*preset.arguments, *case.arguments, f"seed={seed}"))
-        for case in chosen
-        for seed in range(case.seeds)
+        Case(
+            group, name.format(**values), f"{extent['arguments']} {arguments}".format(**extent, **values).split(), seeds
+        )
+        for group, named in STUDY["cases"].items()
+        for seeds in [extent["seeds"] if group in STUDY["several_seeds"] else 1]
+        for name, arguments in named.items()
+        for values in _values(name)
     ]
 
 
-def unseen_demonstrations(folder: Path) -> dict[str, Path]:
-    """Files of demonstrations of each kind that no run is trained on."""
-    files = {kind: folder / f"unseen-{kind}.npz" for kind in KINDS}
-    for kind, path in files.items():
+def _values(name: str) -> list[dict[str, str]]:
+    """The values that a name with a placeholder stands for."""
+    if "{arm}" in name:
+        return [{"arm": arm} for arm in STUDY["arms"]]
+    locks = [lock for count in (1, 2) for lock in itertools.combinations("1234567", count)]
+    return [{"joints": "-".join(lock), "list": ",".join(lock)} for lock in locks] if "{joints}" in name else [{}]
+
+
+def evaluations(chosen: Sequence[Case], folder: Path, unseen: dict[str, str]) -> dict[Path, list[str]]:
+    """Commands that evaluate policies on other demonstrations and arms, and other controllers, by their new folders."""
+    seeds, commands = {case.name: case.seeds for case in chosen}, {}
+    for pattern, kinds in STUDY["evaluations"].items():
+        for name in (pattern.format(**values) for values in _values(pattern)):
+            for kind, arguments in kinds.items():
+                for seed in range(seeds.get(name, 0) if kind == "unseen" else min(seeds.get(name, 0), 1)):
+                    run, out = folder / name / str(seed), folder / f"{name}--{kind}" / str(seed)
+                    paths = path_override("run", str(run)), path_override("out", str(out))
+                    overrides = [unseen.get(argument, argument) for argument in arguments.split()]
+                    commands[out] = [sys.executable, "-m", "mimic.evaluate", *paths, *overrides]
+    return commands
+
+
+def unseen_demonstrations(folder: Path) -> dict[str, str]:
+    """Overrides with the files of demonstrations that no run is trained on, by their placeholders."""
+    overrides = {}
+    for kind in KINDS:
+        path = folder / f"unseen-{kind}.npz"
+        overrides[f"{{{kind}}}"] = path_override("demonstrations", str(path))
         if not path.exists():
-            record_demonstrations(build_arm(ArmConfig()), _UNSEEN, kind=kind, seed=_UNSEEN_SEED).save(path)
-    return files
+            record_demonstrations(build_arm(ArmConfig()), UNSEEN, kind=kind, seed=UNSEEN_SEED).save(path)
+    return overrides
 
 
-def evaluation_tasks(chosen: Sequence[Case], folder: Path, unseen: Mapping[str, Path]) -> list[Task]:
-    """The same policies on other demonstrations and arms, and other controllers in their place."""
-    names = {case.name: case for case in chosen}
-    tasks = []
-
-    def evaluate(run: str, kind: str, *arguments: str) -> None:
-        tasks.append(Task(folder / f"{run}--{kind}", arguments, of=folder / run))
-
-    for name in ("one_demonstration", "panda7dof"):
-        for seed in range(names[name].seeds) if name in names else ():
-            evaluate(f"{name}-{seed}", "unseen", f"demonstrations={unseen['pd']}")
-    for arm in ARMS:
-        if arm in names:
-            for controller in ("hold", "pd", "computed_torque"):
-                evaluate(f"{arm}-0", controller, f"controller={controller}")
-            evaluate(f"{arm}-0", "searched", "controller=searched")  # how near any torques come, as far as is known
-            evaluate(f"{arm}-0", "mjx", "physics=mjx")
-            evaluate(f"{arm}-0", "reaches", f"demonstrations={unseen['reach']}")
-        if f"{arm}-reach" in names:
-            evaluate(f"{arm}-reach-0", "goals", f"demonstrations={unseen['pd']}")
-    for kind, load in _LOADS.items():
-        for name in ("panda4dof", "panda4dof-random"):
-            if name in names:
-                evaluate(f"{name}-0", kind, *load)
-        if "panda4dof" in names:
-            evaluate("panda4dof-0", f"computed_torque-{kind}", "controller=computed_torque", *load)
-    return tasks
+def run(chosen: Sequence[Case], folder: Path, jobs: int) -> list[Path]:
+    """Trains and evaluates what is not done yet; the logs of what failed."""
+    devices = jax.device_count() if jax.default_backend() == "gpu" else 0
+    logs = folder / "logs"
+    logs.mkdir(exist_ok=True)
+    sweeps = {logs / f"{case.name}.log": case.command(folder) for case in chosen if not case.done(folder)}
+    failed = run_parallel(sweeps, jobs=jobs, devices=devices)
+    commands = {}
+    for out, command in evaluations(chosen, folder, unseen_demonstrations(folder)).items():
+        trained = folder / out.parent.name.partition("--")[0] / out.name
+        if (trained / REPORT).is_file() and not (out / REPORT).is_file():
+            out.parent.mkdir(exist_ok=True)
+            commands[logs / f"{out.parent.name}-{out.name}.log"] = command
+    return failed + run_parallel(commands, jobs=jobs, devices=devices)
 
 
-def _arguments() -> argparse.Namespace:
-    summary = (__doc__ or "").split("\n")[0]
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.dynamic_imitation", description=summary)
-    parser.add_argument("--runs", type=Path, required=True, metavar="DIR", help="where the runs are, or go")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="file of results; figures go beside it")
-    parser.add_argument("--preset", choices=PRESETS, default="paper")
-    groups = sorted({case.group for case in cases(PRESETS["quick"])})
-    parser.add_argument("--only", nargs="+", choices=groups, default=groups, metavar="GROUP", help=", ".join(groups))
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes on each device at once")
-    parser.add_argument("--collect", action="store_true", help="run nothing more: results of what is there")
-    parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
-    return parser.parse_args()
+def collect(folder: Path) -> dict[str, list[Row]]:
+    """The reports by case: `NAME` of the runs, `NAME--KIND` of their evaluations; a list over seeds."""
+    results = defaultdict(list)
+    for run in find_runs(folder)[0]:
+        run_dir = folder / run.name
+        report = json.loads((run_dir / REPORT).read_text())
+        entry = {"seed": run.seed, **{key: report[key] for key in STUDY["entries"]}}
+        if gaps := list(run.curves["train"].values()):
+            entry |= {"best_gap": min(gaps), "final_gap": gaps[-1], "env_steps": report["env_steps"]}
+        entry |= {key: report[key] for key in ("frequency_rad_s", "starts", "similarity") if report.get(key)}
+        case = run_dir.parent.name
+        curves = run_dir / "quality.csv"
+        if case.partition("--")[0] in study_figures.CURVES and run.seed == 0 and curves.is_file():
+            with curves.open(newline="") as file:
+                rows = [row for row in csv.DictReader(file) if row.pop("split") == "held_out"]
+            entry["curves"] = {key: [round(float(row[key]), 6) for row in rows] for key in rows[0]}
+        results[case].append(entry)
+    return dict(results)
 
 
 def main() -> None:
-    """Trains, evaluates, and collects."""
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # the card is for the runs
-    options = _arguments()
-    preset = PRESETS[options.preset]
-    chosen = [case for case in cases(preset) if case.group in options.only]
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # the GPU is for the runs
+    parser = make_parser("dynamic_imitation", __doc__, only=STUDY["cases"], jobs=2, collect=False)
+    parser.add_argument("--runs", type=Path, required=True, metavar="DIR", help="folder of the runs")
+    parser.add_argument("--preset", choices=STUDY["presets"], default="paper")
+    options = parser.parse_args()
+    chosen = [case for case in cases(options.preset) if case.group in options.only]
     options.runs.mkdir(parents=True, exist_ok=True)
-    unseen = unseen_demonstrations(options.runs)
-    tasks = [*training_tasks(chosen, preset, options.runs), *evaluation_tasks(chosen, options.runs, unseen)]
-    devices = jax.device_count() if jax.default_backend() == "gpu" else 0
-    failed = [] if options.collect else run_tasks(tasks, jobs=options.jobs, devices=devices)
-    results = study_results.collect(options.runs)
-    study_results.show(results, Console())
+    failed = [] if options.collect else run(chosen, options.runs, options.jobs)
+    os.environ.setdefault("COLUMNS", str(WIDTH))  # also without a terminal
+    prepare_collection(CollectConfig(str(options.runs)))()
+    results = collect(options.runs)
+    write_results(options, preset=options.preset, results=results)
     if options.out:
-        write_results(options.out, "dynamic_imitation", options.commit, preset=options.preset, results=results)
-        study_results.draw(json.loads(options.out.read_text())["results"], options.out.with_suffix(""))
+        study_figures.draw(results, options.out.with_suffix(""))
     if failed:
-        raise SystemExit(
-            f"error: {len(failed)} of {len(tasks)} runs failed: {', '.join(t.folder.name for t in failed)}"
-        )
+        sys.exit(f"error: {len(failed)} commands failed; logs: {', '.join(map(str, failed))}")
 
 
 if __name__ == "__main__":

@@ -1,25 +1,15 @@
-"""Which metric makes a learner resemble the expert: measures that nothing optimises, at each candidate's optimum.
+"""Similarity of the learner to the expert at the optimum of each candidate metric, by measures that nothing optimises.
 
-    python -m benchmarks.similarity --out FILE [--arms FOLDER] [--plot FILE.png] [--all] [--pair NAME]
+    python -m benchmarks.similarity --out FILE [--arms FOLDER] [--plot FILE.png] [--pair NAME ...]
 
-For every pair of arms and set of expert poses, the learner takes the pose of minimum distance under each candidate
-metric (links kept or merged, correspondence, translation weight beside a rotation weight of 1), and the five measures
-of `mimic.metric.similarity` say how alike the arms look; beside them those of the baselines of
-`mimic.retargeting.pose_baselines`.
-FOLDER holds an unpacked wheel of robosuite, for arms other than the Panda; without it they are left out.
-
-Poses are optimised as by `imitate_pose`, but all pairs share one compiled function: see `benchmarks.similarity_poses`.
-Hard and soft correspondence, by `imitate_pose` itself, take most of the time and are run on a few pairs, unless --all.
+The learner takes the pose of minimum distance under each candidate metric (links kept or merged, correspondence,
+translation weight; the rotation weight is 1); baselines are those of `mimic.retargeting.pose_baselines`. FOLDER holds
+an unpacked wheel of robosuite, for arms other than the Panda. Each pair, links and correspondence compiles for 10 s.
 """
 
-import argparse
 import dataclasses
-import functools
 import itertools
-import json
 import logging
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,73 +19,51 @@ import jax.numpy as jnp
 import numpy as np
 
 import mimic
-from benchmarks import similarity_summary
-from benchmarks.record import write_results
-from benchmarks.similarity_poses import arm_data, best_poses
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, write_results
+from benchmarks.figures import similarity_front
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.embodiment import Embodiment
+from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
-from mimic.metric.kinematics import link_state_table
-from mimic.metric.similarity import CentreLine, centre_line_table, similarity
-from mimic.retargeting.pose import shared_joints
+from mimic.metric.similarity import centre_line_table, similarity
 from mimic.retargeting.pose_baselines import BASELINES
 
-TRANSLATIONS = 0.0, 0.25, 0.5, 1.0, 2.0, 4.0  # with a rotation weight of 1
-STATE_DEPENDENT = 0.0, 0.5, 2.0  # translation weights of hard and soft correspondence
-MERGED = {"chord_overlap": (0.0,), "overlap": (0.0, 0.5, 2.0), "arc_length": (0.0, 0.5, 2.0)}
-SUBSET = ("panda -3,6,7", "panda -5")  # of hard and soft, unless --all
-FULL = "panda -3,6,7"  # the environment panda4dof: always on 40 demonstrations, every fifth sample
-FULL_DEMONSTRATIONS, FULL_EVERY = 40, 5
-ROBOSUITE = {
-    "UR5e": "ur5e", "IIWA": "iiwa", "Kinova3": "kinova3", "Sawyer": "sawyer", "Jaco": "jaco", "xArm7": "xarm7",
-}  # fmt: skip
-WANTED = "UR10e", *ROBOSUITE
+TRANSLATIONS = 0.0, 0.25, 0.5, 1.0, 2.0, 4.0  # weights; that of rotation is 1
+SOME_TRANSLATIONS = 0.0, 0.5, 2.0
+KEPT = {("kept", name): TRANSLATIONS for name in ("arc_length", "overlap")}  # candidates
+MERGED = {("merged", name): SOME_TRANSLATIONS for name in ("overlap", "arc_length")} | {
+    ("merged", "chord_overlap"): (0.0,)
+}
+STATE_DEPENDENT = {("kept", name): SOME_TRANSLATIONS for name in ("hard", "soft")}
+SUBSET = ("panda -3,6,7", "panda -5")  # of state-dependent correspondence, which is slow
+EVERY = 10  # samples of a demonstration of which one is taken
+FULL, FULL_DEMONSTRATIONS = "panda -3,6,7", 40  # the environment panda4dof: on more demonstrations and samples
+ROBOSUITE = ("UR10e", "UR5e", "IIWA", "Kinova3", "Sawyer", "Jaco", "xArm7")
 
 
-@dataclasses.dataclass(frozen=True)
-class Pair:
-    """Two arms.
-
-    Attributes:
-      name: "panda -3,6,7" for a Panda with joints locked, else "EXPERT to LEARNER".
-      expert, learner: configs of the arms.
-      locked: the Panda's locked joints, by number.
-    """
-
-    name: str
-    expert: ArmConfig
-    learner: ArmConfig
-    locked: tuple[int, ...] = ()
-
-
-def locked_pandas() -> list[Pair]:
-    """All single and double locks, and two that the environments have."""
+def locked_pandas() -> list[EnvConfig]:
+    """All single and double locks, and two of the environments."""
     locks = [lock for count in (1, 2) for lock in itertools.combinations(range(1, 8), count)]
     locks += [(3, 6, 7), (2, 3, 6, 7)]
-    return [Pair(f"panda -{','.join(map(str, x))}", ArmConfig(), ArmConfig(locked=list(x)), x) for x in locks]
+    return [EnvConfig(f"panda -{','.join(map(str, x))}", learner=ArmConfig(locked=list(x))) for x in locks]
 
 
-def other_arms(folder: Path | None) -> tuple[list[Pair], list[str]]:
-    """Pairs of the Panda with arms in a folder, both directions, and the arms that were not found."""
-    files = {
-        name: (folder or Path()) / f"robosuite/models/assets/robots/{arm}/robot.xml" for name, arm in ROBOSUITE.items()
-    }
-    found = {name: file for name, file in files.items() if folder is not None and file.is_file()}
+def other_arms(folder: Path) -> tuple[list[EnvConfig], list[str]]:
+    """Pairs of the Panda with arms in a folder, both directions, and the names of arms that are not in it."""
+    files = {name: folder / f"robosuite/models/assets/robots/{name.lower()}/robot.xml" for name in ROBOSUITE}
     pairs = []
-    for name, file in found.items():
-        arm = ArmConfig(model=str(file), tip="right_hand", armature=0.3, damping=3.0)  # as docs/own_arm.md proposes
-        pairs += [Pair(f"panda to {name}", ArmConfig(), arm), Pair(f"{name} to panda", arm, ArmConfig())]
-    return pairs, [name for name in WANTED if name not in found]
+    for name in (name for name, file in files.items() if file.is_file()):
+        arm = ArmConfig(str(files[name]), tip="right_hand", armature=0.3, damping=3.0)  # as docs/own_arm.md proposes
+        pairs += [EnvConfig(f"panda to {name}", learner=arm), EnvConfig(f"{name} to panda", expert=arm)]
+    return pairs, [name for name, file in files.items() if not file.is_file()]
 
 
-@functools.lru_cache(maxsize=8)
-def expert_motions(model: str, tip: str | None, count: int, random: int) -> dict[str, Any]:
-    """Motions [count, time, n] of an expert by kind; a string that says why where there are none."""
-    config = ArmConfig() if model == "panda" else ArmConfig(model=model, tip=tip, armature=0.3, damping=3.0)
+def expert_motions(config: ArmConfig, count: int, random: int) -> dict[str, Any]:
+    """Motions [count, time, n] of an expert by kind; instead of motions that cannot be recorded, the reason."""
     arm = build_arm(config)
     lower, upper = np.asarray(arm.embodiment.joint_range).T
-    shape = (random, 1, arm.embodiment.num_joints)
-    motions: dict[str, Any] = {"random": np.random.default_rng(0).uniform(lower, upper, shape)}
+    poses = np.random.default_rng(0).uniform(lower, upper, (random, 1, arm.embodiment.num_joints))
+    motions: dict[str, Any] = {"random": poses}
     for kind in ("pd", "reach"):
         try:
             motions[kind] = mimic.record_demonstrations(arm, count, kind=kind).qpos
@@ -105,132 +73,73 @@ def expert_motions(model: str, tip: str | None, count: int, random: int) -> dict
 
 
 def optimal_poses(
-    expert: Embodiment, pair: Pair, links: str, correspondence: str, translations: tuple[float, ...], qpos: np.ndarray
-) -> Iterator[tuple[float, Embodiment, np.ndarray]]:
-    """For each translation weight, the arm that was optimised and its poses."""
-    learner = build_arm(pair.learner, links=links).embodiment
-    own = shared_joints(expert, learner, qpos.astype(np.float32))
-    metric = MetricConfig(correspondence=correspondence, links=links)
-    matrix = metric.make_correspondence(expert, learner)
-    if callable(matrix):
-        yield from _state_dependent(expert, learner, matrix, translations, qpos)
-        return
-    data, states = arm_data(learner), link_state_table(expert, qpos, np.zeros_like(qpos))
-    for translation in translations:
-        found = best_poses(data, states, matrix, translation, own)
-        yield translation, learner, found[:, : learner.num_joints]
-
-
-def _state_dependent(
-    expert: Embodiment, learner: Embodiment, correspondence: Any, translations: tuple[float, ...], qpos: np.ndarray
-) -> Iterator[tuple[float, Embodiment, np.ndarray]]:
-    """By `imitate_pose`, compiled once for all weights."""
+    pair: EnvConfig, links: str, correspondence: str, translations: tuple[float, ...], qpos: np.ndarray
+) -> Iterator[tuple[str, mimic.Embodiment, np.ndarray]]:
+    """Name, learner and its poses for each translation weight; compiled once for all weights."""
+    pair = dataclasses.replace(pair, metric=MetricConfig(correspondence=correspondence, links=links))
+    expert, learner = pair.build_arms().embodiments
+    matrix = pair.metric.make_correspondence(expert, learner)
 
     @jax.jit
     def solve(qpos: jax.Array, translation: jax.Array) -> jax.Array:
-        weights = mimic.DistanceWeights(translation, 1.0)
-        return mimic.imitate_pose(expert, learner, qpos, correspondence, weights).qpos
+        weights = mimic.DistanceWeights(translation, 1.0)  # type: ignore[arg-type]
+        return mimic.imitate_pose(expert, learner, qpos, matrix, weights).qpos
 
     for translation in translations:
-        yield translation, learner, np.asarray(solve(jnp.asarray(qpos, jnp.float32), jnp.float32(translation)))
+        poses = np.asarray(solve(jnp.asarray(qpos, jnp.float32), jnp.float32(translation)))
+        yield f"{links} {correspondence} {translation:g}", learner, poses
 
 
-def measured(expert_line: CentreLine, learner: Embodiment, qpos: np.ndarray) -> dict[str, list[float]]:
-    """Mean and 90 % quantile of each measure."""
-    values = similarity(expert_line, centre_line_table(learner, qpos))
-    return {name: [round(float(x), 5) for x in (v.mean(), np.quantile(v, 0.9))] for name, v in values.items()}
+def run_pair(pair: EnvConfig, demonstrations: int, random: int) -> list[Row]:
+    expert, learner = pair.build_arms().embodiments
+    count, every = (max(FULL_DEMONSTRATIONS, demonstrations), 5) if pair.name == FULL else (demonstrations, EVERY)
+    rows: list[Row] = []
+    motions = expert_motions(pair.expert, count, random)
+    for kind in [kind for kind, motion in motions.items() if isinstance(motion, str)]:
+        rows.append({"pair": pair.name, "set": kind, "failed": motions.pop(kind)})
+    sets = {kind: motion[:, ::every].reshape(-1, expert.num_joints) for kind, motion in motions.items()}
+    lines = {kind: centre_line_table(expert, qpos) for kind, qpos in sets.items()}
 
+    def add(method: str, kind: str, arm: mimic.Embodiment, qpos: np.ndarray) -> None:
+        values = similarity(lines[kind], centre_line_table(arm, qpos))
+        means = {name: [round(float(x), 5) for x in (v.mean(), np.quantile(v, 0.9))] for name, v in values.items()}
+        rows.append({"pair": pair.name, "set": kind, "poses": len(qpos), "method": method, "measures": means})
 
-def run_pair(pair: Pair, options: argparse.Namespace) -> list[dict[str, Any]]:
-    """All baselines and candidates on all sets of poses."""
-    expert, learner = build_arm(pair.expert).embodiment, build_arm(pair.learner).embodiment
-    model = pair.expert.model
-    is_full = pair.name == FULL
-    count = max(FULL_DEMONSTRATIONS, options.demonstrations) if is_full else options.demonstrations
-    every = min(FULL_EVERY, options.every) if is_full else options.every
-    motions = expert_motions(model, pair.expert.tip, count, options.random)
-    rows = []
-    for name, motion in motions.items():
-        if isinstance(motion, str):
-            rows.append({"pair": pair.name, "set": name, "failed": motion})
-            continue
-        qpos = motion[:, ::every].reshape(-1, expert.num_joints)
-        line = centre_line_table(expert, qpos)
-        here = {"pair": pair.name, "set": name, "poses": len(qpos)}
-        for baseline, function in BASELINES.items():
-            posed = function(expert, learner, motion)
-            if posed is not None:
-                taken = posed[:, ::every].reshape(-1, learner.num_joints)
-                rows.append({**here, "method": baseline, "measures": measured(line, learner, taken)})
-        for links, correspondence, translations in candidates(pair, options.all):
-            for translation, arm, found in optimal_poses(expert, pair, links, correspondence, translations, qpos):
-                candidate = f"{links} {correspondence} {translation:g}"
-                rows.append({**here, "method": candidate, "measures": measured(line, arm, found)})
+    for (kind, motion), (baseline, function) in itertools.product(motions.items(), BASELINES.items()):
+        posed = function(expert, learner, motion)
+        if posed is not None:
+            add(baseline, kind, learner, posed[:, ::every].reshape(-1, learner.num_joints))
+    everything, ends = np.concatenate([*sets.values()]), np.cumsum([len(qpos) for qpos in sets.values()])
+    candidates = KEPT | (MERGED if pair.learner.locked else {}) | (STATE_DEPENDENT if pair.name in SUBSET else {})
+    for (links, correspondence), translations in candidates.items():
+        for method, arm, poses in optimal_poses(pair, links, correspondence, translations, everything):
+            for kind, part in zip(sets, np.split(poses, ends[:-1]), strict=True):
+                add(method, kind, arm, part)
     return rows
 
 
-def candidates(pair: Pair, everything: bool) -> Iterator[tuple[str, str, tuple[float, ...]]]:
-    """Links, correspondence and translation weights."""
-    for correspondence in ("arc_length", "overlap"):
-        yield "kept", correspondence, TRANSLATIONS
-    if pair.locked:  # nothing is merged where nothing is locked
-        for correspondence, translations in MERGED.items():
-            yield "merged", correspondence, translations
-    if everything or pair.name in SUBSET:
-        for correspondence in ("hard", "soft"):
-            yield "kept", correspondence, STATE_DEPENDENT
-
-
-def _rows_so_far(path: Path, settings: dict[str, Any]) -> list[dict[str, Any]]:
-    """Of a file of results; exits where it was made with other settings."""
-    if not path.is_file():
-        return []
-    content = json.loads(path.read_text())
-    if content["settings"] != settings:
-        sys.exit(f"error: {path} was made with {content['settings']}, not with {settings}")
-    return similarity_summary.from_lines(content["rows"])
-
-
 def main() -> None:
-    """Runs all pairs, and writes the file after each."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.similarity", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="file of results")
-    parser.add_argument("--arms", type=Path, help="folder of an unpacked robosuite wheel")
-    parser.add_argument("--plot", type=Path, help="picture of the Pareto front")
-    parser.add_argument("--pair", action="append", help="only this one (may be repeated)")
-    parser.add_argument("--demonstrations", type=int, default=20, help="of each kind")
-    parser.add_argument("--every", type=int, default=10, help="samples of a demonstration of which one is taken")
-    parser.add_argument("--random", type=int, default=120, help="random poses")
-    parser.add_argument("--all", action="store_true", help="hard and soft on all pairs")
-    parser.add_argument("--resume", action="store_true", help="keep the pairs that the file of results has")
-    parser.add_argument("--commit", help="what the results are of, where this is no git checkout")
+    parser = make_parser("similarity", __doc__, plot=Path, demonstrations=20, random=120)
+    parser.add_argument(
+        "--arms", type=Path, default="robosuite", metavar="FOLDER", help="of an unpacked robosuite wheel"
+    )
+    parser.add_argument("--pair", nargs="+", metavar="NAME", help="these pairs alone")
     options = parser.parse_args()
     logging.getLogger("mimic").setLevel(logging.ERROR)
     others, missing = other_arms(options.arms)
-    pairs = [*locked_pandas(), *others]
-    unknown = set(options.pair or ()) - {pair.name for pair in pairs}
-    if unknown:
-        sys.exit(f"error: unknown pair {min(unknown)!r}; valid are {', '.join(pair.name for pair in pairs)}")
-    settings = {name: getattr(options, name) for name in ("demonstrations", "every", "random", "all")}
-    rows = _rows_so_far(options.out, settings) if options.resume else []
-    measured_pairs = {row["pair"] for row in rows}
-    for pair in pairs:
-        if (options.pair and pair.name not in options.pair) or pair.name in measured_pairs:
-            continue
-        began = time.perf_counter()
-        rows += run_pair(pair, options)
-        print(f"{pair.name}: {time.perf_counter() - began:.0f} s", flush=True)
-        summary = similarity_summary.summarise(rows)
-        content = {
-            "settings": settings,
-            "not_found": missing,
-            "summary": summary,
-            "rows": similarity_summary.to_lines(rows),
-        }
-        write_results(options.out, "similarity", options.commit, **content)
-    similarity_summary.print_tables(rows)
+    pairs = {pair.name: pair for pair in (*locked_pandas(), *others)}
+    if unknown := set(options.pair or ()) - set(pairs):
+        parser.error(f"unknown pair {min(unknown)!r}; valid are {', '.join(pairs)}")
+    settings = {"demonstrations": options.demonstrations, "every": EVERY, "random": options.random}
+    rows: list[Row] = []
+    for name in options.pair or pairs:
+        rows += run_pair(pairs[name], options.demonstrations, options.random)
+        print(name, flush=True)
+        summary, lines = similarity_front.summarise(rows), similarity_front.to_lines(rows)
+        write_results(options, settings=settings, not_found=missing, summary=summary, rows=lines)
+    similarity_front.print_tables(rows)
     if options.plot:
-        similarity_summary.save_plot(rows, options.plot)
+        similarity_front.plot(rows, options.plot)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from mimic.runs.files import write_report
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.make import make_ppo_trainer, make_trainer
-from mimic.trainers.run_config import load_config
+from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.trainer import Trainer
 
 
@@ -52,6 +52,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         show_report(console, report, trainer)
         if out:
             out.mkdir()
+            save_config(out, trained)  # what the report is of, for `mimic.collect`
             trainer.save_outcome(out, outcome, config.controller)
             write_report(out, report)
             console.print(f"results: {config.out}", soft_wrap=True, highlight=False)

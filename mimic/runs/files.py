@@ -19,12 +19,13 @@ def write_atomically(path: Path, text: str) -> None:
 
 def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:
     """Writes report.json; numbers that are not finite, as after a divergence, are null."""
-    write_atomically(run_dir / REPORT, json.dumps(_finite(report), indent=2, allow_nan=False) + "\n")
+    write_atomically(run_dir / REPORT, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """The same with None for floats that JSON cannot hold."""
     if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
+        return [finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -43,16 +43,17 @@ QUALITY_METRICS = {
 
 @dataclasses.dataclass(frozen=True)
 class FinishedRun:
-    """A run with a report.
+    """A run with a report, or an evaluation of a run in a folder of its own.
 
     Attributes:
       name: its folder, below the one that is collected.
       trainer: its name.
       seed: of the run.
-      settings: its config by dotted keys, without seed and what no result depends on.
+      settings: its config by dotted keys, without seed and what no result depends on; of an evaluation also controller,
+        demonstrations and steps of the checkpoint.
       numbers: of its report by dotted keys, as optimality_gap.train.
       version: of mimic.
-      curves: the trainer's figure over the steps, by split.
+      curves: the quality metric over the steps, by split.
       finished: when its report was written [s since the epoch].
     """
 
@@ -151,6 +152,13 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
         reason = f"diverged, without a meaningful gap, or of another version ({version})"
         return LeftOut(name, f"{reason}: {REPORT} has no number {missing[0]}")
     settings = flatten(to_dict(config))
+    if "evaluated" in report:
+        is_policy = report["trainer"] == config.trainer.name
+        settings |= {
+            "controller": "policy" if is_policy else report["trainer"],
+            "demonstrations": report["evaluated"]["demonstrations"],
+            metric.unit: numbers[metric.unit],
+        }
     return FinishedRun(
         name=name,
         trainer=config.trainer.name,

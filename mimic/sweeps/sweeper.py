@@ -7,6 +7,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
+from mimic.runs.files import CONFIG, REPORT
 from mimic.sweeps.hydra_plugins import register, target
 
 SWEEP, LOGS = "sweep.json", "logs"
@@ -76,26 +78,28 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         )
 
     def sweep(self, arguments: list[str]) -> None:
-        """Composes all runs, writes `SWEEP` into the folder of the sweep, launches, and says what became of each.
+        """Composes all runs, writes `SWEEP` into the folder of the sweep, launches, and prints the outcome of each.
+
+        A folder with the same sweep continues it: runs with a report are done, others resume from their checkpoint.
 
         Raises:
-          HydraException: a run that cannot be composed, or a folder that has a sweep already; nothing is written.
-          SystemExit: with 1 where a run failed.
+          HydraException: a run that cannot be composed, or a folder with a sweep of other runs; nothing is written.
+          SystemExit: with 1 if a run failed.
         """
         assert self.config is not None
         folder = Path(self.config.hydra.sweep.dir)
-        if (folder / SWEEP).exists():
-            raise HydraException(f"hydra.sweep.dir: {str(folder)!r} has a sweep already; name another folder")
         planned = self.plan(arguments, folder)
+        remaining = _remaining(folder, planned)
         folder.mkdir(parents=True, exist_ok=True)
         OmegaConf.save(self.config, folder / "multirun.yaml")
         _write_sweep(folder, planned, [])
         try:
-            returned = self.launcher.launch([run.overrides for run in planned], initial_job_idx=0)
+            returned = self.launcher.launch(list(remaining.values()), initial_job_idx=0) if remaining else []
         except (SystemExit, KeyboardInterrupt):
             print(f"the sweep was stopped; what there is of it: {folder}", file=sys.stderr)
             raise
-        outcomes = [job.return_value for job in returned]
+        launched = dict(zip(remaining, (job.return_value for job in returned), strict=True))
+        outcomes = [launched.get(number, Outcome()) for number in range(len(planned))]
         _write_sweep(folder, planned, outcomes)
         self._report(folder, planned, outcomes)
 
@@ -152,6 +156,37 @@ def path_of(override: str) -> str:
     """The path in an override made by `path_override`."""
     value = override.partition("=")[2]
     return value[1:-1].replace(r"\'", "'") if value.startswith("'") else value
+
+
+def _remaining(folder: Path, planned: Sequence[PlannedRun]) -> dict[int, list[str]]:
+    """By number, the overrides that start each run, or resume it if the folder has this sweep; none for runs done."""
+    if not (folder / SWEEP).exists():
+        return {number: run.overrides for number, run in enumerate(planned)}
+    try:
+        known = [entry["overrides"] for entry in json.loads((folder / SWEEP).read_text())["runs"]]
+    except (ValueError, LookupError, TypeError):
+        known = []
+    if known != [run.overrides for run in planned]:
+        raise HydraException(
+            f"hydra.sweep.dir: {str(folder)!r} has a sweep already, of other runs; name another folder"
+        )
+    return {
+        number: _resumed(run)
+        for number, run in enumerate(planned)
+        if not run.run_dir or not (Path(run.run_dir) / REPORT).is_file()
+    }
+
+
+def _resumed(run: PlannedRun) -> list[str]:
+    from mimic.runs.checkpoints import checkpoint_steps  # orbax, which --help does without
+
+    run_dir = Path(run.run_dir)
+    if not run.run_dir or not (run_dir / CONFIG).is_file():
+        return run.overrides
+    if checkpoint_steps(run_dir):
+        return [path_override("resume", run.run_dir)]
+    shutil.rmtree(run_dir)  # stopped before its first checkpoint
+    return run.overrides
 
 
 def _write_sweep(folder: Path, planned: Sequence[PlannedRun], outcomes: Sequence[Outcome]) -> None:

@@ -3,17 +3,19 @@
 import csv
 import json
 import sys
+import time
+from pathlib import Path
 
 import hydra
 import pytest
 
 from benchmarks import dynamic_imitation as study
-from benchmarks import study_results
-from benchmarks.processes import Task, run_tasks
+from benchmarks.common.processes import run_parallel
 from mimic import cli
 from mimic.metric.config import MetricConfig
+from tests.helpers.run_directories import write_run
 
-GROUPS = {case.group for case in study.cases(study.PRESETS["paper"])}
+UNSEEN = {f"{{{kind}}}": f"demonstrations={kind}.npz" for kind in ("pd", "reach")}
 
 
 @pytest.fixture(scope="module")
@@ -23,31 +25,34 @@ def compose():
         yield hydra.compose
 
 
-@pytest.mark.parametrize("name", study.PRESETS)
-def test_every_run_and_evaluation_has_arguments_that_the_commands_take(name, compose, tmp_path):
-    preset = study.PRESETS[name]
-    chosen = study.cases(preset)
-    unseen = {kind: tmp_path / f"{kind}.npz" for kind in ("pd", "reach")}
-    trained = study.training_tasks(chosen, preset, tmp_path)
-    evaluated = study.evaluation_tasks(chosen, tmp_path, unseen)
-    assert len({task.folder for task in [*trained, *evaluated]}) == len(trained) + len(evaluated)
-    for task in trained:
-        if "seed=0" not in task.arguments or (name == "quick" and "locked" in task.folder.name):
+@pytest.mark.parametrize("preset", study.STUDY["presets"])
+def test_every_run_and_evaluation_has_arguments_that_the_commands_take(preset, compose, tmp_path):
+    cases = study.cases(preset)
+    assert len({case.name for case in cases}) == len(cases)
+    for case in cases:
+        if preset == "quick" and case.group == "locked":
             continue  # composing takes its time, and what differs is seen already
-        assert compose("train", list(task.arguments)).env.physics == ("mjx" if "mjx" in task.folder.name else "fused")
-    for task in evaluated:
-        assert task.of in {run.folder for run in trained}
-        compose("evaluate", [f"run={task.of}", f"out={task.folder}", *task.arguments])
+        command = case.command(tmp_path)
+        assert command[1:4] == ["-m", "mimic.train", "-m"] and f"hydra.sweep.dir={tmp_path / case.name}" in command
+        config = compose("train", case.arguments)
+        assert config.env.physics == ("mjx" if case.group == "mjx" else "fused")
+    evaluated = study.evaluations(cases, tmp_path, UNSEEN)
+    assert len(evaluated) == (45 if preset == "paper" else 41)
+    for out, command in evaluated.items():
+        config = compose("evaluate", command[3:])
+        run = Path(config.run)
+        assert (config.out, run.parent.name) == (str(out), out.parent.name.partition("--")[0])
+        assert any(case.name == run.parent.name and int(run.name) < case.seeds for case in cases)
 
 
 def test_the_sweep_locks_every_joint_and_every_pair():
-    names = {case.name for case in study.cases(study.PRESETS["paper"]) if case.group == "locked"}
-    assert len(names) == 7 + 21 and {"locked-1", "locked-6-7"} <= names
-    assert "locked" in GROUPS
+    locked = {case.name: case.arguments for case in study.cases("paper") if case.group == "locked"}
+    assert len(locked) == 7 + 21 and {"locked-1", "locked-6-7"} <= set(locked)
+    assert "env.learner.locked=[6,7]" in locked["locked-6-7"]
 
 
 def test_the_variants_change_the_metric_as_they_are_named(compose):
-    cases = {case.name: case for case in study.cases(study.PRESETS["paper"]) if case.group == "variants"}
+    cases = {case.name: case for case in study.cases("paper") if case.group == "variants"}
     reference = MetricConfig()
     for name, correspondence, links in (
         ("hard", "hard", "kept"),
@@ -56,72 +61,59 @@ def test_the_variants_change_the_metric_as_they_are_named(compose):
         ("paper_metric", "overlap", "merged"),
         ("reference", reference.correspondence, reference.links),
     ):
-        metric = compose("train", list(cases[f"variant-{name}"].arguments)).env.metric
+        metric = compose("train", cases[f"variant-{name}"].arguments).env.metric
         assert (metric.correspondence, metric.links, metric.xi) == (correspondence, links, reference.xi)
+    assert f"env.metric.translation={4 * reference.translation:g}" in cases["variant-positions_x4"].arguments
 
 
-WRITE = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'report.json').write_text('{}')"
+def test_a_failed_command_is_named_and_the_rest_goes_on(tmp_path, capsys):
+    commands = {
+        tmp_path / "bad.log": [sys.executable, "-c", "raise SystemExit('no arm')"],
+        tmp_path / "good.log": [sys.executable, "-c", "import os; print(os.environ['CUDA_VISIBLE_DEVICES'])"],
+    }
+    assert run_parallel(commands, jobs=1, devices=1) == [tmp_path / "bad.log"]
+    assert "bad failed: no arm" in capsys.readouterr().out
+    assert (tmp_path / "good.log").read_text() == "0\n"
 
 
-@pytest.fixture
-def fake(monkeypatch):
-    """Tasks that only write their report; one named "bad" fails."""
+def test_as_many_commands_run_in_parallel_as_there_are_jobs(tmp_path):
+    began = time.monotonic()
+    wait = [sys.executable, "-c", "import time; time.sleep(1.5)"]
+    assert run_parallel({tmp_path / f"{i}.log": wait for i in range(4)}, jobs=4, devices=0) == []
+    assert time.monotonic() - began < 4 * 1.5
+
+
+def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     started = []
-
-    def command(task):
-        started.append(task.folder.name)
-        return [
-            sys.executable,
-            "-c",
-            "raise SystemExit('no')" if "bad" in task.folder.name else WRITE,
-            str(task.folder),
-        ]
-
-    monkeypatch.setattr(Task, "command", command)
-    return started
-
-
-def test_tasks_run_once_and_evaluations_after_their_runs(fake, tmp_path):
-    run = Task(tmp_path / "run", ())
-    tasks = [run, Task(tmp_path / "run--x", (), of=run.folder), Task(tmp_path / "other", ())]
-    assert run_tasks(tasks, jobs=2, devices=0) == []
-    assert all(task.done for task in tasks) and fake.index("run") < fake.index("run--x")
-    fake.clear()
-    assert run_tasks(tasks, jobs=2, devices=0) == [] and fake == []
-
-
-def test_a_failed_run_is_named_with_its_evaluations_and_the_rest_goes_on(fake, tmp_path, capsys):
-    bad = Task(tmp_path / "bad", ())
-    tasks = [bad, Task(tmp_path / "bad--x", (), of=bad.folder), Task(tmp_path / "good", ())]
-    failed = run_tasks(tasks, jobs=1, devices=0)
-    assert [task.folder.name for task in failed] == ["bad", "bad--x"]
-    assert tasks[2].done and "no" in capsys.readouterr().out
-
-
-def test_an_interrupted_run_goes_on_and_a_broken_one_starts_anew(tmp_path):
-    task = Task(tmp_path / "run", ("env=panda4dof",))
-    task.folder.mkdir()
-    assert f"run_dir={task.folder}" in task.command() and not task.folder.exists()
-    (task.folder / "checkpoints" / "000000000100").mkdir(parents=True)
-    assert task.command()[-1] == f"resume={task.folder}"
+    monkeypatch.setattr(study, "run_parallel", lambda commands, **_: started.append(list(commands)) or [])
+    monkeypatch.setattr(study, "unseen_demonstrations", lambda _: UNSEEN)
+    chosen = [case for case in study.cases("quick") if case.name in ("panda4dof", "panda3dof")]
+    write_run(tmp_path / "panda4dof" / "0", [0.5])
+    write_run(tmp_path / "panda4dof--pd" / "0", [0.5])
+    study.run(chosen, tmp_path, jobs=1)
+    (trained,), evaluated = started
+    assert trained.stem == "panda3dof"
+    names = {log.stem for log in evaluated}
+    assert "panda4dof--hold-0" in names and "panda4dof--pd-0" not in names and "panda3dof--hold-0" not in names
 
 
 def test_results_are_grouped_by_case_and_seed(tmp_path):
-    figures = {key: {"train": 0.5, "held_out": 0.6} for key in study_results._KEPT}
-    for seed, gaps in ((1, (0.9, 0.2, 0.3)), (0, (0.8, 0.4))):
-        folder = tmp_path / f"panda4dof-{seed}"
-        folder.mkdir()
-        (folder / "report.json").write_text(json.dumps({**figures, "env_steps": 10}))
-        with (folder / "metrics.csv").open("w", newline="") as file:
-            csv.writer(file).writerows([["quality/optimality_gap.train"], *([gap] for gap in gaps)])
-    (tmp_path / "panda4dof-0--pd").mkdir()
-    (tmp_path / "panda4dof-0--pd" / "report.json").write_text(json.dumps({**figures, "frequency_rad_s": 4.0}))
-    results = study_results.collect(tmp_path)
-    assert [entry["seed"] for entry in results["panda4dof"]] == [0, 1]
-    assert (results["panda4dof"][1]["best_gap"], results["panda4dof"][1]["final_gap"]) == (0.2, 0.3)
-    assert results["panda4dof--pd"][0]["frequency_rad_s"] == 4.0
+    entries = {key: {"train": 0.5, "held_out": 0.6} for key in study.STUDY["entries"]}
 
+    def add(name, gaps, seed, **more):
+        run = write_run(tmp_path / name / str(seed), gaps, seed=seed)
+        report = json.loads((run / "report.json").read_text())
+        (run / "report.json").write_text(json.dumps({**entries, **report, **more}))
+        return run
 
-def test_a_spread_is_the_standard_deviation_over_seeds():
-    assert study_results.spread([0.01, 0.03]) == "2.00 ± 1.41 %"
-    assert study_results.spread([0.01]) == "1.00 %"
+    for seed, gaps in ((1, [0.9, 0.2, 0.3]), (0, [0.8, 0.4])):
+        add("panda7dof", gaps, seed)
+        with (tmp_path / "panda7dof" / str(seed) / "quality.csv").open("w", newline="") as file:
+            csv.writer(file).writerows([["split", "time", "mean"], ["train", 0.1, 9], ["held_out", 0.1, 0.5]])
+    pd = add("panda7dof--pd", [0.5], 0, trainer="pd", evaluated={"demonstrations": ""}, frequency_rad_s=4.0)
+    (pd / "metrics.csv").unlink()
+    results = study.collect(tmp_path)
+    assert [entry["seed"] for entry in results["panda7dof"]] == [0, 1]
+    assert (results["panda7dof"][1]["best_gap"], results["panda7dof"][1]["final_gap"]) == (0.2, 0.3)
+    assert results["panda7dof"][0]["curves"] == {"time": [0.1], "mean": [0.5]}
+    assert results["panda7dof--pd"][0]["frequency_rad_s"] == 4.0 and "best_gap" not in results["panda7dof--pd"][0]

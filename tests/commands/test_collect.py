@@ -84,6 +84,19 @@ def test_runs_that_differ_in_seed_alone_are_one_group(six, capsys):
     assert (six / "collected.png").stat().st_size > 10_000
 
 
+def test_evaluations_are_groups_of_their_own(tmp_path):
+    for seed in (0, 1):
+        write_run(tmp_path / f"run{seed}", [0.1], seed=seed)
+        for name in ("policy", "pd"):
+            report = write_run(tmp_path / f"{name}{seed}", [0.2], seed=seed) / "report.json"
+            evaluated = {"trainer": "ppo" if name == "policy" else name, "evaluated": {"demonstrations": ""}}
+            report.write_text(json.dumps({**json.loads(report.read_text()), **evaluated}))
+    assert collect(tmp_path) == 0
+    groups = {group["settings"]["controller"]: group for group in collected(tmp_path)["groups"]}
+    assert {name: group["seeds"] for name, group in groups.items()} == {None: [0, 1], "policy": [0, 1], "pd": [0, 1]}
+    assert groups["pd"]["numbers"]["optimality_gap.train"]["mean"] == pytest.approx(0.2)
+
+
 def test_settings_that_the_name_does_not_tell_are_columns(tmp_path, capsys):
     for rate in (0.001, 0.0003):
         for seed in (0, 1):

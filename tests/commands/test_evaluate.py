@@ -49,6 +49,7 @@ def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path):
     assert report["torque_rms"] == {"train": 0, "held_out": 0}
     names = {path.name for path in (tmp_path / "new").iterdir()}
     assert names == {
+        "config.yaml",
         "report.json",
         "demonstrations.csv",
         "quality.csv",

@@ -10,12 +10,13 @@ import threading
 import time
 
 import pytest
+from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import HydraException
 
-from mimic import cli
+from mimic import cli, train
 from mimic.sweeps.launchers import gpus_of
 from mimic.sweeps.run_command import RunCommand
-from mimic.sweeps.sweeper import path_of, path_override
+from mimic.sweeps.sweeper import Outcome, Sweeper, path_of, path_override
 from tests.helpers.run_directories import write_run
 from tests.helpers.tiny import TINY
 
@@ -111,6 +112,38 @@ def test_missing_slurm_and_packages_are_reported(rejected, monkeypatch):
 def test_a_folder_takes_one_sweep(rejected, tmp_path):
     (tmp_path / "sweep.json").write_text("{}")
     assert "has a sweep already" in rejected("train", "-m", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
+
+
+def test_the_same_sweep_continues(tmp_path, monkeypatch, capsys):
+    launched = []
+
+    class Launcher:
+        def launch(self, job_overrides, initial_job_idx):
+            launched.append(job_overrides)
+            return [JobReturn(status=JobStatus.COMPLETED, _return_value=Outcome()) for _ in job_overrides]
+
+    def setup(sweeper, *, hydra_context, task_function, config):
+        sweeper.hydra_context, sweeper.config, sweeper.launcher = hydra_context, config, Launcher()
+
+    def sweep(seeds):
+        arguments = f"-m seed={seeds} hydra.sweep.dir={tmp_path}/sweep run_dir={tmp_path}/${{seed}}"
+        monkeypatch.setattr(sys, "argv", ["mimic.train", *arguments.split()])
+        cli.run(train.prepare, "train")
+
+    monkeypatch.setattr(Sweeper, "setup", setup)
+    sweep("0,1,2,3")
+    write_run(tmp_path / "0", [0.5], seed=0)
+    write_run(tmp_path / "1", [0.5], seed=1, report=False)
+    (tmp_path / "1" / "checkpoints" / "000000001000").mkdir(parents=True)
+    write_run(tmp_path / "2", [0.5], seed=2, report=False)
+    sweep("0,1,2,3")
+    assert [len(runs) for runs in launched] == [4, 3]
+    assert launched[1] == [[f"resume={tmp_path}/1"], *launched[0][2:]]
+    assert not (tmp_path / "2").exists()  # it had no checkpoint
+    assert "4 of 4 runs done" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        sweep("0,1")
+    assert "has a sweep already, of other runs" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("path", ["runs/a-b.c", "my runs/it's, a=b", "~/x"])

@@ -1,0 +1,108 @@
+"""The rows of `benchmarks.similarity`: ratios to a baseline, cases lost, the Pareto front, tables and figure."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common.record import Row, print_table
+from benchmarks.figures.canvas import plt, save
+from mimic.metric.similarity import MEASURES
+from mimic.retargeting.pose_baselines import BASELINES
+
+FRONT = ("centre_line_distance", "tangent_angle_deg", "hand_position_error", "hand_angle_deg")  # a candidate's aims
+SLACK = {"hand_position_error": 1.05}  # multiple of the baseline's value that is no loss; 1 for the others
+# Below these a baseline is exact (a locked last roll joint moves no link): no ratio, and reaching them is no loss.
+EXACT = {name: 0.1 if name.endswith("deg") else 1e-3 for name in MEASURES}
+DEMONSTRATIONS = "pd", "reach"
+
+
+def to_lines(rows: Sequence[Row]) -> list[str]:
+    """Rows as lines of a table, a quarter of the size of JSON; a set that failed has the reason as its method."""
+    columns = [f"{name}{suffix}" for name in MEASURES for suffix in ("", " q90")]
+    lines = [";".join(["pair", "set", "poses", "method", *columns])]
+    for row in rows:
+        values = [f"{value:g}" for name in MEASURES for value in row.get("measures", {}).get(name, ())]
+        words = [row["pair"], row["set"], str(row.get("poses", 0)), row.get("failed", row.get("method"))]
+        lines.append(";".join([*words, *values]))
+    return lines
+
+
+def is_lock(row: Row) -> bool:
+    """Whether a row is of a Panda with one or two joints locked: the 28 that the default is chosen on."""
+    return row["pair"].startswith("panda -") and row["pair"].count(",") <= 1
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Any]:
+    """`compare` for the locks and for the other arms, on demonstrations and on random poses."""
+    summary = {}
+    for poses, sets in {"demonstrations": DEMONSTRATIONS, "random poses": ("random",)}.items():
+        others = [row for row in rows if " to " in row["pair"]]
+        summary[f"locks, {poses}, to copy_joints"] = compare([*filter(is_lock, rows)], "copy_joints", sets)
+        summary[f"other arms, {poses}, to hand_ik"] = compare(others, "hand_ik", sets)
+    return summary
+
+
+def compare(rows: Sequence[Row], baseline: str, sets: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """By method run on all cases: ratio of each measure to a baseline's (geometric mean), cases lost, and cases."""
+    chosen = [row for row in rows if "failed" not in row and row["set"] in sets]
+    cases: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
+    for row in chosen:
+        means = {name: mean for name, (mean, _) in row["measures"].items()}
+        cases.setdefault((row["pair"], row["set"]), {})[row["method"]] = means
+    result: dict[str, dict[str, Any]] = {}
+    for method in dict.fromkeys(row["method"] for row in chosen):
+        if all({method, baseline} <= set(case) for case in cases.values()):
+            result[method] = {"cases": len(cases)}
+            for name in MEASURES:
+                values = [(case[method][name], case[baseline][name]) for case in cases.values()]
+                ratios = [np.log(max(own, EXACT[name]) / other) for own, other in values if other > EXACT[name]]
+                lost = sum(own > max(SLACK.get(name, 1.0) * other, EXACT[name]) for own, other in values)
+                ratio = round(float(np.exp(np.mean(ratios))), 4) if ratios else None
+                result[method][name] = {"ratio": ratio, "lost": int(lost)}
+    return result
+
+
+def pareto_front(compared: dict[str, dict[str, Any]]) -> list[str]:
+    """Candidates that no other beats on one measure of `FRONT` and equals on the rest."""
+    ratios = {
+        method: np.array([result[name]["ratio"] for name in FRONT])
+        for method, result in compared.items()
+        if method not in BASELINES and all(result[name]["ratio"] is not None for name in FRONT)
+    }
+
+    others = ratios.values()
+    return [key for key, own in ratios.items() if not any(np.all(x <= own) and np.any(x < own) for x in others)]
+
+
+def print_tables(rows: Sequence[Row]) -> None:
+    columns = " ".join(["method", *(f"{name}[{entry}]" for name in MEASURES for entry in ("ratio", "lost")), "front"])
+    for title, compared in summarise(rows).items():
+        front = pareto_front(compared)
+        table = [{"method": key, **result, "front": "*" * (key in front)} for key, result in compared.items()]
+        print_table(table, columns, title)
+
+
+def plot(rows: Sequence[Row], path: Path) -> None:
+    """The candidates on the 28 locked Pandas relative to copying: the whole arm on the left, the hand on the right."""
+    compared = compare([*filter(is_lock, rows)], "copy_joints", DEMONSTRATIONS)
+    front = pareto_front(compared)
+    families: dict[str, list[str]] = {}
+    for method in compared:
+        families.setdefault(method if method in BASELINES else method.rpartition(" ")[0], []).append(method)
+    figure, panels = plt.subplots(1, 2, figsize=(10.5, 4.6), layout="constrained")
+    for axes, names in zip(panels, (FRONT[:2], FRONT[2:]), strict=True):
+        for family, methods in families.items():
+            points = [[compared[method][name]["ratio"] for name in names] for method in methods]
+            (line,) = axes.plot(*np.transpose(points), lw=1, label=family.replace("_", " "))
+            for method, point in zip(methods, points, strict=True):
+                fill = line.get_color() if method in front else "white"
+                axes.plot(*point, "s" if method in BASELINES else "o", ms=7, color=line.get_color(), mfc=fill)
+                weight = "" if method in BASELINES else method.rpartition(" ")[2]
+                axes.annotate(weight, point, xytext=(5, 5), textcoords="offset points", fontsize=8)
+        axes.set(xlim=(0, 1.5), ylim=(0, 1.5), xlabel=f"{names[0]}, relative to copying", ylabel=names[1])
+        axes.grid(alpha=0.25)
+    panels[0].legend(fontsize=8)
+    figure.suptitle("28 locked Pandas, pd and reach; numbers: translation weight; filled: Pareto front", fontsize=10)
+    save(figure, path)
