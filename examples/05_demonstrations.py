@@ -37,8 +37,8 @@ for kind in ("pd", "reach"):
     speed = np.abs(recorded.qvel).max(axis=(0, 1)) / expert.velocity_limit
     torque = np.abs(recorded.torque).max(axis=(0, 1)) / expert.torque_limit
     print(f"{kind}: angles {recorded.qpos.shape}, torques {recorded.torque.shape}")
-    print(f"  largest speed of each joint, as a share of its rated one: {' '.join(f'{share:.0%}' for share in speed)}")
-    print(f"  largest torque, as a share of its limit:                 {' '.join(f'{share:.0%}' for share in torque)}")
+    print(f"  largest speed of each joint, as a fraction of its limit: {' '.join(f'{share:.0%}' for share in speed)}")
+    print(f"  largest torque, as a fraction of its limit:                 {' '.join(f'{share:.0%}' for share in torque)}")
 
 # One file holds them, without pickle, and says of which arm they are. `python -m mimic.demonstrations out=FILE` does
 # the same, with a plot; `python -m mimic.train env.demonstrations.path=FILE` trains on it.
@@ -73,10 +73,10 @@ words = [f"source={out / 'waves.csv'}", f"out={out / 'waves.npz'}"]
 print(f"\n$ python -m mimic.demonstrations {' '.join(words)}", flush=True)
 subprocess.run([sys.executable, "-m", "mimic.demonstrations", *words], check=True)
 
-# ---- What is refused -------------------------------------------------------------------------------------------------
+# ---- What is rejected ------------------------------------------------------------------------------------------------
 #
 # Most mistakes in such files are silent ones: degrees, a wrong column, another rate. So a file must be within the arm's
-# range and its rated speeds. The second of these is the wave again, with a clock that runs eight times too fast.
+# ranges and velocity limits. The second of these is the wave again, with a clock that runs eight times too fast.
 
 lines = (out / "waves.csv").read_text().splitlines()
 rows = [line.split(",") for line in lines[1:]]
@@ -90,7 +90,7 @@ for name, changed in broken.items():
     try:
         mimic.import_demonstrations(out / name, expert, horizon=6)  # the fast clock leaves 0.6 s
     except ValueError as error:
-        print(f"{name} is refused: {error}")
+        print(f"{name} is rejected: {error}")
 
 # ---- How much of it can the learner do? ------------------------------------------------------------------------------
 #

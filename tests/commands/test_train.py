@@ -62,8 +62,8 @@ def test_a_run_compiles_few_functions(finished):
     """Each takes a tenth of a second or more on a GPU."""
     _, result = finished
     names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", result.stderr)
-    for program in ("_begin", "_learn", "rollouts", "closest"):
-        assert names.count(program) == 1
+    for function in ("start", "epoch", "rollouts", "closest"):
+        assert names.count(function) == 1
     assert len(names) < 20  # 54 with brax's own training loop
 
 
@@ -104,7 +104,7 @@ def test_resume_continues_from_the_last_checkpoint(finished, tmp_path):
     assert result.returncode == 0, result.stderr[-2000:]
     assert json.loads((run_dir / "report.json").read_text())["env_steps"] >= 8000
     again = command("train", f"resume={run_dir}")
-    assert again.returncode == 2 and "larger trainer.num_timesteps" in again.stderr
+    assert again.returncode == 2 and "increase trainer.num_timesteps" in again.stderr
 
 
 @pytest.mark.slow
