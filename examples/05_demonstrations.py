@@ -37,8 +37,8 @@ for kind in ("pd", "reach"):
     speed = np.abs(recorded.qvel).max(axis=(0, 1)) / expert.velocity_limit
     torque = np.abs(recorded.torque).max(axis=(0, 1)) / expert.torque_limit
     print(f"{kind}: angles {recorded.qpos.shape}, torques {recorded.torque.shape}")
-    print(f"  largest speed of each joint, as a fraction of its limit: {' '.join(f'{share:.0%}' for share in speed)}")
-    print(f"  largest torque, as a fraction of its limit:                 {' '.join(f'{share:.0%}' for share in torque)}")
+    print(f"  maximum speed, as a fraction of its limit:  {' '.join(f'{fraction:.0%}' for fraction in speed)}")
+    print(f"  maximum torque, as a fraction of its limit: {' '.join(f'{fraction:.0%}' for fraction in torque)}")
 
 # One file holds them, without pickle, and says of which arm they are. `python -m mimic.demonstrations out=FILE` does
 # the same, with a plot; `python -m mimic.train env.demonstrations.path=FILE` trains on it.

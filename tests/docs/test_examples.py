@@ -139,7 +139,7 @@ def test_pose_mapper(said, tmp_path):
 
 @example("05_demonstrations")
 def test_demonstrations(said, tmp_path):
-    for line in re.findall(r"  largest .*: +(.*)", said):
+    for line in re.findall(r"  maximum .*: +(.*)", said):
         assert all(0 < float(share) <= 100 for share in line.replace("%", "").split())
     assert mimic.load_demonstrations(tmp_path / "recorded.npz").count == 20
     waves = mimic.load_demonstrations(tmp_path / "waves.npz")
