@@ -7,7 +7,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from mimic.config import check_new, explain, schema, to_dict
 from mimic.runs.checkpoints import check_checkpoint
-from mimic.runs.files import CONFIG, write_atomically
+from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
+from mimic.runs.lock import LOCK
 from mimic.trainers.config import TRAINERS, TrainConfig
 
 
@@ -15,17 +16,24 @@ def new_run_dir(config: TrainConfig) -> Path:
     """The directory of a new run, which is not created yet.
 
     Raises:
-      ValueError: it exists.
+      ValueError: it exists and is more than a run that ended while it was created.
     """
     if config.run_dir:
         path = Path(config.run_dir).expanduser()
-        check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
+        if not _is_unfinished(path):
+            check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
         return path
     stem = f"{config.env.name}-{config.trainer.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     path, number = Path("runs") / stem, 1
     while path.exists():
         path, number = Path("runs") / f"{stem}-{number}", number + 1
     return path
+
+
+def _is_unfinished(path: Path) -> bool:
+    """Whether a folder has nothing but what a run writes before its config."""
+    before_config = {LOCK, DEMONSTRATIONS, *(f"{name}.partial" for name in (DEMONSTRATIONS, CONFIG))}
+    return path.is_dir() and {file.name for file in path.iterdir()} <= before_config
 
 
 def save_config(run_dir: Path, config: TrainConfig) -> None:
