@@ -63,8 +63,8 @@ def training_epoch(env: ImitationEnv, config: PPOSettings, batches: int) -> Any:
 
 def mimic_loop(physics: str, name: str, config: PPOSettings, batches: int) -> dict[str, float]:
     times = [time.perf_counter()]
-    begin, epoch = training_epoch(mimic.make(name, physics=physics), config, batches)
-    state = begin()(0)
+    start, _, epoch = training_epoch(mimic.make(name, physics=physics), config, batches)
+    state = start(0)
     for _ in range(EPOCHS):
         state, metrics = epoch()(state)
         jax.block_until_ready(metrics)

@@ -72,8 +72,8 @@ def busy(events: Iterable[Event]) -> float:
 def profile(name: str, batches: int) -> dict[str, Any]:
     env = mimic.make(name, physics="fused")
     config = PPOConfig().resolve(jax.default_backend(), jax.device_count())
-    begin, epoch = training_epoch(env, config, batches)
-    state, _ = jax.block_until_ready(epoch()(begin()(0)))
+    start, _, epoch = training_epoch(env, config, batches)
+    state, _ = jax.block_until_ready(epoch()(start(0)))
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             began = time.perf_counter()

@@ -48,10 +48,10 @@ def one_batch():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(updates, "value_loss", of_value)
         patch.setattr(updates, "policy_loss", of_policy)
-        begin, learn = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
-        start = begin()(7)
-        before = jax.device_get(start)
-        after, metrics = jax.device_get(learn()(start))
+        start, _, epoch = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+        state = start(7)
+        before = jax.device_get(state)
+        after, metrics = jax.device_get(epoch()(state))
     shown = {"now": metrics["value_loss"], "next": metrics["policy_loss"]}
     shown["elapsed"] = [metrics[name] for name in ppo_loss.METRICS[1:3]]
     return before, after, shown, along
@@ -169,10 +169,10 @@ env = mimic.make("planar4dof", physics=sys.argv[1], demonstrations={"count": 3, 
 config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
                    hidden_layers=[8]).resolve("cpu", 2)
 networks = training.make_networks(config, env.observation_size, env.action_size)
-begin, learn = programs.compile_training(env, config, networks, 2, optax.constant_schedule(1e-3), None)
-start = begin()(7)
-before = jax.device_get(start.params)
-after, metrics = learn()(start)
+start, _, epoch = programs.compile_training(env, config, networks, 2, optax.constant_schedule(1e-3), None)
+state = start(7)
+before = jax.device_get(state.params)
+after, metrics = epoch()(state)
 changed = jax.tree.map(lambda x, y: not np.array_equal(x, y), before, jax.device_get(after.params))
 assert any(jax.tree.leaves(changed))
 for x in jax.tree.leaves((after.policy, after.value, after.statistics, metrics)):
@@ -210,10 +210,10 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
         config = PPOConfig(**small, **settings).resolve("cpu")  # type: ignore[arg-type]
         networks = training.make_networks(config, env.observation_size, env.action_size)
         rate = optax.constant_schedule(1e-3)
-        begin, learn = programs.compile_training(env, config, networks, 1, rate, None, lambda count: count / 2)
-        state, learn = begin()(7), learn()
+        start, _, epoch = programs.compile_training(env, config, networks, 1, rate, None, lambda count: count / 2)
+        state = start(7)
         for _ in range(batches):
-            state, _ = learn(state)
+            state, _ = epoch()(state)
         return jax.device_get(state.params)
 
     constant, decayed = {"entropy_cost": 0.2}, {"entropy_cost": 0.2, "final_entropy_cost": 0.0}
@@ -229,9 +229,10 @@ def test_both_functions_are_compiled_with_the_options_of_a_run(monkeypatch):
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    for program in programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None):
+    start, _, epoch = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+    for compiled in (lambda: start(7), epoch):
         with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
-            program()
+            compiled()
 
 
 @pytest.mark.gpu
@@ -245,6 +246,6 @@ def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypat
     for scheduling in ("SERIALIZE", given[_SCHEDULING]):
         options = {**given, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
         monkeypatch.setattr(programs, "compiler_options", lambda options=options: options)
-        begin, learn = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
-        learned.append(jax.device_get(learn()(begin()(7))))
+        start, _, epoch = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
+        learned.append(jax.device_get(epoch()(start(7))))
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))
