@@ -5,7 +5,7 @@
 The learner starts at home at rest; for 5 s a new random torque within the environment's torque scale is held for each
 control step. The error is the distance of the tip from that of C MuJoCo with RK4 in steps of 0.1 ms. Candidates are C
 MuJoCo's integrators in double precision, and the environments' own physics in single precision. Sequences in which the
-reference reaches the speed bound are counted and left out. A state that is not finite has an infinite error, null.
+reference reaches the speed bound are counted and excluded. A state that is not finite has an infinite error, null.
 """
 
 import os

@@ -54,8 +54,8 @@ command(
 # ---- The report ------------------------------------------------------------------------------------------------------
 #
 # The optimality gap measures quality: 0 is the kinematic bound, the minimum that the learner's joints allow at each
-# moment, and 1 is holding the start pose. The gap on training demonstrations is far smaller than on held-out ones, since 16
-# demonstrations are few. The held-out gap is the one to judge a policy by.
+# moment, and 1 is holding the start pose. The gap on training demonstrations is far smaller than on held-out ones,
+# since 16 demonstrations are few. The held-out gap is the one to judge a policy by.
 
 report = json.loads((run / "report.json").read_text())
 gap, distance = report["optimality_gap"], report["mean_distance"]

@@ -61,5 +61,5 @@ def test_the_command_shows_what_changed_and_rejects_other_files(tmp_path):
     shown = _compare(old, new).stdout
     assert "+100.0%" in shown and "1 of 1 values changed" in shown and "1 values are not in the new file" in shown
     for wrong in (tmp_path / "none.json", other):
-        refused = _compare(old, wrong)
-        assert refused.returncode == 1 and refused.stderr.startswith("error: ") and refused.stderr.count("\n") == 1
+        rejected = _compare(old, wrong)
+        assert rejected.returncode == 1 and rejected.stderr.startswith("error: ") and rejected.stderr.count("\n") == 1

@@ -98,7 +98,7 @@ def test_benchmarks_are_started_with_what_they_take(tmp_path, monkeypatch):
     assert run.device_name("NVIDIA H200") == "h200" and run.device_name("cpu") == "cpu"
 
 
-def test_an_unknown_benchmark_is_refused(tmp_path):
+def test_an_unknown_benchmark_is_rejected(tmp_path):
     command = [sys.executable, "-m", "benchmarks.run", "nothing", "--out", str(tmp_path / "out")]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 2 and "unknown benchmark 'nothing'; valid are all, startup, kernel" in result.stderr

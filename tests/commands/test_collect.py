@@ -117,7 +117,7 @@ def test_what_is_left_out_is_named_and_the_rest_is_kept(six, capsys):
     write_run(six / "of-old", [0.9], seed=6, version="0.0.1")
     (six / "of-old" / "config.yaml").write_text("trainer: {name: ppo, momentum: 0.9}\n")
     planned = [
-        {"label": "seed=7", "run_dir": "refused", "exit_code": 2, "reason": "no such arm"},
+        {"label": "seed=7", "run_dir": "rejected", "exit_code": 2, "reason": "no such arm"},
         {"label": "seed=8", "run_dir": "waiting"},
         {"label": "seed=0", "run_dir": "planar4dof-0", "exit_code": 0, "reason": ""},
     ]
@@ -130,7 +130,7 @@ def test_what_is_left_out_is_named_and_the_rest_is_kept(six, capsys):
     assert "diverged" in reasons["diverged"] and "optimality_gap.train" in reasons["diverged"]
     assert "report.json cannot be read" in reasons["torn"]
     assert "of mimic 0.0.1, and this is" in reasons["of-old"] and "momentum" in reasons["of-old"]
-    assert reasons["refused"] == "seed=7: failed: no such arm" and reasons["waiting"] == "seed=8: not started"
+    assert reasons["rejected"] == "seed=7: failed: no such arm" and reasons["waiting"] == "seed=8: not started"
     assert len(reasons) == 6
     assert [len(group["seeds"]) for group in collected(six)["groups"]] == [3, 3]
 

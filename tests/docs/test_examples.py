@@ -173,7 +173,7 @@ def test_own_arm(said, tmp_path):
     assert is_picture(tmp_path / "inspected" / "arms.png")
     assert "exit code: 2" in said
     report = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert report["env"] == "pair" and report["optimality_gap"]["train"] < 1  # better than holding the start pose; the start is at 2
+    assert report["env"] == "pair" and report["optimality_gap"]["train"] < 1  # 1: holding the start pose; at first 2
 
 
 @example("08_other_tools", patience)

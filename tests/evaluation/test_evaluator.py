@@ -99,11 +99,11 @@ def test_torques_and_limits_by_hand(evaluator):
     env.learner = env.learner.replace(
         joint_range=np.array([[-1, 1], [-2, 2]]), velocity_limit=np.array([3.0, 4.0]), torque_limit=scale / 2
     )
-    share = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, -0.5]])  # of the maximum torques, over three steps
+    fraction = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, -0.5]])  # of the maximum torques, over three steps
     qpos = np.array([[1.0, -2.0], [1.1, 0.0], [np.nan, 0.0]])
     qvel = np.array([[3.0, -4.1], [3.1, 4.1], [0.0, -4.0]])
     count = env.demonstrations.count
-    motion = [np.broadcast_to(x, (count, 3, 2)) for x in (qpos, qvel, share * scale)]
+    motion = [np.broadcast_to(x, (count, 3, 2)) for x in (qpos, qvel, fraction * scale)]
     states = link_state_table(evaluator.env.learner, *(np.nan_to_num(x) for x in motion[:2]))
     table = measure(env, states, *motion)
     expected = {
@@ -118,10 +118,10 @@ def test_torques_and_limits_by_hand(evaluator):
         np.testing.assert_allclose(table[key], np.full(count, value), rtol=1e-6)  # the maximum torques are in float32
 
 
-def between(evaluator, share):
+def between(evaluator, fraction):
     """Rollouts with given optimality gaps, one for each demonstration."""
     bound, hold = evaluator.lower_bound, evaluator.hold_distance
-    return rollouts(evaluator, distance=bound + np.asarray(share)[:, None] * (hold - bound))
+    return rollouts(evaluator, distance=bound + np.asarray(fraction)[:, None] * (hold - bound))
 
 
 def test_gaps_are_of_mean_distances(evaluator):

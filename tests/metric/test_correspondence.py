@@ -178,8 +178,8 @@ def merged_by_a_right_angle():
 @pytest.mark.parametrize("name", ARMS)
 def test_arc_length_of_an_arm_with_itself_counts_links_by_their_length(name):
     arm = ARMS[name]
-    share = np.asarray(arm.link_lengths) / arm.link_lengths.sum()
-    expected = arm.num_links**2 * np.diag(share)
+    fraction = np.asarray(arm.link_lengths) / arm.link_lengths.sum()
+    expected = arm.num_links**2 * np.diag(fraction)
     np.testing.assert_allclose(arc_length_correspondence(arm, arm), expected, rtol=1e-5)  # float32
     assert np.asarray(arc_length_correspondence(arm, arm)).mean() == pytest.approx(1, rel=1e-6)
 

@@ -113,12 +113,12 @@ def test_each_all_reduce_waits_for_the_one_before(case, monkeypatch):
     of_one = jax.tree.map(lambda x: x[0], (case.unrolls, case.order, case.keys))
     on_one = functools.partial(case.on_device, True, 1)
     program = jax.make_jaxpr(on_one, axis_env=[("devices", DEVICES)])(*of_one).jaxpr
-    messages = [equation for equation in program.eqns if equation.primitive.name.startswith("psum")]
-    assert len(messages) == 2 * UPDATES + 1
-    for before, message in itertools.pairwise(messages):
-        assert message.outvars[0] in _made_of(before.outvars, program)
+    reductions = [equation for equation in program.eqns if equation.primitive.name.startswith("psum")]
+    assert len(reductions) == 2 * UPDATES + 1
+    for before, after in itertools.pairwise(reductions):
+        assert after.outvars[0] in _made_of(before.outvars, program)
     *_, metrics = program.outvars  # whose mean is sent next
-    assert metrics in _made_of(messages[-1].outvars, program)
+    assert metrics in _made_of(reductions[-1].outvars, program)
 
 
 def _made_of(variables, program):
