@@ -15,8 +15,8 @@ def _results(**rows):
 
 def test_values_are_named_by_the_text_and_the_sizes_of_their_row():
     rows = [{"case": "fused", "arms": 64, "steps_per_s": 10.0, "median_ms": 2.0, "spread": 0.1, "compile_s": 3.0}]
-    found = read_values(_results(rows=rows, deep={"a": {"b": 1}}))
-    assert found == {
+    entries = read_values(_results(rows=rows, deep={"a": {"b": 1}}))
+    assert entries == {
         "rows / fused / arms=64 / steps_per_s": Value(10.0, 1.0),
         "rows / fused / arms=64 / median_ms": Value(2.0, 0.2),
         "rows / fused / arms=64 / compile_s": Value(3.0, 0.0),

@@ -31,24 +31,24 @@ def collected(folder):
     ],
 )
 def test_the_interval_is_that_of_students_t(values, quantile):
-    found = mean_interval(values)
-    spread = math.sqrt(sum((value - found.mean) ** 2 for value in values) / (len(values) - 1))
-    assert found.mean == pytest.approx(sum(values) / len(values))
-    assert found.high is not None and found.low is not None
-    assert found.high - found.mean == pytest.approx(quantile * spread / math.sqrt(len(values)), rel=1e-6)
-    assert found.mean - found.low == pytest.approx(found.high - found.mean)
-    assert (found.min, found.max, found.n) == (min(values), max(values), len(values))
+    interval = mean_interval(values)
+    spread = math.sqrt(sum((value - interval.mean) ** 2 for value in values) / (len(values) - 1))
+    assert interval.mean == pytest.approx(sum(values) / len(values))
+    assert interval.high is not None and interval.low is not None
+    assert interval.high - interval.mean == pytest.approx(quantile * spread / math.sqrt(len(values)), rel=1e-6)
+    assert interval.mean - interval.low == pytest.approx(interval.high - interval.mean)
+    assert (interval.min, interval.max, interval.n) == (min(values), max(values), len(values))
 
 
 def test_19_of_20_intervals_hold_the_mean():
     samples = np.random.default_rng(0).normal(3.0, 2.0, (2000, 3))
-    inside = [found.low <= 3.0 <= found.high for found in map(mean_interval, samples)]  # type: ignore[operator]
+    inside = [interval.low <= 3.0 <= interval.high for interval in map(mean_interval, samples)]  # type: ignore[operator]
     assert np.mean(inside) == pytest.approx(0.95, abs=0.015)  # three standard errors
 
 
 def test_one_run_has_no_interval():
-    found = mean_interval([0.5])
-    assert (found.mean, found.low, found.high) == (0.5, None, None)
+    interval = mean_interval([0.5])
+    assert (interval.mean, interval.low, interval.high) == (0.5, None, None)
 
 
 @pytest.fixture
