@@ -59,7 +59,6 @@ def mujoco_motion(env: ImitationEnv, torques: np.ndarray, integrator: str, subst
 def own_motion(env: ImitationEnv, torques: np.ndarray, physics: str, substeps: int) -> Motion:
     """The environments' own physics, in single precision."""
     advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
-
     home = jnp.asarray(env.learner.home, jnp.float32)
 
     def step(state: tuple[jax.Array, jax.Array], torque: jax.Array) -> Any:

@@ -103,7 +103,6 @@ def environment(kind: str, env: ImitationEnv, arms: int) -> Timing:
 def part(name: str, env: ImitationEnv, arms: int) -> Timing:
     qpos, qvel, torques = random_motion(env, arms)
     started = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), arms))
-
     functions = {
         "reward": lambda arm: env.distance(arm.qpos, arm.qvel, arm.demonstration, arm.step),
         "observation": lambda arm: jnp.sum(env.observe(arm)),
