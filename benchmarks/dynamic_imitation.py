@@ -37,7 +37,7 @@ UNSEEN_SEED, UNSEEN = 1000, 32  # demonstrations that no run is trained on, the 
 
 
 class Case(NamedTuple):
-    """Training runs that differ in their seed alone."""
+    """Training runs that differ only in their seed."""
 
     group: str
     name: str
