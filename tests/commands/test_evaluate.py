@@ -83,7 +83,7 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
     job.train(tmp_path, lambda *_: False, Signals(), None)
     (env,) = trained
     assert env.demonstrations.count == COUNT + 3
-    assert job.evaluator.training_env.demonstrations.count == COUNT
+    assert job.evaluator.parts["train"] == slice(0, COUNT)
     np.testing.assert_array_equal(env.demonstrations.qpos[:COUNT], job.evaluator.env.demonstrations.qpos[:COUNT])
 
 
