@@ -2,8 +2,8 @@
 
     python -m benchmarks.profile [--out FILE] [--env panda4dof] [--batches 10]
 
-Profiles one training epoch of so many batches, after another that compiles. The times of concurrent kernels are added
-up, so that their sum exceeds the epoch; "busy" is the time in which a kernel ran.
+Profiles one training epoch after another one that compiles. The times of concurrent kernels are added up, so their sum
+can exceed the epoch; "busy" is the time in which at least one kernel ran.
 """
 
 import re

@@ -66,8 +66,8 @@ def test_each_pass_uses_each_transition(one_batch):
 def test_the_next_observation_belongs_to_its_transition(one_batch):
     """In unrolls of one step, the next observation of the first is the first one of the second."""
     before, after, shown, along = one_batch
-    seen = UNROLLS * ARMS * after.statistics.mean - before.episodes.obs.sum(0) + after.episodes.obs.sum(0)
-    assert shown["next"] == pytest.approx(along @ seen / (UNROLLS * ARMS), abs=1e-5)
+    total = UNROLLS * ARMS * after.statistics.mean - before.episodes.obs.sum(0) + after.episodes.obs.sum(0)
+    assert shown["next"] == pytest.approx(along @ total / (UNROLLS * ARMS), abs=1e-5)
 
 
 def test_the_elapsed_time_belongs_to_the_observation(one_batch):
@@ -129,8 +129,8 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     (loss, shown), gradient = jax.jit(jax.value_and_grad(own, has_aux=True))(params)
     (expected, named), expected_gradient = jax.jit(jax.value_and_grad(of_brax, has_aux=True))(params)
     assert loss == pytest.approx(float(expected), rel=1e-12)
-    for found, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    for actual, reference in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
+        np.testing.assert_allclose(actual, reference, rtol=1e-9, atol=1e-12)
     assert -entropy_cost * shown["entropy"] == pytest.approx(float(named["entropy_loss"]), rel=1e-12, abs=1e-12)
     assert shown["policy_loss"] == pytest.approx(float(named["policy_loss"]), rel=1e-12)
     assert shown["value_loss"] == pytest.approx(float(named["v_loss"]), rel=1e-12)
@@ -242,9 +242,9 @@ def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypat
     env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
     config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    given, learned = compiler_options(), []
-    for scheduling in ("SERIALIZE", given[_SCHEDULING]):
-        options = {**given, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
+    defaults, learned = compiler_options(), []
+    for scheduling in ("SERIALIZE", defaults[_SCHEDULING]):
+        options = {**defaults, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
         monkeypatch.setattr(programs, "compiler_options", lambda options=options: options)
         start, _, epoch = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
         learned.append(jax.device_get(epoch()(start(7))))
