@@ -40,16 +40,14 @@ _TIMES = ("wall_time_s", "training/sps", "training/walltime")
 
 
 def main() -> None:
-    options = {"kills": 20, "seed": 0, "trainer": "ppo"}
-    parser = make_parser("interruptions", __doc__, **dict[str, Any](options))
+    parser = make_parser("interruptions", __doc__, kills=20, seed=0, trainer="ppo")
     parser.add_argument("arguments", nargs="*", help="of mimic.train, instead of a run of seconds")
     chosen = parser.parse_args()
     arguments = chosen.arguments or (_SMALL if chosen.trainer == "ppo" else _SMALL_MAPPER)
     with tempfile.TemporaryDirectory() as folder:
         rows = interrupted_runs(Path(folder), arguments, chosen.kills, chosen.seed)
     print_table(rows, "run kills equal where_killed")
-    if chosen.out:
-        write_results(chosen, rows)
+    write_results(chosen, results=rows)
     if not all(row["equal"] for row in rows):
         sys.exit("error: a run differs from the reference")
 

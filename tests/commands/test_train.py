@@ -154,7 +154,7 @@ def test_a_folder_without_a_config_is_no_run_yet(tmp_path):
 
 def test_a_run_starts_from_the_parameters_of_another_run(finished, tmp_path):
     run_dir = tmp_path / "run"
-    result = command("train", *TINY, "seed=1", f"init={finished[0]}", f"run_dir={run_dir}")
+    result = command("train", *TINY, "seed=1", "trainer.evaluations=1", f"init={finished[0]}", f"run_dir={run_dir}")
     assert result.returncode == 0, result.stderr[-2000:]
     with np.load(finished[0] / "checkpoints" / f"{max(checkpoint_steps(finished[0])):012d}" / "training.npz") as file:
         policy = file["arr_0"]
