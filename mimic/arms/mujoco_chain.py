@@ -1,6 +1,5 @@
 """Reads a serial chain of revolute joints from a MuJoCo model."""
 
-import dataclasses
 from collections.abc import Callable
 
 import mujoco
@@ -17,6 +16,7 @@ _CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjG
 _ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _NO_BIAS = int(mujoco.mjtBias.mjBIAS_NONE)
 _WORLD = 0  # body
+_ALONG_AXIS = 1e-3  # rad; files round directions
 
 
 def read_chain(
@@ -98,10 +98,10 @@ def _base_links(first: Joint) -> list[Link]:
 
     A link along the joint's axis rotates with it, as the Panda's first link does; its position is the same either way.
     """
-    link = Link("base", np.zeros(3), first.anchor, -1)
-    is_along_axis = np.linalg.norm(np.cross(first.axis, first.anchor)) <= SHORTEST_LINK
-    moved = dataclasses.replace(link, joint=0) if is_along_axis else link
-    return [moved] if link.length > SHORTEST_LINK else []
+    length = np.linalg.norm(first.anchor)
+    is_along_axis = np.linalg.norm(np.cross(first.axis, first.anchor)) <= _ALONG_AXIS * length
+    link = Link("base", np.zeros(3), first.anchor, 0 if is_along_axis else -1)
+    return [link] if length > SHORTEST_LINK else []
 
 
 def _anchor_links(joints: list[Joint], tip: np.ndarray) -> list[Link]:
