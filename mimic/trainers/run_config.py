@@ -5,6 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from mimic.arms.arm import BUILT_IN
 from mimic.config import check_new, explain, schema, to_dict
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, write_atomically
@@ -51,10 +52,25 @@ def load_config(run_dir: Path) -> TrainConfig:
         name = OmegaConf.select(content, "trainer.name")
         if name not in TRAINERS:
             raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
-        merged = OmegaConf.merge(run_schema(name), _with_old_default_metric(content))  # type: ignore[arg-type]
+        merged = OmegaConf.merge(run_schema(name), _with_old_defaults(content))  # type: ignore[arg-type]
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
+
+
+def _with_old_defaults(content: DictConfig) -> DictConfig:
+    """Completes the config of a run older than some of the fields with the behaviour of its time."""
+    return _without_base_segments(_with_old_default_metric(content))
+
+
+def _without_base_segments(content: DictConfig) -> DictConfig:
+    """Completes the config of a run older than the field `base_segment`: an arm from a file began at its first joint.
+
+    The number of links, and so the size of observations, is part of what was trained.
+    """
+    models = {role: OmegaConf.select(content, f"env.{role}.model") for role in ("expert", "learner")}
+    old = {role: {"base_segment": False} for role, model in models.items() if model not in (None, *BUILT_IN)}
+    return OmegaConf.merge({"env": old}, content) if old else content  # type: ignore[return-value]
 
 
 def _with_old_default_metric(content: DictConfig) -> DictConfig:
