@@ -99,11 +99,11 @@ def test_the_first_link_starts_at_the_base():
     np.testing.assert_allclose(arm.link_position, [[0, 0, 0.15], [0.5, 0, 0.3], [1.25, 0, 0.3]], atol=1e-12)
     np.testing.assert_allclose(arm.link_lengths, [0.3, 1, 0.5], atol=1e-12)
     states = link_states(arm, np.array([np.pi / 2, 0.0]), np.array([2.0, 0.0]), normalized=False)
-    close = {"atol": 1e-6}  # float32
-    np.testing.assert_allclose(states.position, [[0, 0, 0.15], [0, 0.5, 0.3], [0, 1.25, 0.3]], **close)
-    np.testing.assert_allclose(states.direction, [[0, 0, 1], [0, 1, 0], [0, 1, 0]], **close)
-    np.testing.assert_allclose(states.linear_velocity, [[0, 0, 0], [-1, 0, 0], [-2.5, 0, 0]], **close)
-    np.testing.assert_allclose(states.angular_velocity, [[0, 0, 2]] * 3, **close)  # as the Panda's first link
+    atol = 1e-6  # float32
+    np.testing.assert_allclose(states.position, [[0, 0, 0.15], [0, 0.5, 0.3], [0, 1.25, 0.3]], atol=atol)
+    np.testing.assert_allclose(states.direction, [[0, 0, 1], [0, 1, 0], [0, 1, 0]], atol=atol)
+    np.testing.assert_allclose(states.linear_velocity, [[0, 0, 0], [-1, 0, 0], [-2.5, 0, 0]], atol=atol)
+    np.testing.assert_allclose(states.angular_velocity, [[0, 0, 2]] * 3, atol=atol)  # as the Panda's first link
     locked = load_mjcf(on_a_base("0 0 0.3"), locked={"a": 0.2})
     assert (locked.link_names, locked.link_joint) == (arm.link_names, (-1, -1, 0))
 
@@ -113,6 +113,7 @@ def test_a_base_segment_that_is_not_along_the_first_axis_does_not_move():
     assert arm.link_joint == (-1, 0, 1) and arm.link_lengths[0] == pytest.approx(0.5)
     states = link_states(arm, np.array([1.0, 0.5]), np.array([2.0, 1.0]), normalized=False)
     np.testing.assert_allclose(states.position[0], [0.15, 0, 0.2], atol=1e-7)
+    assert states.direction is not None and states.angular_velocity is not None
     np.testing.assert_allclose(states.direction[0], [0.6, 0, 0.8], atol=1e-7)
     assert not np.any(states.linear_velocity[0]) and not np.any(states.angular_velocity[0])
 
