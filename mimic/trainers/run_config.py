@@ -59,8 +59,13 @@ def load_config(run_dir: Path) -> TrainConfig:
 
 
 def _with_old_defaults(content: DictConfig) -> DictConfig:
-    """Completes the config of a run older than some of the fields with the behaviour of its time."""
-    return _without_base_segments(_with_old_default_metric(content))
+    """Completes the config of an older run with the defaults of its time."""
+    content = _without_base_segments(_with_old_default_metric(content))
+    trainer = OmegaConf.select(content, "trainer")
+    if trainer.name == "ppo":
+        trainer = {"timed_critic": False, "final_entropy_cost": 1.0, **trainer}
+        content = OmegaConf.merge(content, {"trainer": trainer})  # type: ignore[assignment]
+    return content
 
 
 def _without_base_segments(content: DictConfig) -> DictConfig:

@@ -99,6 +99,7 @@ def test_the_first_link_starts_at_the_base():
     np.testing.assert_allclose(arm.link_position, [[0, 0, 0.15], [0.5, 0, 0.3], [1.25, 0, 0.3]], atol=1e-12)
     np.testing.assert_allclose(arm.link_lengths, [0.3, 1, 0.5], atol=1e-12)
     states = link_states(arm, np.array([np.pi / 2, 0.0]), np.array([2.0, 0.0]), normalized=False)
+    assert states.direction is not None and states.angular_velocity is not None
     atol = 1e-6  # float32
     np.testing.assert_allclose(states.position, [[0, 0, 0.15], [0, 0.5, 0.3], [0, 1.25, 0.3]], atol=atol)
     np.testing.assert_allclose(states.direction, [[0, 0, 1], [0, 1, 0], [0, 1, 0]], atol=atol)

@@ -6,6 +6,7 @@ from omegaconf import OmegaConf
 from mimic.arms.arm import ArmConfig
 from mimic.metric.config import MetricConfig
 from mimic.runs.files import CONFIG
+from mimic.trainers.config import PPOSettings
 from mimic.trainers.run_config import load_config
 from tests.helpers import original_model
 from tests.helpers.run_directories import write_run
@@ -52,3 +53,15 @@ def test_an_old_run_of_an_arm_from_a_file_keeps_its_links(tmp_path, role):
     assert num_links == {"new": 7, "old": 6}
     built_in = {"expert": "learner", "learner": "expert"}[role]
     assert getattr(load_config(run_dir).env, built_in) == ArmConfig()
+
+
+def test_an_old_run_keeps_its_critic_and_its_schedule(tmp_path):
+    """Runs older than both fields: their checkpoints have a critic that does not observe the time."""
+    run_dir = write_run(tmp_path / "run", [0.1], env="panda4dof")
+    content = OmegaConf.load(run_dir / CONFIG)
+    assert content.trainer.pop("timed_critic", True) is True
+    content.trainer.pop("final_entropy_cost", None)
+    OmegaConf.save(content, run_dir / CONFIG)
+    settings = load_config(run_dir).trainer.resolve()
+    assert isinstance(settings, PPOSettings)
+    assert settings.timed_critic is False and settings.final_entropy_cost == 1
