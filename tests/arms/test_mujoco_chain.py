@@ -149,6 +149,13 @@ def test_arms_without_a_base_segment(arm, options, names):
     assert load_mjcf(arm, **options).link_names == names
 
 
+def test_a_first_joint_at_the_base_needs_no_message(caplog):
+    chain._warn_merged.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        load_mjcf(on_a_base("0 0 0"))
+    assert not caplog.text
+
+
 def test_links_that_the_model_marks_are_all_its_links():
     site = '<site name="link1" type="capsule" size="0.01" fromto="0 0 0 0.5 0 0"/>'
     marked = model(f'<body name="plate">{revolute("a", pos="0 0 0.3", inner=site)}</body>')
