@@ -43,6 +43,7 @@ class ArmConfig:
       tip: for a file, name of the body or site at the end of the chain; default: see `find_chain`.
       armature: minimum rotor inertia of each joint, at the joint [kg m^2]; many models state none.
       damping: minimum damping of each joint [N m s/rad].
+      base_segment: for a file, whether the segment from the base to the first joint is a link; see `load_mjcf`.
     """
 
     model: str = "panda"
@@ -52,6 +53,7 @@ class ArmConfig:
     tip: str | None = None
     armature: float = 0.0
     damping: float = 0.0
+    base_segment: bool = True
 
     def __post_init__(self) -> None:
         if not self.model:
@@ -142,6 +144,7 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         tip=config.tip,
         links=cast(Links, links),
         limits=cast(Limits, limits),
+        base_segment=config.base_segment,
     )
     notes = () if is_panda else ignored_elements(source, config.base, config.tip)
     return with_minimum_armature(

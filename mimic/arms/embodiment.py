@@ -131,13 +131,15 @@ def load_mjcf(
     base: str | None = None,
     tip: str | None = None,
     links: Links = "kept",
+    base_segment: bool = True,
 ) -> Embodiment:
     """A serial chain of revolute joints from any MJCF or URDF, with the joint ranges and limits of the model.
 
     Capsule sites named link… are the links (`fromto` gives start and end). In a model without such sites, the links are
-    the segments from each joint's anchor to the next; the last one ends at `tip`. The base frame is that of the parent
-    of the first body with a revolute joint, unless `base` names a body. The joints of a hand are fixed. For models that
-    branch, see `find_chain` in mimic.arms.kinematic_tree.
+    the segments from the origin of the base to the first joint's anchor, and from each anchor to the next; the last one
+    ends at `tip`. The base is the parent of the first body with a revolute joint, unless `base` names a body. The world
+    has no segment unless `base` names it. The joints of a hand are fixed. For models that branch, see `find_chain` in
+    mimic.arms.kinematic_tree.
 
     Args:
       path_or_model: an MJCF or URDF file, or a compiled model.
@@ -145,13 +147,15 @@ def load_mjcf(
       base: name of the body that carries the chain; the base frame is then its frame.
       tip: name of the body or site at the end of the chain.
       links: as for `panda`.
+      base_segment: whether the segment from the base to the first joint is a link; without effect where links are
+        merged, because the paper has as many links as joints.
 
     Raises:
       ValueError: a file that is missing or not a model, no revolute joint, a branch, a loop, a name that the model
         lacks, or what `panda` rejects.
     """
     model = _model(path_or_model)
-    chain = read_chain(model, base, tip)
+    chain = read_chain(model, base, tip, base_segment=base_segment and links == "kept")
     angles = resolve_locked(locked, tuple(joint.name for joint in chain.joints))
     return _locked_embodiment(chain, angles, _name(path_or_model, model), links)
 
@@ -165,6 +169,7 @@ def load_arm(
     tip: str | None = None,
     links: Links = "kept",
     limits: Limits = "hardware",
+    base_segment: bool = True,
 ) -> tuple[Embodiment, mujoco.MjModel, dict[str, float]]:
     """An embodiment, its source model, and the angles [rad] of its locked joints by name.
 
@@ -172,7 +177,7 @@ def load_arm(
     """
     check_choice("limits", limits, LIMITS)
     model = _model(path_or_model)
-    chain = read_chain(model, base, tip)
+    chain = read_chain(model, base, tip, base_segment=base_segment and links == "kept")
     if limits == "none":
         unlimited = (dataclasses.replace(joint, range=(-np.pi, np.pi), home=0.0) for joint in chain.joints)
         chain = Chain(tuple(unlimited), chain.links)

@@ -15,10 +15,20 @@ START_POSES = "ready", "home"  # keyframes with the start pose of a model, in or
 _CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 _ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _NO_BIAS = int(mujoco.mjtBias.mjBIAS_NONE)
+_WORLD = 0  # body
+_ALONG_AXIS = 1e-3  # rad; files round directions
 
 
-def read_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None = None) -> Chain:
+def read_chain(
+    model: mujoco.MjModel, base: str | None = None, tip: str | None = None, *, base_segment: bool = True
+) -> Chain:
     """The serial chain of revolute joints of a model, from body `base` to body or site `tip`.
+
+    Args:
+      model: any.
+      base, tip: see `find_chain`.
+      base_segment: add a link from the origin of the base body to the first joint, unless the model marks its links
+        itself. The world is a base body only where `base` names it.
 
     Raises:
       ValueError: no revolute joint, a joint of another kind, a branch, a loop, or a name that the model lacks.
@@ -46,7 +56,9 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None =
     if duplicates:
         raise ValueError(f"two joints of the chain are called {', '.join(duplicates)}; name the unnamed ones in MJCF")
     if not links:
-        links = _anchor_links(joints, in_base(_tip_point(model, data, chain_ids, tip)))
+        has_base = base_segment and (base is not None or base_body != _WORLD)
+        links = _base_links(joints[0]) if has_base else []
+        links += _anchor_links(joints, in_base(_tip_point(model, data, chain_ids, tip)))
     return Chain(tuple(joints), drop_zero_length(links))
 
 
@@ -79,6 +91,17 @@ def _site_links(
             centre = data.site_xpos[site]
             links.append(Link(name, in_base(centre + half), in_base(centre - half), joint))
     return links
+
+
+def _base_links(first: Joint) -> list[Link]:
+    """The link from the base body to the first joint; none where they are at the same point.
+
+    A link along the joint's axis rotates with it, as the Panda's first link does; its position is the same either way.
+    """
+    length = np.linalg.norm(first.anchor)
+    is_along_axis = np.linalg.norm(np.cross(first.axis, first.anchor)) <= _ALONG_AXIS * length
+    link = Link("base", np.zeros(3), first.anchor, 0 if is_along_axis else -1)
+    return [link] if length > SHORTEST_LINK else []
 
 
 def _anchor_links(joints: list[Joint], tip: np.ndarray) -> list[Link]:

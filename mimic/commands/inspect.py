@@ -164,6 +164,7 @@ def _arm_words(key: str, arm: ArmConfig) -> list[str]:
     words += [
         f"{key}.{name}={value}" for name in ("base", "tip", "armature", "damping") if (value := getattr(arm, name))
     ]
+    words += [f"{key}.base_segment=false"] * (not arm.base_segment)
     for name in ("locked", "link_lengths"):
         value = getattr(arm, name)
         if value:

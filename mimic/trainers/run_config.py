@@ -5,6 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from mimic.arms.arm import BUILT_IN
 from mimic.config import check_new, explain, schema, to_dict
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
@@ -67,12 +68,22 @@ def load_config(run_dir: Path) -> TrainConfig:
 
 def _with_old_defaults(content: DictConfig) -> DictConfig:
     """Completes the config of an older run with the defaults of its time."""
-    content = _with_old_default_metric(content)
+    content = _without_base_segments(_with_old_default_metric(content))
     trainer = OmegaConf.select(content, "trainer")
     if trainer.name == "ppo":
         trainer = {"timed_critic": False, "final_entropy_cost": 1.0, **trainer}
         content = OmegaConf.merge(content, {"trainer": trainer})  # type: ignore[assignment]
     return content
+
+
+def _without_base_segments(content: DictConfig) -> DictConfig:
+    """Completes the config of a run older than the field `base_segment`: an arm from a file began at its first joint.
+
+    The number of links, and so the size of observations, is part of what was trained.
+    """
+    models = {role: OmegaConf.select(content, f"env.{role}.model") for role in ("expert", "learner")}
+    old = {role: {"base_segment": False} for role, model in models.items() if model not in (None, *BUILT_IN)}
+    return OmegaConf.merge({"env": old}, content) if old else content  # type: ignore[return-value]
 
 
 def _with_old_default_metric(content: DictConfig) -> DictConfig:

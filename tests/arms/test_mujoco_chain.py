@@ -7,6 +7,7 @@ import pytest
 
 from mimic.arms import chain
 from mimic.arms.embodiment import load_arm, load_mjcf, panda, panda_path
+from mimic.metric.kinematics import link_states
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # the messages are those of mimic
 
@@ -81,8 +82,84 @@ def test_base_and_tip():
     assert load_mjcf(tree, tip="B").joint_names == ("a", "b")
     assert load_mjcf(tree, tip="side").joint_names == ("a", "c")
     arm = load_mjcf(tree, base="A", tip="finger")
-    assert (arm.joint_names, arm.link_lengths.tolist()) == (("b",), [pytest.approx(0.4)])
+    assert (arm.joint_names, arm.link_names) == (("b",), ("base", "link1"))
+    assert arm.link_lengths.tolist() == [1, pytest.approx(0.4)]
     assert arm.joint_anchor.tolist() == [[1, 0, 0]]  # in the frame of A
+
+
+def on_a_base(offset, axis="0 0 1"):
+    """The joints a and b of a toy on a body that is not at the world's origin."""
+    arm = revolute("a", pos=offset, axis=axis, body="A", inner=revolute("b", pos="1 0 0", axis="0 1 0", inner=TIP))
+    return model(f'<body name="plate" pos="2 3 0.5" euler="0 0 1">{arm}</body>')
+
+
+def test_the_first_link_starts_at_the_base():
+    arm = load_mjcf(on_a_base("0 0 0.3"))
+    assert (arm.link_names, arm.num_joints) == (("base", "link1", "link2"), 2)
+    np.testing.assert_allclose(arm.link_position, [[0, 0, 0.15], [0.5, 0, 0.3], [1.25, 0, 0.3]], atol=1e-12)
+    np.testing.assert_allclose(arm.link_lengths, [0.3, 1, 0.5], atol=1e-12)
+    states = link_states(arm, np.array([np.pi / 2, 0.0]), np.array([2.0, 0.0]), normalized=False)
+    assert states.direction is not None and states.angular_velocity is not None
+    atol = 1e-6  # float32
+    np.testing.assert_allclose(states.position, [[0, 0, 0.15], [0, 0.5, 0.3], [0, 1.25, 0.3]], atol=atol)
+    np.testing.assert_allclose(states.direction, [[0, 0, 1], [0, 1, 0], [0, 1, 0]], atol=atol)
+    np.testing.assert_allclose(states.linear_velocity, [[0, 0, 0], [-1, 0, 0], [-2.5, 0, 0]], atol=atol)
+    np.testing.assert_allclose(states.angular_velocity, [[0, 0, 2]] * 3, atol=atol)  # as the Panda's first link
+    locked = load_mjcf(on_a_base("0 0 0.3"), locked={"a": 0.2})
+    assert (locked.link_names, locked.link_joint) == (arm.link_names, (-1, -1, 0))
+
+
+def test_a_base_segment_that_is_not_along_the_first_axis_does_not_move():
+    arm = load_mjcf(on_a_base("0.3 0 0.4"))
+    assert arm.link_joint == (-1, 0, 1) and arm.link_lengths[0] == pytest.approx(0.5)
+    states = link_states(arm, np.array([1.0, 0.5]), np.array([2.0, 1.0]), normalized=False)
+    np.testing.assert_allclose(states.position[0], [0.15, 0, 0.2], atol=1e-7)
+    assert states.direction is not None and states.angular_velocity is not None
+    np.testing.assert_allclose(states.direction[0], [0.6, 0, 0.8], atol=1e-7)
+    assert not np.any(states.linear_velocity[0]) and not np.any(states.angular_velocity[0])
+
+
+def test_an_arm_from_a_urdf_starts_at_its_base(tmp_path):
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    links = "".join(f'<link name="{name}">{inertial}</link>' for name in ("plate", "upper", "fore", "tool"))
+    joint = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><origin xyz="{}"/><axis xyz="0 0 1"/>'
+    joint += '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+    joints = joint.format("a", "revolute", "plate", "upper", "0 0 0.3")
+    joints += joint.format("b", "revolute", "upper", "fore", "1 0 0")
+    joints += joint.format("end", "fixed", "fore", "tool", "0.5 0 0")
+    file = tmp_path / "toy.urdf"
+    file.write_text(f'<robot name="toy">{links}{joints}</robot>')
+    arm = load_mjcf(file)
+    assert (arm.link_names, arm.link_joint) == (("base", "link1", "link2"), (0, 0, 1))
+    np.testing.assert_allclose(arm.link_position, [[0, 0, 0.15], [0.5, 0, 0.3], [1.25, 0, 0.3]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arm", "options", "names"),
+    [
+        (on_a_base("0 0 0.3"), {"base_segment": False}, ("link1", "link2")),
+        (on_a_base("0 0 0.3"), {"links": "merged"}, ("link1", "link2")),  # paper: as many links as joints
+        (on_a_base("0 0 0"), {}, ("link1", "link2")),
+        (model(revolute("a", pos="0 0 0.3", inner=TIP)), {}, ("link1",)),  # on the world, which is no part of an arm
+        (model(revolute("a", pos="0 0 0.3", inner=TIP)), {"base": "world"}, ("base", "link1")),
+    ],
+    ids=["switched off", "merged", "joint at the base", "world", "named world"],
+)
+def test_arms_without_a_base_segment(arm, options, names):
+    assert load_mjcf(arm, **options).link_names == names
+
+
+def test_a_first_joint_at_the_base_needs_no_message(caplog):
+    chain._warn_merged.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        load_mjcf(on_a_base("0 0 0"))
+    assert not caplog.text
+
+
+def test_links_that_the_model_marks_are_all_its_links():
+    site = '<site name="link1" type="capsule" size="0.01" fromto="0 0 0 0.5 0 0"/>'
+    marked = model(f'<body name="plate">{revolute("a", pos="0 0 0.3", inner=site)}</body>')
+    assert load_mjcf(marked, base="plate").link_names == ("link1",)
 
 
 def test_unnamed_joints_get_names():

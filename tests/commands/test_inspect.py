@@ -42,7 +42,7 @@ def inspected(monkeypatch, capsys):
 def test_an_inspection_describes_the_arm(inspected, arm_file, tmp_path):
     said = inspected(arm_file, "bound=false", f"out={tmp_path / 'out'}")
     for text in (
-        "ur_like: 6 joints, 6 links",
+        "ur_like: 6 joints, 7 links",
         "expert panda: 7 joints",
         "6 actuators (6 servos on position)",
         "distal to the tip, fixed; their bodies stay as mass: left (slide), right (slide)",
@@ -60,7 +60,7 @@ def test_an_inspection_describes_the_arm(inspected, arm_file, tmp_path):
 
 
 def test_the_suggested_command_trains_the_inspected_arm(arm_file, monkeypatch):
-    learner = mimic.ArmConfig(model=str(arm_file), locked=["elbow", 6], tip="pinch", armature=0.2)
+    learner = mimic.ArmConfig(model=str(arm_file), locked=["elbow", 6], tip="pinch", armature=0.2, base_segment=False)
     config = InspectConfig(learner=learner, expert=mimic.ArmConfig(locked={"joint2": 0.5}), limits="hardware")
     words = shlex.split(train_command(config))
     assert words[:4] == ["python", "-m", "mimic.train", "env=pair"]

@@ -89,11 +89,17 @@ def link_rotations(model: mujoco.MjModel, data: mujoco.MjData, link_names: tuple
 
 
 def _segment(model: mujoco.MjModel, data: mujoco.MjData, link: str) -> tuple[np.ndarray, np.ndarray, int]:
-    """Start, end and body of one link: its site, else from its joint's anchor to the next one's, or to the tip."""
+    """Start, end and body of one link: its site, else from its joint's anchor to the next one's, or to the tip.
+
+    The link "base" runs from the body that carries the arm to the first anchor; the joint's axis is not along it.
+    """
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, link)
     if site >= 0:
         half = data.site_xmat[site].reshape(3, 3)[:, 2] * model.site_size[site, 1]  # z points from end to start
         return data.site_xpos[site] + half, data.site_xpos[site] - half, int(model.site_bodyid[site])
+    if link == "base":
+        base = int(model.body_parentid[model.jnt_bodyid[0]])
+        return data.xpos[base], data.xanchor[0], base
     joint = int(link.removeprefix("link")) - 1
     end = data.xanchor[joint + 1] if joint + 1 < model.njnt else data.site("tip").xpos
     return data.xanchor[joint], end, int(model.jnt_bodyid[joint])
