@@ -336,11 +336,7 @@ class _Reader:
                     self.files.append(file)
                 kept.append(shape)
             link.children = kept
-        extension = next((child for child in root.children if child.kind == "mujoco"), None)
-        if extension is None:
-            extension = Element("mujoco", {}, 0)
-            root.children.insert(0, extension)
-        extension.children.append(Element("compiler", {"strippath": "false"}, 0))
+        _child(_child(root, "mujoco"), "compiler").attributes["strippath"] = "false"
 
     def _urdf_mesh(self, name: str, folders: tuple[Path, ...]) -> Path | None:
         """A mesh relative to the model or within a ROS package around it; None where there is none."""
@@ -380,6 +376,15 @@ class _Reader:
             return path.resolve()
         except (OSError, RuntimeError, ValueError):  # a loop of links, or a name that no file can have
             return None
+
+
+def _child(element: Element, tag: str) -> Element:
+    """The first child with a tag, which is added where there is none."""
+    child = next((child for child in element.children if child.tag == tag), None)
+    if child is None:
+        child = Element(tag, {}, 0)
+        element.children.insert(0, child)
+    return child
 
 
 def _parse(text: str) -> Element:

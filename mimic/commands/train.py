@@ -25,6 +25,7 @@ from mimic.trainers.config import TrainConfig
 from mimic.trainers.distributed.process_group import ProcessGroup
 from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import load_config, new_run_dir, run_schema, save_config
+from mimic.trainers.run_models import save_models
 from mimic.trainers.trainer import Params, Trainer
 
 
@@ -118,6 +119,7 @@ def _train(
     console = Console()
     with noted_signals(signals):  # also during the report: training is done, so a signal has no effect
         run_dir.mkdir(parents=True, exist_ok=restore is not None)
+        save_models(run_dir, config.env)
         save_config(run_dir, config)
         trainer.save_inputs(run_dir)
         headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"

@@ -1,0 +1,160 @@
+"""Model files in a run directory: the run goes on with its own arm, whatever happens to the original file."""
+
+import dataclasses
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+import mimic
+from mimic.arms.arm import build_arm
+from mimic.commands.config import EvaluateConfig
+from mimic.commands.evaluate import prepare_evaluation
+from mimic.runs.files import CONFIG
+from mimic.trainers.run_config import load_config, save_config
+from mimic.trainers.run_models import FOLDER, RECORD, save_models
+from tests.helpers import original_model
+from tests.helpers.run_directories import write_run
+
+MESH = "".join(  # a tetrahedron
+    ["v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\n", "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"]
+)
+LINK = '<asset><mesh file="l.obj"/></asset>'
+PARTS = "<mujocoinclude><custom><numeric name='velocity_limit' data='1 2 3 4 5 6'/></custom></mujocoinclude>"
+
+
+def write_arm(folder, kind):
+    """An arm with a mesh in a folder of its own; the MJCF has an include too."""
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "meshes" / "l.obj").write_text(MESH)
+    if kind == "urdf":
+        (folder / "arm.urdf").write_text(original_model.urdf(mesh="package://arms/meshes/l.obj"))
+        return folder / "arm.urdf"
+    (folder / "limits.xml").write_text(PARTS)
+    hand = '<body><geom type="mesh" mesh="l" mass="0.1"/></body>'
+    text = original_model.ur_like(gripper=hand).replace("<worldbody>", f"{LINK}<worldbody>", 1)
+    text = text.replace('autolimits="true"', 'autolimits="true" meshdir="meshes"')
+    (folder / "arm.xml").write_text(text.replace("</mujoco>", '<include file="limits.xml"/></mujoco>'))
+    return folder / "arm.xml"
+
+
+@pytest.fixture(params=["mjcf", "urdf"])
+def run(request, tmp_path):
+    """A run of an own arm, and the arm's file."""
+    return start_run(tmp_path, request.param)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    return start_run(tmp_path_factory.mktemp("finished"), "mjcf")[0]
+
+
+def start_run(folder, kind):
+    file = write_arm(folder / "arms" / "arm" if kind == "mjcf" else folder / "arms", kind)
+    run_dir = write_run(folder / "run", [0.1])
+    config = load_config(run_dir)
+    env = mimic.env_config("pair", expert={"model": "planar", "link_lengths": [0.5, 0.5]}, learner=str(file))
+    save_models(run_dir, env)
+    save_config(run_dir, dataclasses.replace(config, env=env))
+    return run_dir, file
+
+
+def assert_same(arm, other):
+    for field in dataclasses.fields(arm.embodiment):
+        np.testing.assert_array_equal(getattr(arm.embodiment, field.name), getattr(other.embodiment, field.name))
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_pos", "dof_armature", "dof_damping"):
+        np.testing.assert_array_equal(getattr(arm.model, name), getattr(other.model, name))
+
+
+@pytest.mark.parametrize("change", ["moved", "changed", "deleted"])
+def test_a_run_keeps_its_arm(run, change, tmp_path):
+    run_dir, file = run
+    original = load_config(run_dir, saved_models=False).env.learner
+    assert original.model == str(file)
+    arm = build_arm(original)
+    if change == "moved":
+        shutil.rmtree(file.parent)
+        run_dir = run_dir.rename(tmp_path / "elsewhere")
+    elif change == "changed":
+        file.write_text(file.read_text().replace('"2"', '"7"').replace("8.4", "80"))
+    else:
+        file.unlink()
+    assert_same(build_arm(load_config(run_dir).env.learner), arm)
+
+
+def test_saving_the_config_again_keeps_original_path_and_models(run):
+    run_dir, file = run
+    before = {path: path.read_bytes() for path in (run_dir / FOLDER).rglob("*") if path.is_file()}
+    file.unlink()
+    config = load_config(run_dir)
+    assert str(run_dir) in config.env.learner.model
+    save_models(run_dir, config.env)
+    save_config(run_dir, config)
+    assert load_config(run_dir, saved_models=False).env.learner.model == str(file)
+    assert str(run_dir / FOLDER) not in (run_dir / CONFIG).read_text()
+    assert {path: path.read_bytes() for path in (run_dir / FOLDER).rglob("*") if path.is_file()} == before
+
+
+def test_a_run_without_models_loads_as_before(run):
+    run_dir, file = run
+    shutil.rmtree(run_dir / FOLDER)
+    assert load_config(run_dir).env.learner.model == str(file)
+
+
+def append(path):
+    path.write_text(path.read_text() + " ")
+
+
+def with_record(change):
+    def apply(folder):
+        record = json.loads((folder / RECORD).read_text())
+        change(record)
+        (folder / RECORD).write_text(json.dumps(record))
+
+    return apply
+
+
+CHANGES = {
+    "a changed model": (lambda folder: append(next(folder.glob("learner/arm.*"))), "arm.* was changed since"),
+    "a changed mesh": (lambda folder: append(next(folder.rglob("*.obj"))), "l.obj' was changed since"),
+    "no mesh": (lambda folder: next(folder.rglob("*.obj")).unlink(), "l.obj' is missing since"),
+    "another file": (lambda folder: (folder / "learner" / "a.xml").write_text(""), "a.xml' was added since"),
+    "a pipe": (lambda folder: os.mkfifo(folder / "learner" / "a.xml"), "a.xml' was added since"),
+    "no record": (lambda folder: (folder / RECORD).unlink(), "models.json' cannot be read: there is no such file"),
+    "a broken record": (lambda folder: (folder / RECORD).write_text('{"arms'), "models.json' cannot be read: "),
+    "a list": (lambda folder: (folder / RECORD).write_text("[]"), "models.json' cannot be read: "),
+    "no checksums": (with_record(lambda record: record.pop("sha256")), "models.json' cannot be read: 'sha256'"),
+    "no learner": (with_record(lambda record: record["arms"].clear()), "models.json' has no model of the learner"),
+    "a file outside": (
+        with_record(lambda record: record["arms"]["learner"].update(file="../config.yaml")),
+        "models.json' has no model of the learner",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_changed_copies_are_rejected_in_one_line(finished, tmp_path, case):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    change, message = CHANGES[case]
+    change(run_dir / FOLDER)
+    with pytest.raises(ValueError, match=message) as error:
+        load_config(run_dir)
+    assert "\n" not in str(error.value)
+
+
+def test_a_moved_run_is_evaluated_without_the_file_of_its_arm(tmp_path):
+    from tests.helpers.untrained_run import untrained_run
+
+    file = tmp_path / "arm.xml"
+    bodies = "".join(
+        f'<body pos="{x} 0 0"><joint name="joint{number}" axis="0 0 1" armature="0.02" damping="0.1"/>'
+        '<geom type="capsule" size="0.02" fromto="0 0 0 0.5 0 0" mass="0.5"/>'
+        for number, x in ((1, 0), (2, 0.5))
+    )
+    file.write_text(f'<mujoco model="two"><worldbody>{bodies}</body></body></worldbody></mujoco>')
+    run_dir = untrained_run(tmp_path / "run", model=str(file))
+    file.unlink()
+    moved = run_dir.rename(tmp_path / "moved")
+    prepare_evaluation(EvaluateConfig(str(moved), compilation_cache=""), 0.0)  # builds the arms and loads the policy
