@@ -150,7 +150,7 @@ def main() -> None:
     """Replies to the request in the input."""
     request = json.loads(sys.stdin.buffer.read())
     sys.path[:] = request["path"]
-    import mujoco  # before the limits, so that these are of the model alone
+    import mujoco  # noqa: F401  # before the limits, so that these are of the model alone
 
     _limit()
     error = None
@@ -158,8 +158,8 @@ def main() -> None:
         _compile(request)
     except MemoryError:
         error = _TOO_LARGE
-    except (ValueError, mujoco.FatalError) as failure:
-        error = str(failure)
+    except Exception as failure:  # MuJoCo's own errors, and what C++ raises for sizes that it cannot have
+        error = str(failure) or type(failure).__name__
     print("\n" + json.dumps({"error": error}), flush=True)
     os._exit(0)  # without MuJoCo's own clean-up, which takes time and may crash
 

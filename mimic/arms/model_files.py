@@ -72,7 +72,7 @@ def _read(path: str | os.PathLike[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
 
 def _is_bundled(file: Path) -> bool:
     """Whether a file is one of mimic's own models, which need no checks."""
-    return file.resolve().parent == (Path(__file__).parents[1] / "xml").resolve()
+    return os.path.dirname(os.path.realpath(file)) == os.path.realpath(Path(__file__).parents[1] / "xml")
 
 
 @functools.cache  # a run reads a model several times

@@ -22,7 +22,7 @@ MAX_ATTRIBUTES = 1000  # of an element
 MAX_PARTS = 200  # files that a model includes; models that it attaches
 MAX_PIXELS = 2**24  # of a texture
 MAX_GRID = 2**22  # points of a height field
-MAX_COUNT = 1000  # elements of a <composite> or <flexcomp>, values of a <numeric>
+MAX_COUNT = 1000  # copies by <replicate>, elements of a <composite> or <flexcomp>, values of a <numeric>, keyframes
 _MAX_NESTED = 10  # levels of models that attach others
 _PACKAGE_LEVELS = 4  # folders above a URDF in which its ROS package may be
 
@@ -97,7 +97,13 @@ def read_source(path: str | os.PathLike[str]) -> ModelSource:
         no regular files, or are outside its folder; or it repeats elements too often, or has huge textures. The
         message is one line.
     """
-    reader = _Reader(Path(path))
+    try:
+        return _source(_Reader(Path(path)))
+    except OSError as error:
+        raise ValueError(f"{os.fspath(path)!r} cannot be read: {error.strerror}: {error.filename!r}") from error
+
+
+def _source(reader: "_Reader") -> ModelSource:
     root = reader.read()
     files = tuple(dict.fromkeys(reader.files))
     size = sum(file.stat().st_size for file in files)
@@ -151,13 +157,13 @@ class _Reader:
     def __init__(self, path: Path, folder: Path | None = None, models: tuple[Path, ...] = ()):
         self.shown = repr(str(path))
         if not path.is_file():
-            raise ValueError(f"no MJCF or URDF file at {self.shown}")
+            raise ValueError(f"no MJCF or URDF file at {self.shown}{', which is no file' if _is_there(path) else ''}")
         self._file = path.resolve()
         self._folder = self._file.parent
         self._bounds = folder or self._folder
         self._models = (*models, self._file)
         self._included = {self._file}
-        self._elements = 0
+        self._elements = 0.0
         self._asset_folders = {name: self._folder for name in (_MESH_FOLDER, *_FOLDERS.values())}
         self._strips_paths = False
         self.attached: dict[str, Element] = {}
@@ -188,7 +194,9 @@ class _Reader:
         except (expat.ExpatError, ValueError) as error:
             place = "" if file == self._file else f"in {file.name!r}: "
             if isinstance(error, expat.ExpatError):
-                raise ValueError(f"{self.shown} is not an MJCF or URDF model that MuJoCo can read: {place}{error}") from None
+                raise ValueError(
+                    f"{self.shown} is not an MJCF or URDF model that MuJoCo can read: {place}{error}"
+                ) from None
             raise ValueError(f"{str(file)!r} {error}") from None
 
     def _text(self, file: Path) -> str:
@@ -221,7 +229,9 @@ class _Reader:
         name = element.attributes.get("file", "")
         file = self._regular_file(name, self._folder / name, (self._bounds,), "includes")
         if file in self._included:
-            raise ValueError(f"{self.shown} is not an MJCF or URDF model that MuJoCo can read: it includes {name!r} twice")
+            raise ValueError(
+                f"{self.shown} is not an MJCF or URDF model that MuJoCo can read: it includes {name!r} twice"
+            )
         if len(self._included) > MAX_PARTS:
             raise ValueError(f"{self.shown} includes too many files; expected at most {MAX_PARTS}")
         self._included.add(file)
@@ -231,20 +241,23 @@ class _Reader:
                 part.line = 0  # a line of another file
         return children
 
-    def _count(self, count: int) -> None:
+    def _count(self, count: float) -> None:
         self._elements += count
         if self._elements > MAX_ELEMENTS:
             raise ValueError(f"{self.shown} has too many XML elements; expected at most {MAX_ELEMENTS:,}")
 
     def _check_sizes(self, root: Element) -> None:
         """Bounds what a few characters can ask for: repeated elements, textures and grids."""
-        pending = [(root, 1)]
+        pending: list[tuple[Element, float]] = [(root, 1)]
         while pending:
             element, times = pending.pop()
             self._count(times)
             if element.kind == "replicate":
+                self._limit(element, "count", MAX_COUNT, times)
                 times *= max(_size(element, "count"), 1)
-                self._limit(element, "count", MAX_ELEMENTS)
+            elif element.kind == "size":
+                for name in ("nkey", *(name for name in element.attributes if name.startswith("nuser"))):
+                    self._limit(element, name, MAX_COUNT)
             elif element.kind in ("composite", "flexcomp"):
                 self._limit(element, "count", MAX_COUNT)
             elif element.kind == "texture":
@@ -255,8 +268,8 @@ class _Reader:
                 self._limit(element, "size", MAX_COUNT)
             pending += [(child, times) for child in element.children]
 
-    def _limit(self, element: Element, names: str, maximum: int) -> None:
-        size = math.prod(_size(element, name) for name in names.split())
+    def _limit(self, element: Element, names: str, maximum: int, times: float = 1) -> None:
+        size = times * math.prod(_size(element, name) for name in names.split())
         if size > maximum:
             raise ValueError(
                 f"{self.shown} has <{element.kind}> with {names.replace(' ', ' x ')} = {size:.6g}; "

@@ -154,7 +154,9 @@ def _columns(header: Sequence[str], names: Sequence[str], prefixes: Sequence[str
 def _npz_content(path: Path) -> dict[str, Any]:
     keys = ("qpos", "qvel", "joint_names", "frequency", "dt", "jnt_type", "split_points")
     try:
-        content: dict[str, Any] = dict(read_arrays(path, keys))  # pickled arrays, as LocoMuJoCo's metadata, are not read
+        content: dict[str, Any] = dict(
+            read_arrays(path, keys)
+        )  # pickled arrays, as LocoMuJoCo's metadata, are not read
     except ValueError as error:
         raise ValueError(f"source: {str(path)!r} cannot be read as an npz file of motions: {error}") from error
     lacking = [key for key in ("qpos", "joint_names") if key not in content]
@@ -190,7 +192,7 @@ def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
     for key, values, width in (("qpos", qpos, angle_at[-1]), ("qvel", qvel, velocity_at[-1])):
         if values is not None and values.shape != (len(qpos), width):
             raise ValueError(
-                f"source: {key} in {str(path)!r} must be {[len(qpos), width]} for its joints, got {list(values.shape)}"
+                f"source: {key} in {str(path)!r} must be {[len(qpos), int(width)]} for its joints, got {list(values.shape)}"
             )
     rate = content["dt"] if "dt" in content else content["frequency"]
     if not 1 / LARGEST <= float(rate) <= LARGEST:

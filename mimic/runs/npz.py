@@ -10,7 +10,9 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-MAX_BYTES = 2**30  # of all arrays, each value counted as float64 at least; 20,000 demonstrations of a Panda have 0.4 GiB
+MAX_BYTES = (
+    2**30
+)  # of all arrays, each value counted as float64 at least; 20,000 demonstrations of a Panda have 0.4 GiB
 MAX_TEXT = 2**20  # bytes of an array of text, whose values become Python objects
 _CHUNK = 2**20  # bytes of a read
 _MAX_DIRECTORY = 2**20  # bytes of a zip archive's directory; mimic's own have 700

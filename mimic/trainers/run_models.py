@@ -43,9 +43,7 @@ def save_models(run_dir: Path, env: EnvConfig) -> None:
             else:
                 shutil.copyfile(content, place)
     record = {
-        "arms": {
-            role: {"file": f"{role}/{Path(arm.model).name}", "original": arm.model} for role, arm in arms.items()
-        },
+        "arms": {role: {"file": f"{role}/{Path(arm.model).name}", "original": arm.model} for role, arm in arms.items()},
         "sha256": {str(path.relative_to(partial)): file_digest(path) for path in _files(partial)},
     }
     write_atomically(partial / RECORD, json.dumps(record, indent=2) + "\n")
