@@ -37,10 +37,12 @@ def _mjcf() -> str:
 <mujoco model="fuzzed"><!-- an arm -- with a comment -->
  <compiler angle="degree" autolimits="true" meshdir="meshes"/>
  <default><geom contype="0" conaffinity="0"/></default>
- <asset><mesh name="tool" file="tool.obj"/><texture name="grid" type="2d" file="grid.png"/><material name="m" texture="grid"/>
+ <asset><mesh name="tool" file="tool.obj"/><texture name="grid" type="2d" file="grid.png"/>
+  <material name="m" texture="grid"/>
   <hfield name="floor" nrow="4" ncol="4" size="1 1 0.1 0.1"/></asset>
  <worldbody><geom type="hfield" hfield="floor" pos="0 0 -1"/>{bodies}
-  <body name="tool" pos="0 0 0.3"><geom type="mesh" mesh="tool" material="m" mass="0.1"/><site name="tip" pos="0 0 0.1"/></body>
+  <body name="tool" pos="0 0 0.3"><geom type="mesh" mesh="tool" material="m" mass="0.1"/>
+   <site name="tip" pos="0 0 0.1"/></body>
  {"</body>" * 5}</worldbody>
  <actuator>{motors}</actuator>
  <include file="parts.xml"/>
@@ -84,9 +86,11 @@ def _png(width: int, height: int, rows: int) -> bytes:
 # --- text ---
 
 Edit = Callable[[str, Generator], str]
-_NUMBERS = ["nan", "inf", "-inf", "1e30", "-1e30", "1e400", "1e-320", "-1", "0", "99999999999", "0x10", "1e5", "", "1 2 3 4",
+_NUMBERS = ["nan", "inf", "-inf", "1e30", "-1e30", "1e400", "1e-320", "-1", "0", "99999999999", "0x10", "1e5", "",
+            "1 2 3 4",
             "1,2", "--1", "1e39", "1e11", "12345678901234567890", "true", "ten", "\u0661"]  # fmt: skip
-_WORDS = ["", "world", "a\u2028b", "x" * 5000, "../..", "/etc/hosts", "&#10;", "&#0;", "&lt;", "%s%n", "nan", "panda", "\u202e",
+_WORDS = ["", "world", "a\u2028b", "x" * 5000, "../..", "/etc/hosts", "&#10;", "&#0;", "&lt;", "%s%n", "nan", "panda",
+          "\u202e",
           "tip", "&amp;#47;", "fixed", "free", "ball", "slide", "mesh"]  # fmt: skip
 
 
@@ -147,9 +151,12 @@ def _repeated(text: str, rng: Generator) -> str:
     count = int(_pick(rng, [1000, 40_000, 400_000]))
     entities = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
     parts = [
-        "<include " * count, "<include file=" * count, "<!--" * count, "<!-- -- -->" * count, "<a>" * count, "<a/>" * count,
-        "<a " + " ".join(f'a{i}=""' for i in range(count // 4)) + "/>", "&lt;" * count, "<![CDATA[" * count, "]]>" * count,
-        "<body>" * count, '<body><geom size="1"/>' * (count // 100), '<geom size="1"/>' * (count // 10), " " * count, "<" * count,
+        "<include " * count, "<include file=" * count, "<!--" * count, "<!-- -- -->" * count, "<a>" * count,
+        "<a/>" * count,
+        "<a " + " ".join(f'a{i}=""' for i in range(count // 4)) + "/>", "&lt;" * count, "<![CDATA[" * count,
+        "]]>" * count,
+        "<body>" * count, '<body><geom size="1"/>' * (count // 100), '<geom size="1"/>' * (count // 10), " " * count,
+        "<" * count,
         '<include file="parts.xml"/>' * (count // 100), "\n" * count, '<a b="' + ">" * count + '"/>',
         '<joint name="j" axis="0 0 1"/>' * (count // 100), "<?a ?>" * count,
     ]  # fmt: skip
@@ -167,26 +174,39 @@ def _inserted(text: str, part: str, rng: Generator) -> str:
     return text[:at] + part + text[at:]
 
 
+def _at_top(text: str, part: str) -> str:
+    return re.sub(r"<(mujoco|robot)\b[^>]*>", lambda match: match.group() + part, text, count=1)
+
+
 def _include(text: str, rng: Generator) -> str:
     """Includes of files outside the folder, in many spellings."""
-    name = _pick(rng, ["../outside.xml", "..&#47;outside.xml", "&#46;&#46;/outside.xml", "{0}", "&#47;etc&#47;hosts", "/etc/hosts",
-                       "link.xml", "folder/../../outside.xml", "./..//outside.xml", "..\\outside.xml", "", ".", "parts.xml",
+    name = _pick(rng, ["../outside.xml", "..&#47;outside.xml", "&#46;&#46;/outside.xml", "{0}", "&#47;etc&#47;hosts",
+                       "/etc/hosts",
+                       "link.xml", "folder/../../outside.xml", "./..//outside.xml", "..\\outside.xml", "", ".",
+                       "parts.xml",
                        "model.xml", "/proc/self/environ", "/dev/zero", "missing.xml", "pipe", "%2e%2e/outside.xml",
                        "x" * 5000, "loop.xml", "..&#x2f;outside.xml", "file:../outside.xml", "deep.xml"])  # fmt: skip
     forms = [
-        '<include file="{}"/>', "<INCLUDE file='{}'/>", '<Include file = "{}" ></Include>', '<include a="&gt;" file="{}"/>',
-        '<include a=">" file="{}"/>', '<include a="<!--" file="{}" b="-->"/>', '<!-- <a b="--> <include file="{}"/> <!-- "/> -->',
-        '<![CDATA[<!--]]><include file="{}"/><![CDATA[-->]]>', '<include\n\tfile\n=\n"{}"\n/>', '<x:include file="{}"/>',
-        '<default><include file="{}"/></default>', '<!-- -- --><include file="{}"/>', '<?a <!-- ?><include file="{}"/><?b --> ?>',
+        '<include file="{}"/>', "<INCLUDE file='{}'/>", '<Include file = "{}" ></Include>',
+        '<include a="&gt;" file="{}"/>',
+        '<include a=">" file="{}"/>', '<include a="<!--" file="{}" b="-->"/>',
+        '<!-- <a b="--> <include file="{}"/> <!-- "/> -->',
+        '<![CDATA[<!--]]><include file="{}"/><![CDATA[-->]]>', '<include\n\tfile\n=\n"{}"\n/>',
+        '<x:include file="{}"/>',
+        '<default><include file="{}"/></default>', '<!-- -- --><include file="{}"/>',
+        '<?a <!-- ?><include file="{}"/><?b --> ?>',
     ]  # fmt: skip
     return _inserted(text, _pick(rng, forms).replace("{}", name), rng)
 
 
 def _asset(text: str, rng: Generator) -> str:
     """Meshes and textures that are no files of the model's folder."""
-    names = ["../../outside.obj", "/etc/hosts", "..&#47;..&#47;outside.obj", "pipe", "/dev/zero", "link.obj", "missing.obj", ".",
-             "../outside.obj", "&#47;dev&#47;stdin", "/proc/self/mem", "package://etc/hosts.stl", "package://../outside.obj",
-             "package://meshes/../../../outside.obj", "file:///etc/hosts", "x" * 3000, "loop.xml", "tool.obj"]  # fmt: skip
+    names = ["../../outside.obj", "/etc/hosts", "..&#47;..&#47;outside.obj", "pipe", "/dev/zero", "link.obj",
+             "missing.obj", ".",
+             "../outside.obj", "&#47;dev&#47;stdin", "/proc/self/mem", "package://etc/hosts.stl",
+             "package://../outside.obj",
+             "package://meshes/../../../outside.obj", "file:///etc/hosts", "x" * 3000, "loop.xml",
+             "tool.obj"]  # fmt: skip
     name = _pick(rng, names)
     forms = [
         '<asset><mesh name="z" file="{}"/></asset>', '<asset><texture name="z" type="2d" file="{}"/></asset>',
@@ -195,9 +215,8 @@ def _asset(text: str, rng: Generator) -> str:
         '<compiler assetdir="{}"/>', '<compiler strippath="true"/><asset><mesh name="z" file="{}"/></asset>',
         '<asset><texture name="z" type="cube" fileright="{}" fileleft="{}"/></asset>',
     ]  # fmt: skip
-    return _inserted(
-        text.replace("tool.obj", name) if rng.integers(2) else text, _pick(rng, forms).replace("{}", name), rng
-    )
+    text = text.replace("tool.obj", name) if rng.integers(2) else text
+    return _at_top(text, _pick(rng, forms).replace("{}", name))
 
 
 def _sizes(text: str, rng: Generator) -> str:
@@ -205,35 +224,41 @@ def _sizes(text: str, rng: Generator) -> str:
     count = _pick(rng, ["10", "100000", "1000000000", "1e9", "-5", "nan", "2147483647", "99999999999"])
     ball = '<body><joint axis="0 0 1"/><geom size="0.1"/></body>'
     forms = [
-        f'<replicate count="{count}" euler="0 0 1">{ball}</replicate>',
-        f'<replicate count="1000"><replicate count="{count}"><replicate count="1000">{ball}</replicate></replicate></replicate>',
+        f'<worldbody><replicate count="{count}" euler="0 0 1">{ball}</replicate></worldbody>',
+        f'<worldbody><replicate count="100"><replicate count="{count}">{ball}</replicate></replicate></worldbody>',
         f'<asset><hfield name="z" nrow="{count}" ncol="{count}" size="1 1 1 1"/></asset>',
         f'<asset><texture name="z" type="2d" builtin="flat" width="{count}" height="{count}"/></asset>',
-        f'<custom><numeric name="z" size="{count}"/></custom>', f'<size memory="{count}G"/>', f'<size nuser_body="{count}"/>',
-        f'<size nkey="{count}"/>', f'<size nstack="{count}" njmax="{count}" nconmax="{count}"/>', f'<size nuser_geom="{count}"/>',
-        f'<flexcomp name="z" type="grid" count="{count} {count} 10" spacing=".1 .1 .1" radius="0.01"/>',
-        f'<composite type="cable" count="{count} 1 1" size="1" initial="none"><geom size=".01"/></composite>',
-        f'<composite type="particle" count="{count} {count} 1" spacing="0.1"><geom size=".01"/></composite>',
+        f'<custom><numeric name="z" size="{count}"/></custom>', f'<size memory="{count}G"/>',
+        f'<size nuser_body="{count}"/>',
+        f'<size nkey="{count}"/>', f'<size nstack="{count}" njmax="{count}" nconmax="{count}"/>',
+        f'<size nuser_geom="{count}"/>',
+        f'<worldbody><body><flexcomp name="z" type="grid" count="{count} 90 10" spacing=".1 .1 .1"/></body></worldbody>',
+        f'<worldbody><composite type="cable" count="{count} 1 1" size="1"><geom size=".01"/></composite></worldbody>',
         f'<asset><mesh name="z" builtin="sphere" params="{count}"/></asset>', f'<option timestep="{count}"/>',
-        '<asset><model name="z" file="model.xml"/></asset><attach model="z" body="body0" prefix="p"/>',
-        '<attach model="fuzzed" body="body0" prefix="p"/>', '<asset><model name="z" file="other.xml"/></asset>',
+        '<asset><model name="z" file="model.xml"/></asset><worldbody><attach model="z" body="body0" prefix="p"/></worldbody>',
+        '<worldbody><attach model="fuzzed" body="body0" prefix="p"/></worldbody>', '<size njmax="100000000"/>',
+        '<asset><model name="z" file="other.xml"/></asset><worldbody><attach model="z" prefix="p"/></worldbody>',
         '<asset><model name="z" file="other.xml"/></asset><worldbody><attach model="z" body="b" prefix="p"/></worldbody>',
     ]  # fmt: skip
-    return _inserted(text, _pick(rng, forms), rng)
+    return _at_top(text, _pick(rng, forms))
 
 
 def _links(text: str, rng: Generator) -> str:
     """Loops, lost links and strange joints of a URDF or MJCF."""
     pairs = [
-        ('child link="l1"', 'child link="l0"'), ('parent link="base"', 'parent link="l3"'), ('parent link="l1"', 'parent link="x"'),
+        ('child link="l1"', 'child link="l0"'), ('parent link="base"', 'parent link="l3"'), ('parent link="l1"',
+        'parent link="x"'),
         ('velocity="2"', 'velocity="nan"'), ('velocity="2"', 'velocity="inf"'), ('velocity="2"', 'velocity="-1"'),
         ('velocity="2"', 'velocity="1e30"'), ('velocity="2"', 'velocity="fast"'), ('effort="40"', 'effort="nan"'),
-        ('effort="40"', 'effort="1e30"'), ('type="revolute"', 'type="continuous"'), ('type="revolute"', 'type="floating"'),
+        ('effort="40"', 'effort="1e30"'), ('type="revolute"', 'type="continuous"'), ('type="revolute"',
+        'type="floating"'),
         ('lower="-2.5"', 'lower="1e30"'), ('lower="-2.5"', 'lower="nan"'), ('mass value="2"', 'mass value="1e30"'),
         ('mass value="2"', 'mass value="-2"'), ('ixx="0.02"', 'ixx="1e20"'), ('ixx="0.02"', 'ixx="nan"'),
         ('xyz="0.02 0 0.25"', 'xyz="1e30 0 0"'), ('axis xyz="0 0 1"', 'axis xyz="0 0 0"'), ('name="j1"', 'name="j0"'),
-        ('data="1 2 3 4 5"', 'data="nan 2 3 4 5"'), ('pos="0.01 0 0.3"', 'pos="1e30 0 0"'), ('mass="2.5"', 'mass="1e30"'),
-        ('axis="0 0 1"', 'axis="0 0 0"'), ('range="-150 150"', 'range="nan nan"'), ('range="-150 150"', 'range="150 -150"'),
+        ('data="1 2 3 4 5"', 'data="nan 2 3 4 5"'), ('pos="0.01 0 0.3"', 'pos="1e30 0 0"'), ('mass="2.5"',
+        'mass="1e30"'),
+        ('axis="0 0 1"', 'axis="0 0 0"'), ('range="-150 150"', 'range="nan nan"'), ('range="-150 150"',
+        'range="150 -150"'),
         ('damping="0.1"', 'damping="-5"'), ('armature="0.02"', 'armature="1e30"'), ('size="0.03"', 'size="1e30"'),
         ('name="turn1"', 'name="turn0"'), ('model="fuzzed"', 'model="&#10;fuzzed"'), ('name="turn0"', 'name="a&#10;b"'),
         ('ctrlrange="-50 50"', 'ctrlrange="nan 50"'), ('qpos="0 0.1 0 0.1 0"', 'qpos="nan 0 0 0 1e30"'),
@@ -277,10 +302,14 @@ def _damaged_mesh(folder: Path, rng: Generator) -> None:
     stl = bytes(80) + struct.pack("<I", triangles) + rng.bytes(50 * min(triangles, 1000))
     numbers = " ".join(map(str, range(1, 1000)))
     texts = [
-        "", "v 0 0 0\n", _TETRAHEDRON.replace("0.1", "nan"), _TETRAHEDRON.replace("0.1", "1e30"), "f 1 2 3\n", "v 1\nf 1 1 1\n",
-        _TETRAHEDRON.replace("f 1 3 2", "f 1 3 99999999999"), _TETRAHEDRON.replace("f 1 3 2", "f -1 -3 -2"), "mtllib /etc/hosts\n",
-        _TETRAHEDRON.replace("0.1", "0"), _TETRAHEDRON.replace("f 1 3 2", f"f {numbers}"), _TETRAHEDRON.replace("0 0 0.1", "0 0"),
-        "v 0 0 0\n" * 100_000, _flipped(_TETRAHEDRON, rng), _TETRAHEDRON.replace("0.1", "1e-30"), "usemtl a\n" * 1000 + _TETRAHEDRON,
+        "", "v 0 0 0\n", _TETRAHEDRON.replace("0.1", "nan"), _TETRAHEDRON.replace("0.1", "1e30"), "f 1 2 3\n",
+        "v 1\nf 1 1 1\n",
+        _TETRAHEDRON.replace("f 1 3 2", "f 1 3 99999999999"), _TETRAHEDRON.replace("f 1 3 2", "f -1 -3 -2"),
+        "mtllib /etc/hosts\n",
+        _TETRAHEDRON.replace("0.1", "0"), _TETRAHEDRON.replace("f 1 3 2", f"f {numbers}"),
+        _TETRAHEDRON.replace("0 0 0.1", "0 0"),
+        "v 0 0 0\n" * 100_000, _flipped(_TETRAHEDRON, rng), _TETRAHEDRON.replace("0.1", "1e-30"),
+        "usemtl a\n" * 1000 + _TETRAHEDRON,
     ]  # fmt: skip
     if rng.integers(2):
         (folder / "meshes" / "tool.obj").write_text(_pick(rng, texts))
@@ -307,7 +336,8 @@ def _strange_file(folder: Path, rng: Generator) -> None:
     file.unlink()
     kinds: list[Callable[[], Any]] = [
         lambda: os.mkfifo(file), file.mkdir, lambda: file.symlink_to("/dev/zero"), lambda: file.symlink_to("/dev/full"),
-        lambda: file.symlink_to(file.name), lambda: file.symlink_to("/etc/hosts"), lambda: file.write_bytes(b""), lambda: None,
+        lambda: file.symlink_to(file.name), lambda: file.symlink_to("/etc/hosts"), lambda: file.write_bytes(b""),
+        lambda: None,
         lambda: file.symlink_to(folder.parent / "outside.xml"), lambda: file.symlink_to("/proc/self/environ"),
         lambda: file.write_bytes(content[: len(content) // 2]), lambda: os.truncate(_touched(file), 2**33),
     ]  # fmt: skip
@@ -385,7 +415,8 @@ def _read(file: Path) -> str:
     return ACCEPTED if _as_in_mujoco(file, model) else OTHER_NUMBERS
 
 
-_COMPARED = ("body_mass", "body_inertia", "body_pos", "body_ipos", "body_quat", "jnt_type", "jnt_pos", "jnt_axis", "jnt_range",
+_COMPARED = ("body_mass", "body_inertia", "body_pos", "body_ipos", "body_quat", "jnt_type", "jnt_pos", "jnt_axis",
+             "jnt_range",
              "dof_damping", "dof_armature", "actuator_ctrlrange", "actuator_gear", "site_pos", "qpos0", "key_qpos",
              "jnt_actfrcrange", "mesh_vert", "tex_data", "hfield_data")  # fmt: skip
 

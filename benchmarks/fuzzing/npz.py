@@ -213,7 +213,8 @@ def _npy(header: str, content: bytes, version: int = 1, length: int | None = Non
 
 _HUGE = ["(2**50,)", f"({2**40},)", f"({2**62}, {2**62})", "(2, 51, 999999999999)", "(-1,)", "(0, -5)", "(True, 7)"]
 _SHAPES = [*_HUGE, "(2.0, 51, 7)", "[2, 51, 7]", "7", "()", "(0, 51, 7)", "(2, 51, 7, 0)", "('a',)", f"({10**400},)"]
-_TYPES = ["'|O'", "'|V8'", "'|S8'", "'<M8[s]'", "'<U1000000000'", "'<c16'", "'<f2'", "'>f8'", "'<f16'", "'|b1'", "'<u8'",
+_TYPES = ["'|O'", "'|V8'", "'|S8'", "'<M8[s]'", "'<U1000000000'", "'<c16'", "'<f2'", "'>f8'", "'<f16'", "'|b1'",
+          "'<u8'",
           "[('a', '<f8')]", "'<f8,<f8'", "'(1000000,)<f8'", "None", "'x'", "''", "'|O8'", "'<U0'"]  # fmt: skip
 _HEADERS = ["", "{", "{}", "(" * 5000, "[" * 9000 + "]" * 9000, "{'descr': '<f8'}", "1", "__import__('os')", "\0" * 100,
             "{'descr': '<f8', 'fortran_order': 3, 'shape': (2, 51, 7)}", "9" * 5000, "-" * 4000 + "1"]  # fmt: skip
@@ -290,7 +291,8 @@ def _forms(arrays: dict[str, np.ndarray], rng: Generator) -> bytes:
         lambda: value.reshape(-1), lambda: value[None], lambda: np.array(value.tolist(), str), lambda: value.T,
         lambda: np.zeros(0), lambda: np.array("text"), lambda: np.zeros((0, 7)), lambda: np.zeros((2, 0, 7)),
         lambda: value.astype("f2"), lambda: value.astype(complex), lambda: value.astype("i8"), lambda: value == value,
-        lambda: np.repeat(value, 3), lambda: np.array(value.tolist(), "S"), lambda: np.zeros(()), lambda: value.astype(">f4"),
+        lambda: np.repeat(value, 3), lambda: np.array(value.tolist(), "S"), lambda: np.zeros(()),
+        lambda: value.astype(">f4"),
     ]  # fmt: skip
     try:
         with warnings.catch_warnings():

@@ -191,8 +191,9 @@ def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
     angle_at, velocity_at = _addresses(content.get("jnt_type"), present)
     for key, values, width in (("qpos", qpos, angle_at[-1]), ("qvel", qvel, velocity_at[-1])):
         if values is not None and values.shape != (len(qpos), width):
+            expected = [len(qpos), int(width)]
             raise ValueError(
-                f"source: {key} in {str(path)!r} must be {[len(qpos), int(width)]} for its joints, got {list(values.shape)}"
+                f"source: {key} in {str(path)!r} must be {expected} for its joints, got {list(values.shape)}"
             )
     rate = content["dt"] if "dt" in content else content["frequency"]
     if not 1 / LARGEST <= float(rate) <= LARGEST:
