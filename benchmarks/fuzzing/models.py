@@ -232,13 +232,14 @@ def _sizes(text: str, rng: Generator) -> str:
         f'<size nuser_body="{count}"/>',
         f'<size nkey="{count}"/>', f'<size nstack="{count}" njmax="{count}" nconmax="{count}"/>',
         f'<size nuser_geom="{count}"/>',
-        f'<worldbody><body><flexcomp name="z" type="grid" count="{count} 90 10" spacing=".1 .1 .1"/></body></worldbody>',
+        f'<worldbody><body><flexcomp name="z" type="grid" count="{count} 9 9"/></body></worldbody>',
         f'<worldbody><composite type="cable" count="{count} 1 1" size="1"><geom size=".01"/></composite></worldbody>',
         f'<asset><mesh name="z" builtin="sphere" params="{count}"/></asset>', f'<option timestep="{count}"/>',
-        '<asset><model name="z" file="model.xml"/></asset><worldbody><attach model="z" body="body0" prefix="p"/></worldbody>',
+        '<asset><model name="z" file="model.xml"/></asset><worldbody><attach model="z" prefix="p"/></worldbody>',
         '<worldbody><attach model="fuzzed" body="body0" prefix="p"/></worldbody>', '<size njmax="100000000"/>',
         '<asset><model name="z" file="other.xml"/></asset><worldbody><attach model="z" prefix="p"/></worldbody>',
-        '<asset><model name="z" file="other.xml"/></asset><worldbody><attach model="z" body="b" prefix="p"/></worldbody>',
+        '<asset><model file="other.xml" name="o"/></asset>'
+        '<worldbody><attach prefix="" model="o" body="b"/></worldbody>',
     ]  # fmt: skip
     return _at_top(text, _pick(rng, forms))
 

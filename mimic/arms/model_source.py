@@ -52,7 +52,7 @@ class Element:
         while pending:
             element = pending.pop()
             yield element
-            pending += reversed(element.children)
+            pending += element.children[::-1]
 
 
 @dataclasses.dataclass(frozen=True)
