@@ -105,6 +105,8 @@ def check_in_process(text: str, attached: Mapping[str, bytes]) -> None:
 
 def _error(process: subprocess.CompletedProcess[bytes]) -> str | None:
     """Why the process rejected the model, or what ended it; None where the model is accepted."""
+    if b"contains a 'NaN'" in process.stderr:  # MuJoCo's warning, in whatever attribute it is
+        return "the model has a number that is not a number: NaN"
     with contextlib.suppress(ValueError, IndexError, TypeError, KeyError):
         error = json.loads(process.stdout.splitlines()[-1])["error"]
         return _TOO_LARGE if error and "allocate memory" in error else error

@@ -206,7 +206,7 @@ def _check_trajectories(content: dict[str, np.ndarray], name: str, joints: int) 
             raise ValueError(f"demonstrations: {key} in {name!r} must be floating point, got {array.dtype}")
         if not np.all(np.isfinite(array)):
             raise ValueError(f"demonstrations: {key} in {name!r} has values that are not finite")
-        if np.any(np.abs(array) > LARGEST):
+        if float(np.abs(array).max(initial=0)) > LARGEST:
             raise ValueError(f"demonstrations: {key} in {name!r} has values above {LARGEST:g}, which no arm has")
     if qpos.ndim != 3 or qpos.shape[0] < 1 or qpos.shape[1] < 2 or qpos.shape[2] != joints:
         raise ValueError(

@@ -52,9 +52,13 @@ def rejection(path, data):
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_arrays_are_those_of_numpy(tmp_path, save):
     arrays = {
-        **ARRAYS, "fortran": np.asfortranarray(ARRAYS["a"]), "empty": np.zeros((0, 7)),
-        "big": ARRAYS["a"].astype(">f4"), "nothing": np.array(""), "many": np.random.default_rng(0).normal(size=(300, 1000)),
-    }  # fmt: skip
+        **ARRAYS,
+        "fortran": np.asfortranarray(ARRAYS["a"]),
+        "empty": np.zeros((0, 7)),
+        "big": ARRAYS["a"].astype(">f4"),
+        "nothing": np.array(""),
+        "many": np.random.default_rng(0).normal(size=(300, 1000)),
+    }
     save(tmp_path / "a.npz", **arrays)
     loaded = read_arrays(tmp_path / "a.npz", (*arrays, "missing"))
     assert loaded.keys() == arrays.keys()

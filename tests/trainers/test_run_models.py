@@ -4,6 +4,8 @@ import dataclasses
 import json
 import os
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -17,12 +19,20 @@ from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.run_models import FOLDER, RECORD, save_models
 from tests.helpers import original_model
 from tests.helpers.run_directories import write_run
+from tests.helpers.tiny import TINY
+from tests.helpers.untrained_run import untrained_run
 
 MESH = "".join(  # a tetrahedron
     ["v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\n", "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"]
 )
 LINK = '<asset><mesh file="l.obj"/></asset>'
 PARTS = "<mujocoinclude><custom><numeric name='velocity_limit' data='1 2 3 4 5 6'/></custom></mujocoinclude>"
+BODIES = "".join(
+    f'<body pos="{x} 0 0"><joint name="joint{number}" axis="0 0 1" armature="0.02" damping="0.1"/>'
+    '<geom type="capsule" size="0.02" fromto="0 0 0 0.5 0 0" mass="0.5"/>'
+    for number, x in ((1, 0), (2, 0.5))
+)
+TWO_JOINTS = f'<mujoco model="two"><worldbody>{BODIES}</body></body></worldbody></mujoco>'
 
 
 def write_arm(folder, kind):
@@ -145,16 +155,42 @@ def test_changed_copies_are_rejected_in_one_line(finished, tmp_path, case):
 
 
 def test_a_moved_run_is_evaluated_without_the_file_of_its_arm(tmp_path):
-    from tests.helpers.untrained_run import untrained_run
-
     file = tmp_path / "arm.xml"
-    bodies = "".join(
-        f'<body pos="{x} 0 0"><joint name="joint{number}" axis="0 0 1" armature="0.02" damping="0.1"/>'
-        '<geom type="capsule" size="0.02" fromto="0 0 0 0.5 0 0" mass="0.5"/>'
-        for number, x in ((1, 0), (2, 0.5))
-    )
-    file.write_text(f'<mujoco model="two"><worldbody>{bodies}</body></body></worldbody></mujoco>')
+    file.write_text(TWO_JOINTS)
     run_dir = untrained_run(tmp_path / "run", model=str(file))
     file.unlink()
     moved = run_dir.rename(tmp_path / "moved")
     prepare_evaluation(EvaluateConfig(str(moved), compilation_cache=""), 0.0)  # builds the arms and loads the policy
+
+
+@pytest.mark.slow
+def test_commands_use_the_arm_of_a_moved_run(tmp_path):
+    """Training, evaluation, export, video and resuming, without the original file."""
+    file = tmp_path / "arm.xml"
+    file.write_text(TWO_JOINTS)
+    arguments = [f"env.learner.model={file}", *TINY, f"run_dir={tmp_path / 'first'}", "compilation_cache="]
+    command("train", *arguments, "env.physics=fused")
+    report = json.loads((tmp_path / "first" / "report.json").read_text())
+    file.write_text(TWO_JOINTS.replace('mass="0.5"', 'mass="5"'))
+    run_dir = (tmp_path / "first").rename(tmp_path / "run")
+    command("evaluate", f"run={run_dir}", f"out={tmp_path / 'out'}")
+    again = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert again["mean_distance"] == pytest.approx(report["mean_distance"], rel=1e-5)  # float32, in another process
+    file.unlink()
+    command("export", f"run={run_dir}", f"out={tmp_path / 'policy.onnx'}")
+    command("render", f"run={run_dir}", f"out={tmp_path / 'video.mp4'}")
+    command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
+    assert load_config(run_dir, saved_models=False).env.learner.model == str(file)
+    append(run_dir / FOLDER / "learner" / "arm.xml")
+    for name in ("evaluate", "export", "render"):
+        error = command(name, f"run={run_dir}", f"out={tmp_path / name}", code=2)
+        assert error.startswith("error: ") and error.count("\n") == 1 and "was changed since" in error
+
+
+def command(name, *arguments, code=0):
+    """Runs a command, whose exit code must be this; returns its error output."""
+    result = subprocess.run(
+        [sys.executable, "-m", f"mimic.{name}", *arguments], capture_output=True, text=True, timeout=280, check=False
+    )
+    assert result.returncode == code, result.stderr[-2000:]
+    return result.stderr
