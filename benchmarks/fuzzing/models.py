@@ -17,6 +17,7 @@ import mimic
 from benchmarks.fuzzing import ACCEPTED, OTHER_NUMBERS, Case
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.model_files import read_model
+from mimic.arms.model_source import read_source
 
 SEED = 26
 _FOLDER, _SECRET = "arm", "secret"  # the model's folder, and a body that is in files outside of it alone
@@ -423,7 +424,9 @@ _COMPARED = ("body_mass", "body_inertia", "body_pos", "body_ipos", "body_quat", 
 
 
 def _as_in_mujoco(file: Path, model: mujoco.MjModel) -> bool:
-    """Whether the model is the one that MuJoCo reads; True if MuJoCo alone rejects the file."""
+    """Whether the model is the one that MuJoCo reads; True if MuJoCo alone rejects the file, or would miss meshes."""
+    if read_source(file).missing:  # MuJoCo would wait for a pipe among them
+        return True
     try:
         spec = mujoco.MjSpec.from_file(str(file))
         spec.compiler.fusestatic = spec.compiler.fusestatic and file.suffix == ".xml"

@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import time
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
@@ -27,7 +28,8 @@ def run_case(case: Case, folder: Path) -> tuple[str, str]:
     """The outcome of a case in an empty folder, and its message."""
     case.write(folder)
     try:
-        with contextlib.chdir(folder):
+        with contextlib.chdir(folder), warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # of NumPy: lines that a user would see
             return case.read(folder), ""
     except ValueError as error:
         message = str(error)
