@@ -1,5 +1,6 @@
 """A part of the fuzzed inputs, which `python -m benchmarks.fuzz` runs as a whole, and how they are counted."""
 
+import multiprocessing
 import os
 
 import pytest
@@ -68,7 +69,8 @@ def test_harm_is_counted_and_the_next_inputs_run(monkeypatch):
     monkeypatch.setitem(fuzzing.KINDS, "npz", ("tests.benchmarks.test_fuzz", "harmful_case"))
     monkeypatch.setattr(runner, "TIME_LIMIT", 5.0)
     monkeypatch.setattr(runner, "MEMORY_LIMIT", runner._peak_memory() + 200 * 2**20)
-    monkeypatch.setattr(runner.multiprocessing, "get_context", lambda _: runner.multiprocessing.context.ForkContext())
+    fork = multiprocessing.get_context("fork")  # the processes know of what is replaced here
+    monkeypatch.setattr(runner.multiprocessing, "get_context", lambda _: fork)
     rows = run_cases("npz", len(READS), 1)
     assert tuple(row["outcome"] for row in rows) == OUTCOMES
     counts = summary("npz", rows)
