@@ -13,13 +13,21 @@ CONFIG, REPORT, METRICS, DEMONSTRATIONS = "config.yaml", "report.json", "metrics
 def write_atomically(path: Path, text: str) -> None:
     """Writes a file; an existing one is replaced only when the new one is complete."""
     partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
+    partial.write_text(text, newline="")
     os.replace(partial, path)
 
 
 def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:
     """Writes report.json; numbers that are not finite, as after a divergence, are null."""
     write_atomically(run_dir / REPORT, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
+
+
+def reported_steps(run_dir: Path, unit: str) -> int:
+    """Training steps of the parameters in a run's report; -1 without a report."""
+    try:
+        return int(json.loads((run_dir / REPORT).read_text())[unit])
+    except (OSError, ValueError, LookupError, TypeError):
+        return -1
 
 
 def finite(value: Any) -> Any:

@@ -25,6 +25,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "final_learning_rate": 0.05,
         "discounting": 0.8,
         "entropy_cost": 0.01,
+        "final_entropy_cost": 1.0,
         "hidden_layers": [128, 128],
         "crossovers": 0,
         "evaluations": 10,
@@ -41,8 +42,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "final_learning_rate": 0.01,
         "discounting": 0.95,
         "entropy_cost": 0.2,
+        "final_entropy_cost": 0.05,
         "hidden_layers": [512, 256],
-        "crossovers": 800,
+        "crossovers": 2000,
         "evaluations": 8,
     },
 }
@@ -58,12 +60,14 @@ class TrainerConfig:
     Attributes:
       name: name of the trainer.
       preset: name of the preset; it gives the values of the fields that are None.
+      keep: number of newest checkpoints that a run keeps.
     """
 
     length_key: ClassVar[str]  # the field that sets the training length
 
     name: str = MISSING
     preset: str = MISSING
+    keep: int = 50
 
     @property
     def total_steps(self) -> int:
@@ -102,10 +106,13 @@ class PPOConfig(TrainerConfig):
       hidden_layers: widths of the hidden layers of the policy and value networks.
       crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
         `crossovers` in mimic/envs/demonstrations.py.
+      timed_critic: whether the value network also observes the elapsed fraction of the episode, on which the return
+        depends. The policy never observes it.
       target_gap: training ends early when the optimality gap on the training demonstrations is at most this; 0 disables
         it.
       evaluations: number of evaluations and checkpoints, as far as whole batches allow; with a target gap five times
         the preset's number.
+      keep: number of newest checkpoints that the run keeps, at least 2: those two can be resumed exactly.
     """
 
     length_key: ClassVar[str] = "num_timesteps"
@@ -124,12 +131,13 @@ class PPOConfig(TrainerConfig):
     final_discounting: float | None = None
     gae_lambda: float = 0.9
     entropy_cost: float | None = None
-    final_entropy_cost: float = 1.0
+    final_entropy_cost: float | None = None
     clipping_epsilon: float = 0.2
     max_grad_norm: float = 1.0
     reward_scaling: float = 10.0
     hidden_layers: list[int] | None = None
     crossovers: int | None = None
+    timed_critic: bool = True
     target_gap: float = 0.0
     evaluations: int | None = None
 
@@ -174,6 +182,7 @@ class PPOSettings(PPOConfig):
     discounting: float = MISSING
     final_discounting: float = MISSING
     entropy_cost: float = MISSING
+    final_entropy_cost: float = MISSING
     hidden_layers: list[int] = MISSING
     crossovers: int = MISSING
     evaluations: int = MISSING
@@ -419,6 +428,7 @@ class TrainConfig:
       seed: random seed of networks, exploration and resets.
       run_dir: folder that the run writes to; runs/ENV-TRAINER-seedSEED-TIME where empty.
       resume: run directory of the run to continue.
+      init: run directory of another run; training starts from the parameters of its last checkpoint.
       logger: "local", "wandb", "mlflow", or a list of these: services that metrics are sent to. The run directory
         always has the metrics.
       compilation_cache: folder where JAX keeps compiled functions between runs; none where empty.
@@ -430,6 +440,7 @@ class TrainConfig:
     seed: int = 0
     run_dir: str = ""
     resume: str = ""
+    init: str = ""
     logger: Any = "local"
     compilation_cache: str = "~/.cache/mimic/jax"
     distributed: DistributedConfig = dataclasses.field(default_factory=DistributedConfig)

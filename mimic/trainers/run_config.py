@@ -8,26 +8,35 @@ from omegaconf import DictConfig, OmegaConf
 
 from mimic.config import check_new, explain, schema, to_dict
 from mimic.runs.checkpoints import check_checkpoint
-from mimic.runs.files import CONFIG, write_atomically
+from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
+from mimic.runs.lock import LOCK
 from mimic.trainers.config import TRAINERS, TrainConfig
-from mimic.trainers.run_models import with_original_models, with_saved_models
+from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
 
 
 def new_run_dir(config: TrainConfig) -> Path:
     """The directory of a new run, which is not created yet.
 
     Raises:
-      ValueError: it exists.
+      ValueError: it exists and is more than a run that ended while it was created.
     """
     if config.run_dir:
         path = Path(config.run_dir).expanduser()
-        check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
+        if not _is_unfinished(path):
+            check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
         return path
     stem = f"{config.env.name}-{config.trainer.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     path, number = Path("runs") / stem, 1
     while path.exists():
         path, number = Path("runs") / f"{stem}-{number}", number + 1
     return path
+
+
+def _is_unfinished(path: Path) -> bool:
+    """Whether a folder has nothing but what a run writes before its config."""
+    inputs = DEMONSTRATIONS, MODELS
+    before_config = {LOCK, *inputs, *(f"{name}.partial" for name in (*inputs, CONFIG))}
+    return path.is_dir() and {file.name for file in path.iterdir()} <= before_config
 
 
 def save_config(run_dir: Path, config: TrainConfig) -> None:
@@ -64,10 +73,20 @@ def _read_config(run_dir: Path) -> TrainConfig:
         name = OmegaConf.select(content, "trainer.name")
         if name not in TRAINERS:
             raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
-        merged = OmegaConf.merge(run_schema(name), _with_old_default_metric(content))  # type: ignore[arg-type]
+        merged = OmegaConf.merge(run_schema(name), _with_old_defaults(content))  # type: ignore[arg-type]
         return OmegaConf.to_object(merged)  # type: ignore[return-value]
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
+
+
+def _with_old_defaults(content: DictConfig) -> DictConfig:
+    """Completes the config of an older run with the defaults of its time."""
+    content = _with_old_default_metric(content)
+    trainer = OmegaConf.select(content, "trainer")
+    if trainer.name == "ppo":
+        trainer = {"timed_critic": False, "final_entropy_cost": 1.0, **trainer}
+        content = OmegaConf.merge(content, {"trainer": trainer})  # type: ignore[assignment]
+    return content
 
 
 def _with_old_default_metric(content: DictConfig) -> DictConfig:

@@ -14,13 +14,13 @@ from mimic.arms.model_source import file_digest, read_source
 from mimic.envs.config import EnvConfig
 from mimic.runs.files import write_atomically
 
-FOLDER, RECORD = "models", "models.json"
+MODELS, RECORD = "models", "models.json"
 _ROLES = "expert", "learner"
 _MAX_RECORD = 2**20  # bytes
 
 
 def save_models(run_dir: Path, env: EnvConfig) -> None:
-    """Copies the model files of the arms into the folder `models`; a run that has them already keeps its own.
+    """Copies the model files of the arms into the folder `models`; a run whose arms are from there keeps them.
 
     The file `models.json` records the original paths and the checksums of the copies. The folder has its final name
     only when it is complete.
@@ -29,10 +29,10 @@ def save_models(run_dir: Path, env: EnvConfig) -> None:
       ValueError: a file that cannot be read any more.
     """
     arms = _own_arms(env)
-    folder = run_dir / FOLDER
-    if not arms or folder.exists():
+    folder = run_dir / MODELS
+    if not arms or any(Path(arm.model).is_relative_to(os.path.abspath(folder)) for arm in arms.values()):
         return
-    partial = run_dir / f"{FOLDER}.partial"
+    partial = run_dir / f"{MODELS}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     for role, arm in arms.items():
         for name, content in copied_files(read_source(arm.model), Path(arm.model).name).items():
@@ -47,6 +47,7 @@ def save_models(run_dir: Path, env: EnvConfig) -> None:
         "sha256": {str(path.relative_to(partial)): file_digest(path) for path in _files(partial)},
     }
     write_atomically(partial / RECORD, json.dumps(record, indent=2) + "\n")
+    shutil.rmtree(folder, ignore_errors=True)  # of a run that ended before it had a config
     os.replace(partial, folder)
 
 
@@ -56,7 +57,7 @@ def with_saved_models(run_dir: Path, env: EnvConfig) -> EnvConfig:
     Raises:
       ValueError: the folder was changed.
     """
-    arms, folder = _own_arms(env), run_dir / FOLDER
+    arms, folder = _own_arms(env), run_dir / MODELS
     if not arms or not folder.exists():
         return env
     record = _read_record(folder)
@@ -77,7 +78,7 @@ def with_original_models(env: EnvConfig) -> EnvConfig:
 
 def _original(arm: ArmConfig, role: str) -> ArmConfig:
     folder = Path(arm.model).parents[1] if len(Path(arm.model).parents) > 1 else Path()
-    if folder.name != FOLDER or Path(arm.model).parent.name != role or not (folder / RECORD).is_file():
+    if folder.name != MODELS or Path(arm.model).parent.name != role or not (folder / RECORD).is_file():
         return arm
     return dataclasses.replace(arm, model=_read_record(folder)["arms"][role]["original"])
 

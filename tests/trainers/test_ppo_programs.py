@@ -1,6 +1,5 @@
 """The compiled functions of PPO: the transitions that they collect, and the loss."""
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -10,22 +9,25 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 
 import mimic
 from mimic.compilation import compiler_options
+from mimic.envs.imitation import arm_state
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import losses as ppo_loss
 from mimic.trainers.ppo import programs, training, updates
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
+HORIZON = 50  # steps of an episode
 _SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
 
 
 @pytest.fixture(scope="module")
 def one_batch():
-    """States before and after a batch; a loss without gradient records its observations, projected on `along`."""
+    """States before and after a batch; losses without gradient record observations, projected on `along`, and time."""
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
     config = PPOConfig(
         num_envs=ARMS, unroll_length=1, batch_size=UNROLLS * ARMS // 2, num_minibatches=2, num_updates_per_batch=PASSES,
@@ -40,16 +42,18 @@ def one_batch():
         return now + 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), after
 
     def of_policy(params, statistics, unrolls, after, *_):
-        return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), jnp.full(len(ppo_loss.METRICS), after)
+        metrics = jnp.full(len(ppo_loss.METRICS), after).at[1:3].set(unrolls.elapsed.mean(axis=0))
+        return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), metrics
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(updates, "value_loss", of_value)
         patch.setattr(updates, "policy_loss", of_policy)
-        begin, learn = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
-        start = begin()(7)
-        before = jax.device_get(start)
-        after, metrics = jax.device_get(learn()(start))
+        start, _, epoch = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+        state = start(7)
+        before = jax.device_get(state)
+        after, metrics = jax.device_get(epoch()(state))
     shown = {"now": metrics["value_loss"], "next": metrics["policy_loss"]}
+    shown["elapsed"] = [metrics[name] for name in ppo_loss.METRICS[1:3]]
     return before, after, shown, along
 
 
@@ -62,8 +66,18 @@ def test_each_pass_uses_each_transition(one_batch):
 def test_the_next_observation_belongs_to_its_transition(one_batch):
     """In unrolls of one step, the next observation of the first is the first one of the second."""
     before, after, shown, along = one_batch
-    seen = UNROLLS * ARMS * after.statistics.mean - before.episodes.obs.sum(0) + after.episodes.obs.sum(0)
-    assert shown["next"] == pytest.approx(along @ seen / (UNROLLS * ARMS), abs=1e-5)
+    total = UNROLLS * ARMS * after.statistics.mean - before.episodes.obs.sum(0) + after.episodes.obs.sum(0)
+    assert shown["next"] == pytest.approx(along @ total / (UNROLLS * ARMS), abs=1e-5)
+
+
+def test_the_elapsed_time_belongs_to_the_observation(one_batch):
+    """Over two unrolls of one step each; an episode that ends starts again at 0."""
+    before, after, shown, _ = one_batch
+    first, last = (arm_state(state.episodes).step for state in (before, after))
+    second = np.where(first + 1 < HORIZON, first + 1, 0)
+    np.testing.assert_array_equal(last, np.where(second + 1 < HORIZON, second + 1, 0))
+    expected = np.array([[first, second], [second, last]]).mean(axis=(1, 2)) / HORIZON
+    np.testing.assert_allclose(shown["elapsed"], expected, rtol=1e-5)
 
 
 def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
@@ -78,7 +92,7 @@ def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
 def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     """The entropy is that of a sample, drawn in the same order only for unrolls of one step."""
     sizes, unrolls = (5, 3), 6
-    config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), entropy_cost=entropy_cost)
+    config = PPOConfig(hidden_layers=[8, 4], entropy_cost=entropy_cost, timed_critic=False).resolve("cpu")
     networks = training.make_networks(config, *sizes)
     rng = np.random.default_rng(time)
 
@@ -91,7 +105,7 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     observation, raw_action = normal(unrolls, time + 1, 5), normal(unrolls, time + 1, 3)
     log_prob, reward = normal(unrolls, time + 1), normal(unrolls, time + 1)
     goes_on = jnp.asarray(rng.random((unrolls, time + 1)) < 0.8, float)
-    ours = ppo_loss.Unrolls(observation, raw_action, log_prob - 4, reward, goes_on)
+    ours = ppo_loss.Unrolls(observation, raw_action, log_prob - 4, reward, goes_on, jnp.zeros_like(reward))
     np.testing.assert_array_equal(ours.unpacked(ours.packed()).raw_action, raw_action)
     now = jax.tree.map(lambda x: x[:, :-1], ours.unpacked(ours.packed()))
     extras = {"raw_action": now.raw_action, "log_prob": now.log_prob}
@@ -115,8 +129,8 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     (loss, shown), gradient = jax.jit(jax.value_and_grad(own, has_aux=True))(params)
     (expected, named), expected_gradient = jax.jit(jax.value_and_grad(of_brax, has_aux=True))(params)
     assert loss == pytest.approx(float(expected), rel=1e-12)
-    for found, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    for actual, reference in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
+        np.testing.assert_allclose(actual, reference, rtol=1e-9, atol=1e-12)
     assert -entropy_cost * shown["entropy"] == pytest.approx(float(named["entropy_loss"]), rel=1e-12, abs=1e-12)
     assert shown["policy_loss"] == pytest.approx(float(named["policy_loss"]), rel=1e-12)
     assert shown["value_loss"] == pytest.approx(float(named["v_loss"]), rel=1e-12)
@@ -128,6 +142,25 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     assert shown["clip_fraction"] == pytest.approx(clipped.mean()) and 0 < clipped.mean() < 1
 
 
+def test_a_timed_critic_observes_the_elapsed_time(x64):
+    """Its loss is that of a critic without time whose observation has the elapsed time as its last entry."""
+    rng = np.random.default_rng(0)
+    unrolls = ppo_loss.Unrolls(*(jnp.asarray(rng.normal(size=(6, 4, *n))) for n in [(5,), (3,), (), (), (), ()]))
+    statistics = running_statistics.init_state(specs.Array((5,), jnp.dtype("float64")))
+    statistics = statistics.replace(mean=jnp.arange(5.0), std=1 + jnp.arange(5.0))
+    longer = jax.tree.map(lambda x: x, statistics)
+    longer = longer.replace(mean=jnp.append(statistics.mean, 0.0), std=jnp.append(statistics.std, 1.0))
+    timed, plain = (PPOConfig(hidden_layers=[8], timed_critic=timed).resolve("cpu") for timed in (True, False))
+    params = training.make_networks(timed, 5, 3).value_network.init(jax.random.PRNGKey(0))
+    loss, _ = ppo_loss.value_loss(params, statistics, unrolls, training.make_networks(timed, 5, 3), timed)
+    extended = unrolls._replace(observation=jnp.concatenate([unrolls.observation, unrolls.elapsed[..., None]], -1))
+    expected, _ = ppo_loss.value_loss(params, longer, extended, training.make_networks(plain, 6, 3), plain)
+    later, _ = ppo_loss.value_loss(
+        params, statistics, unrolls._replace(elapsed=unrolls.elapsed + 1), training.make_networks(timed, 5, 3), timed
+    )
+    assert loss == pytest.approx(float(expected), rel=1e-12) and abs(later - loss) > 1e-3
+
+
 ON_TWO_DEVICES = """
 import sys, jax, numpy as np, optax, mimic
 from mimic.trainers.ppo import programs, training
@@ -136,10 +169,10 @@ env = mimic.make("planar4dof", physics=sys.argv[1], demonstrations={"count": 3, 
 config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
                    hidden_layers=[8]).resolve("cpu", 2)
 networks = training.make_networks(config, env.observation_size, env.action_size)
-begin, learn = programs.compile_training(env, config, networks, 2, optax.constant_schedule(1e-3), None)
-start = begin()(7)
-before = jax.device_get(start.params)
-after, metrics = learn()(start)
+start, _, epoch = programs.compile_training(env, config, networks, 2, optax.constant_schedule(1e-3), None)
+state = start(7)
+before = jax.device_get(state.params)
+after, metrics = epoch()(state)
 changed = jax.tree.map(lambda x, y: not np.array_equal(x, y), before, jax.device_get(after.params))
 assert any(jax.tree.leaves(changed))
 for x in jax.tree.leaves((after.policy, after.value, after.statistics, metrics)):
@@ -177,10 +210,10 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
         config = PPOConfig(**small, **settings).resolve("cpu")  # type: ignore[arg-type]
         networks = training.make_networks(config, env.observation_size, env.action_size)
         rate = optax.constant_schedule(1e-3)
-        begin, learn = programs.compile_training(env, config, networks, 1, rate, None, lambda count: count / 2)
-        state, learn = begin()(7), learn()
+        start, _, epoch = programs.compile_training(env, config, networks, 1, rate, None, lambda count: count / 2)
+        state = start(7)
         for _ in range(batches):
-            state, _ = learn(state)
+            state, _ = epoch()(state)
         return jax.device_get(state.params)
 
     constant, decayed = {"entropy_cost": 0.2}, {"entropy_cost": 0.2, "final_entropy_cost": 0.0}
@@ -196,9 +229,10 @@ def test_both_functions_are_compiled_with_the_options_of_a_run(monkeypatch):
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    for program in programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None):
+    start, _, epoch = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+    for compiled in (lambda: start(7), epoch):
         with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
-            program()
+            compiled()
 
 
 @pytest.mark.gpu
@@ -208,10 +242,10 @@ def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypat
     env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
     config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    given, learned = compiler_options(), []
-    for scheduling in ("SERIALIZE", given[_SCHEDULING]):
-        options = {**given, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
+    defaults, learned = compiler_options(), []
+    for scheduling in ("SERIALIZE", defaults[_SCHEDULING]):
+        options = {**defaults, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
         monkeypatch.setattr(programs, "compiler_options", lambda options=options: options)
-        begin, learn = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
-        learned.append(jax.device_get(learn()(begin()(7))))
+        start, _, epoch = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
+        learned.append(jax.device_get(epoch()(start(7))))
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))

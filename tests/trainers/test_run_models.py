@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ from mimic.arms.arm import build_arm
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.runs.files import CONFIG
-from mimic.trainers.run_config import load_config, save_config
-from mimic.trainers.run_models import FOLDER, RECORD, save_models
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.run_config import load_config, new_run_dir, save_config
+from mimic.trainers.run_models import MODELS, RECORD, save_models
 from tests.helpers import original_model
 from tests.helpers.run_directories import write_run
 from tests.helpers.tiny import TINY
@@ -94,22 +96,38 @@ def test_a_run_keeps_its_arm(run, change, tmp_path):
     assert_same(build_arm(load_config(run_dir).env.learner), arm)
 
 
-def test_saving_the_config_again_keeps_original_path_and_models(run):
+def test_saving_the_config_again_keeps_original_path_and_models(run, tmp_path, monkeypatch):
     run_dir, file = run
-    before = {path: path.read_bytes() for path in (run_dir / FOLDER).rglob("*") if path.is_file()}
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    run_dir = Path("..", run_dir.name)
+    before = {path: path.read_bytes() for path in (run_dir / MODELS).rglob("*") if path.is_file()}
     file.unlink()
     config = load_config(run_dir)
-    assert str(run_dir) in config.env.learner.model
+    assert str(tmp_path / run_dir.name) in config.env.learner.model
     save_models(run_dir, config.env)
     save_config(run_dir, config)
     assert load_config(run_dir, saved_models=False).env.learner.model == str(file)
-    assert str(run_dir / FOLDER) not in (run_dir / CONFIG).read_text()
-    assert {path: path.read_bytes() for path in (run_dir / FOLDER).rglob("*") if path.is_file()} == before
+    assert MODELS not in (run_dir / CONFIG).read_text()
+    assert {path: path.read_bytes() for path in (run_dir / MODELS).rglob("*") if path.is_file()} == before
+
+
+def test_a_run_that_starts_anew_replaces_the_models_of_one_without_config(run, tmp_path):
+    run_dir, file = run
+    (run_dir / CONFIG).rename(tmp_path / CONFIG)
+    other = tmp_path / "other" / "two.xml"
+    other.parent.mkdir()
+    other.write_text(TWO_JOINTS)
+    save_models(run_dir, mimic.env_config("pair", learner=str(other)))
+    assert {path.name for path in (run_dir / MODELS / "learner").iterdir()} == {"two.xml"}
+    unfinished = tmp_path / "unfinished"
+    shutil.copytree(run_dir / MODELS, unfinished / MODELS)
+    assert new_run_dir(TrainConfig(run_dir=str(unfinished))) == unfinished
 
 
 def test_a_run_without_models_loads_as_before(run):
     run_dir, file = run
-    shutil.rmtree(run_dir / FOLDER)
+    shutil.rmtree(run_dir / MODELS)
     assert load_config(run_dir).env.learner.model == str(file)
 
 
@@ -148,7 +166,7 @@ CHANGES = {
 def test_changed_copies_are_rejected_in_one_line(finished, tmp_path, case):
     run_dir = shutil.copytree(finished, tmp_path / "run")
     change, message = CHANGES[case]
-    change(run_dir / FOLDER)
+    change(run_dir / MODELS)
     with pytest.raises(ValueError, match=message) as error:
         load_config(run_dir)
     assert "\n" not in str(error.value)
@@ -181,7 +199,7 @@ def test_commands_use_the_arm_of_a_moved_run(tmp_path):
     command("render", f"run={run_dir}", f"out={tmp_path / 'video.mp4'}")
     command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
     assert load_config(run_dir, saved_models=False).env.learner.model == str(file)
-    append(run_dir / FOLDER / "learner" / "arm.xml")
+    append(run_dir / MODELS / "learner" / "arm.xml")
     for name in ("evaluate", "export", "render"):
         error = command(name, f"run={run_dir}", f"out={tmp_path / name}", code=2)
         assert error.startswith("error: ") and error.count("\n") == 1 and "was changed since" in error
