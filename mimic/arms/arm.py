@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.chain import Links
+from mimic.arms.compile_check import VELOCITY_LIMIT
 from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
 from mimic.arms.ignored_elements import ignored_elements
-from mimic.arms.model_files import VELOCITY_LIMIT, read_spec
+from mimic.arms.model_files import read_spec
 from mimic.arms.simulation_model import effective_inertia, simulation_model
 
 # Planar arms are slender rods; relative to their size, their joints have about the effective inertia of the Panda's.

@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from mimic.arms.chain import Chain, Joint, Link, Links, Locked, lock, resolve_locked
+from mimic.arms.compile_check import check_magnitudes
 from mimic.arms.model_files import model_name, read_model
 from mimic.arms.mujoco_chain import read_chain
 from mimic.config import check_choice
@@ -247,7 +248,10 @@ def in_chain_lengths(arm: Embodiment) -> Embodiment:
 
 
 def _model(path_or_model: str | os.PathLike[str] | mujoco.MjModel) -> mujoco.MjModel:
-    return path_or_model if isinstance(path_or_model, mujoco.MjModel) else read_model(path_or_model)
+    if not isinstance(path_or_model, mujoco.MjModel):
+        return read_model(path_or_model)
+    check_magnitudes(path_or_model)
+    return path_or_model
 
 
 def _name(path_or_model: str | os.PathLike[str] | mujoco.MjModel, model: mujoco.MjModel) -> str:

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 
 from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
+from mimic.arms.compile_check import VELOCITY_LIMIT
 from mimic.arms.kinematic_tree import ChainIds, ancestors, body_id, find_chain, is_revolute, tip_body
-from mimic.arms.model_files import VELOCITY_LIMIT
 
 START_POSES = "ready", "home"  # keyframes with the start pose of a model, in order of preference
 

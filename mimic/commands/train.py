@@ -36,6 +36,7 @@ from mimic.trainers.config import TrainConfig
 from mimic.trainers.distributed.process_group import ProcessGroup
 from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import load_config, new_run_dir, run_schema, save_config
+from mimic.trainers.run_models import save_models
 from mimic.trainers.trainer import Params, Trainer
 
 
@@ -143,6 +144,7 @@ def _train(
         try:
             lock = lock or _new_run(run_dir, trainer)
             stack.callback(lock.close)
+            save_models(run_dir, config.env)
             save_config(run_dir, config)  # after the inputs: a folder without it is no run yet
             headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
             console.print(f"{headline}\nrun directory: {run_dir}", highlight=False, soft_wrap=True)

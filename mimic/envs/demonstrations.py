@@ -2,8 +2,6 @@
 
 import dataclasses
 import os
-import zipfile
-import zlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,10 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.runs.npz import read_arrays
 
 FORMAT = "mimic-demonstrations-1"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
 _OPTIONAL_ARRAYS = ("torque",)
+LARGEST = 1e6  # rad, rad/s, N m, s: no arm's motion has larger values
 _ROUNDING = 1e-6  # relative tolerance of a value above its limit: a file in float32 rounds by 6e-8
 
 
@@ -157,25 +157,19 @@ def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
     """Reads and validates a file of demonstrations, in the format of `Demonstrations.save`.
 
     Raises:
-      ValueError: the file is missing, truncated or no npz file, has pickled objects, lacks an array, or has arrays of
-        wrong shape or with values that are not finite.
+      ValueError: the file is missing or what `read_arrays` rejects, lacks an array, or has arrays of wrong shape or
+        with values that are not finite or above 1e6.
     """
     name = os.fspath(path)
     if not os.path.isfile(path):
         raise ValueError(f"demonstrations: no file at {name!r}")
     try:
-        archive = np.load(path, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError("it has a single array")
-        with archive:
-            missing = [key for key in _ARRAYS if key not in archive.files]
-            if missing:
-                raise ValueError(f"it lacks {', '.join(missing)}; expected are {', '.join(_ARRAYS)}")
-            optional = [key for key in _OPTIONAL_ARRAYS if key in archive.files]
-            content = {key: archive[key] for key in (*_ARRAYS, *optional)}
-    except (ValueError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        reason = "it has pickled objects" if "allow_pickle" in str(error) else str(error)
-        raise ValueError(f"demonstrations: {name!r} is not a complete npz file of demonstrations: {reason}") from error
+        content = read_arrays(path, (*_ARRAYS, *_OPTIONAL_ARRAYS))
+        missing = [key for key in _ARRAYS if key not in content]
+        if missing:
+            raise ValueError(f"it lacks {', '.join(missing)}; expected are {', '.join(_ARRAYS)}")
+    except ValueError as error:
+        raise ValueError(f"demonstrations: {name!r} is not a complete npz file of demonstrations: {error}") from error
     if str(content["format"]) != FORMAT:
         raise ValueError(f"demonstrations: {name!r} has format {str(content['format'])!r}, expected {FORMAT!r}")
     return _validated(content, name)
@@ -212,6 +206,8 @@ def _check_trajectories(content: dict[str, np.ndarray], name: str, joints: int) 
             raise ValueError(f"demonstrations: {key} in {name!r} must be floating point, got {array.dtype}")
         if not np.all(np.isfinite(array)):
             raise ValueError(f"demonstrations: {key} in {name!r} has values that are not finite")
+        if float(np.abs(array).max(initial=0)) > LARGEST:
+            raise ValueError(f"demonstrations: {key} in {name!r} has values above {LARGEST:g}, which no arm has")
     if qpos.ndim != 3 or qpos.shape[0] < 1 or qpos.shape[1] < 2 or qpos.shape[2] != joints:
         raise ValueError(
             f"demonstrations: qpos in {name!r} must be [demonstrations, samples >= 2, {joints} joints], "

@@ -2,7 +2,6 @@
 
 import csv
 import os
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,12 +10,18 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.envs.demonstrations import Demonstrations, check_effort
+from mimic.envs.demonstrations import LARGEST, Demonstrations, check_effort
+from mimic.runs.npz import read_arrays
 
 SOURCES = (".csv", ".npz")
 _TIME, _DEMONSTRATION = ("time", "t"), "demonstration"  # columns of a table
 _ANGLE_PREFIXES, _VELOCITY_PREFIXES = ("", "q_", "q", "qpos_"), ("qdot_", "qdot", "qvel_", "dq_")
 _SIZES = {0: (7, 6), 2: (1, 1), 3: (1, 1)}  # columns of qpos and qvel by MuJoCo's joint type: free, slide, revolute
+_NUMBERS = "biuf"  # kinds of NumPy's types
+_FORMS = {  # of the arrays of an npz file: kinds of their types, and their numbers of dimensions
+    "qpos": (_NUMBERS, (2,)), "qvel": (_NUMBERS, (2,)), "joint_names": ("U", (0, 1)), "frequency": (_NUMBERS, (0,)),
+    "dt": (_NUMBERS, (0,)), "jnt_type": (_NUMBERS, (1,)), "split_points": (_NUMBERS, (0, 1)),
+}  # fmt: skip
 _ROUNDING = 1e-6  # tolerance of the duration (relative) and of joint ranges (rad): float32 rounds pi by 9e-8
 
 
@@ -147,11 +152,12 @@ def _columns(header: Sequence[str], names: Sequence[str], prefixes: Sequence[str
 
 
 def _npz_content(path: Path) -> dict[str, Any]:
+    keys = ("qpos", "qvel", "joint_names", "frequency", "dt", "jnt_type", "split_points")
     try:
-        with np.load(path, allow_pickle=False) as archive:  # pickled arrays, as LocoMuJoCo's metadata, are not read
-            keys = ("qpos", "qvel", "joint_names", "frequency", "dt", "jnt_type", "split_points")
-            content: dict[str, Any] = {key: archive[key] for key in keys if key in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        content: dict[str, Any] = dict(
+            read_arrays(path, keys)
+        )  # pickled arrays, as LocoMuJoCo's metadata, are not read
+    except ValueError as error:
         raise ValueError(f"source: {str(path)!r} cannot be read as an npz file of motions: {error}") from error
     lacking = [key for key in ("qpos", "joint_names") if key not in content]
     if not {"frequency", "dt"} & set(content):
@@ -161,6 +167,15 @@ def _npz_content(path: Path) -> dict[str, Any]:
             f"source: {str(path)!r} lacks {', '.join(lacking)}; expected qpos, joint_names, frequency or dt, and "
             "optionally qvel, jnt_type, split_points"
         )
+    for key, array in content.items():
+        kinds, dimensions = _FORMS[key]
+        if array.dtype.kind not in kinds or array.ndim not in dimensions:
+            raise ValueError(
+                f"source: {key} in {str(path)!r} has type {array.dtype} and shape {list(array.shape)}; "
+                f"expected {'text' if kinds == 'U' else 'numbers'} of {dimensions[-1]} dimensions"
+            )
+        if key in ("qpos", "qvel") and not float(np.abs(array).max(initial=0)) <= LARGEST:
+            raise ValueError(f"source: {key} in {str(path)!r} has values that are not finite or above {LARGEST:g}")
     return content
 
 
@@ -175,18 +190,20 @@ def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
         )
     angle_at, velocity_at = _addresses(content.get("jnt_type"), present)
     for key, values, width in (("qpos", qpos, angle_at[-1]), ("qvel", qvel, velocity_at[-1])):
-        if values is not None and (values.ndim != 2 or values.shape != (len(qpos), width)):
+        if values is not None and values.shape != (len(qpos), width):
+            expected = [len(qpos), int(width)]
             raise ValueError(
-                f"source: {key} in {str(path)!r} must be {[len(qpos), width]} for its joints, got {list(values.shape)}"
+                f"source: {key} in {str(path)!r} must be {expected} for its joints, got {list(values.shape)}"
             )
     rate = content["dt"] if "dt" in content else content["frequency"]
-    if rate.shape != () or not 0 < float(rate) < np.inf:
-        raise ValueError(f"source: frequency or dt in {str(path)!r} must be one number above 0, got {rate}")
+    if not 1 / LARGEST <= float(rate) <= LARGEST:
+        raise ValueError(f"source: frequency or dt in {str(path)!r} must be in [{1 / LARGEST}, {LARGEST}], got {rate}")
     step = float(rate) if "dt" in content else 1 / float(rate)
     indices = [present.index(name) for name in names]
     qpos = np.asarray(qpos, float)[:, angle_at[indices]]
     qvel = None if qvel is None else np.asarray(qvel, float)[:, velocity_at[indices]]
-    bounds = [int(point) for point in np.atleast_1d(content.get("split_points", (0, len(qpos))))]
+    points = np.atleast_1d(content.get("split_points", (0, len(qpos))))
+    bounds = [int(point) if np.isfinite(point) else -1 for point in points[: len(qpos) + 2]]
     if len(bounds) < 2 or bounds[0] != 0 or bounds[-1] != len(qpos) or np.any(np.diff(bounds) <= 0):
         raise ValueError(
             f"source: split_points in {str(path)!r} must increase from 0 to {len(qpos)}, the samples, got {bounds[:8]}"
@@ -199,7 +216,7 @@ def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
 
 def _addresses(types: np.ndarray | None, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """First column of each joint in qpos and in qvel; the last entry is the number of columns."""
-    kinds = [3] * len(names) if types is None else [int(kind) for kind in types]
+    kinds = [3] * len(names) if types is None else [int(kind) for kind in types[: len(names) + 1]]
     if len(kinds) != len(names) or any(kind not in _SIZES for kind in kinds):
         raise ValueError(f"source: jnt_type: expected 0, 2 or 3 for each of {', '.join(names)}, got {kinds}")
     sizes = np.array([_SIZES[kind] for kind in kinds])

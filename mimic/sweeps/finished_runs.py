@@ -137,7 +137,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
         return LeftOut(name, f"{REPORT} cannot be read: {error}")
     version = str((report or {}).get("versions", {}).get("mimic-mjx", "unknown"))
     try:
-        config = load_config(path)
+        config = load_config(path, saved_models=False)  # runs of one arm are compared by its original path
     except ValueError as error:
         this = versions()["mimic-mjx"]
         written = f"of mimic {version}, and this is {this}: " if report and version != this else ""

@@ -1,5 +1,6 @@
 """The config of a run: its directory, and saving and loading the config there."""
 
+import dataclasses
 import time
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
 from mimic.runs.lock import LOCK
 from mimic.trainers.config import TRAINERS, TrainConfig
+from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
 
 
 def new_run_dir(config: TrainConfig) -> Path:
@@ -33,12 +35,14 @@ def new_run_dir(config: TrainConfig) -> Path:
 
 def _is_unfinished(path: Path) -> bool:
     """Whether a folder has nothing but what a run writes before its config."""
-    before_config = {LOCK, DEMONSTRATIONS, *(f"{name}.partial" for name in (DEMONSTRATIONS, CONFIG))}
+    inputs = DEMONSTRATIONS, MODELS
+    before_config = {LOCK, *inputs, *(f"{name}.partial" for name in (*inputs, CONFIG))}
     return path.is_dir() and {file.name for file in path.iterdir()} <= before_config
 
 
 def save_config(run_dir: Path, config: TrainConfig) -> None:
-    """Writes the resolved config."""
+    """Writes the resolved config, with the paths of the arms that the run started from."""
+    config = dataclasses.replace(config, env=with_original_models(config.env))
     write_atomically(run_dir / CONFIG, OmegaConf.to_yaml(OmegaConf.create(to_dict(config))))
 
 
@@ -47,12 +51,22 @@ def run_schema(trainer: str) -> DictConfig:
     return OmegaConf.merge(schema(TrainConfig), {"trainer": schema(TRAINERS[trainer])})  # type: ignore[return-value]
 
 
-def load_config(run_dir: Path) -> TrainConfig:
+def load_config(run_dir: Path, *, saved_models: bool = True) -> TrainConfig:
     """The config of a run.
 
+    Args:
+      run_dir: the run directory.
+      saved_models: whether its arms are those kept in the run directory, see `save_models`, instead of the files that
+        the run started from.
+
     Raises:
-      ValueError: no run directory, or a config that cannot be read.
+      ValueError: no run directory, a config that cannot be read, or model files that were changed.
     """
+    config = _read_config(run_dir)
+    return dataclasses.replace(config, env=with_saved_models(run_dir, config.env)) if saved_models else config
+
+
+def _read_config(run_dir: Path) -> TrainConfig:
     if not (run_dir / CONFIG).is_file():
         raise ValueError(f"{str(run_dir)!r} is not a run directory: it has no {CONFIG}")
     try:

@@ -11,7 +11,8 @@ import pytest
 
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.model_files import MAX_FILE_SIZE, read_model, read_spec
+from mimic.arms.model_files import read_model, read_spec
+from mimic.arms.model_source import MAX_FILE_SIZE
 from tests.helpers import original_model
 
 POSES = 40

@@ -15,16 +15,17 @@ from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import save_config
+from mimic.trainers.run_models import save_models
 
 COUNT, HELD_OUT, HORIZON = 4, 2, 20
 
 
-def environment(learner: Sequence[float] = (0.5, 0.5)) -> EnvConfig:
-    """A planar pair that compiles quickly."""
+def environment(learner: Sequence[float] = (0.5, 0.5), model: str = "planar") -> EnvConfig:
+    """A planar pair that compiles quickly; `model` is a file of another learner."""
     return mimic.env_config(
         "planar4dof",
         expert={"link_lengths": [0.4, 0.3, 0.3]},
-        learner={"link_lengths": list(learner)},
+        learner={"link_lengths": list(learner), "model": model},
         demonstrations={"count": COUNT, "held_out": HELD_OUT},
         horizon=HORIZON,
         physics="fused",
@@ -37,6 +38,7 @@ def untrained_run(folder: Path, **settings: Any) -> Path:
     config = TrainConfig(environment(**settings), ppo, compilation_cache="")
     trainer = PPOTrainer(config, None)
     folder.mkdir()
+    save_models(folder, config.env)
     save_config(folder, dataclasses.replace(config, trainer=trainer.settings))
     trainer.save_inputs(folder)
     env = trainer.evaluator.env

@@ -1,0 +1,126 @@
+"""The model files of a run's own arms, kept in its directory: the run does not depend on the files it started from."""
+
+import dataclasses
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mimic.arms.arm import ArmConfig
+from mimic.arms.model_copy import copied_files
+from mimic.arms.model_source import file_digest, read_source
+from mimic.envs.config import EnvConfig
+from mimic.runs.files import write_atomically
+
+MODELS, RECORD = "models", "models.json"
+_ROLES = "expert", "learner"
+_MAX_RECORD = 2**20  # bytes
+
+
+def save_models(run_dir: Path, env: EnvConfig) -> None:
+    """Copies the model files of the arms into the folder `models`; a run whose arms are from there keeps them.
+
+    The file `models.json` records the original paths and the checksums of the copies. The folder has its final name
+    only when it is complete.
+
+    Raises:
+      ValueError: a file that cannot be read any more.
+    """
+    arms = _own_arms(env)
+    folder = run_dir / MODELS
+    if not arms or any(Path(arm.model).is_relative_to(os.path.abspath(folder)) for arm in arms.values()):
+        return
+    partial = run_dir / f"{MODELS}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    for role, arm in arms.items():
+        for name, content in copied_files(read_source(arm.model), Path(arm.model).name).items():
+            place = partial / role / name
+            place.parent.mkdir(parents=True, exist_ok=True)
+            if isinstance(content, bytes):
+                place.write_bytes(content)
+            else:
+                shutil.copyfile(content, place)
+    record = {
+        "arms": {role: {"file": f"{role}/{Path(arm.model).name}", "original": arm.model} for role, arm in arms.items()},
+        "sha256": {str(path.relative_to(partial)): file_digest(path) for path in _files(partial)},
+    }
+    write_atomically(partial / RECORD, json.dumps(record, indent=2) + "\n")
+    shutil.rmtree(folder, ignore_errors=True)  # of a run that ended before it had a config
+    os.replace(partial, folder)
+
+
+def with_saved_models(run_dir: Path, env: EnvConfig) -> EnvConfig:
+    """The environment with the arms of the folder `models`; unchanged for a run without this folder.
+
+    Raises:
+      ValueError: the folder was changed.
+    """
+    arms, folder = _own_arms(env), run_dir / MODELS
+    if not arms or not folder.exists():
+        return env
+    record = _read_record(folder)
+    _check_files(folder, record["sha256"])
+    changes: dict[str, Any] = {}
+    for role, arm in arms.items():
+        file = record["arms"].get(role, {}).get("file")
+        if file not in record["sha256"]:
+            raise ValueError(f"{str(folder / RECORD)!r} has no model of the {role}; {_ADVICE}")
+        changes[role] = dataclasses.replace(arm, model=str(folder / file))
+    return dataclasses.replace(env, **changes)
+
+
+def with_original_models(env: EnvConfig) -> EnvConfig:
+    """The inverse of `with_saved_models`: with the files that the run started from."""
+    return dataclasses.replace(env, **{role: _original(arm, role) for role, arm in _own_arms(env).items()})
+
+
+def _original(arm: ArmConfig, role: str) -> ArmConfig:
+    folder = Path(arm.model).parents[1] if len(Path(arm.model).parents) > 1 else Path()
+    if folder.name != MODELS or Path(arm.model).parent.name != role or not (folder / RECORD).is_file():
+        return arm
+    return dataclasses.replace(arm, model=_read_record(folder)["arms"][role]["original"])
+
+
+_ADVICE = "copy the run again, or remove this folder to use the files that the run's config names"
+
+
+def _own_arms(env: EnvConfig) -> dict[str, ArmConfig]:
+    return {role: arm for role in _ROLES if (arm := getattr(env, role)).is_file}
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if not path.is_dir())
+
+
+def _read_record(folder: Path) -> Mapping[str, Any]:
+    path = folder / RECORD
+    try:
+        if not path.is_file():
+            raise ValueError("there is no such file")
+        with path.open("rb") as file:
+            record = json.loads(file.read(_MAX_RECORD))
+        for role, arm in record["arms"].items():
+            if not (role in _ROLES and isinstance(arm["file"], str) and isinstance(arm["original"], str)):
+                raise ValueError(f"unexpected entry {role!r}")
+        if not all(isinstance(text, str) for entry in record["sha256"].items() for text in entry):
+            raise ValueError("expected checksums of files")
+    except (ValueError, OSError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{str(path)!r} cannot be read: {reason}; {_ADVICE}") from error
+    return record
+
+
+def _check_files(folder: Path, expected: Mapping[str, str]) -> None:
+    """Rejects a folder whose files are not those that the record lists."""
+    found = [path for path in _files(folder) if path != folder / RECORD]
+    names = {str(path.relative_to(folder)) for path in found}
+    for name in sorted(names ^ set(expected)):
+        what = "is missing" if name in expected else "was added"
+        raise ValueError(f"{str(folder / name)!r} {what} since the training started; {_ADVICE}")
+    for path in found:
+        name = str(path.relative_to(folder))
+        is_same = path.is_file() and not path.is_symlink() and file_digest(path) == expected[name]
+        if not is_same:
+            raise ValueError(f"{str(path)!r} was changed since the training started; {_ADVICE}")

@@ -1,0 +1,214 @@
+"""Model files in a run directory: the run goes on with its own arm, whatever happens to the original file."""
+
+import dataclasses
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mimic
+from mimic.arms.arm import build_arm
+from mimic.commands.config import EvaluateConfig
+from mimic.commands.evaluate import prepare_evaluation
+from mimic.runs.files import CONFIG
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.run_config import load_config, new_run_dir, save_config
+from mimic.trainers.run_models import MODELS, RECORD, save_models
+from tests.helpers import original_model
+from tests.helpers.run_directories import write_run
+from tests.helpers.tiny import TINY
+from tests.helpers.untrained_run import untrained_run
+
+MESH = "".join(  # a tetrahedron
+    ["v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\n", "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"]
+)
+LINK = '<asset><mesh file="l.obj"/></asset>'
+PARTS = "<mujocoinclude><custom><numeric name='velocity_limit' data='1 2 3 4 5 6'/></custom></mujocoinclude>"
+BODIES = "".join(
+    f'<body pos="{x} 0 0"><joint name="joint{number}" axis="0 0 1" armature="0.02" damping="0.1"/>'
+    '<geom type="capsule" size="0.02" fromto="0 0 0 0.5 0 0" mass="0.5"/>'
+    for number, x in ((1, 0), (2, 0.5))
+)
+TWO_JOINTS = f'<mujoco model="two"><worldbody>{BODIES}</body></body></worldbody></mujoco>'
+
+
+def write_arm(folder, kind):
+    """An arm with a mesh in a folder of its own; the MJCF has an include too."""
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "meshes" / "l.obj").write_text(MESH)
+    if kind == "urdf":
+        (folder / "arm.urdf").write_text(original_model.urdf(mesh="package://arms/meshes/l.obj"))
+        return folder / "arm.urdf"
+    (folder / "limits.xml").write_text(PARTS)
+    hand = '<body><geom type="mesh" mesh="l" mass="0.1"/></body>'
+    text = original_model.ur_like(gripper=hand).replace("<worldbody>", f"{LINK}<worldbody>", 1)
+    text = text.replace('autolimits="true"', 'autolimits="true" meshdir="meshes"')
+    (folder / "arm.xml").write_text(text.replace("</mujoco>", '<include file="limits.xml"/></mujoco>'))
+    return folder / "arm.xml"
+
+
+@pytest.fixture(params=["mjcf", "urdf"])
+def run(request, tmp_path):
+    """A run of an own arm, and the arm's file."""
+    return start_run(tmp_path, request.param)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    return start_run(tmp_path_factory.mktemp("finished"), "mjcf")[0]
+
+
+def start_run(folder, kind):
+    file = write_arm(folder / "arms" / "arm" if kind == "mjcf" else folder / "arms", kind)
+    run_dir = write_run(folder / "run", [0.1])
+    config = load_config(run_dir)
+    env = mimic.env_config("pair", expert={"model": "planar", "link_lengths": [0.5, 0.5]}, learner=str(file))
+    save_models(run_dir, env)
+    save_config(run_dir, dataclasses.replace(config, env=env))
+    return run_dir, file
+
+
+def assert_same(arm, other):
+    for field in dataclasses.fields(arm.embodiment):
+        np.testing.assert_array_equal(getattr(arm.embodiment, field.name), getattr(other.embodiment, field.name))
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_pos", "dof_armature", "dof_damping"):
+        np.testing.assert_array_equal(getattr(arm.model, name), getattr(other.model, name))
+
+
+@pytest.mark.parametrize("change", ["moved", "changed", "deleted"])
+def test_a_run_keeps_its_arm(run, change, tmp_path):
+    run_dir, file = run
+    original = load_config(run_dir, saved_models=False).env.learner
+    assert original.model == str(file)
+    arm = build_arm(original)
+    if change == "moved":
+        shutil.rmtree(file.parent)
+        run_dir = run_dir.rename(tmp_path / "elsewhere")
+    elif change == "changed":
+        file.write_text(file.read_text().replace('"2"', '"7"').replace("8.4", "80"))
+    else:
+        file.unlink()
+    assert_same(build_arm(load_config(run_dir).env.learner), arm)
+
+
+def test_saving_the_config_again_keeps_original_path_and_models(run, tmp_path, monkeypatch):
+    run_dir, file = run
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    run_dir = Path("..", run_dir.name)
+    before = {path: path.read_bytes() for path in (run_dir / MODELS).rglob("*") if path.is_file()}
+    file.unlink()
+    config = load_config(run_dir)
+    assert str(tmp_path / run_dir.name) in config.env.learner.model
+    save_models(run_dir, config.env)
+    save_config(run_dir, config)
+    assert load_config(run_dir, saved_models=False).env.learner.model == str(file)
+    assert MODELS not in (run_dir / CONFIG).read_text()
+    assert {path: path.read_bytes() for path in (run_dir / MODELS).rglob("*") if path.is_file()} == before
+
+
+def test_a_run_that_starts_anew_replaces_the_models_of_one_without_config(run, tmp_path):
+    run_dir, file = run
+    (run_dir / CONFIG).rename(tmp_path / CONFIG)
+    other = tmp_path / "other" / "two.xml"
+    other.parent.mkdir()
+    other.write_text(TWO_JOINTS)
+    save_models(run_dir, mimic.env_config("pair", learner=str(other)))
+    assert {path.name for path in (run_dir / MODELS / "learner").iterdir()} == {"two.xml"}
+    unfinished = tmp_path / "unfinished"
+    shutil.copytree(run_dir / MODELS, unfinished / MODELS)
+    assert new_run_dir(TrainConfig(run_dir=str(unfinished))) == unfinished
+
+
+def test_a_run_without_models_loads_as_before(run):
+    run_dir, file = run
+    shutil.rmtree(run_dir / MODELS)
+    assert load_config(run_dir).env.learner.model == str(file)
+
+
+def append(path):
+    path.write_text(path.read_text() + " ")
+
+
+def with_record(change):
+    def apply(folder):
+        record = json.loads((folder / RECORD).read_text())
+        change(record)
+        (folder / RECORD).write_text(json.dumps(record))
+
+    return apply
+
+
+CHANGES = {
+    "a changed model": (lambda folder: append(next(folder.glob("learner/arm.*"))), "arm.* was changed since"),
+    "a changed mesh": (lambda folder: append(next(folder.rglob("*.obj"))), "l.obj' was changed since"),
+    "no mesh": (lambda folder: next(folder.rglob("*.obj")).unlink(), "l.obj' is missing since"),
+    "another file": (lambda folder: (folder / "learner" / "a.xml").write_text(""), "a.xml' was added since"),
+    "a pipe": (lambda folder: os.mkfifo(folder / "learner" / "a.xml"), "a.xml' was added since"),
+    "no record": (lambda folder: (folder / RECORD).unlink(), "models.json' cannot be read: there is no such file"),
+    "a broken record": (lambda folder: (folder / RECORD).write_text('{"arms'), "models.json' cannot be read: "),
+    "a list": (lambda folder: (folder / RECORD).write_text("[]"), "models.json' cannot be read: "),
+    "no checksums": (with_record(lambda record: record.pop("sha256")), "models.json' cannot be read: 'sha256'"),
+    "no learner": (with_record(lambda record: record["arms"].clear()), "models.json' has no model of the learner"),
+    "a file outside": (
+        with_record(lambda record: record["arms"]["learner"].update(file="../config.yaml")),
+        "models.json' has no model of the learner",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_changed_copies_are_rejected_in_one_line(finished, tmp_path, case):
+    run_dir = shutil.copytree(finished, tmp_path / "run")
+    change, message = CHANGES[case]
+    change(run_dir / MODELS)
+    with pytest.raises(ValueError, match=message) as error:
+        load_config(run_dir)
+    assert "\n" not in str(error.value)
+
+
+def test_a_moved_run_is_evaluated_without_the_file_of_its_arm(tmp_path):
+    file = tmp_path / "arm.xml"
+    file.write_text(TWO_JOINTS)
+    run_dir = untrained_run(tmp_path / "run", model=str(file))
+    file.unlink()
+    moved = run_dir.rename(tmp_path / "moved")
+    prepare_evaluation(EvaluateConfig(str(moved), compilation_cache=""), 0.0)  # builds the arms and loads the policy
+
+
+@pytest.mark.slow
+def test_commands_use_the_arm_of_a_moved_run(tmp_path):
+    """Training, evaluation, export, video and resuming, without the original file."""
+    file = tmp_path / "arm.xml"
+    file.write_text(TWO_JOINTS)
+    arguments = [f"env.learner.model={file}", *TINY, f"run_dir={tmp_path / 'first'}", "compilation_cache="]
+    command("train", *arguments, "env.physics=fused")
+    report = json.loads((tmp_path / "first" / "report.json").read_text())
+    file.write_text(TWO_JOINTS.replace('mass="0.5"', 'mass="5"'))
+    run_dir = (tmp_path / "first").rename(tmp_path / "run")
+    command("evaluate", f"run={run_dir}", f"out={tmp_path / 'out'}")
+    again = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert again["mean_distance"] == pytest.approx(report["mean_distance"], rel=1e-5)  # float32, in another process
+    file.unlink()
+    command("export", f"run={run_dir}", f"out={tmp_path / 'policy.onnx'}")
+    command("render", f"run={run_dir}", f"out={tmp_path / 'video.mp4'}")
+    command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
+    assert load_config(run_dir, saved_models=False).env.learner.model == str(file)
+    append(run_dir / MODELS / "learner" / "arm.xml")
+    for name in ("evaluate", "export", "render"):
+        error = command(name, f"run={run_dir}", f"out={tmp_path / name}", code=2)
+        assert error.startswith("error: ") and error.count("\n") == 1 and "was changed since" in error
+
+
+def command(name, *arguments, code=0):
+    """Runs a command, whose exit code must be this; returns its error output."""
+    result = subprocess.run(
+        [sys.executable, "-m", f"mimic.{name}", *arguments], capture_output=True, text=True, timeout=280, check=False
+    )
+    assert result.returncode == code, result.stderr[-2000:]
+    return result.stderr
