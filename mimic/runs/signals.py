@@ -144,7 +144,7 @@ def noted_signals(signals: Signals, notice: str = _NOTICE) -> Iterator[None]:
 
     def note(number: int) -> None:
         signals.caught.append(number)
-        _with_patience(lambda: print(notice, file=sys.stderr, flush=True))
+        with_patience(lambda: print(notice, file=sys.stderr, flush=True))
 
     with watched_signals():
         watch = _watch
@@ -189,12 +189,12 @@ def _exit(number: int) -> NoReturn:
         with contextlib.suppress(OSError, ValueError):
             print(f"stopped by {signal.Signals(number).name}", file=sys.stderr, flush=True)
 
-    _with_patience(finish)
+    with_patience(finish)
     os._exit(exit_code)
 
 
-def _with_patience(act: Callable[[], None]) -> None:
-    """Acts in a thread that may take longer: a blocked terminal must not keep a process from ending."""
+def with_patience(act: Callable[[], None]) -> None:
+    """Acts in a thread, and waits for it two seconds: a blocked terminal must not keep a process from ending."""
 
     def attempt() -> None:
         with contextlib.suppress(OSError, ValueError):

@@ -9,6 +9,7 @@ others miss its heartbeats, and end with one line that names it.
 import atexit
 import contextlib
 import dataclasses
+import functools
 import os
 import re
 import sys
@@ -19,7 +20,7 @@ from collections.abc import Callable
 import jax
 
 from mimic import compat
-from mimic.runs.signals import EXIT_HOOKS, STOPPED_BY_SIGNAL, Signals
+from mimic.runs.signals import EXIT_HOOKS, STOPPED_BY_SIGNAL, Signals, with_patience
 from mimic.trainers.distributed.heartbeats import Heartbeats
 from mimic.trainers.distributed.local_processes import LocalProcesses, gpu_count, local_process
 from mimic.trainers.distributed.relay import Relay
@@ -140,8 +141,6 @@ class ProcessGroup:
             if lost := self._heartbeats.lost():
                 process, silent_s = lost
                 reason = f"is lost or stopped: no sign of life for {silent_s:.0f} s"
-                if self.first or process:  # the first process can pass it on
-                    self._announce(_FAILED, process, reason)
             elif self._relay and self._relay.lost.is_set():
                 process, reason = 0, "is lost: its connection has closed"
                 if self._left.wait(_GRACE_S):
@@ -150,6 +149,7 @@ class ProcessGroup:
                 continue
             self._ending.acquire()
             _report(process, self._others, reason)
+            with_patience(functools.partial(self._announce, _FAILED, process, reason))
             if self._others:
                 self._others.end(patience_s=0)
             elif self.first:
