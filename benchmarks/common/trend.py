@@ -38,6 +38,8 @@ def trend(times: Sequence[float], values: Sequence[float]) -> Trend:
     if blocks < 3:
         return Trend(math.nan, math.nan, math.nan)
     x, y = (np.array([part.mean() for part in np.array_split(all_[late], blocks)]) for all_ in (x, y))
+    if np.ptp(y) == 0:
+        return Trend(0.0, 0.0, 0.0)
     fit = stats.linregress(x, y)
     margin = fit.stderr * stats.t.ppf(0.5 + _CONFIDENCE / 2, blocks - 2)
     return Trend(float(fit.slope), float(fit.slope - margin), float(fit.slope + margin))
