@@ -50,7 +50,9 @@ def soak(run_dir: Path, seconds: float, arguments: list[str]) -> Row:
             process.kill()
     if exit_code != STOPPED_BY_SIGNAL + signal.SIGTERM:
         sys.exit(f"error: the training ended with {exit_code}: {log.read_text(errors='replace')[-2000:]}")
-    speeds = [{"time_s": time, "steps_per_s": sps} for time, sps in read_metrics(run_dir, "wall_time_s", "training/sps")]
+    speeds = [
+        {"time_s": time, "steps_per_s": sps} for time, sps in read_metrics(run_dir, "wall_time_s", "training/sps")
+    ]
     began = speeds[0]["time_s"]  # samples before are of imports and compilation
     return {"samples": [row for row in samples if row["time_s"] >= began], "speeds": speeds}
 
@@ -76,7 +78,9 @@ def draw(measured: Row, path: Path) -> None:
     for axis, (name, series) in zip(axes, panels, strict=True):
         rows = measured[series]
         axis.plot([row["time_s"] / _HOUR for row in rows], [row[name] for row in rows], ".", markersize=2)
-        axis.set_ylabel({"memory_mib": "memory [MiB]", "disk_mib": "disk [MiB]", "steps_per_s": "steps/s"}.get(name, name))
+        axis.set_ylabel(
+            {"memory_mib": "memory [MiB]", "disk_mib": "disk [MiB]", "steps_per_s": "steps/s"}.get(name, name)
+        )
     axes[-1].set_xlabel("time [h]")
     figure.tight_layout()
     figure.savefig(path, dpi=120)

@@ -16,7 +16,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -35,8 +34,9 @@ SAMPLED = ["memory_mib", "handles", "threads"]
 _SAMPLES = 600
 _START_S = 120  # until the view is compiled
 _CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [2.0, 0.0, 1.0], "fov": 0.75, "near": 0.01,
-    "far": 1000.0, "image_height": 850, "image_width": 1360, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0],
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [2.0, 0.0, 1.0], "fov": 0.75,
+    "near": 0.01, "far": 1000.0, "image_height": 850, "image_width": 1360, "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
 }  # fmt: skip  # the first message of a page: before it, viser does not know the client
 _NOTE = re.compile(r'id="mimic-note"[^>]*>([^<]*)')
 
@@ -166,7 +166,9 @@ def main() -> None:
     write_results(options, **settings, **result)
     print_table(result["trends"], "what first:,.1f last:,.1f maximum:,.1f per_hour:,.2f low:,.2f high:,.2f flat")
     delays = ", ".join(f"{q} %: {delay:.0f} ms" for q, delay in result["delay_ms"].items())
-    print(f"{result['frames_per_s']:.1f} frames/s at a client; from slider to frame {delays}; errors: {result['errors']}")
+    print(
+        f"{result['frames_per_s']:.1f} frames/s at a client; from slider to frame {delays}; errors: {result['errors']}"
+    )
 
 
 if __name__ == "__main__":

@@ -49,7 +49,9 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
 
         run_dir, trained = policy_run(config.run, config.checkpoint)
         playback = Playback(trained, run_dir, config.checkpoint)
-        return lambda: _serve(config, trained.env, lambda *page: _play(*page, playback, config.split), playback.run)
+        return lambda: _serve(
+            config, trained.env, lambda page, times: _play(page, times, playback, config.split), playback.run
+        )
     mapper, env = None, config.resolve_env()
     if config.mapper:
         from mimic.trainers.pose_mapper.model import PoseMapper
@@ -57,7 +59,9 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
         env = load_config(Path(config.mapper).expanduser()).env
     live = LiveSession(env, mapper)
-    return lambda: _serve(config, env, lambda *page: _follow(*page, live, env, mapper is None), None, live.finish)
+    return lambda: _serve(
+        config, env, lambda page, times: _follow(page, times, live, env, mapper is None), None, live.finish
+    )
 
 
 def is_installed() -> bool:

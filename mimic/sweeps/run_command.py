@@ -41,7 +41,7 @@ class RunCommand:
     environment: dict[str, str | None] = dataclasses.field(default_factory=dict)
 
     def __call__(self) -> Outcome:
-        """Runs the command to its end. Forwards SIGTERM, SIGHUP and Ray's way to cancel, KeyboardInterrupt, as SIGTERM."""
+        """Runs the command. Forwards SIGTERM, SIGHUP and Ray's way to cancel, KeyboardInterrupt, as SIGTERM."""
         variables = {**os.environ, **self.environment}
         with (Path(self.folder) / self.log).open("a") as log:
             process = subprocess.Popen(

@@ -18,7 +18,8 @@ HOURS = np.linspace(0.0, 2.0, 600)
 
 def test_a_slope_is_found_in_noise():
     random = np.random.default_rng(0)
-    values = 400 + 25 * HOURS + np.cumsum(random.normal(0, 0.05, len(HOURS)))  # correlated, as memory is
+    values = 400 + 25 * HOURS + np.convolve(random.normal(0, 3, len(HOURS) + 9), np.ones(10) / 10, "valid")
+    # noise whose successive samples are correlated, as those of memory are
     change = trend(HOURS.tolist(), values.tolist())
     assert change.low < 25 < change.high and not change.is_flat
 

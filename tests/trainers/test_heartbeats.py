@@ -1,5 +1,7 @@
 """Lost processes: who is named, and when."""
 
+from typing import Any
+
 import pytest
 
 from mimic.trainers.distributed import heartbeats
@@ -19,7 +21,7 @@ def clock(monkeypatch):
 
 def run(beats, clock, seconds, alive, sign=""):
     """Some processes give signs for a time; the last verdict."""
-    verdict = None
+    verdict: Any = None
     for step in range(int(seconds * 2)):
         clock.now += 0.5
         for process in alive:
@@ -52,6 +54,7 @@ def test_the_first_one_is_named_if_nothing_is_heard(clock):
 
 def test_the_same_sign_again_is_none(clock):
     beats = Heartbeats(2)
+    lost: Any = None
     for _ in range(80):
         clock.now += 0.5
         beats.hear(0, f"{clock.now}")

@@ -20,8 +20,9 @@ from mimic.viewer.server import make_server
 
 PROTOCOL = f"viser-v{viser.__version__}"
 CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [2.0, 0.0, 1.0], "fov": 0.75, "near": 0.01,
-    "far": 1000.0, "image_height": 850, "image_width": 1360, "look_at": [0.0, 0.0, 0.0], "up_direction": [0.0, 0.0, 1.0],
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [2.0, 0.0, 1.0], "fov": 0.75,
+    "near": 0.01, "far": 1000.0, "image_height": 850, "image_width": 1360, "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
 }  # fmt: skip
 encode = msgspec.msgpack.encode
 
@@ -135,7 +136,7 @@ def test_twenty_clients_move_the_slider(served):
         for number, client in enumerate(clients):
             await client.send(encode(CAMERA))
             await client.send(move(slider, number / 100 + 0.01))
-        await until(lambda: {number / 100 + 0.01 for number in range(20)} <= set(values))
+            await until(lambda number=number: number / 100 + 0.01 in values)
         for client in clients:
             await client.close()
 

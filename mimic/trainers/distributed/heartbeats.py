@@ -32,7 +32,7 @@ class Heartbeats:
     def lost(self) -> tuple[int, float] | None:
         """A lost process and the time since its last sign [s]; None while all live.
 
-        If the first process is stopped, nothing is heard of any, so that of several it is the one with the least number.
+        If the first process is stopped, nothing is heard of any, so that of several it is the first one that is named.
         """
         now = time.monotonic()
         with self._lock:
