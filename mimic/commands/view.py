@@ -49,7 +49,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
 
         run_dir, trained = policy_run(config.run, config.checkpoint)
         playback = Playback(trained, run_dir, config.checkpoint)
-        return lambda: _serve(
+        return lambda: serve(
             config, trained.env, lambda page, times: _play(page, times, playback, config.split), playback.run
         )
     mapper, env = None, config.resolve_env()
@@ -59,7 +59,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
         env = load_config(Path(config.mapper).expanduser()).env
     live = LiveSession(env, mapper)
-    return lambda: _serve(
+    return lambda: serve(
         config, env, lambda page, times: _follow(page, times, live, env, mapper is None), None, live.finish
     )
 
@@ -88,7 +88,7 @@ def check_port(host: str, port: int) -> None:
             ) from None
 
 
-def _serve(
+def serve(
     config: ViewConfig,
     env: EnvConfig,
     show: "Callable[[Page, Iterator[float]], None]",
