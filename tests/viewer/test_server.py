@@ -42,7 +42,7 @@ def served():
 
 def page(port, **headers):
     """A connection as the page of the view makes it."""
-    options = {"subprotocols": [PROTOCOL], "origin": f"http://127.0.0.1:{port}", "max_size": None, **headers}
+    options = {"subprotocols": [PROTOCOL], "origin": f"http://127.0.0.1:{port}", "max_size": None, "close_timeout": 0.2, **headers}
     return connect(f"ws://127.0.0.1:{port}", **options)
 
 
@@ -137,8 +137,7 @@ def test_twenty_clients_move_the_slider(served):
             await client.send(encode(CAMERA))
             await client.send(move(slider, number / 100 + 0.01))
             await until(lambda number=number: number / 100 + 0.01 in values)
-        for client in clients:
-            await client.close()
+        await asyncio.gather(*(client.close() for client in clients))
 
     values.clear()
     asyncio.run(send())
