@@ -42,7 +42,13 @@ def served():
 
 def page(port, **headers):
     """A connection as the page of the view makes it."""
-    options = {"subprotocols": [PROTOCOL], "origin": f"http://127.0.0.1:{port}", "max_size": None, "close_timeout": 0.2, **headers}
+    options = {
+        "subprotocols": [PROTOCOL],
+        "origin": f"http://127.0.0.1:{port}",
+        "max_size": None,
+        "close_timeout": 0.2,
+        **headers,
+    }
     return connect(f"ws://127.0.0.1:{port}", **options)
 
 
