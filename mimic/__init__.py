@@ -5,7 +5,12 @@ The core functions are pure and take one sample; batch them with `jax.vmap`.
 
 from typing import TYPE_CHECKING, Any
 
-from mimic import compat
+from mimic.runs import signals
+
+if signals.runs_as_command():  # a command ends in one line from here on: the imports below take a second
+    signals.watch_signals()
+
+from mimic import compat  # noqa: E402
 
 compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
 compat.import_mujoco()

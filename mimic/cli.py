@@ -3,7 +3,6 @@
 import contextlib
 import os
 import re
-import signal
 import sys
 import threading
 import time
@@ -35,7 +34,7 @@ from mimic.commands.config import (
 )
 from mimic.config import explain, schema
 from mimic.envs.config import EnvConfig
-from mimic.runs.signals import STOPPED_BY_SIGNAL
+from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals
 from mimic.sweeps.launchers import check_launcher, register_launchers
 from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import TRAINERS, TrainConfig
@@ -87,12 +86,10 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         return Outcome()
 
     try:
-        command()
+        with watched_signals():
+            command()
     except _CONFIG_ERRORS as error:
         _exit_with_error(error)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(STOPPED_BY_SIGNAL + signal.SIGINT)
 
 
 def _sweep_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:

@@ -22,6 +22,8 @@ def prepare(config: TrainConfig) -> cli.Work:
     started = _process_started.pop() if _process_started else prepare_started
     signals = group.signals if group else Signals()
     work = train.prepare_training(config, started, cli.overrides(), group, signals)
+    if group:
+        return lambda: group.run(work)
     # A signal during the final report does not change the exit code of this run, but it ends a sweep.
     return (lambda: work() or signals.exit_code) if cli.is_sweep() else work
 

@@ -3,10 +3,10 @@
 import contextlib
 import importlib.util
 import io
-import signal
 import socket
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +14,11 @@ from mimic import compat
 from mimic.arms.arm import build_arm
 from mimic.commands.config import ViewConfig
 from mimic.envs.config import EnvConfig
+from mimic.runs.signals import Signals, noted_signals
 from mimic.trainers.run_config import load_config
 from mimic.viewer.history import RATE, History
 from mimic.viewer.live_session import Frame, LiveSession
+from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
     from mimic.viewer.page import Page
@@ -47,7 +49,9 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
 
         run_dir, trained = policy_run(config.run, config.checkpoint)
         playback = Playback(trained, run_dir, config.checkpoint)
-        return lambda: _serve(config, trained.env, lambda page: _play(page, playback, config.split), playback.run)
+        return lambda: serve(
+            config, trained.env, lambda page, times: _play(page, times, playback, config.split), playback.run
+        )
     mapper, env = None, config.resolve_env()
     if config.mapper:
         from mimic.trainers.pose_mapper.model import PoseMapper
@@ -55,7 +59,9 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
         env = load_config(Path(config.mapper).expanduser()).env
     live = LiveSession(env, mapper)
-    return lambda: _serve(config, env, lambda page: _follow(page, live, env, mapper is None), None, live.finish)
+    return lambda: serve(
+        config, env, lambda page, times: _follow(page, times, live, env, mapper is None), None, live.finish
+    )
 
 
 def is_installed() -> bool:
@@ -82,43 +88,51 @@ def check_port(host: str, port: int) -> None:
             ) from None
 
 
-def _serve(
+def serve(
     config: ViewConfig,
     env: EnvConfig,
-    show: "Callable[[Page], None]",
+    show: "Callable[[Page, Iterator[float]], None]",
     before: Callable[[], None] | None = None,
     after: Callable[[], None] | None = None,
 ) -> int:
-    """Serves a page until Ctrl-C or SIGTERM. Calls `before` before the server starts and `after` when it has ended."""
-    import viser
-
+    """Serves a page until a signal. Calls `before` before the server starts and `after` when it has ended."""
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
+    from mimic.viewer.server import make_server
 
-    for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C too: it is ignored in background jobs of a script
-        signal.signal(number, signal.default_int_handler)
-    server = None
-    try:
-        if before is not None:
-            before()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner, which `verbose` does not turn off
-            server = viser.ViserServer(host=config.host, port=config.port, label="mimic", verbose=False)
-        shapes = [ArmShape(arm, env.limits) for arm in (env.expert, env.learner)]
-        names = [build_arm(arm, env.limits).embodiment.name.partition("-")[0] for arm in (env.expert, env.learner)]
-        is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
-        page = Page(server, shapes, names, _title(config, env), is_flat)
-        host = "127.0.0.1" if config.host in ("0.0.0.0", "::") else config.host
-        print(f"view: http://{host}:{server.get_port()}   (Ctrl-C ends it)", flush=True)
-        show(page)
-    except KeyboardInterrupt:
-        print("\nview: ended", flush=True)
-    finally:
-        if server is not None:
+    if before is not None:
+        before()
+    if not is_local(config.host):
+        print(
+            f"view: host={config.host}: everyone who can reach this machine can see and move the arms; there is no "
+            f"password. Safer: ssh -L {config.port}:localhost:{config.port} {socket.gethostname()}",
+            file=sys.stderr,
+        )
+    signals = Signals()
+    with noted_signals(signals, "view: ending; repeat to stop immediately"):
+        server, gatekeeper = make_server(config.host, config.port)
+        try:
+            shapes = [ArmShape(arm, env.limits) for arm in (env.expert, env.learner)]
+            names = [build_arm(arm, env.limits).embodiment.name.partition("-")[0] for arm in (env.expert, env.learner)]
+            is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
+            page = Page(server, shapes, names, _title(config, env), is_flat)
+            print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
+            show(page, ticks(signals))
+        finally:
             with contextlib.redirect_stdout(io.StringIO()):
                 server.stop()
-        if after is not None:
-            after()
+            if after is not None:
+                after()
+    counts = {"rejected requests": gatekeeper.rejected, "dropped messages": gatekeeper.dropped}
+    noticed = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    print(f"\nview: ended{noticed and f' ({noticed})'}", flush=True)
     return 0
+
+
+def address(host: str, port: int) -> str:
+    """The address to open in a browser on this machine."""
+    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
 
 
 def _title(config: ViewConfig, env: EnvConfig) -> str:
@@ -126,12 +140,12 @@ def _title(config: ViewConfig, env: EnvConfig) -> str:
     return f"{env.name or 'mimic'}: the learner is moved by the {controller}"
 
 
-def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
+def _follow(page: "Page", times: Iterator[float], live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
     from mimic.viewer.controls import LiveControls
 
     controls = LiveControls(page.server, live, env, can_lock)
     history, frame, was_compiling = History(), None, True
-    for dt in _ticks():
+    for dt in times:
         try:
             new_frame = live.advance(dt)
         except ValueError as error:
@@ -149,21 +163,21 @@ def _follow(page: "Page", live: LiveSession, env: EnvConfig, can_lock: bool) -> 
         controls.update()
 
 
-def _play(page: "Page", playback: Any, split: str) -> None:
+def _play(page: "Page", times: Iterator[float], playback: Any, split: str) -> None:
     from mimic.viewer.player import Player
 
     player = Player(page.server, playback, split)
-    for dt in _ticks():
+    for dt in times:
         if player.advance(dt):
             episode = player.split, player.demonstration
             frame = playback.frame(*episode, player.time)
             page.show(frame, playback.chart(*episode, player.time), playback.note(*episode))
 
 
-def _ticks() -> Any:
-    """Yields the time since the last tick [s], at most `RATE` times per second."""
+def ticks(signals: Signals) -> Iterator[float]:
+    """Yields the time since the last tick [s], at most `RATE` times per second, until a signal."""
     last = time.perf_counter()
-    while True:
+    while not signals.caught:
         time.sleep(max(0.0, last + 1 / RATE - time.perf_counter()))
         now = time.perf_counter()
         yield min(now - last, _MAX_STEP)

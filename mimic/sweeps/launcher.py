@@ -4,7 +4,7 @@ import importlib
 import sys
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
-from mimic.runs.signals import Signals, noted_signals
+from mimic.runs.signals import Signals, exit_hook, noted_signals
 from mimic.sweeps.run_command import RunCommand
 from mimic.sweeps.sweeper import FAILED, LOGS, Outcome, path_of
 
@@ -60,7 +60,7 @@ class CommandLauncher(Launcher):
         slots = list(range(self.max_parallel or len(commands)))
         outcomes: dict[int, Outcome] = {}
         signals = Signals()
-        with noted_signals(signals, self.notice):
+        with noted_signals(signals, self.notice), exit_hook(lambda _: self._cancel(running)):
             while waiting or running:
                 if signals.caught:
                     self._stop([job for _, job in running.values()], signals)
@@ -82,6 +82,10 @@ class CommandLauncher(Launcher):
             JobReturn(overrides=list(overrides), status=JobStatus.COMPLETED, _return_value=outcomes[number])
             for number, overrides in enumerate(job_overrides)
         ]
+
+    def _cancel(self, running: Mapping[int, tuple[int, Any]]) -> None:
+        for _, job in list(running.values()):
+            self.cancel(job)
 
     def _stop(self, running: Sequence[Any], signals: Signals) -> None:
         for job in running:

@@ -13,10 +13,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from mimic.runs.signals import STOPPED_BY_SIGNAL
+from mimic.runs.signals import NOTED, STOPPED_BY_SIGNAL
 from mimic.sweeps.sweeper import FAILED, Outcome, path_override
 
 _POLL_S = 0.2
+_FORWARDED = tuple(number for number in NOTED if number.name in ("SIGTERM", "SIGHUP"))
 
 
 @dataclasses.dataclass
@@ -40,7 +41,7 @@ class RunCommand:
     environment: dict[str, str | None] = dataclasses.field(default_factory=dict)
 
     def __call__(self) -> Outcome:
-        """Runs the command to its end. Forwards SIGTERM, and KeyboardInterrupt (Ray's way to cancel) as SIGTERM."""
+        """Runs the command. Forwards SIGTERM, SIGHUP and Ray's way to cancel, KeyboardInterrupt, as SIGTERM."""
         variables = {**os.environ, **self.environment}
         with (Path(self.folder) / self.log).open("a") as log:
             process = subprocess.Popen(
@@ -52,7 +53,7 @@ class RunCommand:
                 start_new_session=True,  # signals reach it only through this process
             )
         self._process = process
-        previous = signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+        previous = {number: signal.signal(number, lambda *_: process.terminate()) for number in _FORWARDED}
         try:
             while process.poll() is None:  # not wait(), which `checkpoint` could not interrupt
                 time.sleep(_POLL_S)
@@ -62,7 +63,8 @@ class RunCommand:
             if process.returncode is None:
                 process.terminate()
                 process.wait()
-            signal.signal(signal.SIGTERM, previous or signal.SIG_DFL)
+            for number, handler in previous.items():
+                signal.signal(number, handler or signal.SIG_DFL)
         return self._outcome(process.wait())
 
     def checkpoint(self) -> Any:

@@ -22,6 +22,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
 from mimic.runs.files import CONFIG, REPORT
+from mimic.runs.signals import exit_hook
 from mimic.sweeps.hydra_plugins import register, target
 
 SWEEP, LOGS = "sweep.json", "logs"
@@ -93,9 +94,10 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         OmegaConf.save(self.config, folder / "multirun.yaml")
         _write_sweep(folder, planned, [])
         try:
-            returned = self.launcher.launch(list(remaining.values()), initial_job_idx=0) if remaining else []
-        except (SystemExit, KeyboardInterrupt):
-            print(f"the sweep was stopped; what there is of it: {folder}", file=sys.stderr)
+            with exit_hook(lambda _: _report_stop(folder)):
+                returned = self.launcher.launch(list(remaining.values()), initial_job_idx=0) if remaining else []
+        except SystemExit:
+            _report_stop(folder)
             raise
         launched = dict(zip(remaining, (job.return_value for job in returned), strict=True))
         outcomes = [launched.get(number, Outcome()) for number in range(len(planned))]
@@ -131,6 +133,10 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
             print(f"failed: {run.label}: {outcome.reason}", file=sys.stderr)
         if failed:
             sys.exit(FAILED)
+
+
+def _report_stop(folder: Path) -> None:
+    print(f"the sweep was stopped; what there is of it: {folder}", file=sys.stderr)
 
 
 def _run_dir(config: DictConfig, folder: Path, number: str) -> tuple[str, list[str]]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ from mimic.retargeting.pose import continuous_joints, imitate_pose, wrap_angles
 
 Mapper = Callable[[Array], Array]  # pose of the expert -> pose of the learner
 
+_MAX_COMPILED = 16  # sets of functions that are kept; each takes some MB
 _TRACKING_ITERATIONS = 8  # Newton steps from the current pose, which is close: sliders move in small steps
 
 
@@ -42,6 +44,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_choice("correspondence", self.correspondence, CORRESPONDENCES)
+        for name, weight in (("translation", self.translation), ("rotation", self.rotation)):
+            if not 0 <= weight < math.inf:
+                raise ValueError(f"{name}: expected a finite weight of at least 0, got {weight}")
 
     @property
     def compilation_key(self) -> tuple[tuple[str, ...], str, bool]:
@@ -218,6 +223,8 @@ class FunctionCache:
             self._thread.join()
 
     def _run(self, key: Any, settings: Settings) -> None:
+        while len(self._results) >= _MAX_COMPILED:
+            del self._results[next(iter(self._results))]
         try:
             for functions in self._compile(settings):
                 self._results[key] = functions

@@ -98,7 +98,9 @@ class LiveSession:
         return self._motion is not None
 
     def move(self, joint: int, angle: float) -> None:
-        """Sets one joint of the expert to an angle [rad] and stops any motion."""
+        """Sets one joint of the expert to an angle [rad] and stops any motion; NaN and infinity are dropped."""
+        if not math.isfinite(angle):
+            return
         with self._lock:
             self._motion = None
             pose = self.pose

@@ -94,9 +94,8 @@ def _mesh(scene: viser.SceneApi, path: str, part: Part) -> Any:
 
 
 def _set_stage(server: viser.ViserServer, reach: float, is_flat: bool) -> None:
-    server.gui.configure_theme(
-        control_layout="collapsible", control_width="large", show_logo=False, show_share_button=False
-    )
+    server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(True, cast_shadow=True)
     server.scene.add_grid(

@@ -1,5 +1,6 @@
 """Controls of a playback: play, pause, scrub, and the demonstration."""
 
+import math
 from typing import Any
 
 import viser
@@ -49,7 +50,7 @@ class Player:
         self._button.label = "pause" if playing else "play"
 
     def _scrubbed(self, event: Any) -> None:
-        if event.client is not None:  # the user moved it, not `advance`
+        if event.client is not None and math.isfinite(event.target.value):  # the user moved it, not `advance`
             self._set_playing(False)
             self.time, self._changed = float(event.target.value), True
 

@@ -193,7 +193,12 @@ def test_training_ends_at_the_target_gap(tmp_path):
     assert json.loads((run_dir / "report.json").read_text())["env_steps"] < 5000
 
 
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
+SLOW_SIGNALS = signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in SLOW_SIGNALS)]
+)
 def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
     run_dir = tmp_path / "stopped"
     arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
@@ -211,3 +216,23 @@ def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
     assert process.returncode == 128 + number, error[-2000:]
     assert f"resume={run_dir}" in out.replace("\n", "") and "stopping at the next checkpoint" in error
     assert list((run_dir / "checkpoints").iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_leaves_no_partial_checkpoint(number, tmp_path):
+    run_dir = tmp_path / "stopped"
+    arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mimic.train", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    until = time.monotonic() + 200
+    while time.monotonic() < until and not list(run_dir.glob("config.yaml")):
+        assert process.poll() is None, process.communicate()[1][-2000:]
+        time.sleep(0.2)
+    for pause in (0.4, 0.0):
+        process.send_signal(number)
+        time.sleep(pause)
+    _, error = process.communicate(timeout=20)  # it does not wait for a checkpoint
+    assert process.returncode == 128 + number and error.splitlines()[1:] == [f"stopped by {number.name}"], error
+    assert all(path.name.isdigit() for path in run_dir.glob("checkpoints/*"))

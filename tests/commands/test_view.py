@@ -10,6 +10,8 @@ import pytest
 
 from mimic.commands import view
 from mimic.commands.config import ViewConfig
+from mimic.envs import env_config
+from mimic.runs.signals import Signals
 
 
 @pytest.mark.parametrize(
@@ -57,6 +59,33 @@ def test_only_the_page_of_the_view_imports_viser():
 def test_arms_can_be_named_by_their_environment():
     arms = ViewConfig(expert="planar4dof", learner="planar4dof").resolve_env()
     assert len(arms.expert.link_lengths) == 7 and len(arms.learner.link_lengths) == 4
+
+
+@pytest.mark.parametrize(
+    ("host", "url"),
+    [("127.0.0.1", "127.0.0.1"), ("0.0.0.0", "127.0.0.1"), ("::", "[::1]"), ("::1", "[::1]"), ("node1", "node1")],
+)
+def test_the_address_can_be_opened(host, url):
+    assert view.address(host, 8080) == f"http://{url}:8080"
+
+
+def test_ticks_end_with_a_signal():
+    signals = Signals()
+    ticks = view.ticks(signals)
+    assert next(ticks) >= 0
+    signals.caught.append(signal.SIGINT)
+    assert list(ticks) == []
+
+
+@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-mjx[view]'")
+@pytest.mark.parametrize(("host", "warned"), [("0.0.0.0", True), ("127.0.0.1", False)])
+def test_a_view_that_others_can_reach_says_so(host, warned, capsys):
+    config = ViewConfig(env=env_config("planar4dof"), host=host, port=free_port())
+    shown = []
+    assert view.serve(config, config.env, lambda page, times: shown.append(page)) == 0
+    output = capsys.readouterr()
+    assert shown and f"view: http://127.0.0.1:{config.port}" in output.out and "view: ended\n" in output.out
+    assert ("everyone who can reach this machine" in output.err) == warned
 
 
 def free_port():

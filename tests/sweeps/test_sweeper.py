@@ -1,7 +1,9 @@
 """Sweeps: their runs and launchers, failed runs, and signals."""
 
+import contextlib
 import json
 import os
+import pathlib
 import signal
 import stat
 import subprocess
@@ -207,10 +209,11 @@ def test_a_run_gets_its_environment(program, monkeypatch):
     assert program(text, environment={"A": None, "B": "2"})().exit_code == 0
 
 
-def test_sigterm_is_passed_on(program, tmp_path):
-    after_begin(tmp_path, lambda: os.kill(os.getpid(), signal.SIGTERM))
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_signals_are_passed_on(program, tmp_path, number):
+    after_begin(tmp_path, lambda: os.kill(os.getpid(), number))
     assert program(WAITS)().exit_code == 143
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(number) == signal.SIG_DFL
 
 
 def test_a_time_limit_stops_a_run_that_can_be_resumed(program, tmp_path):
@@ -328,3 +331,41 @@ def test_ctrl_c_ends_a_sweep_at_the_next_checkpoint(launcher, tmp_path):
     assert not list(tmp_path.glob("sweep/1-*"))
     result = command("collect", "sweep", folder=tmp_path)
     assert result.returncode == 2 and "expected runs with a report.json, found none" in result.stderr
+
+
+def running(text):
+    """Ids of the processes with this in their command."""
+    found = []
+    for path in pathlib.Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if text in (path / "cmdline").read_bytes().decode(errors="replace"):
+                found.append(int(path.name))
+    return found
+
+
+@pytest.mark.slow
+def test_ctrl_c_twice_ends_a_sweep_and_its_runs_immediately(tmp_path):
+    endless = ["trainer.num_timesteps=100000000", "trainer.evaluations=1"]  # no checkpoint for a long time
+    arguments = ["-m", *SHORT, *endless, "seed=0,1", "hydra/launcher=submitit_local", "hydra.launcher.parallel=2"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mimic.train", *arguments, f"hydra.sweep.dir={tmp_path}/sweep"],
+        cwd=tmp_path,
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    until = time.monotonic() + 200
+    while time.monotonic() < until and len(list(tmp_path.glob("sweep/*/config.yaml"))) < 2:
+        assert process.poll() is None, process.communicate()[1][-2000:]
+        time.sleep(0.2)
+    for pause in (1.0, 0.0):
+        os.killpg(process.pid, signal.SIGINT)
+        time.sleep(pause)
+    _, error = process.communicate(timeout=30)
+    assert process.returncode == 130 and "Traceback" not in error, error[-2000:]
+    assert "the sweep was stopped" in error
+    until = time.monotonic() + 20
+    while left := running(str(tmp_path)):
+        assert time.monotonic() < until, left
+        time.sleep(0.2)

@@ -153,6 +153,48 @@ def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path, early):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+@pytest.mark.parametrize("lost", [0, 1])
+def test_all_end_within_a_minute_if_one_is_stopped_or_killed(tmp_path, number, lost):
+    processes = start(tmp_path, "run_dir=run", *LONG)
+    wait_for_checkpoint(tmp_path, processes)
+    os.kill(processes[lost].pid, number)
+    began = time.monotonic()
+    other = processes[1 - lost]
+    try:
+        shown = other.communicate(timeout=100)[0]
+        assert time.monotonic() - began < 60
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    assert other.returncode == 1 and shown.count(f"error: process {lost} of the training is lost") == 1, shown
+    assert "Traceback" not in shown and "stack trace" not in shown
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0, 1])
+def test_one_command_ends_if_a_process_of_it_is_stopped(tmp_path, lost):
+    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
+    wait_for_checkpoint(tmp_path, [process])
+    (other,) = started_by(process)
+    os.kill([process.pid, other][lost], signal.SIGSTOP)
+    began = time.monotonic()
+    while lost == 0 and there(other) and state(other) != "Z":
+        assert time.monotonic() - began < 60
+        time.sleep(0.2)
+    if lost == 0:
+        process.send_signal(signal.SIGCONT)
+    ((code, shown),) = finish([process])
+    assert code == 1 and f"process {lost} of the training is lost or stopped" in shown, shown[-2000:]
+    assert time.monotonic() - began < 60 + 20 and not there(other)
+
+
+def state(process):
+    return pathlib.Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+@pytest.mark.slow
 def test_input_that_both_processes_reject_is_one_line(tmp_path):
     process = alone(tmp_path, "distributed.processes=3", "run_dir=run")
     ((code, shown),) = finish([process])

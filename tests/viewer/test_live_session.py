@@ -52,6 +52,19 @@ def settle(session, seconds=6.0):
     raise AssertionError("the learner does not come to rest")
 
 
+@pytest.mark.parametrize("angle", [float("nan"), float("inf"), -float("inf")])
+def test_an_angle_that_is_no_number_is_dropped(live, angle):
+    before = live.pose
+    live.move(1, angle)
+    assert np.array_equal(live.pose, before)
+
+
+@pytest.mark.parametrize("weight", [float("nan"), float("inf"), -0.1])
+def test_a_weight_that_is_no_weight_is_rejected(live, weight):
+    with pytest.raises(ValueError, match="rotation: expected a finite weight of at least 0"):
+        live.change(rotation=weight)
+
+
 def test_the_learner_follows_and_rests_at_the_bound(live):
     start = settle(live)
     assert start.bound <= start.distance < start.bound * 1.01  # the tolerance at which it stops searching, ten times

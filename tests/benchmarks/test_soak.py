@@ -1,0 +1,66 @@
+"""`python -m benchmarks.soak`: slopes with their confidence, and a short soak."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from benchmarks import soak
+from benchmarks.common.process_samples import sample, trends
+from benchmarks.common.trend import trend
+
+HOURS = np.linspace(0.0, 2.0, 600)
+
+
+def test_a_slope_is_found_in_noise():
+    random = np.random.default_rng(0)
+    values = 400 + 25 * HOURS + np.convolve(random.normal(0, 3, len(HOURS) + 9), np.ones(10) / 10, "valid")
+    # noise whose successive samples are correlated, as those of memory are
+    change = trend(HOURS.tolist(), values.tolist())
+    assert change.low < 25 < change.high and not change.is_flat
+
+
+def test_noise_and_a_warm_up_are_flat():
+    random = np.random.default_rng(1)
+    values = 400 - 100 * np.exp(-HOURS / 0.05) + random.normal(0, 3, len(HOURS))
+    assert trend(HOURS.tolist(), values.tolist()).is_flat
+
+
+def test_constant_values_are_flat_and_few_have_no_slope():
+    assert trend([0, 1, 2, 3, 4], [7.0] * 5) == (0, 0, 0)
+    assert math.isnan(trend([0, 1], [0, 1]).slope) and not trend([], []).is_flat
+
+
+def test_a_process_is_sampled(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "file").write_bytes(b"x" * 2**20)
+    row = sample(os.getpid(), tmp_path)
+    assert row["disk_mib"] == 1 and row["files"] == 1 and row["memory_mib"] > 10
+    with (tmp_path / "folder" / "file").open():
+        assert sample(os.getpid())["handles"] == row["handles"] + 1
+
+
+def test_the_summary_counts_the_memory_of_each_evaluation(tmp_path):
+    samples = [{"time_s": 10.0 * i, **dict.fromkeys(soak.SAMPLED, 5.0), "memory_mib": 400 + i / 10} for i in range(100)]
+    speeds = [{"time_s": float(i), "steps_per_s": 100.0} for i in range(991)]
+    result = soak.summary({"samples": samples, "speeds": speeds}, tmp_path)
+    memory = next(row for row in result["trends"] if row["what"] == "memory_mib")
+    assert memory["per_hour"] == pytest.approx(36) and not memory["flat"]
+    assert result["memory_kib_per_evaluation"] == pytest.approx(36 * 0.275 / 991 * 1024, rel=1e-3)
+    soak.draw({"samples": samples, "speeds": speeds}, tmp_path / "soak.png")
+    assert (tmp_path / "soak.png").stat().st_size > 0
+    assert trends(samples, ["handles"])[0]["flat"]
+
+
+@pytest.mark.slow
+def test_a_short_soak(tmp_path):
+    out = tmp_path / "soak.json"
+    command = [sys.executable, "-m", "benchmarks.soak", "--hours", "0.015", "--out", str(out)]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert result.returncode == 0, result.stderr[-2000:]
+    measured = json.loads(out.read_text())
+    assert measured["evaluations"] > 0 and len(measured["samples"]) > 3 and out.with_suffix(".png").exists()

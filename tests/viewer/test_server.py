@@ -1,0 +1,149 @@
+"""The server of a view, over real connections: other sites, broken messages, many clients."""
+
+import asyncio
+import importlib.util
+import math
+import socket
+import time
+
+import pytest
+
+if importlib.util.find_spec("viser") is None:
+    pytest.skip("needs viser: pip install 'mimic-mjx[view]'", allow_module_level=True)
+
+import msgspec
+import viser
+from websockets.asyncio.client import connect
+from websockets.exceptions import InvalidStatus
+
+from mimic.viewer.server import make_server
+
+PROTOCOL = f"viser-v{viser.__version__}"
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [2.0, 0.0, 1.0], "fov": 0.75,
+    "near": 0.01, "far": 1000.0, "image_height": 850, "image_width": 1360, "look_at": [0.0, 0.0, 0.0],
+    "up_direction": [0.0, 0.0, 1.0],
+}  # fmt: skip
+encode = msgspec.msgpack.encode
+
+
+@pytest.fixture(scope="module")
+def served():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    server, gatekeeper = make_server("127.0.0.1", port)
+    values = []
+    slider = server.gui.add_slider("joint", -1.0, 1.0, 0.01, 0.0)
+    slider.on_update(lambda event: values.append(event.target.value) if event.client else None)
+    yield server.get_port(), gatekeeper, slider, values
+    server.stop()
+
+
+def page(port, **headers):
+    """A connection as the page of the view makes it."""
+    options = {
+        "subprotocols": [PROTOCOL],
+        "origin": f"http://127.0.0.1:{port}",
+        "max_size": None,
+        "close_timeout": 0.2,
+        **headers,
+    }
+    return connect(f"ws://127.0.0.1:{port}", **options)
+
+
+def move(slider, value):
+    return encode({"type": "GuiUpdateMessage", "uuid": slider._impl.uuid, "updates": {"value": value}})
+
+
+async def until(condition):
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"additional_headers": {"Host": "evil.example"}, "origin": "http://evil.example"},
+        {"subprotocols": None},
+    ],
+    ids=str,
+)
+def test_pages_of_other_sites_are_rejected(served, headers):
+    port, gatekeeper, *_ = served
+    before = gatekeeper.rejected
+
+    async def attempt():
+        async with page(port, **headers):
+            pass
+
+    with pytest.raises(InvalidStatus, match="403"):
+        asyncio.run(attempt())
+    assert gatekeeper.rejected == before + 1
+
+
+@pytest.mark.parametrize(("host", "status"), [("127.0.0.1", b"200"), ("evil.example", b"403")])
+def test_the_page_is_for_own_names_and_not_for_frames(served, host, status):
+    with socket.create_connection(("127.0.0.1", served[0])) as browser:
+        browser.sendall(f"GET / HTTP/1.1\r\nHost: {host}:{served[0]}\r\n\r\n".encode())
+        answer = browser.recv(65536)
+    assert answer.split()[1] == status and b"frame-ancestors 'self'" in answer
+
+
+def test_broken_messages_are_dropped_and_counted(served, capfd):
+    port, gatekeeper, slider, values = served
+    broken = [b"garbage", "text", b"", b"\xc1", b"\x91" * 5000, encode(5), encode({"type": "GuiUpdateMessage"})]
+    broken += [move(slider, value) for value in (math.nan, math.inf, 5.0, "0.5", None)]
+
+    async def send():
+        async with page(port) as first, page(port) as second:
+            for client in (first, second):
+                await client.send(encode(CAMERA))
+            for message in broken:
+                await first.send(message)
+            await first.send(move(slider, 0.25))
+            await until(lambda: 0.25 in values)  # the sender goes on, and so does the other one
+            await second.send(move(slider, 0.5))
+            await until(lambda: 0.5 in values)
+
+    before = gatekeeper.dropped
+    values.clear()
+    asyncio.run(send())
+    assert gatekeeper.dropped - before == len(broken) and values == [0.25, 0.5]
+    error = capfd.readouterr().err
+    assert "Traceback" not in error and error.count("dropped a message") <= 1  # once for each address
+
+
+def test_a_message_that_is_too_long_ends_its_connection_alone(served, capfd):
+    port, _, slider, values = served
+
+    async def send():
+        async with page(port) as first, page(port) as second:
+            await second.send(encode(CAMERA))
+            await first.send(b"\0" * 100_000)
+            await first.wait_closed()
+            assert first.close_code == 1009
+            await second.send(move(slider, -0.5))
+            await until(lambda: -0.5 in values)
+
+    asyncio.run(send())
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_twenty_clients_move_the_slider(served):
+    port, _, slider, values = served
+
+    async def send():
+        clients = [await page(port) for _ in range(20)]
+        for number, client in enumerate(clients):
+            await client.send(encode(CAMERA))
+            await client.send(move(slider, number / 100 + 0.01))
+            await until(lambda number=number: number / 100 + 0.01 in values)
+        await asyncio.gather(*(client.close() for client in clients))
+
+    values.clear()
+    asyncio.run(send())
