@@ -21,11 +21,13 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from mimic.runs.files import write_atomically
+from mimic.runs.npz import read_arrays
 
 FOLDER = "checkpoints"
 WITH_STATE = 2  # newest checkpoints of a run that have the state of the training
 _STATE, _CONTENT, _RUN = "training.npz", "checkpoint.json", "run_id"
 _PARTIAL = ".partial"
+_MAX_ARRAYS = 1000  # of a training's state; PPO has some 60
 
 
 class Checkpoint(NamedTuple):
@@ -145,8 +147,9 @@ def load_training(run_dir: Path, template: Any) -> Checkpoint:
     metrics = _content(path).get("metrics", {})
     if not (path / _STATE).is_file():
         return Checkpoint(step, params, None, metrics)
-    with np.load(path / _STATE, allow_pickle=False) as file:
-        return Checkpoint(step, params, [file[f"arr_{i}"] for i in range(len(file.files))], metrics)
+    names = [f"arr_{i}" for i in range(_MAX_ARRAYS)]  # as NumPy names them
+    state = read_arrays(path / _STATE, names)
+    return Checkpoint(step, params, [state[name] for name in names if name in state], metrics)
 
 
 def _first_undamaged(run_dir: Path, step: int | None, read: Any) -> tuple[int, Any]:

@@ -156,7 +156,9 @@ def test_a_damaged_checkpoint(rejected, run_dir, tmp_path):
     shutil.copytree(run_dir, damaged)
     (checkpoint,) = (damaged / "checkpoints").glob("0*")
     (checkpoint / "_METADATA").write_text("not JSON")
-    assert "is damaged: _METADATA is missing or was changed" in rejected("evaluate", f"run={damaged}", "compilation_cache=")
+    assert "is damaged: _METADATA is missing or was changed" in rejected(
+        "evaluate", f"run={damaged}", "compilation_cache="
+    )
 
 
 def test_a_mapper_has_no_controllers(rejected, tmp_path):

@@ -22,7 +22,7 @@ from mimic.runs.checkpoints import (
 )
 
 PARAMS = {"layer": {"kernel": np.arange(6, dtype=np.float32).reshape(2, 3), "bias": np.ones(3, np.float32)}}
-STATE = [np.arange(4, dtype=np.uint32), np.float32([[1.5, -0.0]]), np.array(7)]
+STATE = [np.arange(4, dtype=np.uint32), np.array([[1.5, -0.0]], np.float32), np.array(7)]
 
 
 @pytest.fixture
