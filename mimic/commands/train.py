@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from mimic.commands.progress import TrainingProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
-from mimic.config import flatten, to_dict
+from mimic.config import check_writable, flatten, to_dict, typed
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.loggers import check_loggers, make_loggers
@@ -55,6 +55,7 @@ def prepare_training(
     resumed_dir = Path(config.resume).expanduser() if config.resume else None
     if resumed_dir:
         config = _resumed_config(resumed_dir, config, overrides)
+        check_writable("resume", resumed_dir)
     if group and config.trainer.name != "ppo":
         raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
     is_first = group is None or group.first
@@ -85,7 +86,7 @@ def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[s
             f"got {rejected[0]!r}"
         )
     merged = OmegaConf.merge(run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
-    config = cast(TrainConfig, OmegaConf.to_object(merged))
+    config: TrainConfig = typed(cast(DictConfig, merged))
     total = config.trainer.resolve().total_steps
     if steps >= total:
         raise ValueError(

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.config import check_new, explain, schema, to_dict
+from mimic.config import check_new, check_writable, explain, schema, to_dict, typed
+from mimic.config_files import check_references, read_config
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, write_atomically
 from mimic.trainers.config import TRAINERS, TrainConfig
@@ -15,16 +16,18 @@ def new_run_dir(config: TrainConfig) -> Path:
     """The directory of a new run, which is not created yet.
 
     Raises:
-      ValueError: it exists.
+      ValueError: it exists, or cannot be written.
     """
     if config.run_dir:
         path = Path(config.run_dir).expanduser()
         check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
+        check_writable("run_dir", path)
         return path
     stem = f"{config.env.name}-{config.trainer.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     path, number = Path("runs") / stem, 1
     while path.exists():
         path, number = Path("runs") / f"{stem}-{number}", number + 1
+    check_writable("run_dir", path)
     return path
 
 
@@ -47,12 +50,16 @@ def load_config(run_dir: Path) -> TrainConfig:
     if not (run_dir / CONFIG).is_file():
         raise ValueError(f"{str(run_dir)!r} is not a run directory: it has no {CONFIG}")
     try:
-        content = OmegaConf.load(run_dir / CONFIG)
+        content = read_config(run_dir / CONFIG)
+        check_references(content)  # before anything resolves them
+        for group in {"env", "trainer"}.intersection(content):
+            if not OmegaConf.is_dict(content[group]):
+                raise ValueError(f"{group}: expected keys and values, got {content[group]}")
         name = OmegaConf.select(content, "trainer.name")
         if name not in TRAINERS:
             raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
         merged = OmegaConf.merge(run_schema(name), _with_old_default_metric(content))  # type: ignore[arg-type]
-        return OmegaConf.to_object(merged)  # type: ignore[return-value]
+        return typed(merged)  # type: ignore[arg-type]
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
 
