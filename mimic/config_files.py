@@ -34,8 +34,8 @@ class _BoundedLoader(get_yaml_loader()):
         return super().compose_node(parent, index)
 
 
-def read_config(path: Path) -> DictConfig:
-    """Reads a YAML file that holds a mapping.
+def read_config(path: Path, *, may_be_empty: bool = False) -> DictConfig:
+    """Reads a YAML file that holds a mapping, or nothing if it may be empty.
 
     Raises:
       ValueError: no regular file, too large, not YAML or no mapping, or with too many aliases. The message does not
@@ -49,6 +49,8 @@ def read_config(path: Path) -> DictConfig:
         raise ValueError(f"expected at most {MAX_BYTES:,} bytes, got {path.stat().st_size:,}")
     try:
         content = yaml.load(text.decode(), _BoundedLoader)
+        if content is None and may_be_empty:
+            content = {}
         if not isinstance(content, dict):
             raise ValueError(f"expected keys and values, got {content!r:.80}")
         if sum(1 for _ in itertools.islice(_values(content), MAX_VALUES + 1)) > MAX_VALUES:

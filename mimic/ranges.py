@@ -6,13 +6,12 @@ calls `check_ranges`. A subclass that declares the field again without a range k
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from numbers import Real
 from typing import Any
+
+import numpy as np
 
 _RANGE = "range"  # key in the metadata of a field
 _MAX_SHOWN = 80  # characters of a rejected value in an error message
-
-SEED = {"at_least": -(2**63), "at_most": 2**63 - 1}  # a 64-bit integer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,23 +39,23 @@ class Range:
             fewest, most = self.entries
             is_valid = not isinstance(value, str) and fewest <= len(value) <= most and all(map(self.contains, value))
         else:
-            is_valid = self.contains(value) or not isinstance(value, Real | Sequence | Mapping)
+            is_valid = self.contains(value) or not isinstance(value, int | float | np.number | Sequence | Mapping)
         if not is_valid:
             raise ValueError(f"{key}: expected {self}, got {_shortened(value)}")
 
     def contains(self, value: Any) -> bool:
         """Whether a value is a number within the limits; nan is not."""
-        if not isinstance(value, Real) or isinstance(value, bool):
+        if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
             return False
         over = value > self.minimum if self.above else value >= self.minimum
         under = value < self.maximum if self.below else value <= self.maximum
         return bool(over and under)
 
     def __str__(self) -> str:
-        lower, upper = _text(self.minimum), _text(self.maximum)
-        limits = f"from {lower} to {upper}"
+        limits = f"from {_text(self.minimum)} to {_text(self.maximum)}"
         if self.above or self.below:
-            limits = f"{'above' if self.above else 'of at least'} {lower} and {'below' if self.below else 'at most'} {upper}"
+            lower, upper = "above" if self.above else "of at least", "below" if self.below else "at most"
+            limits = f"{lower} {_text(self.minimum)} and {upper} {_text(self.maximum)}"
         kind = "whole number" if isinstance(self.minimum, int) and isinstance(self.maximum, int) else "number"
         return f"a {kind} {limits}" if self.entries is None else f"{_count(self.entries)} {kind}s, each {limits}"
 
@@ -84,6 +83,11 @@ def number(
     if callable(default):
         return dataclasses.field(default_factory=default, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
+
+
+def seed_number(default: int = 0) -> Any:
+    """A dataclass field for a random seed, a 64-bit integer."""
+    return number(default, at_least=-(2**63), at_most=2**63 - 1)
 
 
 def ranges(config_class: type) -> dict[str, Range]:

@@ -14,13 +14,21 @@ from mimic.envs import env_config, environments
 from mimic.envs.config import PHYSICS, EnvConfig
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
-from mimic.ranges import SEED, check_ranges, number
+from mimic.ranges import check_ranges, number, seed_number
 from mimic.trainers.config import TRAINERS
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "searched")
 EXPORT_FORMATS = ("onnx", "jax")
-_STEPS = {"at_least": 0, "at_most": 10**15}  # of a checkpoint
-_FACTOR = {"at_least": 1e-3, "at_most": 1e3}  # on masses and damping, as in `RandomizationConfig`
+
+
+def _steps() -> Any:
+    """Field for the steps of a checkpoint."""
+    return number(None, at_least=0, at_most=10**15)
+
+
+def _factor() -> Any:
+    """Field for a factor on masses or damping, as in `RandomizationConfig`."""
+    return number(None, at_least=1e-3, at_most=1e3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,13 +49,13 @@ class EvaluateConfig:
     """
 
     run: str = ""
-    checkpoint: int | None = number(None, **_STEPS)
+    checkpoint: int | None = _steps()
     controller: str = "policy"
     search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
     demonstrations: str = ""
     physics: str = ""
-    mass: float | None = number(None, **_FACTOR)
-    damping: float | None = number(None, **_FACTOR)
+    mass: float | None = _factor()
+    damping: float | None = _factor()
     torque_noise: float | None = number(None, at_least=0.0, at_most=10.0)
     out: str = ""
     compilation_cache: str = "~/.cache/mimic/jax"
@@ -75,7 +83,7 @@ class FiguresConfig:
     out: str = ""
     only: list[str] = dataclasses.field(default_factory=list)
     runs: str = ""
-    seed: int = number(0, **SEED)
+    seed: int = seed_number()
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
@@ -103,11 +111,11 @@ class RenderConfig:
     """
 
     run: str = ""
-    checkpoint: int | None = number(None, **_STEPS)
+    checkpoint: int | None = _steps()
     split: str = "held_out"
     demonstration: int = number(0, at_least=0, at_most=1_000_000)
     demonstrations: str = ""
-    seed: int = number(0, **SEED)
+    seed: int = seed_number()
     retargeted: str = ""
     learner: str = ""
     limits: str = "none"
@@ -136,7 +144,7 @@ class ExportConfig:
     out: str = ""
     format: str = "onnx"
     learner: str = ""
-    checkpoint: int | None = number(None, **_STEPS)
+    checkpoint: int | None = _steps()
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -241,7 +249,7 @@ class RetargetConfig:
     mapper: str = ""
     limits: str = "none"
     out: str = ""
-    seed: int = number(0, **SEED)
+    seed: int = seed_number()
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -268,7 +276,7 @@ class ViewConfig:
     learner: str = ""
     mapper: str = ""
     run: str = ""
-    checkpoint: int | None = number(None, **_STEPS)
+    checkpoint: int | None = _steps()
     split: str = "held_out"
     host: str = "127.0.0.1"
     port: int = number(8080, at_least=1, at_most=65_535)

@@ -10,6 +10,7 @@ from mimic.metric.config import MetricConfig
 from mimic.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
+_MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,13 +97,20 @@ class EnvConfig:
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     preview: int = number(1, at_least=0, at_most=100)  # each step adds an expert to the observation
     limit_weight: float = number(1.0, at_least=0.0, at_most=1e6)
-    action_scale: float = number(1.0, above=0.0, at_most=1000.0)  # the torque is cut at the torque limit anyway
-    speed_bound: float = number(30.0, above=0.0, at_most=1000.0)  # the fastest joints of robots reach some 30 rad/s
+    action_scale: float = number(1.0, at_least=1e-3, at_most=1000.0)  # the torque is cut at the torque limit anyway
+    speed_bound: float = number(30.0, at_least=1e-3, at_most=1000.0)  # the fastest joints of robots reach some 30 rad/s
 
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)
         check_choice("physics", self.physics, PHYSICS)
         check_ranges(self)
+        recorded = 0 if self.demonstrations.path else self.demonstrations.count + self.demonstrations.held_out
+        steps = recorded * self.horizon * self.substeps
+        if steps > _MAX_RECORDED_STEPS:
+            raise ValueError(
+                f"demonstrations: expected (count + held_out) * horizon * substeps of at most {_MAX_RECORDED_STEPS:,} "
+                f"physics steps to record, got {steps:,}"
+            )
 
     def build_arms(self) -> ArmPair:
         """Both arms, with the links that the metric compares.

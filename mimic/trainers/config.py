@@ -7,7 +7,7 @@ from omegaconf import MISSING
 
 from mimic.config import check_choice
 from mimic.envs.config import EnvConfig
-from mimic.ranges import SEED, check_ranges, number
+from mimic.ranges import check_ranges, number, seed_number
 from mimic.trainers.distributed.process_group import DistributedConfig
 
 LOGGERS = ("local", "wandb", "mlflow")
@@ -391,7 +391,7 @@ class TrainConfig:
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     trainer: TrainerConfig = dataclasses.field(default_factory=TrainerConfig)
-    seed: int = number(0, **SEED)
+    seed: int = seed_number()
     run_dir: str = ""
     resume: str = ""
     logger: Any = "local"
