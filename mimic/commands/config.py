@@ -115,7 +115,7 @@ class RenderConfig:
     split: str = "held_out"
     demonstration: int = number(0, at_least=0, at_most=1_000_000)
     demonstrations: str = ""
-    seed: int = seed_number()
+    seed: int = number(0, at_least=0, at_most=2**63 - 1)
     retargeted: str = ""
     learner: str = ""
     limits: str = "none"
