@@ -25,6 +25,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "final_learning_rate": 0.05,
         "discounting": 0.8,
         "entropy_cost": 0.01,
+        "final_entropy_cost": 1.0,
         "hidden_layers": [128, 128],
         "crossovers": 0,
         "evaluations": 10,
@@ -41,8 +42,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "final_learning_rate": 0.01,
         "discounting": 0.95,
         "entropy_cost": 0.2,
+        "final_entropy_cost": 0.05,
         "hidden_layers": [512, 256],
-        "crossovers": 800,
+        "crossovers": 2000,
         "evaluations": 8,
     },
 }
@@ -102,6 +104,8 @@ class PPOConfig(TrainerConfig):
       hidden_layers: widths of the hidden layers of the policy and value networks.
       crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
         `crossovers` in mimic/envs/demonstrations.py.
+      timed_critic: whether the value network also observes the elapsed fraction of the episode, on which the return
+        depends. The policy never observes it.
       target_gap: training ends early when the optimality gap on the training demonstrations is at most this; 0 disables
         it.
       evaluations: number of evaluations and checkpoints, as far as whole batches allow; with a target gap five times
@@ -126,12 +130,13 @@ class PPOConfig(TrainerConfig):
     final_discounting: float | None = number(None, at_least=0.0, at_most=1.0)
     gae_lambda: float = number(0.9, at_least=0.0, at_most=1.0)
     entropy_cost: float | None = number(None, at_least=0.0, at_most=1000.0)
-    final_entropy_cost: float = number(1.0, at_least=0.0, at_most=1.0)
+    final_entropy_cost: float | None = number(None, at_least=0.0, at_most=1.0)
     clipping_epsilon: float = number(0.2, above=0.0, at_most=10.0)
     max_grad_norm: float = number(1.0, above=0.0, at_most=1e6)
     reward_scaling: float = number(10.0, above=0.0, at_most=1e6)  # its square is in the loss
     hidden_layers: list[int] | None = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     crossovers: int | None = number(None, at_least=0, at_most=100_000)
+    timed_critic: bool = True
     target_gap: float = number(0.0, at_least=0.0, at_most=100.0)
     evaluations: int | None = number(None, at_least=1, at_most=1_000_000)
 
@@ -177,6 +182,7 @@ class PPOSettings(PPOConfig):
     discounting: float = MISSING
     final_discounting: float = MISSING
     entropy_cost: float = MISSING
+    final_entropy_cost: float = MISSING
     hidden_layers: list[int] = MISSING
     crossovers: int = MISSING
     evaluations: int = MISSING

@@ -58,10 +58,20 @@ def load_config(run_dir: Path) -> TrainConfig:
         name = OmegaConf.select(content, "trainer.name")
         if name not in TRAINERS:
             raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
-        merged = OmegaConf.merge(run_schema(name), _with_old_default_metric(content))  # type: ignore[arg-type]
+        merged = OmegaConf.merge(run_schema(name), _with_old_defaults(content))  # type: ignore[arg-type]
         return typed(merged)  # type: ignore[arg-type]
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
+
+
+def _with_old_defaults(content: DictConfig) -> DictConfig:
+    """Completes the config of an older run with the defaults of its time."""
+    content = _with_old_default_metric(content)
+    trainer = OmegaConf.select(content, "trainer")
+    if trainer.name == "ppo":
+        trainer = {"timed_critic": False, "final_entropy_cost": 1.0, **trainer}
+        content = OmegaConf.merge(content, {"trainer": trainer})  # type: ignore[assignment]
+    return content
 
 
 def _with_old_default_metric(content: DictConfig) -> DictConfig:

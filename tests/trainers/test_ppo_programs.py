@@ -1,6 +1,5 @@
 """The compiled functions of PPO: the transitions that they collect, and the loss."""
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -10,22 +9,25 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 
 import mimic
 from mimic.compilation import compiler_options
+from mimic.envs.imitation import arm_state
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import losses as ppo_loss
 from mimic.trainers.ppo import programs, training, updates
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
+HORIZON = 50  # steps of an episode
 _SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
 
 
 @pytest.fixture(scope="module")
 def one_batch():
-    """States before and after a batch; a loss without gradient records its observations, projected on `along`."""
+    """States before and after a batch; losses without gradient record observations, projected on `along`, and time."""
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
     config = PPOConfig(
         num_envs=ARMS, unroll_length=1, batch_size=UNROLLS * ARMS // 2, num_minibatches=2, num_updates_per_batch=PASSES,
@@ -40,7 +42,8 @@ def one_batch():
         return now + 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), after
 
     def of_policy(params, statistics, unrolls, after, *_):
-        return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), jnp.full(len(ppo_loss.METRICS), after)
+        metrics = jnp.full(len(ppo_loss.METRICS), after).at[1:3].set(unrolls.elapsed.mean(axis=0))
+        return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), metrics
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(updates, "value_loss", of_value)
@@ -50,6 +53,7 @@ def one_batch():
         before = jax.device_get(start)
         after, metrics = jax.device_get(learn()(start))
     shown = {"now": metrics["value_loss"], "next": metrics["policy_loss"]}
+    shown["elapsed"] = [metrics[name] for name in ppo_loss.METRICS[1:3]]
     return before, after, shown, along
 
 
@@ -66,6 +70,16 @@ def test_the_next_observation_belongs_to_its_transition(one_batch):
     assert shown["next"] == pytest.approx(along @ seen / (UNROLLS * ARMS), abs=1e-5)
 
 
+def test_the_elapsed_time_belongs_to_the_observation(one_batch):
+    """Over two unrolls of one step each; an episode that ends starts again at 0."""
+    before, after, shown, _ = one_batch
+    first, last = (arm_state(state.episodes).step for state in (before, after))
+    second = np.where(first + 1 < HORIZON, first + 1, 0)
+    np.testing.assert_array_equal(last, np.where(second + 1 < HORIZON, second + 1, 0))
+    expected = np.array([[first, second], [second, last]]).mean(axis=(1, 2)) / HORIZON
+    np.testing.assert_allclose(shown["elapsed"], expected, rtol=1e-5)
+
+
 def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
     before, after, *_ = one_batch
     assert jax.tree.all(jax.tree.map(np.array_equal, before.params[1:], after.params[1:]))
@@ -78,7 +92,7 @@ def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
 def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     """The entropy is that of a sample, drawn in the same order only for unrolls of one step."""
     sizes, unrolls = (5, 3), 6
-    config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), entropy_cost=entropy_cost)
+    config = PPOConfig(hidden_layers=[8, 4], entropy_cost=entropy_cost, timed_critic=False).resolve("cpu")
     networks = training.make_networks(config, *sizes)
     rng = np.random.default_rng(time)
 
@@ -91,7 +105,7 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     observation, raw_action = normal(unrolls, time + 1, 5), normal(unrolls, time + 1, 3)
     log_prob, reward = normal(unrolls, time + 1), normal(unrolls, time + 1)
     goes_on = jnp.asarray(rng.random((unrolls, time + 1)) < 0.8, float)
-    ours = ppo_loss.Unrolls(observation, raw_action, log_prob - 4, reward, goes_on)
+    ours = ppo_loss.Unrolls(observation, raw_action, log_prob - 4, reward, goes_on, jnp.zeros_like(reward))
     np.testing.assert_array_equal(ours.unpacked(ours.packed()).raw_action, raw_action)
     now = jax.tree.map(lambda x: x[:, :-1], ours.unpacked(ours.packed()))
     extras = {"raw_action": now.raw_action, "log_prob": now.log_prob}
@@ -126,6 +140,25 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     assert shown["approx_kl"] == pytest.approx(float((jnp.expm1(log_ratio) - log_ratio).mean()), rel=1e-9)
     clipped = np.abs(np.exp(log_ratio) - 1) > config.clipping_epsilon
     assert shown["clip_fraction"] == pytest.approx(clipped.mean()) and 0 < clipped.mean() < 1
+
+
+def test_a_timed_critic_observes_the_elapsed_time(x64):
+    """Its loss is that of a critic without time whose observation has the elapsed time as its last entry."""
+    rng = np.random.default_rng(0)
+    unrolls = ppo_loss.Unrolls(*(jnp.asarray(rng.normal(size=(6, 4, *n))) for n in [(5,), (3,), (), (), (), ()]))
+    statistics = running_statistics.init_state(specs.Array((5,), jnp.dtype("float64")))
+    statistics = statistics.replace(mean=jnp.arange(5.0), std=1 + jnp.arange(5.0))
+    longer = jax.tree.map(lambda x: x, statistics)
+    longer = longer.replace(mean=jnp.append(statistics.mean, 0.0), std=jnp.append(statistics.std, 1.0))
+    timed, plain = (PPOConfig(hidden_layers=[8], timed_critic=timed).resolve("cpu") for timed in (True, False))
+    params = training.make_networks(timed, 5, 3).value_network.init(jax.random.PRNGKey(0))
+    loss, _ = ppo_loss.value_loss(params, statistics, unrolls, training.make_networks(timed, 5, 3), timed)
+    extended = unrolls._replace(observation=jnp.concatenate([unrolls.observation, unrolls.elapsed[..., None]], -1))
+    expected, _ = ppo_loss.value_loss(params, longer, extended, training.make_networks(plain, 6, 3), plain)
+    later, _ = ppo_loss.value_loss(
+        params, statistics, unrolls._replace(elapsed=unrolls.elapsed + 1), training.make_networks(timed, 5, 3), timed
+    )
+    assert loss == pytest.approx(float(expected), rel=1e-12) and abs(later - loss) > 1e-3
 
 
 ON_TWO_DEVICES = """

@@ -76,7 +76,7 @@ def case(x64):
         return jnp.asarray(rng.normal(size=(DEVICES, UNROLLS, TIME + 1, *shape)))
 
     goes_on = jnp.asarray(rng.random((DEVICES, UNROLLS, TIME + 1)) < 0.8, float)
-    unrolls = Unrolls(normal(OBSERVED), normal(ACTIONS), normal() - 3, normal(), goes_on)
+    unrolls = Unrolls(normal(OBSERVED), normal(ACTIONS), normal() - 3, normal(), goes_on, normal())
     order = jnp.asarray([[rng.permutation(UNROLLS)[:MINIBATCH] for _ in range(UPDATES)] for _ in range(DEVICES)])
     config = dataclasses.replace(PPOConfig(hidden_layers=[8, 4]).resolve("cpu"), max_grad_norm=LIMIT)
     return Case(config, unrolls, order, jax.random.split(jax.random.PRNGKey(2), DEVICES))

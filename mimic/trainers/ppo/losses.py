@@ -30,6 +30,7 @@ class Unrolls(NamedTuple):
       log_prob: [*unrolls, time + 1] log-probability of the action under the policy that took it.
       reward: [*unrolls, time + 1].
       goes_on: [*unrolls, time + 1] 0 where the episode ended with the step, else 1.
+      elapsed: [*unrolls, time + 1] fraction of the episode before the step; the final observation has it too.
     """
 
     observation: Array
@@ -37,6 +38,7 @@ class Unrolls(NamedTuple):
     log_prob: Array
     reward: Array
     goes_on: Array
+    elapsed: Array
 
     def packed(self) -> Array:
         """All fields, concatenated along the last axis, so that one kernel gathers a minibatch."""
@@ -65,7 +67,10 @@ def value_loss(
       networks: policy and value network.
       config: the trainer's settings.
     """
-    values = networks.value_network.apply(statistics, params, unrolls.observation)
+    observation = unrolls.observation
+    if config.timed_critic:
+        observation = jnp.concatenate([observation, unrolls.elapsed[..., None]], axis=-1)
+    values = networks.value_network.apply(statistics, params, observation)
     reward, goes_on = unrolls.reward[:, :-1], unrolls.goes_on[:, :-1]
     targets, advantages = jax.lax.stop_gradient(
         compute_gae(config.reward_scaling * reward, config.discounting * goes_on, values, config.gae_lambda)

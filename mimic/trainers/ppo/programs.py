@@ -22,7 +22,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
 from mimic.compilation import Background, a_process_for_each_gpu, compiler_options, in_background
-from mimic.envs.imitation import ImitationEnv
+from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.envs.wrappers import fresh_episodes
 from mimic.metric.kinematics import LinkStates
 from mimic.trainers.config import PPOSettings
@@ -162,6 +162,9 @@ class _Training(NamedTuple):
     def _unroll(self, env: Wrapper, policy: Any, state: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
         """Steps of all arms, [time + 1, arms, ...]."""
 
+        def elapsed(episodes: State) -> Array:
+            return arm_state(episodes).step / self.env.config.horizon
+
         def step(episodes: State, key: Array) -> tuple[State, Unrolls]:
             action, extras = policy(episodes.obs, key)
             after = env.step(episodes, action)
@@ -171,11 +174,13 @@ class _Training(NamedTuple):
                 extras["log_prob"],
                 after.reward,
                 1 - after.done,
+                elapsed(episodes),
             )
 
         keys = jax.random.split(key, self.config.unroll_length)
         episodes, steps = jax.lax.scan(step, state.episodes, keys)
-        last = jax.tree.map(lambda x: jnp.zeros_like(x[:1]), steps)._replace(observation=episodes.obs[None])
+        last = jax.tree.map(lambda x: jnp.zeros_like(x[:1]), steps)
+        last = last._replace(observation=episodes.obs[None], elapsed=elapsed(episodes)[None])
         steps = jax.tree.map(lambda *x: jnp.concatenate(x), steps, last)
         return dataclasses.replace(state, episodes=episodes), steps
 
