@@ -24,7 +24,10 @@ import mimic
         (["+foo=1"], "foo"),
         (["env.metric.correspondence=soft", "env.metric.xi=1"], "below 0"),
         (["env.metric.rotation=inf"], "env.metric.rotation: expected a number from 0 to 1e+06, got inf"),
-        (["env=planar4dof", "env.learner.link_lengths=[0.5,0]"], "link_lengths: expected 0 to 100 numbers, each from 0.001 to 100, got [0.5, 0.0]"),
+        (
+            ["env=planar4dof", "env.learner.link_lengths=[0.5,0]"],
+            "each from 0.001 to 100, got [0.5, 0.0]",
+        ),
         (["env.learner.model=missing.xml"], "missing.xml"),
         (["trainer=pose_mapper", "trainer.preset=huge"], "expected one of paper, large, got 'huge'"),
         (["trainer=pose_mapper", "trainer.batch_size=1000"], "expected a divisor of samples = 65536, got 1000"),

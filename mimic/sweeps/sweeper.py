@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mimic.config import check_writable
 from mimic.config_files import check_references
-from mimic.runs.files import CONFIG, REPORT
+from mimic.runs.files import CONFIG, REPORT, read_json
 from mimic.sweeps.hydra_plugins import register, target
 
 SWEEP, LOGS = "sweep.json", "logs"
@@ -183,7 +183,7 @@ def _remaining(folder: Path, planned: Sequence[PlannedRun]) -> dict[int, list[st
     if not (folder / SWEEP).exists():
         return {number: run.overrides for number, run in enumerate(planned)}
     try:
-        known = [entry["overrides"] for entry in json.loads((folder / SWEEP).read_text())["runs"]]
+        known = [entry["overrides"] for entry in read_json(folder / SWEEP)["runs"]]
     except (ValueError, LookupError, TypeError):
         known = []
     if known != [run.overrides for run in planned]:
