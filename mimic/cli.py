@@ -88,7 +88,10 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
             work = prepare(typed(config))
         except _BAD_INPUT as error:
             _exit_with_error(error)
-        exit_code = work()
+        try:
+            exit_code = work()
+        except OSError as error:  # disk full, quota, permission
+            _exit_with_error(error, FAILED)
         if exit_code:
             sys.exit(exit_code)
         return Outcome()
@@ -98,7 +101,7 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         command()
     except _CONFIG_ERRORS as error:
         _exit_with_error(error)
-    except OSError as error:  # of the work: disk full, quota, permission
+    except OSError as error:  # of Hydra or our sweeper
         _exit_with_error(error, FAILED if began else BAD_INPUT)
     except (ValueError, RecursionError) as error:
         if began:

@@ -1,5 +1,6 @@
 """Typed configs: frozen dataclasses as OmegaConf schemas, checks of values, and one-line error messages."""
 
+import dataclasses
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -48,6 +49,9 @@ def _check_ranges(node: DictConfig, prefix: str = "") -> None:
         if OmegaConf.is_missing(node, key):
             continue
         value, name = node[key], f"{prefix}{key}"
+        expected = node._get_node(key)._metadata.ref_type  # type: ignore[union-attr]
+        if dataclasses.is_dataclass(expected) and not issubclass(OmegaConf.get_type(value) or object, expected):
+            raise ValueError(f"{name}: expected the keys of {expected.__name__}, got {value!s:.80}")  # by a reference
         if isinstance(value, DictConfig):
             _check_ranges(value, f"{name}.")
         elif key in limits and value is not None:

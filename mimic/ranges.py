@@ -30,6 +30,11 @@ class Range:
     below: bool = False
     entries: tuple[int, int] | None = None
 
+    @property
+    def whole(self) -> bool:
+        """Whether only integers are valid: both limits are integers."""
+        return isinstance(self.minimum, int) and isinstance(self.maximum, int)
+
     def check(self, key: str, value: Any) -> None:
         """Raises a ValueError with the key, the range and the value if the value is out of range.
 
@@ -45,7 +50,8 @@ class Range:
 
     def contains(self, value: Any) -> bool:
         """Whether a value is a number within the limits; nan is not."""
-        if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
+        valid_types = (int, np.integer) if self.whole else (int, float, np.integer, np.floating)
+        if not isinstance(value, valid_types) or isinstance(value, bool):
             return False
         over = value > self.minimum if self.above else value >= self.minimum
         under = value < self.maximum if self.below else value <= self.maximum
@@ -56,7 +62,7 @@ class Range:
         if self.above or self.below:
             lower, upper = "above" if self.above else "of at least", "below" if self.below else "at most"
             limits = f"{lower} {_text(self.minimum)} and {upper} {_text(self.maximum)}"
-        kind = "whole number" if isinstance(self.minimum, int) and isinstance(self.maximum, int) else "number"
+        kind = "whole number" if self.whole else "number"
         return f"a {kind} {limits}" if self.entries is None else f"{_count(self.entries)} {kind}s, each {limits}"
 
 
@@ -74,7 +80,7 @@ def number(
     Args:
       default: value of the field; for a list, a function that returns it.
       at_least, above: the minimum, with or without itself.
-      at_most, below: the maximum, with or without itself. Where all are integers, error messages say so.
+      at_most, below: the maximum, with or without itself. Where both are integers, only integers are valid.
       entries: minimum and maximum number of entries, for a list.
     """
     minimum, maximum = (at_least if above is None else above), (at_most if below is None else below)
