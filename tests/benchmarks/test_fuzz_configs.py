@@ -9,8 +9,8 @@ from benchmarks.fuzzing.configs import command_line_case
 from benchmarks.fuzzing.runner import GOOD, run_case, run_here
 from benchmarks.fuzzing.runs import run_case as run_directory_case
 
-COMMAND_LINES = 60
-RUNS = 290  # of which every sixth and fifth is a checkpoint
+COMMAND_LINES = 45
+RUNS = 300  # of which every sixth and fifth is a checkpoint
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -23,7 +23,8 @@ def test_odd_inputs_end_in_one_line(kind):
 
 def test_cases_are_the_same_in_each_process():
     assert [command_line_case(n).read.keywords for n in range(20)] == [  # type: ignore[attr-defined]
-        command_line_case(n).read.keywords for n in range(20)  # type: ignore[attr-defined]
+        command_line_case(n).read.keywords
+        for n in range(20)  # type: ignore[attr-defined]
     ]
     assert len({run_directory_case(n).name for n in range(200)}) > 20
 
