@@ -50,8 +50,8 @@ def _check_ranges(node: DictConfig, prefix: str = "") -> None:
             continue
         value, name = node[key], f"{prefix}{key}"
         expected = node._get_node(key)._metadata.ref_type  # type: ignore[union-attr]
-        if dataclasses.is_dataclass(expected) and not issubclass(OmegaConf.get_type(value) or object, expected):
-            raise ValueError(f"{name}: expected the keys of {expected.__name__}, got {value!s:.80}")  # by a reference
+        if dataclasses.is_dataclass(expected) and expected not in (OmegaConf.get_type(value) or object).__mro__:
+            raise ValueError(f"{name}: expected keys and values of its own, got {value!s:.80}")  # by a reference
         if isinstance(value, DictConfig):
             _check_ranges(value, f"{name}.")
         elif key in limits and value is not None:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,8 +15,18 @@ from mimic.commands.progress import TrainingProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
 from mimic.config import check_writable, flatten, to_dict, typed
-from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
-from mimic.runs.files import write_report
+from mimic.runs.checkpoints import (
+    Checkpoint,
+    checkpoint_steps,
+    delete_checkpoint,
+    delete_partial_checkpoints,
+    load_checkpoint,
+    load_training,
+)
+from mimic.runs.divergence import EXIT_CODE as DIVERGED
+from mimic.runs.divergence import Diverged
+from mimic.runs.files import reported_steps, write_report
+from mimic.runs.lock import RunLock
 from mimic.runs.loggers import check_loggers, make_loggers
 from mimic.runs.metrics_log import MetricsLog
 from mimic.runs.provenance import hardware
@@ -61,20 +72,20 @@ def prepare_training(
     is_first = group is None or group.first
     check_loggers(config.loggers)
     run_dir = resumed_dir or (new_run_dir(config) if is_first else Path())
+    lock = RunLock(run_dir) if resumed_dir and is_first else None  # before its checkpoints are read
     with stopwatch.stage("build"):
         trainer = make_trainer(config, resumed_dir)
-        restore = load_checkpoint(resumed_dir, trainer.params_template()) if resumed_dir else None
+        restored = _start(config, resumed_dir, trainer)
     config = dataclasses.replace(config, trainer=trainer.settings)
     if group and not is_first:
-        return lambda: _follow(trainer, restore, group)
+        return lambda: _follow(trainer, restored, group)
     signals = group.signals if group else signals or Signals()
-    return lambda: _train(config, trainer, run_dir, restore, stopwatch, group, signals)
+    return lambda: _train(config, trainer, run_dir, lock, restored, stopwatch, group, signals)
 
 
 def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
     """The config of a run directory, with the overrides of the command line that a resumed run accepts."""
     config = load_config(run_dir)
-    steps = check_checkpoint(run_dir)
     process_keys = ("resume=", "compilation_cache=", "distributed.", "logger=")  # taken from `requested`
     changes = [override for override in overrides if not override.startswith(process_keys)]
     logger = {"logger": requested.logger} if any(override.startswith("logger=") for override in overrides) else {}
@@ -87,21 +98,32 @@ def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[s
         )
     merged = OmegaConf.merge(run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
     config: TrainConfig = typed(cast(DictConfig, merged))
-    total = config.trainer.resolve().total_steps
-    if steps >= total:
-        raise ValueError(
-            f"resume: {str(run_dir)!r} has been trained for {steps} of {total} steps; "
-            f"increase trainer.{config.trainer.length_key}"
-        )
     return dataclasses.replace(
         config, compilation_cache=requested.compilation_cache, distributed=requested.distributed, **logger
     )
 
 
-def _follow(trainer: Trainer, restore: tuple[int, Params] | None, group: ProcessGroup) -> int:
+def _start(config: TrainConfig, resumed_dir: Path | None, trainer: Trainer) -> Checkpoint | None:
+    """The checkpoint that a resumed run continues from, or the parameters that a new run starts from."""
+    if config.init and not resumed_dir:
+        _, params = load_checkpoint(Path(config.init).expanduser(), trainer.params_template())
+        return Checkpoint(0, params, None, {})
+    if not resumed_dir or not checkpoint_steps(resumed_dir):  # a run that ended before its first checkpoint
+        return None
+    restored = load_training(resumed_dir, trainer.params_template())
+    if restored.step >= trainer.total_steps and reported_steps(resumed_dir, trainer.unit) >= restored.step:
+        raise ValueError(
+            f"resume: {str(resumed_dir)!r} has been trained for {restored.step} of {trainer.total_steps} steps; "
+            f"increase trainer.{config.trainer.length_key}"
+        )
+    return restored
+
+
+def _follow(trainer: Trainer, restored: Checkpoint | None, group: ProcessGroup) -> int:
     """Trains in lockstep with the first process, which ends this one. For the other processes of a group."""
     with noted_signals(group.signals):
-        trainer.follow(restore)
+        with contextlib.suppress(Diverged):  # in the first process too, which reports it
+            trainer.follow(restored)
         group.wait()
     return 0
 
@@ -110,39 +132,62 @@ def _train(
     config: TrainConfig,
     trainer: Trainer,
     run_dir: Path,
-    restore: tuple[int, Params] | None,
+    lock: RunLock | None,
+    restored: Checkpoint | None,
     stopwatch: Stopwatch,
     group: ProcessGroup | None,
     signals: Signals,
 ) -> int:
     """Trains, evaluates and reports; returns the exit code."""
     console = Console()
-    with noted_signals(signals):  # also during the report: training is done, so a signal has no effect
-        run_dir.mkdir(parents=True, exist_ok=restore is not None)
-        save_config(run_dir, config)
-        trainer.save_inputs(run_dir)
-        headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
-        console.print(f"{headline}\nrun directory: {run_dir}", highlight=False, soft_wrap=True)
+    with noted_signals(signals), contextlib.ExitStack() as stack:  # also during the report, where they have no effect
         try:
-            steps, params = _train_and_log(config, trainer, run_dir, signals, restore, stopwatch, console)
-        except Interrupted as interruption:
-            if group:
-                group.end(interruption.exit_code)
-            command = f"python -m mimic.train resume={run_dir}"
-            console.print(f"stopped by {interruption}; continue with: {command}", soft_wrap=True)
-            return interruption.exit_code
+            lock = lock or _new_run(run_dir, trainer)
+            stack.callback(lock.close)
+            save_config(run_dir, config)  # after the inputs: a folder without it is no run yet
+            headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
+            console.print(f"{headline}\nrun directory: {run_dir}", highlight=False, soft_wrap=True)
+            steps, params = _train_and_log(config, trainer, run_dir, signals, restored, stopwatch, console)
+            exit_code = 0
+        except (Interrupted, Diverged, OSError) as error:
+            exit_code = _stopped(console, run_dir, error)
         if group:
-            group.end(0)
+            group.end(exit_code)
+        if exit_code:
+            return exit_code
         with stopwatch.stage("evaluate"):
             outcome = trainer.evaluate(params)
             metrics = {**trainer.metrics(outcome), **trainer.details(outcome)}
-        resumed_steps = restore[0] if restore else 0
-        report = make_report(config, trainer, metrics, stopwatch, steps, steps - resumed_steps)
+        report = make_report(config, trainer, metrics, stopwatch, steps, steps - (restored.step if restored else 0))
         write_report(run_dir, report)
+        for step in checkpoint_steps(run_dir):  # the last checkpoint is the result
+            if step > steps:
+                delete_checkpoint(run_dir, step)
         trainer.save_outcome(run_dir, outcome)
     show_report(console, report, trainer)
     console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
     return 0
+
+
+def _new_run(run_dir: Path, trainer: Trainer) -> RunLock:
+    """Creates and locks a run directory, and writes the inputs of the run."""
+    run_dir.mkdir(parents=True, exist_ok=True)
+    lock = RunLock(run_dir)
+    trainer.save_inputs(run_dir)
+    return lock
+
+
+def _stopped(console: Console, run_dir: Path, error: Interrupted | Diverged | OSError) -> int:
+    """Prints why a training stopped and how to continue; returns the exit code."""
+    command = f"python -m mimic.train resume={run_dir}"
+    if isinstance(error, Interrupted):
+        console.print(f"stopped by {error}; continue with: {command}", soft_wrap=True)
+        return error.exit_code
+    if isinstance(error, Diverged):
+        print(f"error: {error}; the checkpoints before it are kept in {run_dir}", file=sys.stderr)
+        return DIVERGED
+    print(f"error: {error}; once this is solved, continue with: {command}", file=sys.stderr)
+    return 1
 
 
 def _train_and_log(
@@ -150,17 +195,18 @@ def _train_and_log(
     trainer: Trainer,
     run_dir: Path,
     signals: Signals,
-    restore: tuple[int, Params] | None,
+    restored: Checkpoint | None,
     stopwatch: Stopwatch,
     console: Console,
 ) -> tuple[int, Params]:
     """Trains; evaluates and logs after each training epoch. Returns the steps and the parameters of the result."""
-    resumed_steps = restore[0] if restore else 0
+    resumed_step = restored.step if restored else 0
+    delete_partial_checkpoints(run_dir)
     with contextlib.ExitStack() as stack:
-        loggers = [MetricsLog(run_dir), *make_loggers(config.loggers, run_dir, to_dict(config))]
+        loggers = [MetricsLog(run_dir, resumed_step), *make_loggers(config.loggers, run_dir, to_dict(config))]
         for logger in loggers:
             stack.callback(logger.close)  # also where training is interrupted
-        progress = stack.enter_context(TrainingProgress(console, trainer.total_steps, resumed_steps))
+        progress = stack.enter_context(TrainingProgress(console, trainer.total_steps, resumed_step))
         stack.enter_context(stopwatch.stage("train"))
 
         def on_evaluation(step: int, params: Params, training_metrics: Mapping[str, float]) -> bool:
@@ -175,4 +221,4 @@ def _train_and_log(
                 progress.update(step, trainer.status(metrics), training_metrics.get("sps"))
             return trainer.good_enough(metrics)
 
-        return trainer.train(run_dir, on_evaluation, signals, restore)
+        return trainer.train(run_dir, on_evaluation, signals, restored)

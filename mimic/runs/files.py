@@ -14,7 +14,7 @@ _MAX_JSON_BYTES = 10_000_000  # a report has some 20 kB, the plan of a large swe
 def write_atomically(path: Path, text: str) -> None:
     """Writes a file; an existing one is replaced only when the new one is complete."""
     partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
+    partial.write_text(text, newline="")
     os.replace(partial, path)
 
 
@@ -39,6 +39,14 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"expected an object, got {content!r:.80}")
     return content
+
+
+def reported_steps(run_dir: Path, unit: str) -> int:
+    """Training steps of the parameters in a run's report; -1 without a report."""
+    try:
+        return int(read_json(run_dir / REPORT)[unit])
+    except (OSError, ValueError, LookupError, TypeError):
+        return -1
 
 
 def finite(value: Any) -> Any:

@@ -1,48 +1,72 @@
 """The metrics log of a training: CSV and TensorBoard events."""
 
 import csv
+import io
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
 from mimic import compat
-from mimic.runs.files import METRICS
+from mimic.runs.files import METRICS, write_atomically
 
 
 class MetricsLog:
-    """Metrics over training, as one CSV file and as TensorBoard events. A resumed run appends to them."""
+    """Metrics over training, as one CSV file and as TensorBoard events.
 
-    def __init__(self, run_dir: Path):
+    Args:
+      run_dir: the run directory.
+      resumed_step: training steps that a resumed run continues from; rows from there on are removed, and rows that were
+        not written to their end.
+    """
+
+    def __init__(self, run_dir: Path, resumed_step: int | None = None):
         self._path = run_dir / METRICS
-        self._writer = compat.import_tensorboard().SummaryWriter(str(run_dir / "tensorboard"))
-        self._columns: list[str] = []  # of the file, once it has been read or created
+        purge = {} if resumed_step is None else {"purge_step": resumed_step}
+        self._writer = compat.import_tensorboard().SummaryWriter(str(run_dir / "tensorboard"), **purge)
+        self._columns, rows = _read(self._path)
+        if resumed_step is not None and self._columns:
+            self._rewrite([row for row in rows if row["step"].isdigit() and int(row["step"]) < resumed_step])
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Appends one row; columns without a metric are empty."""
+        """Appends one row; columns without a metric are empty.
+
+        Raises:
+          OSError: it cannot be written; the file is as before.
+        """
         row = {"step": step, **metrics}
-        if not set(row) <= set(self._columns):
-            self._add_columns(row)
-        with self._path.open("a", newline="") as file:
-            csv.DictWriter(file, self._columns).writerow(row)
+        missing = [name for name in row if name not in self._columns]
+        if missing:  # all for a new run, some if another version of mimic started the run
+            _, rows = _read(self._path)
+            self._columns += missing
+            self._rewrite(rows)
+        size = self._path.stat().st_size
+        try:
+            with self._path.open("a", newline="") as file:
+                csv.DictWriter(file, self._columns).writerow(row)
+        except OSError:
+            os.truncate(self._path, size)
+            raise
         for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
 
-    def _add_columns(self, row: Mapping[str, float]) -> None:
-        """Adds missing columns to the file: all for a new run, some if another version of mimic started the run."""
-        rows: list[dict[str, str]] = []
-        if self._path.exists():
-            with self._path.open(newline="") as file:
-                reader = csv.DictReader(file)
-                self._columns, rows = list(reader.fieldnames or ()), list(reader)
-        missing = [name for name in row if name not in self._columns]
-        if missing:
-            self._columns += missing
-            new = self._path.with_suffix(".new")
-            with new.open("w", newline="") as file:
-                writer = csv.DictWriter(file, self._columns)
-                writer.writeheader()
-                writer.writerows(rows)
-            new.replace(self._path)
+    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self._columns)
+        writer.writeheader()
+        writer.writerows(rows)
+        write_atomically(self._path, text.getvalue())
 
     def close(self) -> None:
         """Writes buffered events."""
         self._writer.close()
+
+
+def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Columns and rows of a metrics file, without rows that were not written to their end."""
+    if not path.exists():
+        return [], []
+    with path.open(newline="") as file:
+        lines = [line for line in file if line.endswith("\n")]
+    header, *rows = csv.reader(lines) if lines else [[]]
+    complete = [row for row in rows if len(row) == len(header)]
+    return header, [dict(zip(header, row, strict=True)) for row in complete]

@@ -8,7 +8,6 @@ import itertools
 import json
 import os
 import re
-import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -198,15 +197,10 @@ def _remaining(folder: Path, planned: Sequence[PlannedRun]) -> dict[int, list[st
 
 
 def _resumed(run: PlannedRun) -> list[str]:
-    from mimic.runs.checkpoints import checkpoint_steps  # orbax, which --help does without
-
     run_dir = Path(run.run_dir)
     if not run.run_dir or not (run_dir / CONFIG).is_file():
         return run.overrides
-    if checkpoint_steps(run_dir):
-        return [path_override("resume", run.run_dir)]
-    shutil.rmtree(run_dir)  # stopped before its first checkpoint
-    return run.overrides
+    return [path_override("resume", run.run_dir)]
 
 
 def _write_sweep(folder: Path, planned: Sequence[PlannedRun], outcomes: Sequence[Outcome]) -> None:

@@ -60,12 +60,14 @@ class TrainerConfig:
     Attributes:
       name: name of the trainer.
       preset: name of the preset; it gives the values of the fields that are None.
+      keep: number of newest checkpoints that a run keeps.
     """
 
     length_key: ClassVar[str]  # the field that sets the training length
 
     name: str = MISSING
     preset: str = MISSING
+    keep: int = number(50, at_least=2, at_most=1_000_000)
 
     @property
     def total_steps(self) -> int:
@@ -110,6 +112,7 @@ class PPOConfig(TrainerConfig):
         it.
       evaluations: number of evaluations and checkpoints, as far as whole batches allow; with a target gap five times
         the preset's number.
+      keep: number of newest checkpoints that the run keeps, at least 2: those two can be resumed exactly.
     """
 
     length_key: ClassVar[str] = "num_timesteps"
@@ -389,6 +392,7 @@ class TrainConfig:
       seed: random seed of networks, exploration and resets.
       run_dir: folder that the run writes to; runs/ENV-TRAINER-seedSEED-TIME where empty.
       resume: run directory of the run to continue.
+      init: run directory of another run; training starts from the parameters of its last checkpoint.
       logger: "local", "wandb", "mlflow", or a list of these: services that metrics are sent to. The run directory
         always has the metrics.
       compilation_cache: folder where JAX keeps compiled functions between runs; none where empty.
@@ -400,6 +404,7 @@ class TrainConfig:
     seed: int = seed_number()
     run_dir: str = ""
     resume: str = ""
+    init: str = ""
     logger: Any = "local"
     compilation_cache: str = "~/.cache/mimic/jax"
     distributed: DistributedConfig = dataclasses.field(default_factory=DistributedConfig)

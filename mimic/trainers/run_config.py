@@ -1,5 +1,6 @@
 """The config of a run: its directory, and saving and loading the config there."""
 
+import os
 import time
 from pathlib import Path
 
@@ -8,7 +9,8 @@ from omegaconf import DictConfig, OmegaConf
 from mimic.config import check_new, check_writable, explain, schema, to_dict, typed
 from mimic.config_files import check_references, read_config
 from mimic.runs.checkpoints import check_checkpoint
-from mimic.runs.files import CONFIG, write_atomically
+from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
+from mimic.runs.lock import LOCK
 from mimic.trainers.config import TRAINERS, TrainConfig
 
 
@@ -16,11 +18,12 @@ def new_run_dir(config: TrainConfig) -> Path:
     """The directory of a new run, which is not created yet.
 
     Raises:
-      ValueError: it exists, or cannot be written.
+      ValueError: it exists and is more than a run that ended while it was created, or cannot be written.
     """
     if config.run_dir:
         path = Path(config.run_dir).expanduser()
-        check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
+        if not _is_unfinished(path):
+            check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
         check_writable("run_dir", path)
         return path
     stem = f"{config.env.name}-{config.trainer.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -29,6 +32,12 @@ def new_run_dir(config: TrainConfig) -> Path:
         path, number = Path("runs") / f"{stem}-{number}", number + 1
     check_writable("run_dir", path)
     return path
+
+
+def _is_unfinished(path: Path) -> bool:
+    """Whether a folder has nothing but what a run writes before its config."""
+    before_config = {LOCK, DEMONSTRATIONS, *(f"{name}.partial" for name in (DEMONSTRATIONS, CONFIG))}
+    return os.path.isdir(path) and {file.name for file in path.iterdir()} <= before_config
 
 
 def save_config(run_dir: Path, config: TrainConfig) -> None:

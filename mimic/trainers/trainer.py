@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mimic.evaluation.config import SearchConfig
+from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainerConfig
 
@@ -41,7 +42,7 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def train(
-        self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
+        self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restored: Checkpoint | None
     ) -> tuple[int, Params]:
         """Trains, and saves a checkpoint before each call of `on_evaluation`.
 
@@ -49,18 +50,21 @@ class Trainer(abc.ABC):
           run_dir: folder of the checkpoints.
           on_evaluation: called after each training epoch; training ends when it returns True.
           signals: signals of the process; after one, training ends at the next checkpoint.
-          restore: steps and parameters to continue from.
+          restored: checkpoint to continue from, which is evaluated again. At step 0, and if `run_dir` does not have it,
+            it has the parameters to start from.
 
         Returns:
           Steps and parameters of the result.
 
         Raises:
           Interrupted: a signal was received; a checkpoint has been written.
+          Diverged: a number is not finite; the checkpoints before it are kept.
+          OSError: a checkpoint cannot be written.
         """
 
-    def follow(self, restore: tuple[int, Params] | None) -> None:
+    def follow(self, restored: Checkpoint | None) -> None:
         """Trains in a process other than the first, which alone evaluates and writes; returns when training ends."""
-        del restore
+        del restored
         raise NotImplementedError
 
     @abc.abstractmethod

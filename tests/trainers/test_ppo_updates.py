@@ -31,7 +31,7 @@ class Case:
     def __post_init__(self):
         self.networks = training.make_networks(self.config, *SIZES)
         self.statistics, *self.params = programs.initial_params(self.networks, OBSERVED, jax.random.PRNGKey(1))
-        self.optimizer = optax.adam(0.01)
+        self.optimizer = optax.adam(optax.constant_schedule(0.01))
 
     def on_device(self, staggered, unroll, unrolls, order, key):
         """Policy, value and metrics by mimic."""

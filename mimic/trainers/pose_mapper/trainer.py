@@ -14,6 +14,7 @@ from mimic.compilation import Background, compiling
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose
+from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings, TrainConfig
 from mimic.trainers.pose_mapper import training
@@ -149,7 +150,7 @@ class PoseMapperTrainer(Trainer):
         return jax.eval_shape(lambda: self._model.init(jax.random.key(0)))
 
     def train(
-        self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
+        self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restored: Checkpoint | None
     ) -> tuple[int, Params]:
         """Trains with the metric as loss, see `mimic.trainers.pose_mapper.training.train`."""
         # Starts to compile these in parallel with the training's functions, the slowest first.
@@ -161,7 +162,7 @@ class PoseMapperTrainer(Trainer):
             seed=self._seed,
             on_evaluation=on_evaluation,
             signals=signals,
-            restore=restore,
+            restored=restored,
         )
 
     def evaluate(self, params: Params) -> _Evaluated:

@@ -1,6 +1,5 @@
 """Training of a pose mapper: the embodiment distance is the loss, and there are no labels (paper, eq. 23)."""
 
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -8,13 +7,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float
 
 from mimic.compilation import Background, compiling
-from mimic.runs.checkpoints import delete_checkpoint, save_checkpoint
+from mimic.runs.checkpoints import Checkpoint, checkpoint_steps, load_checkpoint, save_checkpoint, thin_checkpoints
+from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
 from mimic.trainers.pose_mapper.model import MapperModel, Params
+from mimic.trainers.schedules import schedules_from
 from mimic.trainers.trainer import OnEvaluation
 
 _WARM_UP = 0.02  # fraction of the updates over which the learning rate rises
@@ -28,7 +30,7 @@ class _Functions(NamedTuple):
     """The functions of a training, which compile in the background.
 
     Attributes:
-      start: (seed, restored parameters) -> (parameters, optimiser state).
+      start: (seed, parameters to start from or None, updates done with them) -> (parameters, optimiser state).
       train: a training epoch, see `_training_epoch`.
       validate: (parameters, poses) -> mean distance of the nearest head.
     """
@@ -36,6 +38,14 @@ class _Functions(NamedTuple):
     start: Background[Callable[..., Any]]
     train: Background[Callable[..., Any]]
     validate: Background[Callable[..., Any]]
+
+
+class _Best(NamedTuple):
+    """The parameters with the smallest validation distance so far."""
+
+    distance: float
+    steps: int
+    params: Params
 
 
 # Above 40 lines because of its docstring.
@@ -47,7 +57,7 @@ def train(
     seed: int,
     on_evaluation: OnEvaluation,
     signals: Signals,
-    restore: tuple[int, Params] | None = None,
+    restored: Checkpoint | None = None,
 ) -> tuple[int, Params]:
     """Trains a mapper. If the distance on the validation poses rises, the result has the best parameters before.
 
@@ -55,77 +65,79 @@ def train(
       model: the mapper.
       poses: returns training poses, for epochs without fresh ones, and validation poses; called after the functions
         of the training have started to compile.
-      run_dir: folder of the checkpoints; those after the best one are deleted.
+      run_dir: folder of the checkpoints.
       seed: random seed of the network, the order and the fresh poses.
       on_evaluation: called after each checkpoint; training ends when it returns True.
       signals: signals of the process; after one, training ends at the next checkpoint.
-      restore: training poses so far, and parameters to continue from; the moments of the optimiser are reset.
+      restored: the checkpoint to continue from. With the training's state the result is that of a training that was not
+        interrupted; without it, the moments of the optimiser start anew.
 
     Returns:
       Training poses so far and parameters of the result.
 
     Raises:
       Interrupted: a signal was received; a checkpoint has been written.
+      Diverged: a number is not finite.
+      OSError: a checkpoint cannot be written.
     """
     config = model.config
-    steps, restored = restore or (0, None)
-    done = steps // config.samples
+    steps, initial, leaves, metrics = restored or Checkpoint(0, None, None, {})
     interval = max(config.epochs // config.evaluations, 1)  # epochs between two evaluations
-    functions = _compile(model, done, interval, seed, restored)
-    state = functions.start()(seed, restored)
+    functions = _compile(model, interval, seed, initial)
+    state = functions.start()(seed, initial, steps // config.batch_size)
     training, validation = poses()
-
-    def save(steps: int, params: Params, metrics: dict[str, float]) -> bool:
-        save_checkpoint(run_dir, steps, params)
-        stop = on_evaluation(steps, params, metrics)
+    if leaves is None:
+        best = _Best(float(functions.validate()(state[0], validation)), steps, state[0])
+    else:
+        *leaves, distance, best_steps = leaves
+        state = jax.tree.unflatten(jax.tree.structure(state), leaves)
+        best_params = state[0] if best_steps == steps else load_checkpoint(run_dir, state[0], int(best_steps))[1]
+        best = _Best(float(distance), int(best_steps), best_params)
+    while True:
+        if steps not in checkpoint_steps(run_dir):
+            saved = [*jax.tree.leaves(jax.device_get(state)), np.array(best.distance), np.array(best.steps)]
+            save_checkpoint(run_dir, steps, state[0], saved, metrics)
+            thin_checkpoints(run_dir, config.keep, best.steps)
+        stop = on_evaluation(steps, state[0], metrics)
         signals.check()
-        return stop
-
-    save(steps, state[0], {})
-    best = float(functions.validate()(state[0], validation)), steps, state[0]
-    since_best: list[int] = []
-    for _ in range(math.ceil((config.epochs - done) / interval)):
+        evaluations_since_best = (steps - best.steps) // (interval * config.samples)
+        impatient = config.patience and evaluations_since_best >= config.patience
+        if stop or impatient or steps >= config.total_steps:
+            return best.steps, best.params
         run = functions.train()
         began = time.perf_counter()
-        state, loss = run(state, seed, done, training)
+        state, loss = run(state, seed, steps // config.samples, training)
         loss = float(loss)
-        done += interval
-        steps = done * config.samples
+        steps += interval * config.samples
+        check_finite(steps, {"loss": loss}, jax.device_get(state[0]))
         speed = interval * config.samples / (time.perf_counter() - began)
         distance = float(functions.validate()(state[0], validation))
-        stop = save(steps, state[0], {"loss": loss, "validation_distance": distance, "sps": speed})
-        if distance < best[0]:
-            best, since_best = (distance, steps, state[0]), []
-        else:
-            since_best.append(steps)
-        if stop or (config.patience and len(since_best) >= config.patience):
-            break
-    for step in since_best:
-        delete_checkpoint(run_dir, step)
-    return best[1], best[2]
+        metrics = {"loss": loss, "validation_distance": distance, "sps": speed}
+        if distance < best.distance:
+            best = _Best(distance, steps, state[0])
 
 
-def _compile(model: MapperModel, done: int, interval: int, seed: int, restored: Params | None) -> _Functions:
-    optimiser = _optimiser(model, done)
+def _compile(model: MapperModel, interval: int, seed: int, initial: Params | None) -> _Functions:
+    optimiser = _optimiser(model)
 
-    def start(seed: int, restored: Params | None) -> Any:
-        params = model.init(_keys(seed)[0]) if restored is None else restored
-        return params, optimiser.init(params)
+    def start(seed: int, initial: Params | None, done_updates: int) -> Any:
+        params = model.init(_keys(seed)[0]) if initial is None else initial
+        return params, schedules_from(optimiser.init(params), done_updates)
 
     def validation_distance(params: Params, poses: Poses) -> Array:
         return _distances(model, params, poses).min(axis=1).mean()
 
-    state = jax.eval_shape(start, seed, restored)
+    state = jax.eval_shape(start, seed, initial, 0)
     training, validation = poses_shape(model, model.config.samples), poses_shape(model, model.config.validation_poses)
     train = compiling(_training_epoch(model, optimiser, interval), state, seed, 0, training)  # first: it takes longest
     return _Functions(
-        start=compiling(start, seed, restored),
+        start=compiling(start, seed, initial, 0),
         train=train,
         validate=compiling(validation_distance, state[0], validation),
     )
 
 
-def _optimiser(model: MapperModel, done_epochs: int) -> optax.GradientTransformation:
+def _optimiser(model: MapperModel) -> optax.GradientTransformation:
     """AdamW with a constant rate, or with a warm-up and a cosine decay. Biases do not decay."""
     config = model.config
     updates_per_epoch = config.samples // config.batch_size
@@ -134,10 +146,7 @@ def _optimiser(model: MapperModel, done_epochs: int) -> optax.GradientTransforma
     schedule = optax.warmup_cosine_decay_schedule(0.0, rate, warm_up, max(updates, warm_up + 1), final)
     if config.final_learning_rate == 1:
         schedule = optax.constant_schedule(rate)
-    offset = done_epochs * updates_per_epoch
-    adam = optax.adamw(
-        lambda count: schedule(count + offset), b2=0.99, weight_decay=config.weight_decay, mask=_is_matrix
-    )
+    adam = optax.adamw(schedule, b2=0.99, weight_decay=config.weight_decay, mask=_is_matrix)
     return optax.chain(optax.clip_by_global_norm(1.0), adam)
 
 

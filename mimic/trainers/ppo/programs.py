@@ -7,7 +7,7 @@ and with the evaluation's functions.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -60,6 +60,25 @@ class TrainingState:
         """The parameters that define a policy, as they are saved."""
         return self.statistics, self.policy.params, self.value.params
 
+    @property
+    def saved(self) -> "TrainingState":
+        """The state without what follows from the demonstrations."""
+        return self.replace(expert_states=None)  # type: ignore[attr-defined]
+
+
+class TrainingFunctions(NamedTuple):
+    """The functions of a training. Those that compile do so in the background.
+
+    Attributes:
+      start: (seed, parameters to start from or None, updates that were done with them) -> state.
+      restore: leaves of `TrainingState.saved` -> state; None where they do not fit the settings.
+      epoch: state -> state after a training epoch, and the means of the training metrics.
+    """
+
+    start: Callable[[int, Params | None, int], TrainingState]
+    restore: Callable[[Sequence[np.ndarray]], TrainingState | None]
+    epoch: Background[Callable[[TrainingState], tuple[TrainingState, Metrics]]]
+
 
 # Above 40 lines because of its docstring.
 def compile_training(
@@ -68,12 +87,12 @@ def compile_training(
     networks: ppo_networks.PPONetworks,
     batches: int,
     learning_rate: optax.Schedule,
-    restored: Params | None,
+    initial: Params | None,
     progress: optax.Schedule = lambda count: 0.0,
-) -> tuple[
-    Background[Callable[[int], TrainingState]], Background[Callable[[TrainingState], tuple[TrainingState, Metrics]]]
-]:
-    """Compiles the two functions of a training in the background.
+    *,
+    restored: bool = False,
+) -> TrainingFunctions:
+    """Compiles the functions of a training in the background.
 
     Args:
       env: the environment with its training demonstrations.
@@ -81,29 +100,38 @@ def compile_training(
       networks: policy and value network.
       batches: number of batches in a training epoch.
       learning_rate: Adam's learning rate at each update from 0 on.
-      restored: parameters to continue from.
+      initial: parameters to start from, or their shapes; random ones where None.
       progress: fraction of the training that is done at each update, see `PPOSettings.at`.
 
-    Returns:
-      The function that starts a training from a seed, and the function that runs a training epoch; it returns the new
-      state and the means of the training metrics.
+      restored: whether a saved state is to be restored, so that `start` is not needed.
     """
     mesh = Mesh(np.array(jax.devices()), (_AXIS,))
     training = _Training(env, config, networks, optax.adam(learning_rate), progress, mesh.size)
     replicated, sharded = PartitionSpec(), PartitionSpec(_AXIS)
-    state = TrainingState(replicated, replicated, replicated, sharded, replicated, replicated)  # type: ignore[arg-type]
-    start = _over_devices(mesh, training.start, (replicated, replicated, replicated), state)
+    partitions = TrainingState(replicated, replicated, replicated, sharded, replicated, replicated)  # type: ignore[arg-type]
+    start = _over_devices(mesh, training.start, (replicated,) * 4, partitions)
     epoch = functools.partial(training.epoch, batches)
-    learn = _over_devices(mesh, epoch, (state,), (state, replicated), donate_argnums=0)
+    learn = _over_devices(mesh, epoch, (partitions,), (partitions, replicated), donate_argnums=0)
     expert_states = jax.device_get(env.expert_states)
-    lowered = learn.lower(jax.eval_shape(start, 0, restored, expert_states))
-    compiled_learn = in_background(lowered.compile)  # before the other, because it takes longer
+    shapes = jax.eval_shape(start, 0, initial, 0, expert_states)
+    compiled_learn = in_background(learn.lower(shapes).compile)  # before the other, because it takes longer
+    compiled_start = Background(lambda: start.lower(0, initial, 0, expert_states).compile())
+    if not restored:
+        compiled_start.start()
 
-    def compile_start() -> Callable[[int], TrainingState]:
-        compiled = start.lower(0, restored, expert_states).compile()
-        return lambda seed: compiled(seed, restored, expert_states)
+    def restore(leaves: Sequence[np.ndarray]) -> TrainingState | None:
+        expected, structure = jax.tree.flatten(shapes.saved)
+        if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in expected]:
+            return None
+        state = jax.tree.unflatten(structure, leaves).replace(expert_states=expert_states)
+        shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), partitions)
+        return jax.device_put(state, shardings)
 
-    return in_background(compile_start), compiled_learn
+    return TrainingFunctions(
+        start=lambda seed, params, done_updates: compiled_start()(seed, params, done_updates, expert_states),
+        restore=restore,
+        epoch=compiled_learn,
+    )
 
 
 def _over_devices(mesh: Mesh, function: Any, inputs: Any, outputs: Any, **options: Any) -> Any:
@@ -132,14 +160,16 @@ class _Training(NamedTuple):
     progress: optax.Schedule
     devices: int
 
-    def start(self, seed: Int[Array, ""], restored: Params | None, expert_states: LinkStates) -> TrainingState:
+    def start(
+        self, seed: Int[Array, ""], initial: Params | None, done_updates: Int[Array, ""], expert_states: LinkStates
+    ) -> TrainingState:
         """The state before the first update."""
         key_networks, key_episodes, key = jax.random.split(jax.random.PRNGKey(seed), 3)
-        statistics, policy, value = restored or initial_params(self.networks, self.env.observation_size, key_networks)
+        statistics, policy, value = initial or initial_params(self.networks, self.env.observation_size, key_networks)
         num_envs = self.config.num_envs // self.devices
         keys = jax.random.split(jax.random.fold_in(key_episodes, jax.lax.axis_index(_AXIS)), num_envs)
         episodes = fresh_episodes(self.env.with_expert_states(expert_states)).reset(keys)
-        states = updates.begin(policy, self.optimizer), updates.begin(value, self.optimizer)
+        states = (updates.begin(params, self.optimizer, done_updates) for params in (policy, value))
         return TrainingState(*states, statistics, episodes, expert_states, key)  # type: ignore[arg-type]
 
     def epoch(self, batches: int, state: TrainingState) -> tuple[TrainingState, Metrics]:
@@ -215,4 +245,4 @@ class _Training(NamedTuple):
 
     def _settings_now(self, state: TrainingState) -> PPOSettings:
         """The settings at the present update."""
-        return self.config.at(self.progress(state.policy.optimizer[0].count))
+        return self.config.at(self.progress(state.policy.optimizer[1].count))

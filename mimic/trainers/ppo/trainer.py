@@ -16,6 +16,7 @@ from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.rollout_metrics import MIN_SPAN
+from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, PPOSettings, TrainConfig
@@ -84,7 +85,7 @@ class PPOTrainer(Trainer):
         self.evaluator.prepare()
 
     def train(
-        self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restore: tuple[int, Params] | None
+        self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restored: Checkpoint | None
     ) -> tuple[int, Params]:
         """See `ppo.train`."""
         return ppo.train(
@@ -94,13 +95,13 @@ class PPOTrainer(Trainer):
             seed=self._seed,
             on_evaluation=on_evaluation,
             signals=signals,
-            restore=restore,
+            restored=restored,
             on_compiling=self._prepare,
         )
 
-    def follow(self, restore: tuple[int, Params] | None) -> None:
+    def follow(self, restored: Checkpoint | None) -> None:
         """See `ppo.train`."""
-        ppo.follow(self._env, self.settings, seed=self._seed, restore=restore)
+        ppo.follow(self._env, self.settings, seed=self._seed, restored=restored)
 
     def evaluate(self, params: Params) -> Rollouts:
         """Runs the deterministic policy once on each demonstration."""

@@ -4,21 +4,23 @@ import functools
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import networks as ppo_networks
+from jax.experimental import multihost_utils
 from jaxtyping import Array
 
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.evaluator import Controller
-from mimic.runs.checkpoints import save_checkpoint
+from mimic.runs.checkpoints import Checkpoint, checkpoint_steps, save_checkpoint, thin_checkpoints
+from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOSettings
-from mimic.trainers.ppo.programs import Params, compile_training, initial_params
+from mimic.trainers.ppo.programs import Params, TrainingState, compile_training, initial_params
 from mimic.trainers.trainer import OnEvaluation
 
 
@@ -66,7 +68,7 @@ def train(
     seed: int,
     on_evaluation: OnEvaluation,
     signals: Signals,
-    restore: tuple[int, Params] | None = None,
+    restored: Checkpoint | None = None,
     on_compiling: Callable[[], None] = lambda: None,
 ) -> tuple[int, Params]:
     """Trains a policy, and saves a checkpoint before each call of `on_evaluation`.
@@ -79,8 +81,8 @@ def train(
       on_evaluation: called for the initial parameters, without metrics, and after each training epoch; the metrics are
         those of the losses, environment steps per second (sps) and seconds of training (walltime).
       signals: signals of the process; after one, training ends at the next checkpoint.
-      restore: steps and parameters to continue from. Networks and observation statistics are kept; the moments of the
-        optimiser and the states of the environments are reset.
+      restored: the checkpoint to continue from. With the training's state the result is that of a training that was not
+        interrupted; without it, the optimizer and the environments start anew.
       on_compiling: called when the functions of the training start to compile; it may start work in other threads.
 
     Returns:
@@ -88,14 +90,18 @@ def train(
 
     Raises:
       Interrupted: a signal was received; a checkpoint has been written.
+      Diverged: a number is not finite.
+      OSError: a checkpoint cannot be written.
     """
-    pending: list[_Checkpoint] = []
-    for checkpoint in _checkpoints(env, config, seed, restore, on_compiling):
-        save_checkpoint(run_dir, checkpoint.step, checkpoint.params)
+    pending: list[Checkpoint] = []
+    for checkpoint in _checkpoints(env, config, seed, restored, on_compiling):
+        if checkpoint.step not in checkpoint_steps(run_dir):
+            save_checkpoint(run_dir, *checkpoint)
+            thin_checkpoints(run_dir, config.keep)
         pending.append(checkpoint)
         stop = False
         if checkpoint.metrics:  # the start is evaluated with the first epoch: the evaluation compiles until then
-            stop = [on_evaluation(*evaluated) for evaluated in pending][-1]
+            stop = [on_evaluation(each.step, each.params, each.metrics) for each in pending][-1]
             pending.clear()
         if checkpoint.step < config.total_steps:  # a finished training is not interrupted: there is nothing to resume
             signals.check()
@@ -104,66 +110,70 @@ def train(
     return checkpoint.step, checkpoint.params
 
 
-def follow(env: ImitationEnv, config: PPOSettings, *, seed: int, restore: tuple[int, Params] | None = None) -> None:
+def follow(env: ImitationEnv, config: PPOSettings, *, seed: int, restored: Checkpoint | None = None) -> None:
     """Runs the same training epochs as the first process, where `train` runs."""
-    for _ in _checkpoints(env, config, seed, restore, lambda: None):
+    for _ in _checkpoints(env, config, seed, restored, lambda: None):
         pass
-
-
-class _Checkpoint(NamedTuple):
-    """The result of a training epoch.
-
-    Attributes:
-      step: environment steps so far.
-      params: parameters on the host.
-      metrics: training metrics of the epoch; empty before the first epoch.
-    """
-
-    step: int
-    params: Params
-    metrics: dict[str, float]
 
 
 def _checkpoints(
     env: ImitationEnv,
     config: PPOSettings,
     seed: int,
-    restore: tuple[int, Params] | None,
+    restored: Checkpoint | None,
     on_compiling: Callable[[], None],
-) -> Iterator[_Checkpoint]:
-    """The start of a training, and the result of each training epoch."""
-    step, restored = jax.device_get(restore) if restore else (0, None)
-    remaining = max(config.num_timesteps - step, 1)
-    evaluations = max(round(config.evaluations * remaining / config.num_timesteps), 1)
-    all_batches = -(-remaining // config.steps_per_batch)
-    batches = max(round(all_batches / evaluations), 1)
+) -> Iterator[Checkpoint]:
+    """The checkpoint at the start of a training or the restored one, and that after each training epoch."""
+    step, initial, leaves, metrics = restored or Checkpoint(0, None, None, {})
+    batches = _batches_per_epoch(config)
     networks = make_networks(config, env.observation_size, env.action_size)
-    progress = _progress(config, step)
+    progress = _progress(config)
     learning_rate = _learning_rate(config, progress)
-    start, learn = compile_training(env, config, networks, batches, learning_rate, restored, progress)
+    functions = compile_training(
+        env, config, networks, batches, learning_rate, initial, progress, restored=leaves is not None
+    )
     on_compiling()
-    state = start()((seed + step) % 2**31)  # the range of a 32-bit integer
-    yield _Checkpoint(step, jax.device_get(state.params), {})
-    walltime = 0.0
-    for _ in range(-(-all_batches // batches)):
-        run_epoch = learn()
+    state = functions.restore(leaves) if leaves is not None else None
+    if state is None:
+        state = functions.start((seed + step) % 2**31, initial, _updates(config, step))  # the range of a 32-bit integer
+    yield Checkpoint(step, jax.device_get(state.params), _leaves(state), metrics)
+    walltime = metrics.get("walltime", 0.0)
+    while step < config.num_timesteps:
+        run_epoch = functions.epoch()
         began = time.perf_counter()
         state, means = run_epoch(state)
         metrics = {name: float(value) for name, value in jax.device_get(means).items()}
         seconds = time.perf_counter() - began
         walltime += seconds
         step += batches * config.steps_per_batch
+        params = jax.device_get(state.params)
+        check_finite(step, metrics, params)
         speed = {"sps": batches * config.steps_per_batch / seconds, "walltime": walltime}
-        yield _Checkpoint(step, jax.device_get(state.params), {**speed, **metrics})
+        yield Checkpoint(step, params, _leaves(state), {**speed, **metrics})
 
 
-def _progress(config: PPOSettings, done_steps: int) -> optax.Schedule:
-    """Fraction of the whole training that is done after `done_steps` and a number of updates."""
-    updates_per_batch = config.num_minibatches * config.num_updates_per_batch
-    updates = config.num_timesteps // config.steps_per_batch * updates_per_batch
-    done_updates = done_steps // config.steps_per_batch * updates_per_batch
-    schedule = optax.linear_schedule(0.0, 1.0, updates)
-    return lambda count: schedule(count + done_updates)
+def _leaves(state: TrainingState) -> list[np.ndarray]:
+    """The leaves of a state on the host, those of all processes."""
+    if jax.process_count() == 1:
+        return jax.tree.leaves(jax.device_get(state.saved))
+    episodes = multihost_utils.process_allgather(state.episodes, tiled=True)
+    return jax.tree.leaves(jax.device_get(state.saved.replace(episodes=episodes)))  # type: ignore[attr-defined]
+
+
+def _batches_per_epoch(config: PPOSettings) -> int:
+    """Batches between two evaluations. A resumed training has the same, and so the same compiled function."""
+    batches = -(-config.num_timesteps // config.steps_per_batch)
+    return max(round(batches / config.evaluations), 1)
+
+
+def _updates(config: PPOSettings, step: int) -> int:
+    """Updates of a network in a number of environment steps."""
+    return step // config.steps_per_batch * config.num_minibatches * config.num_updates_per_batch
+
+
+def _progress(config: PPOSettings) -> optax.Schedule:
+    """Fraction of the training that is done after a number of updates."""
+    return optax.linear_schedule(0.0, 1.0, _updates(config, config.num_timesteps))
 
 
 def _learning_rate(config: PPOSettings, progress: optax.Schedule) -> optax.Schedule:

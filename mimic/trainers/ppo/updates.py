@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo.losses import METRICS as POLICY_METRICS
 from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
+from mimic.trainers.schedules import schedules_from
 
 METRICS = ("value_loss", *POLICY_METRICS)
 
@@ -33,9 +34,10 @@ class TrainState(NamedTuple):
 TrainStates = tuple[TrainState, TrainState]  # policy, value
 
 
-def begin(params: Any, optimizer: optax.GradientTransformation) -> TrainState:
-    """The state of a network before its first update."""
-    return TrainState(params, optimizer.init(ravel_pytree(params)[0]))
+def begin(params: Any, optimizer: optax.GradientTransformation, done_updates: Any = 0) -> TrainState:
+    """The state of a network before its first update; schedules of the optimizer begin after `done_updates`."""
+    state = optimizer.init(ravel_pytree(params)[0])
+    return TrainState(params, schedules_from(state, done_updates))
 
 
 class UpdateConfig(NamedTuple):
