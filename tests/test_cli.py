@@ -56,6 +56,7 @@ def test_a_bad_arm_file(rejected, tmp_path):
 def test_bad_run_directories(rejected, tmp_path):
     run_dir = tmp_path / "run"
     run_dir.mkdir()
+    (run_dir / "notes.txt").touch()
     assert "exists" in rejected("train", f"run_dir={run_dir}")
 
 
@@ -64,7 +65,6 @@ def test_bad_run_directories(rejected, tmp_path):
     ("config", "message"),
     [
         (None, "not a run directory"),
-        ("trainer: {name: ppo}\n", "no checkpoint"),
         ("trainer: {name: sac}\n", "expected one of"),
         ("trainer: {name: ppo, previw: 1}\n", "previw"),
         ("a: [\n", "cannot be read"),
@@ -76,6 +76,12 @@ def test_unreadable_run_directories(rejected, tmp_path, command, key, config, me
     if config is not None:
         (run_dir / "config.yaml").write_text(config)
     assert message in rejected(command, f"{key}={run_dir}")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "render"])
+def test_run_directories_without_a_checkpoint(rejected, tmp_path, command):
+    (tmp_path / "config.yaml").write_text("trainer: {name: ppo}\n")
+    assert "no checkpoint" in rejected(command, f"run={tmp_path}")
 
 
 def test_all_commands_are_listed():
