@@ -4,7 +4,7 @@
 
 Trains each case by `python -m mimic.train -m` over its seeds, and evaluates runs by `python -m mimic.evaluate`, several
 in parallel. What DIR contains is not repeated, so that an interrupted study can be continued. Prints the table of
-`python -m mimic.collect DIR`, writes a results file, and figures beside it.
+`python -m mimic.collect DIR`, writes a results file, and figures next to it.
 """
 
 import csv
@@ -37,7 +37,7 @@ UNSEEN_SEED, UNSEEN = 1000, 32  # demonstrations that no run is trained on, the 
 
 
 class Case(NamedTuple):
-    """Training runs that differ in their seed alone."""
+    """Training runs that differ only in their seed."""
 
     group: str
     name: str
@@ -68,7 +68,7 @@ def cases(preset: str) -> list[Case]:
 
 
 def _values(name: str) -> list[dict[str, str]]:
-    """The values that a name with a placeholder stands for."""
+    """The values of the placeholder in a name."""
     if "{arm}" in name:
         return [{"arm": arm} for arm in STUDY["arms"]]
     locks = [lock for count in (1, 2) for lock in itertools.combinations("1234567", count)]

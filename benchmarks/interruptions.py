@@ -41,7 +41,7 @@ _TIMES = ("wall_time_s", "training/sps", "training/walltime")
 
 def main() -> None:
     options = {"kills": 20, "seed": 0, "trainer": "ppo"}
-    parser = make_parser("interruptions", __doc__, **options)
+    parser = make_parser("interruptions", __doc__, **dict[str, Any](options))
     parser.add_argument("arguments", nargs="*", help="of mimic.train, instead of a run of seconds")
     chosen = parser.parse_args()
     arguments = chosen.arguments or (_SMALL if chosen.trainer == "ppo" else _SMALL_MAPPER)

@@ -45,7 +45,7 @@ def run_stage(stage: Stage, clone: Path, home: Path) -> Row:
     changes = {"PIP_NO_CACHE_DIR": "1"} if stage is INSTALL else {"HOME": str(home)}
     variables = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")} | changes
     load = round(os.getloadavg()[0], 1)
-    # Not every python3 is new enough; this one is.
+    # A python3 on the path may be too old.
     command = [*stage.command, f"PYTHON={sys.executable}"] if stage.command[0] == "make" else stage.command
     row: Row = {"stage": stage.name, "command": " ".join(stage.command), "load_at_start": load}
     row["wall_s"] = run_process(command, cwd=clone, env=variables)

@@ -5,7 +5,7 @@
 The learner starts at home at rest; for 5 s a new random torque within the environment's torque scale is held for each
 control step. The error is the distance of the tip from that of C MuJoCo with RK4 in steps of 0.1 ms. Candidates are C
 MuJoCo's integrators in double precision, and the environments' own physics in single precision. Sequences in which the
-reference reaches the speed bound are counted and left out. A state that is not finite has an infinite error, null.
+reference reaches the speed bound are counted and excluded. A state that is not finite has an infinite error, null.
 """
 
 import os
@@ -59,7 +59,6 @@ def mujoco_motion(env: ImitationEnv, torques: np.ndarray, integrator: str, subst
 def own_motion(env: ImitationEnv, torques: np.ndarray, physics: str, substeps: int) -> Motion:
     """The environments' own physics, in single precision."""
     advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
-
     home = jnp.asarray(env.learner.home, jnp.float32)
 
     def step(state: tuple[jax.Array, jax.Array], torque: jax.Array) -> Any:

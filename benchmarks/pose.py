@@ -3,9 +3,9 @@
     python -m benchmarks.pose --out FILE [--poses 1000] [--batch 1000] [--mink-poses 100]
 
 Quality is (d - d_best) / (d_random - d_best), where d_best is the minimum distance over all methods and a search from
-512 random starts with 60 Newton steps each; the global share is that of poses within 0.1 % of d_best. "One start" is
-the paper's method, from the angles of the joints that both arms share. mink drives the learner's links to the full
-orientations of the expert's links that they overlap most, which constrains more than directions.
+512 random initial guesses with 60 Newton steps each. `global_share` is the fraction of poses within 0.1 % of d_best.
+"One start" is the paper's method: one initial guess, the angles of the joints that both arms have. mink drives the
+learner's links to the full orientations, not only directions, of the expert's links that they overlap most.
 """
 
 from collections.abc import Callable

@@ -3,7 +3,7 @@
     python -m benchmarks.ppo --out FILE [--env panda4dof] [--only CASE ...] [--num-envs N]
 
 PPO as `mimic.train` runs it, with the settings of the preset; brax's own training loop on the same environment, and on
-the same task as brax and MuJoCo Playground environments usually implement it; and, where it is installed, PPO of
+the same task as brax and MuJoCo Playground environments usually implement it; and, if it is installed, PPO of
 stable-baselines3 on C MuJoCo on the CPU, with the same networks, minibatches and passes, and an arm for each core. The
 speed is the median of all epochs but the first, which compiles, with the quartiles as spread.
 """
@@ -43,19 +43,19 @@ Case = Callable[[str, PPOSettings, int], dict[str, float]]  # environment, setti
 
 
 def rates(steps: int, times: Sequence[float]) -> dict[str, float]:
-    """Speed between the ends of epochs of so many steps, without the first, and how long that compiled."""
+    """Speed from the times at which epochs end, without the first one, and the compilation time of that one."""
     first, *later = np.diff(times).tolist()
     compile_s = round(max(first - float(np.median(later)), 0.0), 3)
     return {"compile_s": compile_s, **summary_of_rates([steps / seconds for seconds in later])}
 
 
 def settings(config: PPOSettings) -> dict[str, Any]:
-    """The settings of a resolved config that all implementations share."""
+    """The settings of a resolved config that all implementations have."""
     return {name: getattr(config, name) for name in SETTINGS}
 
 
 def training_epoch(env: ImitationEnv, config: PPOSettings, batches: int) -> Any:
-    """The compiled functions of `mimic.train` that begin a training, and that train for so many batches."""
+    """The compiled functions of `mimic.train`: one begins a training, one trains for a number of batches."""
     networks = training.make_networks(config, env.observation_size, env.action_size)
     schedule = optax.constant_schedule(config.learning_rate)
     return compile_training(env, config, networks, batches, schedule, None)
@@ -63,8 +63,8 @@ def training_epoch(env: ImitationEnv, config: PPOSettings, batches: int) -> Any:
 
 def mimic_loop(physics: str, name: str, config: PPOSettings, batches: int) -> dict[str, float]:
     times = [time.perf_counter()]
-    begin, epoch = training_epoch(mimic.make(name, physics=physics), config, batches)
-    state = begin()(0)
+    start, _, epoch = training_epoch(mimic.make(name, physics=physics), config, batches)
+    state = start(0)
     for _ in range(EPOCHS):
         state, metrics = epoch()(state)
         jax.block_until_ready(metrics)

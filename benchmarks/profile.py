@@ -2,8 +2,8 @@
 
     python -m benchmarks.profile [--out FILE] [--env panda4dof] [--batches 10]
 
-Profiles one training epoch of so many batches, after another that compiles. The times of concurrent kernels are added
-up, so that their sum exceeds the epoch; "busy" is the time in which a kernel ran.
+Profiles one training epoch after another one that compiles. The times of concurrent kernels are added up, so their sum
+can exceed the epoch; "busy" is the time in which at least one kernel ran.
 """
 
 import re
@@ -72,8 +72,8 @@ def busy(events: Iterable[Event]) -> float:
 def profile(name: str, batches: int) -> dict[str, Any]:
     env = mimic.make(name, physics="fused")
     config = PPOConfig().resolve(jax.default_backend(), jax.device_count())
-    begin, epoch = training_epoch(env, config, batches)
-    state, _ = jax.block_until_ready(epoch()(begin()(0)))
+    start, _, epoch = training_epoch(env, config, batches)
+    state, _ = jax.block_until_ready(epoch()(start(0)))
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             began = time.perf_counter()

@@ -49,7 +49,7 @@ def time_steps(step: Callable[[Any, Any], Any], state: Any, inputs: jax.Array) -
 
 
 def own_physics(physics: str, env: ImitationEnv, arms: int) -> Timing:
-    """The physics of the environments, which carries joint states alone."""
+    """The physics of the environments, which carries only joint states."""
     substeps = env.config.substeps
     advance = make_advance(env.arm.model, env.config.control_dt / substeps, substeps, physics)
     qpos, qvel, torques = random_motion(env, arms)
@@ -103,7 +103,6 @@ def environment(kind: str, env: ImitationEnv, arms: int) -> Timing:
 def part(name: str, env: ImitationEnv, arms: int) -> Timing:
     qpos, qvel, torques = random_motion(env, arms)
     started = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), arms))
-
     functions = {
         "reward": lambda arm: env.distance(arm.qpos, arm.qvel, arm.demonstration, arm.step),
         "observation": lambda arm: jnp.sum(env.observe(arm)),

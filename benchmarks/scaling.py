@@ -2,9 +2,9 @@
 
     python -m benchmarks.scaling --out FILE [--devices 1 2 4 8] [--processes one each] [--env panda4dof] [--seeds 0 1]
 
-Weak scaling gives each device as many arms, samples and steps as one device alone has; strong scaling distributes
-those, so that its gaps must agree within their noise. A run is one process that sees all devices, or a process for
-each; without GPUs, of devices that XLA makes of the CPU. The speed is the median between two evaluations.
+Weak scaling gives each device as many arms, samples and steps as a run on one device has; strong scaling distributes
+that work, so its gaps must agree within noise. A run is one process with all devices, or one process per device.
+Without GPUs, XLA divides the CPU into devices. The speed is the median between two evaluations.
 """
 
 import argparse
@@ -33,7 +33,7 @@ COLUMNS = "scaling devices processes steps_per_s:,.0f efficiency:.1% gap:.2% gap
 
 
 def environment(devices: int, processes: int, backend: str) -> dict[str, str]:
-    """Variables of a run that sees so many GPUs, or whose processes together have so many devices made of the CPU."""
+    """Environment variables of a run: the GPUs that are visible to it, or the CPU devices of each process."""
     inherited = {key: value for key, value in os.environ.items() if key != _PREALLOCATE}
     if backend == "gpu":
         visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
@@ -74,7 +74,7 @@ def summary(runs: Sequence[Row]) -> list[Row]:
 
 
 def run(options: argparse.Namespace) -> Iterator[Row]:
-    """Each run as it ends; a run on one device counts for all kinds."""
+    """Rows of the runs as they end; a run on one device is a row of each kind of scaling."""
     of_one = {"num_envs": options.num_envs, "batch_size": options.batch_size, "num_timesteps": options.steps}
     common = [f"env={options.env}", "env.physics=fused", f"trainer.evaluations={_EVALUATIONS}", *options.arguments]
     cases = itertools.product(sorted(options.devices), options.seeds, options.processes, options.kinds)

@@ -119,14 +119,11 @@ def run_pair(pair: EnvConfig, demonstrations: int, random: int) -> list[Row]:
 
 
 def main() -> None:
-    parser = make_parser("similarity", __doc__, plot=Path, demonstrations=20, random=120)
-    parser.add_argument(
-        "--arms", type=Path, default="robosuite", metavar="FOLDER", help="of an unpacked robosuite wheel"
-    )
+    parser = make_parser("similarity", __doc__, plot=Path, demonstrations=20, random=120, arms="robosuite")
     parser.add_argument("--pair", nargs="+", metavar="NAME", help="these pairs alone")
     options = parser.parse_args()
     logging.getLogger("mimic").setLevel(logging.ERROR)
-    others, missing = other_arms(options.arms)
+    others, missing = other_arms(Path(options.arms))
     pairs = {pair.name: pair for pair in (*locked_pandas(), *others)}
     if unknown := set(options.pair or ()) - set(pairs):
         parser.error(f"unknown pair {min(unknown)!r}; valid are {', '.join(pairs)}")

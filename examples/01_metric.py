@@ -1,4 +1,4 @@
-"""1. How alike are two arms? Poses, motions, and which links belong together.
+"""1. How similar are two arms? Poses, motions, and which links correspond.
 
     python examples/01_metric.py [FOLDER]
 
@@ -23,9 +23,9 @@ out.mkdir(parents=True, exist_ok=True)
 
 # ---- Two embodiments -------------------------------------------------------------------------------------------------
 #
-# An embodiment is what the metric knows of an arm: a chain of hinges and links. Here the expert is a Panda, which has
-# seven joints. The learner is a Panda whose joints 3, 6 and 7 are locked. Locking removes a joint and no link: it has
-# four joints and seven links. `planar_arm` and `load_mjcf` make other embodiments.
+# An embodiment is what the metric knows of an arm: a chain of revolute joints and links. Here the expert is a Panda,
+# which has seven joints. The learner is a Panda whose joints 3, 6 and 7 are locked. Locking removes the joint and keeps
+# the link: the learner has four joints and seven links. `planar_arm` and `load_mjcf` make other embodiments.
 
 expert = mimic.panda()
 learner = mimic.panda(locked=(3, 6, 7))
@@ -36,9 +36,9 @@ print(f"length of the chain: {expert.chain_length:.3f} m and {learner.chain_leng
 
 # ---- Link states -----------------------------------------------------------------------------------------------------
 #
-# A frame sits in the middle of each link, its x-axis along the link. The metric compares four things of each frame:
-# where it is, where the link points, and how both change. Positions and linear velocities are divided by the length of
-# the chain: an arm and its copy at twice the size are equal.
+# Each link has a frame in its middle, with the x-axis along the link. The metric compares four quantities of each
+# frame: position, direction, linear velocity and angular velocity. Positions and linear velocities are divided by the
+# length of the chain, so an arm and its copy at another size are equal.
 
 expert_qpos = np.array([0.3, 0.5, -0.2, -1.2, 0.4, 0.9, 0.0])  # rad, one for each joint
 expert_qvel = np.array([0.5, 0.0, 0.0, -0.5, 0.0, 0.0, 0.0])  # rad/s
@@ -48,17 +48,17 @@ for name, direction in zip(expert.link_names, np.asarray(states.direction), stri
     print(f"  {name}  " + "  ".join(f"{x:+.2f}" for x in direction))
 
 small, large, pose = mimic.planar_arm([0.2, 0.1]), mimic.planar_arm([2.0, 1.0]), np.array([0.4, 0.8])
-apart = mimic.link_distances(
+distances = mimic.link_distances(
     mimic.link_states(small, pose), mimic.link_states(large, pose), mimic.DistanceWeights(translation=1.0, rotation=1.0)
 )
-print("\nan arm and its copy at ten times the size, in the same pose: link distances", np.diag(apart).round(6))
+print("\nan arm and its copy at ten times the size, in the same pose: link distances", np.diag(distances).round(6))
 
-# ---- Which links belong together -------------------------------------------------------------------------------------
+# ---- Which links correspond ------------------------------------------------------------------------------------------
 #
-# A correspondence matrix W says how much each pair of links counts. The one that all environments use lays both chains
-# on [0, 1] and takes the length that two links share there: for two Pandas, each link with itself, by its length. It
-# does not depend on the pose, which leaves the distance with fewer local minima than the two that follow the distances:
-# `hard_correspondence` (nearest neighbours) and `soft_correspondence` (a softmax).
+# A correspondence matrix W weights each pair of links. The default of all environments, `arc_length_correspondence`,
+# lays both chains on [0, 1] and weights a pair by the length of its overlap. For two Pandas, each link corresponds to
+# itself, weighted by its length. This W does not depend on the pose, so the distance has fewer local minima than with
+# `hard_correspondence` (nearest neighbours) or `soft_correspondence` (a softmax), which depend on the link distances.
 
 correspondence = mimic.arc_length_correspondence(expert, learner)
 print("\ncorrespondence by arc length (rows: expert, columns: learner)")
@@ -67,8 +67,8 @@ print(np.asarray(correspondence).round(2))
 # ---- From link distances to one number -------------------------------------------------------------------------------
 #
 # The distance of two links is a weighted sum of four parts: translation (in chain lengths), rotation (an angle, 0 to
-# pi), linear velocity and angular velocity. Let the learner do what is obvious: turn its four joints as the expert
-# turns the joints of the same name. The embodiment distance is the mean of all entries of W times the link distances.
+# pi), linear velocity and angular velocity. The embodiment distance is the mean of the elementwise product of W and the
+# link distances. The simplest imitation copies the angles of the joints that both arms have:
 
 shared = [expert.joint_names.index(name) for name in learner.joint_names]
 copied = mimic.link_states(learner, expert_qpos[shared], expert_qvel[shared])
@@ -83,31 +83,31 @@ print("\nembodiment distance of the copied joint angles, by part:")
 for name, weights in PARTS.items():
     print(f"  {name:16}  {mimic.embodiment_distance(states, copied, correspondence, weights):.4f}")
 
-# Those are not on one scale: a rotation can be 3.1, a translation hardly more than 1. The weights decide what "alike"
-# means. The paper's, used below, are rotation 1, angular velocity 0.01, linear velocity 0.001 and no translation. The
-# default of the commands has a translation weight of 1 besides, by which arms resemble each other more.
+# The parts have different scales: a rotation is at most 3.1, a translation hardly more than 1. The weights define what
+# "similar" means. The paper's, used below, are rotation 1, angular velocity 0.01, linear velocity 0.001 and
+# translation 0. The default of the commands also has a translation weight of 1, with which arms look more similar.
 
 paper = mimic.embodiment_distance(states, copied, correspondence, mimic.PAPER_WEIGHTS)
 print(f"under the paper's weights: {paper:.4f}")
 
-# ---- Which link is to blame? -----------------------------------------------------------------------------------------
+# ---- Which link contributes most? ------------------------------------------------------------------------------------
 #
-# Before the mean there is a number for each pair of links. The sum over the expert's links says what each link of the
-# learner adds. The sum of the shares is the distance again.
+# The embodiment distance is a sum over pairs of links. The sum over the expert's links is the contribution of each link
+# of the learner. The contributions add up to the distance.
 
 pairs = mimic.link_distances(states, copied, mimic.PAPER_WEIGHTS)
-shares = np.asarray(correspondence * pairs).sum(axis=0) / pairs.size
-print("\nwhat each link of the learner adds:")
-for name, share in zip(learner.link_names, shares, strict=True):
-    print(f"  {name:18}  {share:.4f}  ({share / paper:.0%})")
-print(f"  sum                 {shares.sum():.4f}")
+contributions = np.asarray(correspondence * pairs).sum(axis=0) / pairs.size
+print("\ncontribution of each link of the learner:")
+for name, contribution in zip(learner.link_names, contributions, strict=True):
+    print(f"  {name:18}  {contribution:.4f}  ({contribution / paper:.0%})")
+print(f"  sum                 {contributions.sum():.4f}")
 
 # ---- Is the distance small? ------------------------------------------------------------------------------------------
 #
-# A distance by itself says little. Two others give it a scale: that of a learner which stays in its zero pose, and the
-# least that any pose and velocity of this learner can reach. `kinematic_bound` searches for the latter, at each time of
-# a motion by itself; here the motion has one. It is found by descent from several starts, so in principle it may be
-# above the true minimum.
+# Two other distances give it a scale: that of a learner which holds its start pose, here the zero pose, and the minimum
+# over all poses and velocities of this learner. `kinematic_bound` computes the latter for each time step of a motion
+# independently; here the motion has one step. It optimises from several initial guesses, so in principle it may miss
+# the global minimum.
 
 rest = mimic.embodiment_distance(states, mimic.link_states(learner, np.zeros(4)), correspondence, mimic.PAPER_WEIGHTS)
 bound = mimic.kinematic_bound(

@@ -1,8 +1,8 @@
-"""4. A network that answers at once: train a pose mapper, and retarget a whole motion.
+"""4. Train a neural pose mapper, and retarget whole motions with it.
 
     python examples/04_pose_mapper.py [FOLDER]
 
-Trains for some seconds; a mapper trained as `python -m mimic.train trainer=pose_mapper` does by default is far better.
+Trains for some seconds. The default training, `python -m mimic.train trainer=pose_mapper`, is longer and far better.
 """
 
 import json
@@ -26,19 +26,20 @@ out.mkdir(parents=True, exist_ok=True)
 
 
 def command(name, *arguments):
-    """Runs `python -m mimic.NAME`, and shows the line that does the same in a shell."""
+    """Prints the shell command `python -m mimic.NAME ...` and runs it."""
     print(f"\n$ python -m mimic.{name} {' '.join(arguments)}", flush=True)
     subprocess.run([sys.executable, "-m", f"mimic.{name}", *arguments], check=True)
 
 
 # ---- Training --------------------------------------------------------------------------------------------------------
 #
-# The network takes a pose of the expert and gives one of the learner. There are no labels: what it learns from is the
-# embodiment distance of its answer, differentiated through both arms. It proposes four poses, of which the nearest
-# counts (`trainer.heads`), because the best pose jumps as the expert moves on, and one continuous answer cannot.
+# The network maps a pose of the expert to a pose of the learner. It needs no labels: the loss is the embodiment
+# distance of the two poses, differentiated through both kinematics. The network has four heads (`trainer.heads`), each
+# of which proposes a pose; the nearest one is used. The optimal pose jumps as the expert moves: a choice between heads
+# can follow that, one continuous function cannot.
 #
-# A training run writes all that belongs to it into one folder. This one is short, and its network is small: three
-# epochs of the default's thirty.
+# A training writes everything into its run directory. This one is short and its network small: three epochs instead of
+# the default's thirty.
 
 mapper_run = out / "mapper"
 command(
@@ -50,8 +51,7 @@ print(f"\nquality on unseen poses, 0 for the optimiser and 1 for a random pose: 
 
 # ---- One pose at a time ----------------------------------------------------------------------------------------------
 #
-# A mapper is a function of a pose or of any batch of them, and far faster than the optimiser: the searching was done in
-# training.
+# A mapper takes one pose or a batch. It is far faster than the optimiser, because it searches nothing.
 
 mapper = mimic.PoseMapper.load(mapper_run)
 env = mimic.env_config("panda4dof")
@@ -61,7 +61,7 @@ poses = np.random.default_rng(0).uniform(-np.pi, np.pi, (2000, 7)).astype(np.flo
 
 
 def seconds(function):
-    """Of a call, once compiled."""
+    """Seconds of a call after compilation."""
     jax.block_until_ready(function(poses))
     began = time.perf_counter()
     jax.block_until_ready(function(poses))
@@ -74,9 +74,9 @@ for name, function in (("optimiser", optimise), ("mapper", jax.jit(mapper))):
 
 # ---- A whole motion --------------------------------------------------------------------------------------------------
 #
-# Neighbouring poses must stay neighbours, and no joint may turn faster than it is rated. `mimic.retarget` sees to both:
-# by the optimiser it tracks minima over time, by the mapper it chooses among the heads such that the motion stays near
-# and smooth. What comes out are demonstrations of the learner's arm. First, motions of the expert to retarget:
+# A motion must be continuous, and no joint may exceed its velocity limit. `mimic.retarget` ensures both: with the
+# optimiser it tracks minima over time, with a mapper it chooses among the heads so that the motion is smooth and its
+# distance small. The results are demonstrations of the learner's arm. First, motions of the expert to retarget:
 
 motions = mimic.record_demonstrations(mimic.build_arm(env.expert), 4)
 motions.save(out / "expert.npz")
@@ -87,11 +87,11 @@ command(
     f"mapper={mapper_run}",
 )  # fmt: skip
 
-# ---- How far apart? --------------------------------------------------------------------------------------------------
+# ---- Compare the motions ---------------------------------------------------------------------------------------------
 #
-# The same distance for both, at each time; that of a learner which stays in its zero pose is the scale. Two things to
-# know: the optimiser's motion is no bound, since a better pose may be out of reach without a jump. And motions begin
-# where the learner is most like the expert, not in its zero pose: a robot must get there first.
+# Both motions are compared by their distance over time; a learner that holds its zero pose sets the scale. The
+# optimiser's motion is not a bound: a better pose may need a jump. Motions start at the learner's optimal pose, not in
+# its zero pose; a robot must move there first.
 
 distance = jax.jit(
     jax.vmap(
@@ -110,7 +110,7 @@ print()
 for name, qpos in retargeted.items():
     by_time = np.asarray(distance(motions.qpos, qpos))
     step = np.abs(np.diff(qpos, axis=1)).max()
-    print(f"{name:14}  mean distance {by_time.mean():.4f}   largest step of a joint {step:.2f} rad")
+    print(f"{name:14}  mean distance {by_time.mean():.4f}   maximum step of a joint {step:.2f} rad")
     axes[0].plot(seconds_of_motion, by_time[0], label=name)
 for joint, joint_name in enumerate(learner.joint_names):
     (line,) = axes[1].plot(seconds_of_motion, retargeted["optimiser"][0, :, joint], label=joint_name)

@@ -1,8 +1,8 @@
-"""5. What the expert shows: record demonstrations, bring your own, see what they ask for.
+"""5. Demonstrations: record them, import your own, and see how well a learner can imitate them.
 
     python examples/05_demonstrations.py [FOLDER]
 
-Writes what it records and imports, and pictures of it, into FOLDER (a new one in examples_out by default).
+Writes demonstrations and pictures of them into FOLDER (a new one in examples_out by default).
 """
 
 import csv
@@ -25,31 +25,31 @@ out.mkdir(parents=True, exist_ok=True)
 
 # ---- Recording -------------------------------------------------------------------------------------------------------
 #
-# The expert is simulated by C MuJoCo and driven to random goals: by joint-space control ("pd", as in the paper), or the
-# hand goes straight to its goal by inverse kinematics ("reach"). Goals that would take it beyond a torque, speed or
-# joint limit are drawn anew. A demonstration has 51 samples, 0.1 s apart, and the torque that was held between any two.
+# The expert is simulated in C MuJoCo and moves to random goals: by joint-space PD control ("pd", as in the paper), or
+# with the hand on a straight line by inverse kinematics ("reach"). Goals whose motions exceed a torque, velocity or
+# joint limit are resampled. A demonstration has 51 samples, 0.1 s apart, and the torque held in each interval.
 
 panda = mimic.build_arm(mimic.ArmConfig())  # an embodiment, and a MuJoCo model to simulate it
 expert = panda.embodiment
 for kind in ("pd", "reach"):
     recorded = mimic.record_demonstrations(panda, 20, kind=kind, seed=0)
-    assert recorded.torque is not None  # as in demonstrations from elsewhere, see below
+    assert recorded.torque is not None  # imported demonstrations have none, see below
     speed = np.abs(recorded.qvel).max(axis=(0, 1)) / expert.velocity_limit
     torque = np.abs(recorded.torque).max(axis=(0, 1)) / expert.torque_limit
     print(f"{kind}: angles {recorded.qpos.shape}, torques {recorded.torque.shape}")
     print(f"  maximum speed, as a fraction of its limit:  {' '.join(f'{fraction:.0%}' for fraction in speed)}")
     print(f"  maximum torque, as a fraction of its limit: {' '.join(f'{fraction:.0%}' for fraction in torque)}")
 
-# One file holds them, without pickle, and says of which arm they are. `python -m mimic.demonstrations out=FILE` does
-# the same, with a plot; `python -m mimic.train env.demonstrations.path=FILE` trains on it.
+# They are saved in one file, without pickle, with the name of their arm. `python -m mimic.demonstrations out=FILE` does
+# the same and plots them; `python -m mimic.train env.demonstrations.path=FILE` trains on them.
 
 recorded.save(out / "recorded.npz")
 print(f"read back: {mimic.load_demonstrations(out / 'recorded.npz').count} demonstrations of {recorded.arm!r}")
 
 # ---- Your own --------------------------------------------------------------------------------------------------------
 #
-# A CSV table will do: a column `time`, and the angle of each joint by its name. Here two of them, one after the other
-# in one table, at 50 samples a second: a wave of the whole arm, and the same at half the speed.
+# A CSV file needs a column `time` and a column with the angle of each joint under its name. This one has two
+# demonstrations, one after the other, at 50 samples a second: a wave of the whole arm, and the same at half the speed.
 
 time_s = np.arange(0, 5.01, 0.02)
 amplitude, frequency = np.array([0.6, 0.4, 0.5, 0.4, 0.6, 0.4, 0.6]), np.array([1.5, 1.0, 1.2, 1.4, 1.8, 1.6, 2.0])
@@ -60,8 +60,8 @@ with (out / "waves.csv").open("w", newline="") as file:
         for t in time_s:
             table.writerow([number, f"{t:.2f}", *(amplitude * np.sin(frequency * tempo * t) ** 2)])
 
-# Importing resamples to control steps and checks that the expert could do it. There are no velocities in the table, so
-# they are differentiated, and it says so. Torques nobody knows.
+# The import resamples to control steps and checks the expert's limits. The table has no velocities, so they are
+# differentiated, which the second result says. The torques are unknown.
 
 waves, differentiated = mimic.import_demonstrations(out / "waves.csv", expert)
 print(f"\nwaves.csv: {waves.count} demonstrations, {waves.horizon} steps of {waves.dt} s; velocities differentiated: "
@@ -69,34 +69,34 @@ print(f"\nwaves.csv: {waves.count} demonstrations, {waves.horizon} steps of {wav
 
 # The same as a command, which writes the file and a picture of it:
 
-words = [f"source={out / 'waves.csv'}", f"out={out / 'waves.npz'}"]
-print(f"\n$ python -m mimic.demonstrations {' '.join(words)}", flush=True)
-subprocess.run([sys.executable, "-m", "mimic.demonstrations", *words], check=True)
+arguments = [f"source={out / 'waves.csv'}", f"out={out / 'waves.npz'}"]
+print(f"\n$ python -m mimic.demonstrations {' '.join(arguments)}", flush=True)
+subprocess.run([sys.executable, "-m", "mimic.demonstrations", *arguments], check=True)
 
 # ---- What is rejected ------------------------------------------------------------------------------------------------
 #
-# Most mistakes in such files are silent ones: degrees, a wrong column, another rate. So a file must be within the arm's
-# ranges and velocity limits. The second of these is the wave again, with a clock that runs eight times too fast.
+# Most mistakes in such files are silent: degrees, a wrong column, another sample rate. A file must therefore be within
+# the arm's joint ranges and velocity limits. The first file below is in degrees, the second eight times too fast.
 
 lines = (out / "waves.csv").read_text().splitlines()
 rows = [line.split(",") for line in lines[1:]]
-broken = {
+wrong_tables = {
     "degrees.csv": [[*row[:2], *(str(np.degrees(float(x))) for x in row[2:])] for row in rows],
     "clock.csv": [[row[0], str(float(row[1]) / 8), *row[2:]] for row in rows],
 }
 print()
-for name, changed in broken.items():
-    (out / name).write_text("\n".join([lines[0], *map(",".join, changed)]))
+for name, table_rows in wrong_tables.items():
+    (out / name).write_text("\n".join([lines[0], *map(",".join, table_rows)]))
     try:
-        mimic.import_demonstrations(out / name, expert, horizon=6)  # the fast clock leaves 0.6 s
+        mimic.import_demonstrations(out / name, expert, horizon=6)  # the second file has 0.6 s
     except ValueError as error:
         print(f"{name} is rejected: {error}")
 
-# ---- How much of it can the learner do? ------------------------------------------------------------------------------
+# ---- How well can the learner imitate it? ----------------------------------------------------------------------------
 #
-# Before anything is trained, the kinematic bound tells what the learner's joints allow. Four joints against seven: what
-# lies below the line is out of reach, whatever controls the arm. It is a bound for each moment by itself: a motion
-# through all of these poses need not exist.
+# The kinematic bound is the minimum distance that the learner's joints allow, with four joints here. It needs no
+# training, and no controller can go below it. It bounds each moment independently, so a motion that attains it
+# throughout need not exist.
 
 learner = mimic.panda(locked=(3, 6, 7))
 metric = mimic.env_config("panda4dof").metric  # what a training would use
@@ -109,7 +109,7 @@ steps = waves.dt * np.arange(waves.horizon + 1)
 for joint in range(3):
     (line,) = axes[0].plot(time_s, amplitude[joint] * np.sin(frequency[joint] * time_s) ** 2, alpha=0.5)
     axes[0].plot(steps, waves.qpos[0, :, joint], ".", color=line.get_color(), label=expert.joint_names[joint])
-axes[0].set(xlabel="time [s]", ylabel="angle [rad]", title="the table (lines), and what was taken from it")
+axes[0].set(xlabel="time [s]", ylabel="angle [rad]", title="the table (lines) and its samples (dots)")
 axes[0].legend(fontsize=8)
 axes[1].plot(steps, np.asarray(bound))
 axes[1].set(xlabel="time [s]", ylabel="embodiment distance", title="kinematic bound of a learner with four joints")

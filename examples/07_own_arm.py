@@ -1,8 +1,8 @@
-"""7. An arm of your own: from a file to a trained policy.
+"""7. Your own arm: from a model file to a trained policy.
 
     python examples/07_own_arm.py [FOLDER]
 
-The file is written here, so that the example needs none; any MJCF or URDF of a serial arm will do instead.
+The example writes its own model file. Any MJCF or URDF file of a serial arm can be used instead.
 """
 
 import json
@@ -18,19 +18,19 @@ out.mkdir(parents=True, exist_ok=True)
 
 
 def command(name, *arguments, check=True):
-    """Runs `python -m mimic.NAME`, and shows the line that does the same in a shell."""
+    """Prints the shell command `python -m mimic.NAME ...` and runs it."""
     print(f"\n$ python -m mimic.{name} {' '.join(arguments)}", flush=True)
     return subprocess.run([sys.executable, "-m", f"mimic.{name}", *arguments], check=check)
 
 
 # ---- A model ---------------------------------------------------------------------------------------------------------
 #
-# Five hinges: a base that turns, shoulder and elbow, and a wrist that bends and turns. Each body has a capsule, whose
-# mass and shape give its inertia. The gripper at the end slides, so it is no part of the chain; it stays as mass.
-# Actuators say how strong each joint is. Armature is the inertia of a motor's rotor as the joint feels it; many models
-# lack it, and then light wrists spin under random torques before anything is learned.
+# Five revolute joints: base, shoulder, elbow, and two in the wrist. Each body is a capsule, whose mass and shape give
+# its inertia. The finger of the gripper slides, so it is not part of the chain; its mass is kept. The actuators set
+# the torque limits. Armature is the rotor's inertia reflected to the joint. Many models lack it, and then random
+# torques spin light wrist links up before anything is learned.
 
-JOINTS = (  # name, axis, offset of its body in the body before [m], length [m], mass [kg], largest torque [N m]
+JOINTS = (  # name, axis, offset of its body in the parent body [m], length [m], mass [kg], torque limit [N m]
     ("turn", "0 0 1", 0.0, 0.25, 3.0, 60),
     ("shoulder", "0 1 0", 0.25, 0.35, 2.5, 60),
     ("elbow", "0 1 0", 0.35, 0.30, 1.5, 40),
@@ -55,10 +55,10 @@ arm_file.write_text(f"""<mujoco model="five">
 </mujoco>
 """)
 
-# ---- What the metric makes of it -------------------------------------------------------------------------------------
+# ---- The embodiment --------------------------------------------------------------------------------------------------
 #
-# Links go from each joint to the next, the last one to the tip. `roll` and `turn` move no link sideways, but they turn
-# all that comes behind them. What the metric sees of the arm is an embodiment, like those of the examples before.
+# A link goes from each joint to the next one, and the last link to the tip. The metric uses this embodiment, like those
+# of the previous examples.
 
 arm = mimic.load_mjcf(arm_file)
 print(f"{arm.name}: {arm.num_joints} joints ({', '.join(arm.joint_names)}), {arm.chain_length:.2f} m long")
@@ -67,24 +67,24 @@ for name, length in zip(arm.link_names, arm.link_lengths, strict=True):
 
 # ---- Inspection ------------------------------------------------------------------------------------------------------
 #
-# What would fail in training is found before. `inspect` lists joints and links, says what of the model is set aside
-# (the slide, gravity, contacts) and what is assumed (rated speeds, of which MJCF has none), and tells how much of a
-# Panda's motions these joints can imitate at all. The last line is the command that trains it.
+# `inspect` checks a model before training. It lists joints and links, what is ignored (the sliding joint, gravity,
+# contacts) and what is assumed (velocity limits, for which MJCF has no attribute), and how well these joints can
+# imitate a Panda's motions. Its last line is the command that trains a policy.
 
 command("inspect", str(arm_file), f"out={out / 'inspected'}")
-findings = json.loads((out / "inspected" / "inspection.json").read_text())
-print(f"\nof what the Panda does, {1 - findings['bound'] / findings['hold']:.0%} can be imitated, "
-      "measured by the distance; the rest no policy can")  # fmt: skip
+inspection = json.loads((out / "inspected" / "inspection.json").read_text())
+print(f"\nat best, the distance to the Panda's motions is {1 - inspection['bound'] / inspection['hold']:.0%} smaller "
+      "than that of holding the start pose")  # fmt: skip
 
-# A mistake ends with one line and exit code 2, here a tip that is not in the file.
+# Wrong input ends with one line and exit code 2; here the tip is not in the file.
 
-refused = command("inspect", str(arm_file), "learner.tip=hand", check=False)
-print(f"exit code: {refused.returncode}")
+rejected = command("inspect", str(arm_file), "learner.tip=hand", check=False)
+print(f"exit code: {rejected.returncode}")
 
 # ---- Training --------------------------------------------------------------------------------------------------------
 #
-# `env=pair` takes two arms; the expert is the Panda where none is named. This is a test that all is in place: eight
-# demonstrations, and a twenty-fifth of the steps that are made on CPUs by default.
+# `env=pair` trains any pair of arms; the expert is the Panda by default. This training is a test that everything works:
+# eight demonstrations, and 4 % of the default number of steps on CPUs.
 
 run = out / "run"
 command(
@@ -99,12 +99,12 @@ print(
     f"{gap['held_out']:.0%} on held-out ones"
 )
 
-# 0 is the kinematic bound, 1 is holding the start pose. The policy knows its eight motions roughly, and next to nothing
-# of others: that takes more of them, and more steps. A gap above 1 is no failure of the arm: a policy that has not
-# learned moves about, which is worse than to stay. The command that `inspect` proposed trains on 124, for ten minutes
-# or more on two cores.
+# 0 is the kinematic bound, 1 is holding the start pose. The policy imitates its eight training motions roughly, and
+# others hardly at all: that needs more demonstrations and more steps. A gap above 1 does not mean that the arm cannot
+# do better: an untrained policy moves at random, which is worse than holding the start pose. The command that `inspect`
+# printed trains on 124 demonstrations, for ten minutes or more on two cores.
 
 print(f"kinematic bound: {report['lower_bound']['held_out']:.3f}, "
       f"holding the start pose: {report['hold_distance']['held_out']:.3f}")  # fmt: skip
-print(f"to train it in earnest: {findings['train']}")
+print(f"for a full training: {inspection['train']}")
 print(f"results: {out}")

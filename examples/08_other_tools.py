@@ -23,39 +23,39 @@ out.mkdir(parents=True, exist_ok=True)
 
 # ---- A policy --------------------------------------------------------------------------------------------------------
 #
-# To have one to take elsewhere: trained for seconds, which is too short for it to be good. Example 6 trains a better
-# one.
+# A policy to export. It is trained for seconds, which is too short for good results; example 6 trains a better one.
 
 run = out / "run"
-words = [
+arguments = [
     "env=planar4dof", "env.physics=fused", "env.demonstrations.count=8", "env.demonstrations.held_out=2",
     "trainer.preset=cpu", "trainer.num_envs=128", "trainer.batch_size=64", "trainer.num_minibatches=16",
     "trainer.hidden_layers=[32,32]", "trainer.num_timesteps=80000", "trainer.evaluations=1", f"run_dir={run}",
 ]  # fmt: skip
-print(f"$ python -m mimic.train {' '.join(words)}", flush=True)
-subprocess.run([sys.executable, "-m", "mimic.train", *words], check=True)
+print(f"$ python -m mimic.train {' '.join(arguments)}", flush=True)
+subprocess.run([sys.executable, "-m", "mimic.train", *arguments], check=True)
 
-# ---- As a file that needs neither mimic nor JAX ----------------------------------------------------------------------
+# ---- A file that needs neither mimic nor JAX -------------------------------------------------------------------------
 #
-# All that the policy computes is in the file, normalisation of observations included. The metadata say what each number
-# is.
+# The ONNX file contains the whole policy, with the normalisation of observations. Its metadata name every input and
+# output.
 
 policy = mimic.export_run(run, out / "policy.onnx")  # or python -m mimic.export run=DIR out=FILE
 session = onnxruntime.InferenceSession(str(policy), providers=["CPUExecutionProvider"])
-about = session.get_modelmeta().custom_metadata_map
-joints = ", ".join(json.loads(about["learner_joints"]))
+metadata = session.get_modelmeta().custom_metadata_map
+joints = ", ".join(json.loads(metadata["learner_joints"]))
 print(f"\n{policy.name}: {policy.stat().st_size / 1024:.0f} KiB, for the joints {joints}")
-for part in json.loads(about["observation_layout"]):
+for part in json.loads(metadata["observation_layout"]):
     print(f"  observation[{part['start']}:{part['stop']}]  {part['name']}")
 
-# ---- Many arms as Gymnasium has them ---------------------------------------------------------------------------------
+# ---- Many arms as a Gymnasium environment ----------------------------------------------------------------------------
 #
-# NumPy in, NumPy out, all arms stepped at once by one JAX program. An episode ends after 5 s or with a runaway, and the
-# same step starts the next one. What an episode is worth is the sum of its rewards, which are minus the distances.
+# Inputs and outputs are NumPy arrays; one compiled function steps all arms in parallel. An episode ends after 5 s or
+# with a runaway, and the same step starts the next episode. The return of an episode is the sum of its rewards, which
+# are minus the distances.
 
 demonstrations = {"path": str(run / "demonstrations.npz"), "count": 8, "held_out": 2}
 arms = gymnasium.make_vec("mimic/planar4dof-v0", num_envs=64, physics="fused", demonstrations=demonstrations)
-limit = np.array(json.loads(about["torque_scale"]))  # N m, what an action of 1 stands for
+limit = np.array(json.loads(metadata["torque_scale"]))  # N m, the torque of an action of 1
 
 
 def episode(act):
@@ -72,7 +72,7 @@ def episode(act):
 
 def onnx_policy(observations):
     action, torque = session.run(["action", "torque"], {"observation": observations})
-    np.testing.assert_allclose(torque, action * limit, rtol=1e-4, atol=1e-4)  # N m, for a robot that takes torques
+    np.testing.assert_allclose(torque, action * limit, rtol=1e-4, atol=1e-4)  # N m
     return action
 
 
@@ -83,7 +83,7 @@ controllers = {
     "the policy, by ONNX Runtime": onnx_policy,
 }
 episode(controllers["no torque"])  # compiles
-print(f"\nrewards of an episode, mean of {arms.num_envs} arms (0 would be a perfect match at all times)")
+print(f"\nreturn of an episode, mean of {arms.num_envs} arms (0 is a perfect match throughout)")
 for name, act in controllers.items():
     reward, rate = episode(act)
     print(f"  {name:28} {reward:8.2f}    {rate:9,.0f} steps/s")
@@ -91,18 +91,17 @@ arms.close()
 
 # ---- Is it the same policy? ------------------------------------------------------------------------------------------
 #
-# What `mimic.evaluate` computes by JAX, and what ONNX Runtime gave just now, should agree: the mean distance of the
-# training demonstrations in the report, times 50 steps. The arms above drew their demonstrations at random, so the
-# comparison on the same ones steps one arm through each.
+# The report of the training, computed by JAX, and the exported policy in Gymnasium should agree on the mean distance of
+# the training demonstrations. The arms above follow random demonstrations, so here one arm follows each in turn.
 
-one = gymnasium.make("mimic/planar4dof-v0", physics="fused", demonstrations=demonstrations)
+arm = gymnasium.make("mimic/planar4dof-v0", physics="fused", demonstrations=demonstrations)
 distances = []
 for index in range(8):
-    observation, _ = one.reset(seed=0, options={"demonstration": index})
+    observation, _ = arm.reset(seed=0, options={"demonstration": index})
     for _ in range(50):
-        observation, reward, _, _, _ = one.step(onnx_policy(observation[None])[0])
+        observation, reward, _, _, _ = arm.step(onnx_policy(observation[None])[0])
         distances.append(-float(reward))
-one.close()
+arm.close()
 report = json.loads((run / "report.json").read_text())
 print(f"\nmean distance on the training demonstrations: {np.mean(distances):.5f} by Gymnasium and ONNX Runtime, "
       f"{report['mean_distance']['train']:.5f} in the report")  # fmt: skip

@@ -9,13 +9,13 @@ from mimic.compilation import Background, compiler_options
 
 
 def test_background_functions_run_once():
-    made = []
-    lazy, started = Background(lambda: made.append("lazy")), Background(lambda: made.append("started"))
+    computed = []
+    lazy, started = Background(lambda: computed.append("lazy")), Background(lambda: computed.append("started"))
     started.start()
     started.start()
     for program in (started, started, lazy, lazy):
         program()
-    assert made == ["started", "lazy"]
+    assert computed == ["started", "lazy"]
     failing = Background(lambda: 1 / 0)
     failing.start()
     with pytest.raises(ZeroDivisionError):
@@ -58,8 +58,8 @@ def test_all_reduces_overlap_with_computation_where_each_gpu_has_a_process(
     monkeypatch.setattr(jax, "process_count", lambda: processes)
     monkeypatch.setattr(jax, "device_count", lambda: devices)
     assert compilation.a_process_for_each_gpu() == expected
-    given = compilation.compiler_options().get("xla_gpu_enable_command_buffer", "")
-    assert ("COLLECTIVES" in given) == expected
+    commands = compilation.compiler_options().get("xla_gpu_enable_command_buffer", "")
+    assert ("COLLECTIVES" in commands) == expected
 
 
 def test_a_cache_that_cannot_be_written_is_not_used(capsys):

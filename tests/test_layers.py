@@ -12,7 +12,7 @@ import pytest
 
 from tests.helpers.repository import REPOSITORY
 
-# From the lowest up: what stands in a layer may import its own layer and those before it.
+# From the lowest up: a module may import its own layer and the layers before it.
 LAYERS = (
     ("compat", "compilation", "config", "config_files", "memory", "ranges"),
     ("arms",),

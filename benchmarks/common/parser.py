@@ -19,7 +19,7 @@ def make_parser(name: str, doc: str | None, out: str = "FILE", **options: Any) -
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.set_defaults(benchmark=name)
     if out:
-        parser.add_argument("--out", type=Path, metavar=out, required=out == "DIR", help="results, figures beside them")
+        parser.add_argument("--out", type=Path, metavar=out, required=out == "DIR", help="results; figures next to it")
         parser.add_argument("--commit", help="commit to record, if this is not a git checkout")
     for option, default in options.items():
         parser.add_argument(f"--{option.replace('_', '-')}", **_arguments(default), help="default: %(default)s")

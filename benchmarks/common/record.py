@@ -36,7 +36,7 @@ def write_results(options: argparse.Namespace, **content: Any) -> None:
 
 
 def collect(options: argparse.Namespace, rows: Iterable[Row], key: str, columns: str, **content: Any) -> list[Row]:
-    """Writes the results anew after each row, under a key beside other content, and prints the table of all rows."""
+    """Rewrites the results file after each row: rows under a key, and other content. Prints the table of all rows."""
     measured: list[Row] = []
     for row in rows:
         measured.append(row)

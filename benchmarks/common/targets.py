@@ -71,7 +71,7 @@ def read_folder(folder: Path) -> list[tuple[str, Row]]:
 
 
 def find(target: Target, files: Iterable[tuple[str, Row]]) -> tuple[float, str] | None:
-    """The value in the newest file that contains it, and the name of that file."""
+    """The value of the newest file that has one, and the name of that file."""
     for name, results in files:
         backend = results.get("hardware", {}).get("backend")
         if results["benchmark"] == target.benchmark and target.backend in ("", backend):

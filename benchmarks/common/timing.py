@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 _LONGEST_S = 10.0  # a call that takes longer is timed once
-_SHORTEST_S = 0.02  # a repeat makes as many calls as fill this time, so that the clock's overhead is negligible
+_SHORTEST_S = 0.02  # minimum duration of a repeat, by several calls, so that the clock's overhead is negligible
 
 
 @dataclasses.dataclass(frozen=True)

@@ -71,7 +71,6 @@ def pareto_front(compared: dict[str, dict[str, Any]]) -> list[str]:
         for method, result in compared.items()
         if method not in BASELINES and all(result[name]["ratio"] is not None for name in FRONT)
     }
-
     others = ratios.values()
     return [key for key, own in ratios.items() if not any(np.all(x <= own) and np.any(x < own) for x in others)]
 

@@ -12,11 +12,11 @@ import mimic
 from benchmarks.peers.mujoco_task import MujocoTask
 from mimic.trainers.config import PPOSettings
 
-STEPS = 256  # of each arm in a batch: as many arms as on a GPU, 4096, would be as many processes
+STEPS = 256  # of each arm in a batch; the 4096 arms of a GPU would be 4096 processes
 
 
 def make_arm(name: str, seed: int) -> MujocoTask:
-    jax.config.update("jax_platforms", "cpu")  # before the backend starts: the arms leave the accelerator alone
+    jax.config.update("jax_platforms", "cpu")  # before the backend starts: the arms do not use the accelerator
     task = MujocoTask(mimic.make(name, physics="fused"))
     task.reset(seed=seed)
     return task

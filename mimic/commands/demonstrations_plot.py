@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import matplotlib
 
 matplotlib.use("Agg")
@@ -13,9 +11,9 @@ import numpy as np  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 from matplotlib.collections import LineCollection  # noqa: E402
 
-from mimic.arms.embodiment import Embodiment  # noqa: E402
+from mimic.arms.embodiment import Embodiment, segment_arm  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations  # noqa: E402
-from mimic.metric.kinematics import forward_kinematics  # noqa: E402
+from mimic.metric.similarity import centre_line_table  # noqa: E402
 
 _COLOURS = {"angle": "tab:blue", "velocity": "tab:green", "torque": "tab:purple", "hand": "tab:orange"}
 _LIMIT: dict[str, Any] = {"color": "tab:red", "lw": 0.8, "ls": "--"}
@@ -39,14 +37,7 @@ def hand_paths(
     arm: Embodiment, qpos: Float[np.ndarray, "demonstrations samples joints"]
 ) -> Float[np.ndarray, "demonstrations samples 3"]:
     """Position of the end of the last link in the base frame [m]."""
-
-    def end(qpos: jax.Array) -> jax.Array:
-        frames = forward_kinematics(arm, qpos)
-        return (
-            frames.position[-1] + frames.rotation[-1, :, 0] * arm.link_lengths[-1] / 2
-        )  # a frame is in the middle of its link
-
-    return np.asarray(jax.jit(jax.vmap(jax.vmap(end)))(jnp.asarray(qpos, jnp.float32)))
+    return float(segment_arm(arm).chain_length) * centre_line_table(arm, qpos, samples=1).hand_position
 
 
 def plot_demonstrations(demonstrations: Demonstrations, arm: Embodiment, out: Path, *, title: str) -> None:

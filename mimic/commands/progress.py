@@ -18,15 +18,7 @@ class TrainingProgress:
     def __init__(self, console: Console, total_steps: int, done_steps: int = 0):
         self._console = console
         self._total = total_steps
-        self._bar = Progress(
-            TextColumn("[bold]training"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[status]}"),
-            TimeElapsedColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
+        self._bar = _progress_bar(console, "training")
         self._task = self._bar.add_task("train", total=total_steps, completed=done_steps, status="compiling")
 
     def __enter__(self) -> "TrainingProgress":
@@ -51,15 +43,7 @@ class SearchProgress:
 
     def __init__(self, console: Console, total: int):
         self._console, self._total = console, total
-        self._bar = Progress(
-            TextColumn("[bold]searching"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[status]}"),
-            TimeElapsedColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
+        self._bar = _progress_bar(console, "searching")
         self._task = self._bar.add_task("search", total=total, status="compiling")
 
     def __enter__(self) -> "SearchProgress":
@@ -75,6 +59,12 @@ class SearchProgress:
         self._bar.update(self._task, completed=done, status=status)
         if not self._console.is_terminal and (done % max(self._total // 10, 1) == 0 or done == self._total):
             self._console.print(f"searching {done:>4} of {self._total}  {status}", soft_wrap=True, highlight=False)
+
+
+def _progress_bar(console: Console, label: str) -> Progress:
+    """A bar with a status text, hidden without a terminal."""
+    columns = BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[status]}"), TimeElapsedColumn()
+    return Progress(TextColumn(f"[bold]{label}"), *columns, console=console, disable=not console.is_terminal)
 
 
 def _duration(seconds: float) -> str:

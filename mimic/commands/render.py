@@ -29,7 +29,7 @@ from mimic.evaluation.labels import similarity_texts  # noqa: E402
 _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760  # pixels, width of the arms' picture
 _GIF_EVERY, _GIF_SCALE = 3, 0.5
-_LEGEND_ROOM = 1.25  # of the largest distance, above which the legend stands
+_LEGEND_ROOM = 1.25  # height of the axes relative to the maximum distance, so that the legend hides no curve
 
 Bounds = tuple[float, float, float, float]  # left, bottom, width, height as fractions of the frame
 

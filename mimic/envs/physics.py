@@ -12,7 +12,7 @@ from mujoco import mjx
 from mimic.envs import dynamics
 from mimic.metric import fused_kernel
 
-_LAYOUT = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest by measurement
+_LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest by measurement
 
 
 class Load(NamedTuple):
@@ -83,7 +83,7 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
 
     # For CPUs: a loop over a few arrays is twice as fast as a loop over an array for each joint.
     widths = len(arm), len(arm)
-    step = fused_kernel.fused(_scalar_step(arm, timestep, substeps), widths, plain=plain, layout=_LAYOUT)
+    step = fused_kernel.fused(_scalar_step(arm, timestep, substeps), widths, plain=plain, launch=_LAUNCH)
 
     def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
         qpos, qvel = step(qpos, qvel, torque, jnp.stack([jnp.asarray(x, qpos.dtype) for x in load]))

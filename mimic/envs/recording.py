@@ -23,7 +23,7 @@ GOAL_SHARE = 0.5  # goals lie within this fraction of the way from the home pose
 # Joint-space PD control: critically damped, at 2 rad/s. A goal that is pi/2 away needs a peak speed of 1.2 rad/s
 # (omega * distance / e), within every joint's velocity limit, and is reached to within 1 % in 3.3 s of the 5 s.
 PD_FREQUENCY = 2.0  # rad/s
-REACH_SHARE = 0.6  # fraction of an episode after which the expert has reached its goal and stays there
+REACH_FRACTION = 0.6  # fraction of an episode after which the expert has reached its goal and stays there
 REACH_FREQUENCY = 4.0  # rad/s, of the feedback that tracks the joint path of the reach
 _REACH_SPEED_FRACTION = 0.9  # of the velocity limit, for inverse kinematics; the feedback needs the rest
 _REACH_DAMPING = 1e-2  # regularises inverse kinematics near the stretched arm, a singularity where episodes start
@@ -144,7 +144,7 @@ def _reach_path(
     task = mink.FrameTask(hand, "body", position_cost=1.0, orientation_cost=0.3)  # 0.3 m/rad: the reach of a hand
     path, path_velocity = [configuration.q.copy()], []
     for step in range(horizon):
-        progress = min((step + 1) / (REACH_SHARE * horizon), 1.0)
+        progress = min((step + 1) / (REACH_FRACTION * horizon), 1.0)
         task.set_target(start.interpolate(end, alpha=10 * progress**3 - 15 * progress**4 + 6 * progress**5))
         velocity = mink.solve_ik(configuration, [task], dt, solver="daqp", damping=_REACH_DAMPING, limits=limits)
         configuration.integrate_inplace(velocity, dt)

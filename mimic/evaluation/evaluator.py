@@ -55,12 +55,10 @@ class Evaluator:
       held_out: demonstrations for evaluation only.
 
     Attributes:
-      training_env: the training environment.
-      env: the same environment on all demonstrations, those for training first.
+      env: the training environment on all demonstrations, those for training first.
     """
 
     def __init__(self, env: ImitationEnv, held_out: Demonstrations):
-        self.training_env = env
         self._num_train = env.demonstrations.count
         self.env = env.with_demonstrations(concatenate(env.demonstrations, held_out))
         self._references = Background(lambda: _references(self.env))

@@ -48,18 +48,19 @@ def measure(
       torque: constant torque in each step [N m].
     """
     arm = env.learner
-    shares = env.config.metric.link_fractions(env.expert, arm)
+    fractions = env.config.metric.link_fractions(env.expert, arm)
     expert = {key: np.asarray(value)[:, 1 : qpos.shape[1] + 1] for key, value in vars(env.expert_states).items()}
     cosine = np.einsum("dtix,dtjx->dtij", expert["direction"], np.asarray(learner.direction))
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean(axis=1)
-    by_link = (angle * shares).sum(axis=1)
+    by_link = (angle * fractions).sum(axis=1)
     difference = expert["angular_velocity"][:, :, :, None] - np.asarray(learner.angular_velocity)[:, :, None]
+    velocity_error = (np.linalg.norm(difference, axis=-1).mean(axis=1) * fractions).sum(axis=1)
     relative = torque / np.asarray(env.torque_scale)
     change = np.diff(relative, axis=1)
     return {
         "link_angle_error_deg": by_link.mean(axis=1),
         **{f"link_angle_error_deg.{name}": by_link[:, i] for i, name in enumerate(arm.link_names)},
-        "angular_velocity_error": (np.linalg.norm(difference, axis=-1).mean(axis=1) * shares).sum(axis=1).mean(axis=1),
+        "angular_velocity_error": velocity_error.mean(axis=1),
         "torque_rms": np.sqrt((relative**2).mean(axis=(1, 2))),
         "torque_change": np.sqrt((change**2).mean(axis=(1, 2))) if change.size else np.zeros(len(qpos)),
         "torque_saturation": (np.abs(relative) > 0.99).any(axis=-1).mean(axis=1),

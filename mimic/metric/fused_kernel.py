@@ -43,7 +43,7 @@ def fused(
     widths: Sequence[int],
     *,
     plain: Callable[..., tuple[Array, ...]] | None = None,
-    layout: LaunchConfig = DEFAULT,
+    launch: LaunchConfig = DEFAULT,
 ) -> Callable[..., tuple[Array, ...]]:
     """A function of vectors whose `jax.vmap` is one kernel on NVIDIA GPUs.
 
@@ -55,7 +55,7 @@ def fused(
         like the functions of `mimic.metric.spatial`: in the kernel a scalar is a block of samples.
       widths: length of each returned sequence.
       plain: the same function on vectors, for other devices; `function` itself where None.
-      layout: launch configuration of the kernel.
+      launch: launch configuration of the kernel.
 
     Returns:
       The function of vectors, which have one floating dtype. Its derivatives are those of `function`, compiled by XLA.
@@ -75,7 +75,7 @@ def fused(
     of_sample = jax.jit(plain or by_vectors)  # traced once for all outputs and all callers
     # For several outputs together XLA's CPU compiler recomputes common subexpressions many times: the distance and its
     # gradient with respect to the learner's angles took seven times as long (measured).
-    return batched_by(gpu_kernel(function, widths, layout), of_sample, of_sample if plain else sequential)
+    return batched_by(gpu_kernel(function, widths, launch), of_sample, of_sample if plain else sequential)
 
 
 def batched_by(
@@ -107,14 +107,14 @@ def batched_by(
 
 
 def gpu_kernel(
-    function: ScalarFunction, widths: Sequence[int], layout: LaunchConfig = DEFAULT
+    function: ScalarFunction, widths: Sequence[int], launch: LaunchConfig = DEFAULT
 ) -> Callable[..., tuple[Array, ...]]:
     """A function over arrays [samples, width], as one Pallas kernel.
 
     Args:
       function: see `fused`.
       widths: see `fused`.
-      layout: launch configuration of the kernel.
+      launch: launch configuration of the kernel.
     """
 
     def body(inputs: Sequence[Columns], outputs: Sequence[Columns]) -> None:
@@ -124,7 +124,7 @@ def gpu_kernel(
             for k, value in enumerate(scalars):
                 columns.write(jnp.asarray(k), value)
 
-    return by_columns(body, widths, layout=layout)
+    return by_columns(body, widths, launch=launch)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,7 +164,7 @@ class Columns:
 
 
 def by_columns(
-    body: Callable[..., None], widths: Sequence[int], *tables: np.ndarray, layout: LaunchConfig = DEFAULT
+    body: Callable[..., None], widths: Sequence[int], *tables: np.ndarray, launch: LaunchConfig = DEFAULT
 ) -> Callable[..., tuple[Array, ...]]:
     """A function of arrays [samples, width] as one Pallas kernel: a thread computes a sample.
 
@@ -172,9 +172,9 @@ def by_columns(
       body: takes `Columns` of the inputs, `Columns` of the outputs, and references to the tables.
       widths: of the output arrays.
       *tables: constant arrays, common to all samples.
-      layout: launch configuration of the kernel.
+      launch: launch configuration of the kernel.
     """
-    block, sample_axis = layout.block, layout.sample_axis
+    block, sample_axis = launch.block, launch.sample_axis
 
     def window(width: int) -> pl.BlockSpec:
         if sample_axis:
@@ -199,7 +199,7 @@ def by_columns(
             grid=(pl.cdiv(count, block),),
             in_specs=[*(window(x.shape[1]) for x in rows), *whole],
             out_specs=[window(width) for width in widths],
-            compiler_params=triton.CompilerParams(num_warps=layout.warps, num_stages=1),
+            compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
         )(*(x.T if sample_axis else x for x in rows), *numbers)
         return tuple(x.T if sample_axis else x for x in outputs)
 

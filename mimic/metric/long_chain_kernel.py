@@ -173,8 +173,8 @@ def gpu_kernel(schedule: Schedule, arguments: Sequence[int]) -> Callable[..., tu
 
     widths = [1, *(int(num_crossed[index // 2]) for index in arguments)]
     # The fastest for 32 and 64 links, by measurement.
-    layout = fused_kernel.LaunchConfig(sample_axis=1 if arguments else 0)
-    kernel = fused_kernel.by_columns(body, widths, schedule.joints, schedule.numbers, layout=layout)
+    launch = fused_kernel.LaunchConfig(sample_axis=1 if arguments else 0)
+    kernel = fused_kernel.by_columns(body, widths, schedule.joints, schedule.numbers, launch=launch)
 
     def with_distal_joints(*motion: Array) -> tuple[Array, ...]:
         value, *gradients = kernel(*motion)

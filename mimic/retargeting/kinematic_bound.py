@@ -17,8 +17,8 @@ from mimic.retargeting.quasi_newton import Descent, bfgs
 
 _POSES = 256  # random poses whose distances are compared to choose the initial guesses
 _MIN_SPEED = 1e-2  # rad/s, of the unit of the optimised velocities
-# One entry for each round of exchange: each time tries the motions of so many steps before and after it. Long shifts
-# spread a minimum quickly, short ones track it.
+# Shift of each round of exchange, in steps: each step tries the motions of the steps before and after it by this shift.
+# Long shifts spread a minimum quickly, short ones track it.
 _SHIFTS = (1, 2, 4, 1, 8, 1, 2, 1, 1, 1, 1, 1)
 _HOP = 1.0  # standard deviation of a random step from the best motion [rad]; each round tries one
 # Minimum numbers, over all times, of descents and of hops in a round: a short motion has fewer neighbours to exchange

@@ -70,7 +70,7 @@ def imitate_pose(
     is returned. "newton" is a damped Newton method on the exact second derivative with negative curvature flipped
     (saddle-free Newton); "gradient_descent" is the paper's descent with a constant step.
 
-    Each call compiles anew: to call it repeatedly, wrap the caller in `jax.jit`.
+    Each call compiles again: to call it repeatedly, wrap the caller in `jax.jit`.
 
     Args:
       expert: n joints.

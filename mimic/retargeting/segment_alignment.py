@@ -261,8 +261,7 @@ def _placement(arm: Embodiment, qpos: Float[np.ndarray, "poses joints"]) -> Plac
 
 def _movers(arm: Embodiment) -> list[int]:
     """Last joint that moves each vertex of the centre line; -1 for none."""
-    movers = [arm.link_joint[link] for link in arm.segment_link]
-    return [-1, *movers]
+    return [-1, *(arm.link_joint[link] for link in arm.segment_link)]
 
 
 def _zero_vertices(arm: Embodiment) -> Float[np.ndarray, "vertices 3"]:

@@ -50,8 +50,8 @@ class Trainer(abc.ABC):
           run_dir: folder of the checkpoints.
           on_evaluation: called after each training epoch; training ends when it returns True.
           signals: signals of the process; after one, training ends at the next checkpoint.
-          restored: checkpoint to continue from, which is evaluated again. At step 0, and if `run_dir` does not have it,
-            it has the parameters to start from.
+          restored: checkpoint to continue from, which is evaluated again. At step 0, if `run_dir` does not
+            have it, it has the parameters to start from.
 
         Returns:
           Steps and parameters of the result.

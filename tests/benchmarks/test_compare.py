@@ -15,8 +15,8 @@ def _results(**rows):
 
 def test_values_are_named_by_the_text_and_the_sizes_of_their_row():
     rows = [{"case": "fused", "arms": 64, "steps_per_s": 10.0, "median_ms": 2.0, "spread": 0.1, "compile_s": 3.0}]
-    found = read_values(_results(rows=rows, deep={"a": {"b": 1}}))
-    assert found == {
+    entries = read_values(_results(rows=rows, deep={"a": {"b": 1}}))
+    assert entries == {
         "rows / fused / arms=64 / steps_per_s": Value(10.0, 1.0),
         "rows / fused / arms=64 / median_ms": Value(2.0, 0.2),
         "rows / fused / arms=64 / compile_s": Value(3.0, 0.0),
@@ -61,5 +61,5 @@ def test_the_command_shows_what_changed_and_rejects_other_files(tmp_path):
     shown = _compare(old, new).stdout
     assert "+100.0%" in shown and "1 of 1 values changed" in shown and "1 values are not in the new file" in shown
     for wrong in (tmp_path / "none.json", other):
-        refused = _compare(old, wrong)
-        assert refused.returncode == 1 and refused.stderr.startswith("error: ") and refused.stderr.count("\n") == 1
+        rejected = _compare(old, wrong)
+        assert rejected.returncode == 1 and rejected.stderr.startswith("error: ") and rejected.stderr.count("\n") == 1

@@ -29,10 +29,10 @@ def test_a_method_that_fails_says_why_and_the_others_go_on(monkeypatch):
     monkeypatch.setattr(kernel, "run", out_of_memory)
     arms = kernel.planar_pair(3)
     cases = {1: (arms, 1), 2: (arms, 2)}
-    found = [row for name in ("mimic", "matrices") for row in kernel.sweep("batch", cases, name)]
-    failed = [row for row in found if "failed" in row]
+    measured = [row for name in ("mimic", "matrices") for row in kernel.sweep("batch", cases, name)]
+    failed = [row for row in measured if "failed" in row]
     assert [row["failed"] for row in failed] == ["MemoryError: no room"] * 3  # one size of each quantity
-    assert sum(row["method"] == "matrices" for row in found) == 4
+    assert sum(row["method"] == "matrices" for row in measured) == 4
 
 
 def test_the_reference_is_in_double_precision():

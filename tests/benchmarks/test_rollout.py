@@ -19,7 +19,7 @@ def test_the_time_of_a_call_is_what_it_takes():
 def test_compilation_is_apart_and_memory_is_known():
     timing = time_program(lambda x: jnp.sin(x) * 2, jnp.ones(1000))
     assert timing.compile > timing.median > 0
-    assert timing.bytes >= 8000  # a thousand numbers in, and as many out
+    assert timing.bytes >= 8000  # a thousand input and a thousand output numbers
     assert set(timing.summary()) == {"compile_s", "median_ms", "spread"}
 
 

@@ -69,9 +69,9 @@ def test_each_benchmark_is_read_as_it_is_written(tmp_path):
         ("gap, 4-DOF, held out", ""): (0.05, False),
     }
     for which, (value, met) in expected.items():
-        found = measured(tmp_path, *which)
-        assert found is not None, which
-        assert found[0] == pytest.approx(value) and target(*which).met(found[0]) is met, which
+        entry = measured(tmp_path, *which)
+        assert entry is not None, which
+        assert entry[0] == pytest.approx(value) and target(*which).met(entry[0]) is met, which
 
 
 def test_the_table_says_where_each_row_is_from_and_what_makes_the_others(tmp_path):
@@ -84,8 +84,8 @@ def test_the_table_says_where_each_row_is_from_and_what_makes_the_others(tmp_pat
 
 def test_the_results_of_this_repository_are_read(request):
     files = targets.read_folder(request.config.rootpath / "benchmarks" / "results")
-    found = {row.quantity for row in targets.TARGETS if targets.find(row, files)}
-    assert {"gap, 7-DOF", "optimal poses/s, slowest pair", "tip after 5 s, 95 of 100"} <= found
+    quantities = {row.quantity for row in targets.TARGETS if targets.find(row, files)}
+    assert {"gap, 7-DOF", "optimal poses/s, slowest pair", "tip after 5 s, 95 of 100"} <= quantities
 
 
 def test_benchmarks_are_started_with_what_they_take(tmp_path, monkeypatch):
@@ -98,7 +98,7 @@ def test_benchmarks_are_started_with_what_they_take(tmp_path, monkeypatch):
     assert run.device_name("NVIDIA H200") == "h200" and run.device_name("cpu") == "cpu"
 
 
-def test_an_unknown_benchmark_is_refused(tmp_path):
+def test_an_unknown_benchmark_is_rejected(tmp_path):
     command = [sys.executable, "-m", "benchmarks.run", "nothing", "--out", str(tmp_path / "out")]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 2 and "unknown benchmark 'nothing'; valid are all, startup, kernel" in result.stderr

@@ -20,9 +20,9 @@ def test_a_run_sees_so_many_devices(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "--of-the-user")
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     assert scaling.environment(2, 1, "gpu")["CUDA_VISIBLE_DEVICES"] == "0,1"
-    made = "--of-the-user --xla_force_host_platform_device_count"
-    assert scaling.environment(2, 1, "cpu")["XLA_FLAGS"] == f"{made}=2"
-    assert scaling.environment(2, 2, "cpu")["XLA_FLAGS"] == f"{made}=1"
+    flags = "--of-the-user --xla_force_host_platform_device_count"
+    assert scaling.environment(2, 1, "cpu")["XLA_FLAGS"] == f"{flags}=2"
+    assert scaling.environment(2, 2, "cpu")["XLA_FLAGS"] == f"{flags}=1"
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5,7")
     assert scaling.environment(2, 2, "gpu")["CUDA_VISIBLE_DEVICES"] == "3,5"
 
@@ -84,12 +84,12 @@ def test_two_devices_train_the_same_in_all_ways(monkeypatch):
     sizes = {"env": "planar4dof", "num_envs": 16, "batch_size": 16, "steps": 3000, "arguments": SMALL}
     lists = {"devices": [1, 2], "kinds": scaling.KINDS, "processes": scaling.PROCESSES, "seeds": [0]}
     results = list(scaling.run(argparse.Namespace(**sizes, **lists)))
-    found = {(row["scaling"], row["devices"], row["processes"]): row for row in results}
+    by_case = {(row["scaling"], row["devices"], row["processes"]): row for row in results}
     counts = (1, 1), (2, 1), (2, 2)
-    assert sorted(found) == sorted((kind, *count) for kind in scaling.KINDS for count in counts)
+    assert sorted(by_case) == sorted((kind, *count) for kind in scaling.KINDS for count in counts)
     assert min(row["steps_per_s"] for row in results) > 0
-    alone = found["weak", 1, 1]
+    alone = by_case["weak", 1, 1]
     for processes in (1, 2):
-        weak, strong = found["weak", 2, processes], found["strong", 2, processes]
+        weak, strong = by_case["weak", 2, processes], by_case["strong", 2, processes]
         assert weak["env_steps"] == pytest.approx(2 * alone["env_steps"], rel=0.2)  # whole batches
         assert strong["env_steps"] == alone["env_steps"]

@@ -31,24 +31,24 @@ def collected(folder):
     ],
 )
 def test_the_interval_is_that_of_students_t(values, quantile):
-    found = mean_interval(values)
-    spread = math.sqrt(sum((value - found.mean) ** 2 for value in values) / (len(values) - 1))
-    assert found.mean == pytest.approx(sum(values) / len(values))
-    assert found.high is not None and found.low is not None
-    assert found.high - found.mean == pytest.approx(quantile * spread / math.sqrt(len(values)), rel=1e-6)
-    assert found.mean - found.low == pytest.approx(found.high - found.mean)
-    assert (found.min, found.max, found.n) == (min(values), max(values), len(values))
+    interval = mean_interval(values)
+    spread = math.sqrt(sum((value - interval.mean) ** 2 for value in values) / (len(values) - 1))
+    assert interval.mean == pytest.approx(sum(values) / len(values))
+    assert interval.high is not None and interval.low is not None
+    assert interval.high - interval.mean == pytest.approx(quantile * spread / math.sqrt(len(values)), rel=1e-6)
+    assert interval.mean - interval.low == pytest.approx(interval.high - interval.mean)
+    assert (interval.min, interval.max, interval.n) == (min(values), max(values), len(values))
 
 
 def test_19_of_20_intervals_hold_the_mean():
     samples = np.random.default_rng(0).normal(3.0, 2.0, (2000, 3))
-    inside = [found.low <= 3.0 <= found.high for found in map(mean_interval, samples)]  # type: ignore[operator]
+    inside = [interval.low <= 3.0 <= interval.high for interval in map(mean_interval, samples)]  # type: ignore[operator]
     assert np.mean(inside) == pytest.approx(0.95, abs=0.015)  # three standard errors
 
 
 def test_one_run_has_no_interval():
-    found = mean_interval([0.5])
-    assert (found.mean, found.low, found.high) == (0.5, None, None)
+    interval = mean_interval([0.5])
+    assert (interval.mean, interval.low, interval.high) == (0.5, None, None)
 
 
 @pytest.fixture
@@ -117,7 +117,7 @@ def test_what_is_left_out_is_named_and_the_rest_is_kept(six, capsys):
     write_run(six / "of-old", [0.9], seed=6, version="0.0.1")
     (six / "of-old" / "config.yaml").write_text("trainer: {name: ppo, momentum: 0.9}\n")
     planned = [
-        {"label": "seed=7", "run_dir": "refused", "exit_code": 2, "reason": "no such arm"},
+        {"label": "seed=7", "run_dir": "rejected", "exit_code": 2, "reason": "no such arm"},
         {"label": "seed=8", "run_dir": "waiting"},
         {"label": "seed=0", "run_dir": "planar4dof-0", "exit_code": 0, "reason": ""},
     ]
@@ -130,7 +130,7 @@ def test_what_is_left_out_is_named_and_the_rest_is_kept(six, capsys):
     assert "diverged" in reasons["diverged"] and "optimality_gap.train" in reasons["diverged"]
     assert "report.json cannot be read" in reasons["torn"]
     assert "of mimic 0.0.1, and this is" in reasons["of-old"] and "momentum" in reasons["of-old"]
-    assert reasons["refused"] == "seed=7: failed: no such arm" and reasons["waiting"] == "seed=8: not started"
+    assert reasons["rejected"] == "seed=7: failed: no such arm" and reasons["waiting"] == "seed=8: not started"
     assert len(reasons) == 6
     assert [len(group["seeds"]) for group in collected(six)["groups"]] == [3, 3]
 

@@ -62,11 +62,11 @@ def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path):
 def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_path):
     """1e-5: float32, the same distances from another compiled function."""
     unseen.of_length(HORIZON + 5).save(tmp_path / "unseen.npz")  # more steps than the run's demonstrations have
-    given = {"demonstrations": str(tmp_path / "unseen.npz")}
-    plain, rows = evaluate(run_dir, tmp_path / "plain", **given)
+    overrides = {"demonstrations": str(tmp_path / "unseen.npz")}
+    plain, rows = evaluate(run_dir, tmp_path / "plain", **overrides)
     numbers = [(row["split"], int(row["demonstration"])) for row in rows]
     assert numbers == [*(("train", i) for i in range(COUNT)), *(("held_out", i) for i in range(unseen.count))]
-    heavy, heavy_rows = evaluate(run_dir, tmp_path / "heavy", **given, mass=1.5, damping=2.0, torque_noise=0.1)
+    heavy, heavy_rows = evaluate(run_dir, tmp_path / "heavy", **overrides, mass=1.5, damping=2.0, torque_noise=0.1)
     for row, other in zip(rows, heavy_rows, strict=True):
         for key in ("hold_distance", "lower_bound"):
             assert float(row[key]) == pytest.approx(float(other[key]), rel=1e-5)
@@ -83,7 +83,7 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
     job.train(tmp_path, lambda *_: False, Signals(), None)
     (env,) = trained
     assert env.demonstrations.count == COUNT + 3
-    assert job.evaluator.training_env.demonstrations.count == COUNT
+    assert job.evaluator.parts["train"] == slice(0, COUNT)
     np.testing.assert_array_equal(env.demonstrations.qpos[:COUNT], job.evaluator.env.demonstrations.qpos[:COUNT])
 
 
@@ -128,7 +128,10 @@ def too_fast(demonstrations):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda given: dataclasses.replace(given, arm="panda"), "recorded with the joints joint1, joint2, joint3 of"),
+        (
+            lambda overrides: dataclasses.replace(overrides, arm="panda"),
+            "recorded with the joints joint1, joint2, joint3 of",
+        ),
         (too_fast, "joint3 of demonstration 1 has a velocity of 100 rad/s at 0.4 s, but its velocity limit is"),
     ],
 )

@@ -88,8 +88,8 @@ def test_the_metadata_describes_inputs_and_outputs(tmp_path):
     for whose, states in {"learner": own, "expert 1 steps ahead": ahead}.items():
         for name, values in vars(states).items():
             part = layout[f"{whose}: {name}"]
-            seen = state.obs[part["start"] : part["stop"]].reshape(part["shape"])
-            np.testing.assert_allclose(seen, values, atol=1e-6)
+            observed = state.obs[part["start"] : part["stop"]].reshape(part["shape"])
+            np.testing.assert_allclose(observed, values, atol=1e-6)
     assert max(part["stop"] for part in layout.values()) == env.observation_size
 
 
@@ -107,12 +107,12 @@ def test_an_onnx_pose_mapper_equals_the_mapper(tmp_path, name, preset, metric):
     mapper = mapper_run(tmp_path / "run", name, preset, metric)
     session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "mapper.onnx"))
     poses = random_poses(mapper.expert, 200)
-    (found,) = session.run(None, {"expert_qpos": poses})
+    (outputs,) = session.run(None, {"expert_qpos": poses})
     expected = mapper(poses)
     # Where two heads are equally good, rounding decides; where a point is near the seam of the circle, it does too.
-    off = np.abs(np.angle(np.exp(1j * (found - np.asarray(expected))))).max(axis=1)
+    off = np.abs(np.angle(np.exp(1j * (outputs - np.asarray(expected))))).max(axis=1)
     assert np.mean(off < TOLERANCE) >= (1.0 if preset == "paper" else 0.99)
-    assert len(np.unique(np.round(found, 3), axis=0)) > 100
+    assert len(np.unique(np.round(outputs, 3), axis=0)) > 100
 
 
 def test_jax_reads_its_own_format(tmp_path):
@@ -122,8 +122,8 @@ def test_jax_reads_its_own_format(tmp_path):
     mapper = mapper_run(tmp_path / "run", preset="large")
     path = mimic.export_run(tmp_path / "run", tmp_path / "mapper.jax", format="jax")
     poses = random_poses(mapper.expert, 9)
-    found = export.deserialize(bytearray(path.read_bytes())).call(poses)["learner_qpos"]
-    np.testing.assert_allclose(found, mapper(poses), atol=TOLERANCE)
+    outputs = export.deserialize(bytearray(path.read_bytes())).call(poses)["learner_qpos"]
+    np.testing.assert_allclose(outputs, mapper(poses), atol=TOLERANCE)
     assert json.loads((tmp_path / "mapper.jax.json").read_text())["learner_joints"][2] == "joint4"
 
 

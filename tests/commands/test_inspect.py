@@ -51,12 +51,12 @@ def test_an_inspection_describes_the_arm(inspected, arm_file, tmp_path):
         "no <inertial> in pan_link",
     ):
         assert text in said, said
-    found = json.loads((tmp_path / "out" / "inspection.json").read_text())
-    assert [joint["torque limit"] for joint in found["joints"]] == [150] * 6
-    shares = np.array([sum(link["compared with"].values()) for link in found["links"]])
-    np.testing.assert_allclose(shares, 1, rtol=1e-6)  # float32
+    inspection = json.loads((tmp_path / "out" / "inspection.json").read_text())
+    assert [joint["torque limit"] for joint in inspection["joints"]] == [150] * 6
+    fractions = np.array([sum(link["compared with"].values()) for link in inspection["links"]])
+    np.testing.assert_allclose(fractions, 1, rtol=1e-6)  # float32
     assert Image.open(tmp_path / "out" / "arms.png").size == (1300, 560)
-    assert said.splitlines()[-1] == f"train it: {found['train']}"
+    assert said.splitlines()[-1] == f"train it: {inspection['train']}"
 
 
 def test_the_suggested_command_trains_the_inspected_arm(arm_file, monkeypatch):

@@ -10,9 +10,15 @@ import sys
 import time
 
 import imageio_ffmpeg
+import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.interruptions import differences
+from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint
+from mimic.runs.lock import RunLock
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.run_config import new_run_dir
 from tests.helpers.tiny import TINY
 
 BY_SPLIT = {
@@ -105,6 +111,77 @@ def test_resume_continues_from_the_last_checkpoint(finished, tmp_path):
     assert json.loads((run_dir / "report.json").read_text())["env_steps"] >= 8000
     again = command("train", f"resume={run_dir}")
     assert again.returncode == 2 and "increase trainer.num_timesteps" in again.stderr
+
+
+def test_a_resumed_run_ends_as_if_it_had_not_been_interrupted(finished, tmp_path):
+    """As after a SIGKILL while a checkpoint was written, and one before the report."""
+    reference, _ = finished
+    run_dir = shutil.copytree(reference, tmp_path / "run")
+    last = max(checkpoint_steps(run_dir))
+    delete_checkpoint(run_dir, last)
+    (run_dir / "checkpoints" / f"{last:012d}.partial").mkdir()
+    for _ in range(2):
+        (run_dir / "report.json").unlink()
+        result = command("train", f"resume={run_dir}")
+        assert result.returncode == 0, result.stderr[-2000:]
+        assert differences(reference, run_dir) == ""
+        assert json.loads((run_dir / "report.json").read_text())["env_steps"] == last
+    assert not list((run_dir / "checkpoints").glob("*.partial*"))
+
+
+def test_a_run_without_a_checkpoint_starts_anew_when_resumed(finished, tmp_path):
+    reference, _ = finished
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    for name in ("config.yaml", "demonstrations.npz"):
+        shutil.copy(reference / name, run_dir)
+    (run_dir / "metrics.csv").write_text("step,quality/opti")  # half of a header
+    result = command("train", f"resume={run_dir}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert differences(reference, run_dir) == ""
+
+
+def test_a_folder_without_a_config_is_no_run_yet(tmp_path):
+    """A process that was killed before it wrote the config."""
+    config = TrainConfig(run_dir=str(tmp_path))
+    for name in ("demonstrations.npz", "config.yaml.partial", ".lock"):
+        (tmp_path / name).touch()
+    assert new_run_dir(config) == tmp_path
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(ValueError, match="exists"):
+        new_run_dir(config)
+
+
+def test_a_run_starts_from_the_parameters_of_another_run(finished, tmp_path):
+    run_dir = tmp_path / "run"
+    result = command("train", *TINY, "seed=1", f"init={finished[0]}", f"run_dir={run_dir}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    with np.load(finished[0] / "checkpoints" / f"{max(checkpoint_steps(finished[0])):012d}" / "training.npz") as file:
+        policy = file["arr_0"]
+    with np.load(run_dir / "checkpoints" / f"{0:012d}" / "training.npz") as file:
+        np.testing.assert_array_equal(file["arr_0"], policy)
+    other = command("train", "env=panda3dof", f"init={finished[0]}", f"run_dir={tmp_path / 'other'}")
+    assert other.returncode == 2 and "another network" in other.stderr
+
+
+def test_a_run_that_another_process_writes_is_not_resumed(finished):
+    lock = RunLock(finished[0])
+    try:
+        result = command("train", f"resume={finished[0]}", "trainer.num_timesteps=8000")
+    finally:
+        lock.close()
+    assert result.returncode == 2 and f"is in use by process {os.getpid()} on" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_training_that_diverges_stops(tmp_path):
+    """The value loss is beyond float32."""
+    run_dir = tmp_path / "run"
+    result = command("train", *TINY, "trainer.reward_scaling=1e30", f"run_dir={run_dir}")
+    assert result.returncode == 3, result.stderr[-2000:]
+    (line,) = result.stderr.splitlines()
+    assert re.match(r"error: training diverged: \w+ is not finite after \d+ steps; the checkpoints before it", line)
+    assert checkpoint_steps(run_dir) == [0] and not (run_dir / "report.json").exists()
 
 
 @pytest.mark.slow

@@ -89,8 +89,8 @@ def test_metric(said, tmp_path):
     gap = (float(copied) - float(bound)) / (float(rest) - float(bound))
     said_gap = number(r"1 for holding the start pose: (\S+)%", said) / 100
     assert said_gap == pytest.approx(gap, abs=0.006)  # of four digits
-    shares = [float(share) for share in re.findall(r"^  link\S+ +(\S+)  \(", said, re.MULTILINE)]
-    assert len(shares) == 7 and sum(shares) == pytest.approx(float(copied), abs=3e-4)
+    contributions = [float(value) for value in re.findall(r"^  link\S+ +(\S+)  \(", said, re.MULTILINE)]
+    assert len(contributions) == 7 and sum(contributions) == pytest.approx(float(copied), abs=3e-4)
     parts = ("translation", "rotation", "linear_velocity", "angular_velocity")
     by_part = {part: number(rf"\n  {part} +(\S+)(?=\n)", said) for part in parts}
     weighted = sum(getattr(mimic.PAPER_WEIGHTS, part) * value for part, value in by_part.items())
@@ -104,9 +104,9 @@ def test_batches_and_gradients(said):
     gradient, differences = (np.array(row.split(), float) for row in rows)
     np.testing.assert_allclose(gradient, differences, atol=2e-3)  # float32 over 0.02 rad, and four digits
     assert np.abs(gradient).max() > 0.01
-    ((distance, slope),) = re.findall(r"same motion: distance (\S+), gradient (\S+)", said)
-    assert float(distance) < 1e-9 and float(slope) < 1e-2  # rounding, of a distance whose terms have a kink there
-    assert number(r"one by one differ by (\S+)", said) < 1e-5
+    ((distance, gradient),) = re.findall(r"same motion: distance (\S+), gradient (\S+)", said)
+    assert float(distance) < 1e-9 and float(gradient) < 1e-2  # rounding, of a distance whose terms have a kink there
+    assert number(r"a loop over them differ by (\S+)", said) < 1e-5
     rates = re.findall(r" s +\S+ ms +([\d,]+)$", said, re.MULTILINE)
     assert len(rates) == 4 and all(int(rate.replace(",", "")) > 0 for rate in rates)
     ((before, after),) = re.findall(r"mean distance (\S+) before, (\S+) after", said)
@@ -115,9 +115,9 @@ def test_batches_and_gradients(said):
 
 @example("03_imitate_poses", patience)
 def test_imitate_poses(said, tmp_path):
-    methods = ("imitate_pose", "gradient descent, one start", "copied angles", "random")
-    shares = [number(rf"\n{method} +\S+ +(\S+)%", said) for method in methods]
-    assert shares == sorted(shares) and shares[0] < 1 and shares[-1] == 100
+    methods = ("imitate_pose", "gradient descent, one guess", "copied angles", "random")
+    errors = [number(rf"\n{method} +\S+ +(\S+)%", said) for method in methods]
+    assert errors == sorted(errors) and errors[0] < 1 and errors[-1] == 100
     assert is_picture(tmp_path / "poses.png")
 
 
@@ -140,7 +140,7 @@ def test_pose_mapper(said, tmp_path):
 @example("05_demonstrations")
 def test_demonstrations(said, tmp_path):
     for line in re.findall(r"  maximum .*: +(.*)", said):
-        assert all(0 < float(share) <= 100 for share in line.replace("%", "").split())
+        assert all(0 < float(percent) <= 100 for percent in line.replace("%", "").split())
     assert mimic.load_demonstrations(tmp_path / "recorded.npz").count == 20
     waves = mimic.load_demonstrations(tmp_path / "waves.npz")
     times = 0.1 * np.arange(51)
@@ -168,12 +168,12 @@ def test_train_and_evaluate(said, tmp_path):
 @example("07_own_arm", patience)
 def test_own_arm(said, tmp_path):
     assert mimic.load_mjcf(tmp_path / "arm.xml").joint_names == ("turn", "shoulder", "elbow", "bend", "roll")
-    findings = json.loads((tmp_path / "inspected" / "inspection.json").read_text())
-    assert findings["bound"] < findings["hold"] and f"to train it in earnest: {findings['train']}" in said
+    inspection = json.loads((tmp_path / "inspected" / "inspection.json").read_text())
+    assert inspection["bound"] < inspection["hold"] and f"for a full training: {inspection['train']}" in said
     assert is_picture(tmp_path / "inspected" / "arms.png")
     assert "exit code: 2" in said
     report = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert report["env"] == "pair" and report["optimality_gap"]["train"] < 1  # better than to stay; the start is at 2
+    assert report["env"] == "pair" and report["optimality_gap"]["train"] < 1  # 1: holding the start pose; at first 2
 
 
 @example("08_other_tools", patience)

@@ -123,7 +123,7 @@ def test_links_resolve(page):
 
 def test_contributing_names_files_that_exist():
     text = (REPOSITORY / "CONTRIBUTING.md").read_text()
-    paths = [path for path in re.findall(r"`((?:mimic|tests|docs)/[\w/.]+)`", text) if "NAME" not in path]
+    paths = [path for path in re.findall(r"`((?:mimic|tests|docs|benchmarks)/[\w/.]+)`", text) if "NAME" not in path]
     assert len(paths) > 30
     for path in paths:
         assert (REPOSITORY / path).exists(), path

@@ -84,15 +84,15 @@ def test_hardware_limits_are_penalised_near_and_beyond_them():
         for limits in ("none", "hardware")
     )
     home, still = jnp.asarray(limited.learner.home, jnp.float32), jnp.zeros(4)
-    upper, rated = limited.learner.joint_range[:, 1], limited.learner.velocity_limit
+    upper, limit = limited.learner.joint_range[:, 1], limited.learner.velocity_limit
     assert limited.limit_excess(home, still) == 0
     beyond = limited.limit_excess(home.at[0].set(upper[0] + 0.02), still)
     assert beyond == pytest.approx(0.5 * (0.02 + 0.03) / 0.1 / 4, rel=1e-3)  # 3e-7 of an angle, over 0.05
     assert limited.limit_excess(home.at[0].set(upper[0] + 9.0), still) == pytest.approx(0.5 / 4)
-    assert limited.limit_excess(home, still.at[1].set(-1.5 * rated[1])) == pytest.approx(0.5 / 4)
+    assert limited.limit_excess(home, still.at[1].set(-1.5 * limit[1])) == pytest.approx(0.5 / 4)
     for env, weight in ((free, 0.0), (limited, 2.0)):
         state = env.reset(jax.random.PRNGKey(0))
-        arm = state.pipeline_state.replace(qvel=still.at[1].set(1.2 * rated[1]))
+        arm = state.pipeline_state.replace(qvel=still.at[1].set(1.2 * limit[1]))
         after = jax.jit(env.step)(state.replace(pipeline_state=arm), still)
         costs = after.metrics["distance"] + weight * after.metrics["limit_excess"]
         assert after.metrics["limit_excess"] > 0

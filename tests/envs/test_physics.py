@@ -56,11 +56,11 @@ def random_states(model, count=4, seed=0):
 
 def mujoco_acceleration(model, qpos, qvel, torque):
     data = mujoco.MjData(model)
-    found = []
+    actual = []
     for data.qpos[:], data.qvel[:], data.qfrc_applied[:] in zip(qpos, qvel, torque, strict=True):
         mujoco.mj_forward(model, data)
-        found.append(data.qacc.copy())
-    return np.array(found)
+        actual.append(data.qacc.copy())
+    return np.array(actual)
 
 
 def ours(function, model, *rows, **factors):
@@ -78,10 +78,10 @@ def loaded(model, load):
     return heavier
 
 
-def assert_near(found, expected, rtol=RTOL):
+def assert_near(actual, expected, rtol=RTOL):
     """Within `rtol` of the largest entry of each row: an entry that happens to be small is the difference of others."""
     scale = np.abs(expected).max(axis=-1, keepdims=True)
-    np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=rtol)
+    np.testing.assert_allclose(actual / scale, expected / scale, rtol=0, atol=rtol)
 
 
 @pytest.mark.parametrize("name", ARMS)
@@ -168,12 +168,12 @@ def test_both_physics_step_a_loaded_arm_as_mujoco_does(x64, kind):
     heavier.opt.timestep = timestep
     qpos, qvel, torque = random_states(model)
     advance = make_advance(model, timestep, substeps, kind)
-    found = jax.jit(jax.vmap(lambda a, b, c: advance(a, b, c, LOAD)))(*map(jnp.asarray, (qpos, qvel, torque)))
+    actual = jax.jit(jax.vmap(lambda a, b, c: advance(a, b, c, LOAD)))(*map(jnp.asarray, (qpos, qvel, torque)))
     data, expected = mujoco.MjData(heavier), []
     for data.qpos[:], data.qvel[:], data.qfrc_applied[:] in zip(qpos, qvel, torque, strict=True):
         mujoco.mj_step(heavier, data, substeps)
         expected.append((data.qpos.copy(), data.qvel.copy()))
-    for values, reference in zip(found, np.swapaxes(expected, 0, 1), strict=True):
+    for values, reference in zip(actual, np.swapaxes(expected, 0, 1), strict=True):
         assert_near(np.asarray(values), reference)
 
 
@@ -182,8 +182,8 @@ def test_mjx_adds_no_empty_array_to_a_compiled_function():
     model, empty = build_arm(ARMS["planar"]).model, np.zeros((0, 3), np.float32)
     state = [jnp.asarray(x[0]) for x in random_states(model)]
     programs = make_advance(model, 0.01, 3, "mjx"), lambda qpos, *_: jnp.sum(qpos[0] * empty)
-    found = ["constant dense<>" in jax.jit(program).lower(*state, LOAD).as_text() for program in programs]
-    assert found == [False, True]
+    actual = ["constant dense<>" in jax.jit(program).lower(*state, LOAD).as_text() for program in programs]
+    assert actual == [False, True]
 
 
 @pytest.fixture(scope="module")

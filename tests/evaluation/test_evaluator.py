@@ -43,8 +43,8 @@ def evaluator():
 
 def rollouts(evaluator, turned=(0.0, 0.0), faster=(0.0, 0.0), distance=None):
     """The learner at the expert's joint angles and velocities plus offsets."""
-    given = evaluator.env.demonstrations
-    qpos, qvel = (np.asarray(x[:, 1:], np.float32) for x in (given.qpos + turned, given.qvel + faster))
+    motions = evaluator.env.demonstrations
+    qpos, qvel = (np.asarray(x[:, 1:], np.float32) for x in (motions.qpos + turned, motions.qvel + faster))
     distance = np.zeros(qpos.shape[:2]) if distance is None else distance
     return Rollouts(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, 0 * qpos, distance)))
 
@@ -84,9 +84,9 @@ def test_angles_are_weighted_by_the_fraction_of_each_expert_link():
         physics="fused",
         metric={"correspondence": "overlap"},
     )
-    given = training_and_held_out(config)[0]
-    given.qpos[:], given.qvel[:] = [0, np.pi / 2], [0, 2.0]
-    evaluator = Evaluator(mimic.ImitationEnv(config, given), given)
+    motions = training_and_held_out(config)[0]
+    motions.qpos[:], motions.qvel[:] = [0, np.pi / 2], [0, 2.0]
+    evaluator = Evaluator(mimic.ImitationEnv(config, motions), motions)
     still = np.zeros((2, 1, 1))
     table = measure(evaluator.env, link_state_table(evaluator.env.learner, still, still), *(np.zeros((2, 1, 1)),) * 3)
     np.testing.assert_allclose(table["link_angle_error_deg"], 90 * 5 / 12, atol=0.05)
@@ -99,11 +99,11 @@ def test_torques_and_limits_by_hand(evaluator):
     env.learner = env.learner.replace(
         joint_range=np.array([[-1, 1], [-2, 2]]), velocity_limit=np.array([3.0, 4.0]), torque_limit=scale / 2
     )
-    share = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, -0.5]])  # of the maximum torques, over three steps
+    fraction = np.array([[0.0, 0.0], [0.5, 0.0], [1.0, -0.5]])  # of the maximum torques, over three steps
     qpos = np.array([[1.0, -2.0], [1.1, 0.0], [np.nan, 0.0]])
     qvel = np.array([[3.0, -4.1], [3.1, 4.1], [0.0, -4.0]])
     count = env.demonstrations.count
-    motion = [np.broadcast_to(x, (count, 3, 2)) for x in (qpos, qvel, share * scale)]
+    motion = [np.broadcast_to(x, (count, 3, 2)) for x in (qpos, qvel, fraction * scale)]
     states = link_state_table(evaluator.env.learner, *(np.nan_to_num(x) for x in motion[:2]))
     table = measure(env, states, *motion)
     expected = {
@@ -118,10 +118,10 @@ def test_torques_and_limits_by_hand(evaluator):
         np.testing.assert_allclose(table[key], np.full(count, value), rtol=1e-6)  # the maximum torques are in float32
 
 
-def between(evaluator, share):
+def between(evaluator, fraction):
     """Rollouts with given optimality gaps, one for each demonstration."""
     bound, hold = evaluator.lower_bound, evaluator.hold_distance
-    return rollouts(evaluator, distance=bound + np.asarray(share)[:, None] * (hold - bound))
+    return rollouts(evaluator, distance=bound + np.asarray(fraction)[:, None] * (hold - bound))
 
 
 def test_gaps_are_of_mean_distances(evaluator):
@@ -177,8 +177,8 @@ def test_similarity_of_a_turned_arm_is_in_the_report(evaluator):
 
 def test_a_meaningless_gap_is_not_reported():
     distance, bound, hold = np.array([[0.2, 0.2, 0.0], [0.087, 0.075, 0.0], [0.101, 0.1, 0.0]])
-    found = gaps(distance, bound, hold)
-    assert np.isnan(found[[0, 2]]).all() and found[1] == pytest.approx(5.0)
+    actual = gaps(distance, bound, hold)
+    assert np.isnan(actual[[0, 2]]).all() and actual[1] == pytest.approx(5.0)
     assert has_gap(0.075, 0.1) and not has_gap(0.0751, 0.1)
 
 
@@ -231,12 +231,12 @@ def test_holding_the_start_pose_is_the_reference_of_the_gap(evaluator):
 
 def test_exact_dynamics_track_better_than_none(evaluator):
     feedback, exact = (run_controller(evaluator, name)[0] for name in ("pd", "computed_torque"))
-    found = [evaluator.summary(ran)["optimality_gap"] for ran in (exact, feedback)]
+    actual = [evaluator.summary(ran)["optimality_gap"] for ran in (exact, feedback)]
     for split in SPLITS:
         # 1.3e-3 by measurement: a torque is held for 0.1 s while the dynamics go on, and near a match the distance of
         # positions grows with the error itself, not with its square.
-        assert found[0][split] < 3e-3
-        assert 5 * found[0][split] < found[1][split] < 0.1  # it does without the coupling of joints
+        assert actual[0][split] < 3e-3
+        assert 5 * actual[0][split] < actual[1][split] < 0.1  # it does without the coupling of joints
 
 
 def test_actions_out_of_range_get_the_maximum_torque(evaluator):

@@ -233,6 +233,6 @@ def _newest_run(word: str, folder: pathlib.Path) -> str:
     key, placeholder, rest = word.partition("runs/NAME")
     if not placeholder:
         return word
-    found = sorted(folder.glob(f"runs/*/{rest.lstrip('/') or 'config.yaml'}"), key=lambda path: path.stat().st_mtime)
-    assert found, f"{word}: nothing on the page makes it"
-    return f"{key}{found[-1] if rest else found[-1].parent}"
+    files = sorted(folder.glob(f"runs/*/{rest.lstrip('/') or 'config.yaml'}"), key=lambda path: path.stat().st_mtime)
+    assert files, f"{word}: nothing on the page makes it"
+    return f"{key}{files[-1] if rest else files[-1].parent}"

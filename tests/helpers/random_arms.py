@@ -20,19 +20,21 @@ def random_arm(seed: int, joints: int | None = None) -> mujoco.MjModel:
     anchor, so that the link between these has length zero.
     """
     rng = np.random.default_rng(seed)
-    opened, made, joints = [], 0, joints or 1 + seed % 9
-    while made < joints:
+    opened, num_joints, joints = [], 0, joints or 1 + seed % 9
+    while num_joints < joints:
         if rng.random() < 0.4:
             opened.append(f"<body {_pose(rng)}>")
         opened.append(f'<body {_pose(rng)}><geom size="0.02"/>')
         anchor = _text(rng.uniform(-_REACH, _REACH, 3))
-        twins = not has_link_sites(seed) and made + 2 <= joints and rng.random() < 0.25
+        twins = not has_link_sites(seed) and num_joints + 2 <= joints and rng.random() < 0.25
         for _ in range(2 if twins else 1):
-            made += 1
+            num_joints += 1
             ref = rng.choice([0.0, rng.uniform(-1, 1)])
-            opened[-1] += f'<joint name="joint{made}" pos="{anchor}" axis="{_text(rng.normal(size=3))}" ref="{ref}"/>'
+            opened[-1] += (
+                f'<joint name="joint{num_joints}" pos="{anchor}" axis="{_text(rng.normal(size=3))}" ref="{ref}"/>'
+            )
         if has_link_sites(seed):
-            site = f'<site name="link{made}" fromto="{_text(rng.uniform(-_REACH, _REACH, 6))}"/>'
+            site = f'<site name="link{num_joints}" fromto="{_text(rng.uniform(-_REACH, _REACH, 6))}"/>'
             opened[-1] += site if rng.random() < 0.5 else f"<body {_pose(rng)}>{site}</body>"
     opened[-1] += f'<site name="tip" type="sphere" pos="{_text(rng.uniform(-_REACH, _REACH, 3))}"/>'
     xml = f"""<mujoco model="random{seed}">

@@ -25,18 +25,18 @@ def write_run(
 ) -> Path:
     """A run whose gap on training data was `gaps`, one for each evaluation, and twice that on held-out data."""
     settings_of = {"ppo": lambda: PPOConfig(**settings).resolve("cpu"), "pose_mapper": PoseMapperConfig().resolve}
-    figure, unit = {"ppo": ("optimality_gap", "env_steps"), "pose_mapper": ("quality", "training_poses")}[trainer]
+    metric, unit = {"ppo": ("optimality_gap", "env_steps"), "pose_mapper": ("quality", "training_poses")}[trainer]
     config = TrainConfig(env=env_config(env), trainer=settings_of[trainer](), seed=seed, run_dir=str(run_dir))
     run_dir.mkdir(parents=True)
     save_config(run_dir, config)
-    rows = [{"step": 1000 * (i + 1), **_by_split(f"quality/{figure}.", gap)} for i, gap in enumerate(gaps)]
+    rows = [{"step": 1000 * (i + 1), **_by_split(f"quality/{metric}.", gap)} for i, gap in enumerate(gaps)]
     with (run_dir / METRICS).open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows({key: "nan" if x is None else x for key, x in row.items()} for row in rows)
     if report:
         package_versions = {**versions(), **({"mimic-mjx": version} if version else {})}
-        content = {"seed": seed, figure: _by_split("", gaps[-1]), unit: 1000 * len(gaps), "versions": package_versions}
+        content = {"seed": seed, metric: _by_split("", gaps[-1]), unit: 1000 * len(gaps), "versions": package_versions}
         (run_dir / REPORT).write_text(json.dumps(content))
     return run_dir
 

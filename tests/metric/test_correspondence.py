@@ -146,10 +146,12 @@ def test_overlap_ignores_the_size_of_an_arm():
 
 def test_overlap_under_jit_with_the_arms_as_arguments():
     arms = ARMS["panda"], ARMS["panda4dof"]
-    known, given = overlap_correspondence(*arms), jax.jit(overlap_correspondence)(*arms)
-    assert known.shape == (7, 7)
-    np.testing.assert_allclose(given, known, atol=1e-5)  # float32: differences of sums up to 1, over lengths of 0.04
-    assert np.array_equal(np.asarray(given) > 0, np.asarray(known) > 0)
+    constant, traced = overlap_correspondence(*arms), jax.jit(overlap_correspondence)(*arms)
+    assert constant.shape == (7, 7)
+    np.testing.assert_allclose(
+        traced, constant, atol=1e-5
+    )  # float32: differences of sums up to 1, over lengths of 0.04
+    assert np.array_equal(np.asarray(traced) > 0, np.asarray(constant) > 0)
 
 
 def test_merged_links_overlap_by_their_path_or_their_chord():
@@ -161,8 +163,8 @@ def test_merged_links_overlap_by_their_path_or_their_chord():
     chord_twin = planar_arm([np.sqrt(2), 1.0])
     np.testing.assert_allclose(overlap_correspondence(bent, chord_twin, lengths="chord"), 2 * np.eye(2), atol=1e-9)
     assert np.count_nonzero(overlap_correspondence(bent, chord_twin)) == 3
-    given = jax.jit(overlap_correspondence)(bent, twin)
-    np.testing.assert_allclose(given, 2 * np.eye(2), atol=1e-6)  # float32
+    traced = jax.jit(overlap_correspondence)(bent, twin)
+    np.testing.assert_allclose(traced, 2 * np.eye(2), atol=1e-6)  # float32
 
 
 def merged_by_a_right_angle():
@@ -178,8 +180,8 @@ def merged_by_a_right_angle():
 @pytest.mark.parametrize("name", ARMS)
 def test_arc_length_of_an_arm_with_itself_counts_links_by_their_length(name):
     arm = ARMS[name]
-    share = np.asarray(arm.link_lengths) / arm.link_lengths.sum()
-    expected = arm.num_links**2 * np.diag(share)
+    fraction = np.asarray(arm.link_lengths) / arm.link_lengths.sum()
+    expected = arm.num_links**2 * np.diag(fraction)
     np.testing.assert_allclose(arc_length_correspondence(arm, arm), expected, rtol=1e-5)  # float32
     assert np.asarray(arc_length_correspondence(arm, arm)).mean() == pytest.approx(1, rel=1e-6)
 
@@ -210,8 +212,8 @@ def test_arc_length_is_the_integral_of_the_pair_distance():
 
 def test_arc_length_under_jit_with_the_arms_as_arguments():
     arms = ARMS["panda"], ARMS["panda4dof"]
-    known, given = arc_length_correspondence(*arms), jax.jit(arc_length_correspondence)(*arms)
-    np.testing.assert_allclose(given, known, atol=1e-4)  # float32, entries up to 12
+    constant, traced = arc_length_correspondence(*arms), jax.jit(arc_length_correspondence)(*arms)
+    np.testing.assert_allclose(traced, constant, atol=1e-4)  # float32, entries up to 12
 
 
 def test_correspondences_agree_on_equal_arms_near_a_match():

@@ -98,8 +98,8 @@ def test_long_arms_take_both_precisions_in_one_process():
     for wide in (False, True, False):
         dtype = np.dtype(np.float64 if wide else np.float32)
         with jax.enable_x64(wide):
-            found = jax.jit(lambda *motion: link_states(arm, *motion))(qpos.astype(dtype), qvel.astype(dtype))
-            assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {dtype}
+            actual = jax.jit(lambda *motion: link_states(arm, *motion))(qpos.astype(dtype), qvel.astype(dtype))
+            assert {leaf.dtype for leaf in jax.tree.leaves(actual)} == {dtype}
 
 
 @pytest.mark.parametrize("links", ["merged", "kept"])
@@ -213,14 +213,14 @@ def test_jit_takes_the_arm_as_an_argument(function, joints):
         traced.append(arm)
         return function(arm, *inputs)
 
-    known, given = function(arm, *inputs), jitted(arm, *inputs)
+    constant, compiled = function(arm, *inputs), jitted(arm, *inputs)
     # other constants, folded or not, and fused or not: a few float32 roundings of numbers up to 3
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), known, given)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), constant, compiled)
     longer = dataclasses.replace(arm, link_lengths=2 * arm.link_lengths)
     other = jitted(longer, *inputs)
     assert len(traced) == 1  # arms that differ in numbers share what was compiled
     if function is link_states:
-        np.testing.assert_allclose(2 * other.position, known.position, atol=2e-6)  # as above
+        np.testing.assert_allclose(2 * other.position, constant.position, atol=2e-6)  # as above
 
 
 @pytest.mark.parametrize("arm", [planar_arm([0.4, 0.6]), panda(locked=(2, 3, 4, 5, 6, 7))], ids=lambda arm: arm.name)
@@ -267,6 +267,6 @@ def test_the_table_of_link_states_equals_link_states():
         jnp.asarray(qpos), jnp.asarray(qvel)
     )
     for name, values in vars(one_by_one).items():
-        found = getattr(table, name)
-        assert isinstance(found, np.ndarray) and found.dtype == np.float32
-        np.testing.assert_allclose(found, values, atol=1e-5)  # float32 against float64 that is rounded
+        actual = getattr(table, name)
+        assert isinstance(actual, np.ndarray) and actual.dtype == np.float32
+        np.testing.assert_allclose(actual, values, atol=1e-5)  # float32 against float64 that is rounded

@@ -80,13 +80,13 @@ def test_the_kernel_equals_the_composition(x64, long_kernel, case):
     batch = motions(arms, fused_kernel.DEFAULT.block + 1)  # the last block is partial
     value, *gradients = values_and_gradients(arms, correspondence, weights, batch)
     distance = motion_distance(arms[0], arms[1], correspondence, weights)
-    found: list = [jax.jit(jax.vmap(distance))(*batch)]
+    actual: list = [jax.jit(jax.vmap(distance))(*batch)]
     expected = [value]
     for by in ((2,), ARGUMENTS):
-        found += jax.tree.leaves(jax.jit(jax.vmap(jax.value_and_grad(distance, by)))(*batch))
+        actual += jax.tree.leaves(jax.jit(jax.vmap(jax.value_and_grad(distance, by)))(*batch))
         expected += [value, *(gradients[k] for k in by)]
     assert len(long_kernel) == 3
-    for values, reference in zip(found, expected, strict=True):
+    for values, reference in zip(actual, expected, strict=True):
         np.testing.assert_allclose(values, reference, atol=1e-13)  # rounding
 
 

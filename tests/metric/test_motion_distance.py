@@ -45,8 +45,8 @@ def motions(arms, batch=5, dtype: DTypeLike = np.float64):
     return [jnp.asarray(rng.uniform(-m, m, (batch, n)), dtype) for m, n in zip(largest, joints, strict=True)]
 
 
-def largest_difference(found, expected):
-    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True)
+def largest_difference(actual, expected):
+    pairs = zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True)
     return max(float(np.abs(np.asarray(a, float) - np.asarray(b, float)).max()) for a, b in pairs)
 
 
@@ -64,8 +64,8 @@ def test_value_and_gradient_equal_those_of_the_composition(x64, pair, weights):
     arms = PAIRS[pair]
     metric = overlap_correspondence(*arms), EVERY_WEIGHT[weights]
     functions = motion_distance(*arms, *metric), composed(arms, *metric)
-    found, expected = (jax.jit(jax.vmap(jax.value_and_grad(f, ALL_ARGUMENTS)))(*motions(arms)) for f in functions)
-    assert largest_difference(found, expected) < 1e-13  # rounding
+    actual, expected = (jax.jit(jax.vmap(jax.value_and_grad(f, ALL_ARGUMENTS)))(*motions(arms)) for f in functions)
+    assert largest_difference(actual, expected) < 1e-13  # rounding
     assert float(np.abs(expected[1][2]).max()) > 1e-2
 
 
@@ -75,8 +75,8 @@ def test_other_metrics_equal_the_composition(x64, correspondence, weights):
     sample = [x[0] for x in motions(arms)]
     several: tuple[dict, ...] = {}, {"rotation": "angle"}, {"reduction": "frobenius"}
     for options in several:
-        found = motion_distance(*arms, *metric, **options)(*sample)
-        np.testing.assert_allclose(found, composed(arms, *metric, **options)(*sample), rtol=1e-13)  # rounding
+        actual = motion_distance(*arms, *metric, **options)(*sample)
+        np.testing.assert_allclose(actual, composed(arms, *metric, **options)(*sample), rtol=1e-13)  # rounding
 
 
 def test_gradients_equal_finite_differences(x64):
@@ -117,10 +117,10 @@ def test_one_expert_pose_serves_a_batch_of_learners():
     arms = EXPERT, LEARNER
     distance = motion_distance(*arms, overlap_correspondence(*arms))
     qpos, qvel, *learner = motions(arms, dtype=np.float32)
-    found = jax.vmap(distance, in_axes=(None, None, 0, 0))(qpos[0], qvel[0], *learner)
+    actual = jax.vmap(distance, in_axes=(None, None, 0, 0))(qpos[0], qvel[0], *learner)
     every = jax.vmap(jax.vmap(distance, in_axes=(None, None, 0, 0)), in_axes=(0, 0, None, None))(qpos, qvel, *learner)
     expected = [distance(qpos[0], qvel[0], *(x[k] for x in learner)) for k in range(5)]
-    np.testing.assert_allclose(found, expected, rtol=1e-6)  # float32, fused and not
+    np.testing.assert_allclose(actual, expected, rtol=1e-6)  # float32, fused and not
     np.testing.assert_allclose(every[0], expected, rtol=1e-6)
 
 
@@ -205,9 +205,9 @@ def test_the_kernel_equals_the_plain_function(count):
         return [[x[0] * y[1] + 2.0], [jnp.sin(x[1]), 0.5, y[0] - x[0]]]
 
     rows = [jnp.asarray(x, jnp.float32) for x in np.random.default_rng(0).normal(size=(2, count, 2))]
-    found = jax.jit(lambda *rows: fused_kernel.gpu_kernel(program, (1, 3))(*rows))(*rows)
+    actual = jax.jit(lambda *rows: fused_kernel.gpu_kernel(program, (1, 3))(*rows))(*rows)
     expected = jax.vmap(fused_kernel.fused(program, (1, 3)))(*rows)
-    for values, reference, width in zip(found, expected, (1, 3), strict=True):
+    for values, reference, width in zip(actual, expected, (1, 3), strict=True):
         assert values.shape == (count, width)
         np.testing.assert_allclose(values, reference, rtol=1e-6)  # float32, fused and not
 
@@ -236,8 +236,8 @@ def test_the_gpu_agrees_with_double_precision(pair):
     arms = (load_mjcf(random_arm(4, 40)), load_mjcf(random_arm(7, 20))) if pair == "random, long" else PAIRS[pair]
     metric = overlap_correspondence(*arms), PAPER_WEIGHTS
     batch = motions(arms, 10_001, np.float32)
-    found = jax.jit(jax.vmap(jax.value_and_grad(motion_distance(*arms, *metric), ALL_ARGUMENTS)))(*batch)
+    actual = jax.jit(jax.vmap(jax.value_and_grad(motion_distance(*arms, *metric), ALL_ARGUMENTS)))(*batch)
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         plain = jax.jit(jax.vmap(jax.value_and_grad(composed(arms, *metric), ALL_ARGUMENTS)))
         expected = plain(*(np.asarray(x, np.float64) for x in batch))
-    assert largest_difference(found, expected) < 1e-5  # float32, there and back over up to 40 joints
+    assert largest_difference(actual, expected) < 1e-5  # float32, there and back over up to 40 joints

@@ -37,8 +37,8 @@ def test_a_reachable_pose_is_reached(env, tmp_path):
     np.testing.assert_allclose(pairs.learner_qpos[0], qpos[0, :2], atol=1e-3)  # float32, where the distance is flat
     assert pairs.distance[0] < 1e-3 < 0.05 < pairs.distance[1]
     assert pairs.similarity["centre_line_distance"][0] < 1e-3 < pairs.similarity["centre_line_distance"][1]
-    found = pairs.as_json()
-    assert len(found) == 2 and set(found[0]) == {"expert_qpos", "learner_qpos", "distance", *MEASURES}
+    entries = pairs.as_json()
+    assert len(entries) == 2 and set(entries[0]) == {"expert_qpos", "learner_qpos", "distance", *MEASURES}
     save_poses(tmp_path / "poses.png", expert, learner, env, pairs)
     image = np.asarray(Image.open(tmp_path / "poses.png").convert("RGB"), float)
     assert image.std() > 10 and image.shape[0] == 759  # 6.9 in at 110 dots an inch

@@ -26,9 +26,9 @@ ARMS = {
 def demonstrations(joints, count, seed=0):
     """Minimum-jerk motions from the zero pose to random goals, 51 steps of 0.1 s."""
     goals = np.random.default_rng(seed).uniform(-np.pi / 2, np.pi / 2, (count, 1, joints))
-    share = np.linspace(0, 1, 51)[:, None]
-    qpos = goals * (10 * share**3 - 15 * share**4 + 6 * share**5)
-    qvel = goals * (30 * share**2 - 60 * share**3 + 30 * share**4) / 5.0
+    progress = np.linspace(0, 1, 51)[:, None]
+    qpos = goals * (10 * progress**3 - 15 * progress**4 + 6 * progress**5)
+    qvel = goals * (30 * progress**2 - 60 * progress**3 + 30 * progress**4) / 5.0
     return jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)
 
 
@@ -129,7 +129,7 @@ def test_starts_iterations_and_seed_reach_the_search():
 
 
 def searched(expert, learner, qpos, qvel, correspondence, weights, starts=64, iterations=150):
-    """[T] minimum distance of Adam from many random motions: a search that shares no code with the bound's."""
+    """[T] minimum distance of Adam from many random motions: a search with no code in common with the bound's."""
 
     def descend(states, start):
         optimiser = optax.adam(optax.cosine_decay_schedule(0.1, iterations))

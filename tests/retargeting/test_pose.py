@@ -38,17 +38,17 @@ def poses(arm, count, seed=0):
 def test_planar_arms_reach_the_closed_form(name):
     expert, learner = PAIRS[name]
     qpos = poses(expert, 64)
-    found = imitate_pose(expert, learner, qpos, overlap_correspondence(expert, learner), DIRECTIONS)
-    np.testing.assert_allclose(found.distance, planar_optimum(expert, learner, qpos), atol=2e-6)  # float32
-    assert np.all(found.converged) and np.all(np.abs(found.qpos) <= np.pi + 1e-6)
+    solution = imitate_pose(expert, learner, qpos, overlap_correspondence(expert, learner), DIRECTIONS)
+    np.testing.assert_allclose(solution.distance, planar_optimum(expert, learner, qpos), atol=2e-6)  # float32
+    assert np.all(solution.converged) and np.all(np.abs(solution.qpos) <= np.pi + 1e-6)
 
 
 @pytest.mark.parametrize(("metric", "tolerance"), [("directions", 1e-9), ("default", 1e-6)])
 def test_an_equal_arm_finds_the_pose_itself(metric, tolerance):
     """Distances of directions are quadratic in the error, of positions linear: float32 rounds it to 1e-7."""
     arm, (correspond, weights) = panda(), METRICS[metric]
-    found = imitate_pose(arm, arm, poses(arm, 32), correspond(arm, arm), weights)
-    assert np.all(found.distance < tolerance) and np.all(found.converged)
+    solution = imitate_pose(arm, arm, poses(arm, 32), correspond(arm, arm), weights)
+    assert np.all(solution.distance < tolerance) and np.all(solution.converged)
 
 
 @pytest.mark.parametrize("weights", [(0.5, 1.0), pytest.param((2.0, 1.0), marks=pytest.mark.slow)])
@@ -61,13 +61,13 @@ def test_no_descent_of_the_distance_itself_gets_lower(name, weights, dtype):
     expert, learner = PAIRS[name]
     matrix, alpha = arc_length_correspondence(expert, learner), DistanceWeights(*weights)
     qpos = poses(expert, 64).astype(dtype)
-    found = imitate_pose(expert, learner, qpos, matrix, alpha)
-    assert found.distance.dtype == dtype
-    assert np.mean(found.converged) > 0.9  # 0.94 to 1 of 256 poses
+    solution = imitate_pose(expert, learner, qpos, matrix, alpha)
+    assert solution.distance.dtype == dtype
+    assert np.mean(solution.converged) > 0.9  # 0.94 to 1 of 256 poses
     distance = jax.jit(
         lambda pose, q: embodiment_distance(link_states(expert, pose), link_states(learner, q), matrix, alpha)
     )
-    for pose, start, left, _ in zip(qpos, found.qpos, found.distance, range(6), strict=False):
+    for pose, start, left, _ in zip(qpos, solution.qpos, solution.distance, range(6), strict=False):
         nearby = minimize(lambda q, pose=pose: float(distance(pose, q.astype(dtype))), start, method="Nelder-Mead")
         assert left <= nearby.fun + weights[0] * SMOOTHING + 1e-6
 
@@ -94,20 +94,20 @@ def test_the_minimum_is_global(name):
     """Against long descents from 512 random initial guesses: within 1e-3 for at least 99.5 % of the poses."""
     expert, learner = PAIRS[name]
     qpos, correspondence = poses(expert, 400, seed=1), overlap_correspondence(expert, learner)
-    found = imitate_pose(expert, learner, qpos, correspondence, DIRECTIONS)
+    solution = imitate_pose(expert, learner, qpos, correspondence, DIRECTIONS)
     options = {"starts": 512, "iterations": 60, "key": jax.random.key(1)}
     best = jax.lax.map(lambda pose: imitate_pose(expert, learner, pose, correspondence, DIRECTIONS, **options), qpos)
-    assert np.mean(found.distance <= best.distance * 1.001 + 1e-6) >= 0.995
+    assert np.mean(solution.distance <= best.distance * 1.001 + 1e-6) >= 0.995
 
 
 def test_joint_limits_are_kept():
     expert, learner = panda(), panda(locked=(3, 6, 7), limits="hardware")
     correspondence = overlap_correspondence(expert, learner)
-    found = imitate_pose(expert, learner, poses(expert, 32), correspondence, DIRECTIONS)
+    solution = imitate_pose(expert, learner, poses(expert, 32), correspondence, DIRECTIONS)
     lower, upper = learner.joint_range.T
-    assert np.all((found.qpos >= lower - 1e-6) & (found.qpos <= upper + 1e-6))
-    held = np.isclose(found.qpos, lower, atol=1e-6) | np.isclose(found.qpos, upper, atol=1e-6)
-    assert held.any() and np.mean(found.converged) > 0.95
+    assert np.all((solution.qpos >= lower - 1e-6) & (solution.qpos <= upper + 1e-6))
+    held = np.isclose(solution.qpos, lower, atol=1e-6) | np.isclose(solution.qpos, upper, atol=1e-6)
+    assert held.any() and np.mean(solution.converged) > 0.95
 
 
 def test_distances_belong_to_the_poses_and_no_nearby_pose_is_better():
@@ -119,17 +119,17 @@ def test_distances_belong_to_the_poses_and_no_nearby_pose_is_better():
         (DistanceWeights(1.0, 1.0), hard_correspondence, 1e-6),
         (DEFAULT.make_weights(), DEFAULT.make_correspondence(expert, learner), 1e-6),
     ):
-        found = imitate_pose(expert, learner, qpos, correspondence, weights)
+        solution = imitate_pose(expert, learner, qpos, correspondence, weights)
 
         def distance(qpos, learner_qpos, weights=weights, correspondence=correspondence):
             states = link_states(expert, qpos), link_states(learner, learner_qpos)
             return embodiment_distance(*states, correspondence, weights)
 
         batched = jax.vmap(distance)
-        np.testing.assert_allclose(batched(qpos, found.qpos), found.distance, atol=1e-6)
+        np.testing.assert_allclose(batched(qpos, solution.qpos), solution.distance, atol=1e-6)
         for seed in range(10):
-            near = found.qpos + 1e-2 * np.random.default_rng(seed).normal(size=found.qpos.shape)
-            assert np.all(batched(qpos, near) > found.distance - tolerance)
+            near = solution.qpos + 1e-2 * np.random.default_rng(seed).normal(size=solution.qpos.shape)
+            assert np.all(batched(qpos, near) > solution.distance - tolerance)
 
 
 def test_newton_beats_gradient_descent():

@@ -59,10 +59,10 @@ def test_copying_is_not_available_without_a_common_joint():
 def test_shapes_and_dtype(name):
     learner = panda(locked=(2, 4))
     qpos = motion(PANDA, 6, time=4).reshape(2, 3, 4, 7).astype(np.float32)
-    found = BASELINES[name](PANDA, learner, qpos)
-    assert found is not None
-    assert found.shape == (2, 3, 4, 5)
-    assert found.dtype == np.float32
+    poses = BASELINES[name](PANDA, learner, qpos)
+    assert poses is not None
+    assert poses.shape == (2, 3, 4, 5)
+    assert poses.dtype == np.float32
 
 
 @pytest.mark.parametrize("name", BASELINES)
@@ -90,16 +90,16 @@ def test_hand_ik_of_an_equal_arm_reaches_the_hand():
 
 def test_hand_ik_keeps_to_the_joint_range():
     learner = panda(limits="hardware")
-    found = hand_ik(PANDA, learner, motion(PANDA, 4, time=11))
+    poses = hand_ik(PANDA, learner, motion(PANDA, 4, time=11))
     slack = 1e-6  # rad: the solver's tolerance on constraints
-    assert np.all((found >= learner.joint_range[:, 0] - slack) & (found <= learner.joint_range[:, 1] + slack))
+    assert np.all((poses >= learner.joint_range[:, 0] - slack) & (poses <= learner.joint_range[:, 1] + slack))
 
 
 def test_hand_ik_interpolates_between_solved_samples():
     qpos = motion(PANDA, 1, time=8, spread=1.0)
-    found = hand_ik(PANDA, PANDA, qpos, every=5)[0]  # samples 0, 5 and 7 are solved
-    np.testing.assert_allclose(found[6], (found[5] + found[7]) / 2, atol=1e-12)
-    np.testing.assert_allclose(np.diff(found[:6], axis=0), np.tile((found[5] - found[0]) / 5, (5, 1)), atol=1e-12)
+    poses = hand_ik(PANDA, PANDA, qpos, every=5)[0]  # samples 0, 5 and 7 are solved
+    np.testing.assert_allclose(poses[6], (poses[5] + poses[7]) / 2, atol=1e-12)
+    np.testing.assert_allclose(np.diff(poses[:6], axis=0), np.tile((poses[5] - poses[0]) / 5, (5, 1)), atol=1e-12)
     with pytest.raises(ValueError, match="every"):
         hand_ik(PANDA, PANDA, qpos, every=0)
 
@@ -116,8 +116,8 @@ def test_an_arm_without_elbow_has_no_landmarks():
 
 def test_the_panda_aligns_with_itself():
     qpos = motion(PANDA, 300)
-    found = align_segments(PANDA, PANDA, qpos)
-    assert part_angles(PANDA, PANDA, PANDA_MARKS, qpos, found).max() < ROUNDING
+    poses = align_segments(PANDA, PANDA, qpos)
+    assert part_angles(PANDA, PANDA, PANDA_MARKS, qpos, poses).max() < ROUNDING
 
 
 @pytest.mark.parametrize("locked", [(1,), (2,), (3,), (4,), (5,), (6,), (7,), (3, 6, 7), (2, 3, 6, 7), (1, 4)])
@@ -125,12 +125,12 @@ def test_aligning_a_part_is_no_worse_than_leaving_it_at_home(locked):
     """Each part, against the pose with the joints that orient it at home."""
     learner = panda(locked=locked)
     qpos = motion(PANDA, 200)
-    found = align_segments(PANDA, learner, qpos)
-    angles = part_angles(PANDA, learner, PANDA_MARKS, qpos, found)
+    poses = align_segments(PANDA, learner, qpos)
+    angles = part_angles(PANDA, learner, PANDA_MARKS, qpos, poses)
     parts = part_joints(learner, PANDA_MARKS)
-    assert found is not None and any(part.joints for part in parts)
+    assert poses is not None and any(part.joints for part in parts)
     for part, (joints, _) in enumerate(parts[1:], start=1):  # the forearm's roll joint may move the upper arm
-        unmoved = found.copy()
+        unmoved = poses.copy()
         unmoved[..., list(joints)] = 0
         still = part_angles(PANDA, learner, PANDA_MARKS, qpos, unmoved)[part]
         assert np.all(angles[part] <= still + ROUNDING)
@@ -140,9 +140,9 @@ def test_solutions_within_the_joint_range_come_first():
     learner = panda(limits="hardware")
     lower, upper = learner.joint_range.T
     qpos = np.random.default_rng(0).uniform(lower, upper, (300, 1, 7))
-    found = align_segments(learner, learner, qpos)
-    assert found is not None and np.all((found >= lower) & (found <= upper))
-    angles = part_angles(learner, learner, PANDA_MARKS, qpos, found)
+    poses = align_segments(learner, learner, qpos)
+    assert poses is not None and np.all((poses >= lower) & (poses <= upper))
+    angles = part_angles(learner, learner, PANDA_MARKS, qpos, poses)
     # The expert's own pose is within the range. The upper arm and forearm are solved with four joints, and of their
     # four solutions one is within it; the hand's two joints are chosen after them, which may leave it none.
     assert np.mean(angles[:2].max(axis=0) < ROUNDING) > 0.99
@@ -183,9 +183,9 @@ def test_bending_makes_the_angle():
     rng = np.random.default_rng(3)
     axis, vector, other = rng.normal(size=(3, 40, 3))
     axis, vector, other = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (axis, vector, other))
-    wanted = np.sum(rotated(axis, 0.7, vector) * other, axis=1)  # so that it can be reached
-    for bend in bend_to_angle(axis, vector, other, wanted):
-        np.testing.assert_allclose(np.sum(rotated(axis, bend[:, None], vector) * other, axis=1), wanted, atol=1e-12)
+    cosine = np.sum(rotated(axis, 0.7, vector) * other, axis=1)  # so that it can be reached
+    for bend in bend_to_angle(axis, vector, other, cosine):
+        np.testing.assert_allclose(np.sum(rotated(axis, bend[:, None], vector) * other, axis=1), cosine, atol=1e-12)
 
 
 def rotated(axis, angle, vector):

@@ -50,12 +50,12 @@ def check_derivatives(learner, matrix, weights, seed=0):
 
     one, other = rng.uniform(-3, 3, (2, learner.num_joints))
     derivatives = jax.jit(lambda qpos: closed.derivatives(target, tuple(qpos)))
-    found, there = derivatives(one), derivatives(other)
-    np.testing.assert_allclose(jnp.stack(found.gradient), jax.jit(jax.grad(distance))(one), atol=1e-12)
+    here, there = derivatives(one), derivatives(other)
+    np.testing.assert_allclose(jnp.stack(here.gradient), jax.jit(jax.grad(distance))(one), atol=1e-12)
     hessian = jax.jit(jax.hessian(distance))(one)
-    for i, row in enumerate(found.hessian):
+    for i, row in enumerate(here.hessian):
         np.testing.assert_allclose(jnp.stack(row[: i + 1]), hessian[i, : i + 1], atol=1e-12)
-    np.testing.assert_allclose(found.value - there.value, distance(one) - distance(other), atol=1e-12)
+    np.testing.assert_allclose(here.value - there.value, distance(one) - distance(other), atol=1e-12)
     values = [closed.value(target, link_states(learner, qpos)) for qpos in (one, other)]
     np.testing.assert_allclose(values[0] - values[1], distance(one) - distance(other), atol=1e-12)
 
@@ -93,10 +93,10 @@ def test_a_match_has_zero_gradient_and_finite_curvature(dtype):
     closed = pose_objective(arm, Metric(arc_length_correspondence(arm, arm), DEFAULT))
     for qpos in (np.zeros(7), np.linspace(-2, 2, 7)):
         angles = jnp.asarray(qpos, dtype)
-        found = closed.derivatives(closed.target(link_states(arm, angles)), tuple(angles))
-        assert found.value <= 1e-9 and found.value.dtype == dtype
-        np.testing.assert_allclose(jnp.stack(found.gradient), 0, atol=1e-4)
-        assert all(np.all(np.isfinite(jnp.stack(row))) for row in found.hessian)
+        here = closed.derivatives(closed.target(link_states(arm, angles)), tuple(angles))
+        assert here.value <= 1e-9 and here.value.dtype == dtype
+        np.testing.assert_allclose(jnp.stack(here.gradient), 0, atol=1e-4)
+        assert all(np.all(np.isfinite(jnp.stack(row))) for row in here.hessian)
 
 
 def test_smoothing_changes_the_distance_by_less_than_its_own_size(dtype):

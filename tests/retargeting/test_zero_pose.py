@@ -59,10 +59,10 @@ def stays(joints, **options):
     expert, learner = panda(), panda(locked=joints)
     correspondence = METRIC.make_correspondence(expert, learner)
     pose = np.zeros(7, np.float32)
-    found = imitate_pose(expert, learner, pose, correspondence, METRIC.make_weights(), **options)
-    states = link_states(expert, pose), link_states(learner, found.qpos)
+    solution = imitate_pose(expert, learner, pose, correspondence, METRIC.make_weights(), **options)
+    states = link_states(expert, pose), link_states(learner, solution.qpos)
     # The pose itself need not be 0: where joints are collinear, as 1, 3 and 5 are there, only their sum counts.
-    return found.distance <= 1e-6 and found.converged and np.allclose(*(x.position for x in states), atol=1e-5)
+    return solution.distance <= 1e-6 and solution.converged and np.allclose(*(x.position for x in states), atol=1e-5)
 
 
 @pytest.mark.parametrize("joints", HANDFUL, ids=str)

@@ -3,6 +3,8 @@
 import csv
 import json
 
+import pytest
+
 from mimic.runs.files import REPORT, write_report
 from mimic.runs.metrics_log import MetricsLog
 
@@ -26,3 +28,49 @@ def test_metrics_of_another_version_keep_their_columns(tmp_path):
     assert rows[0] == {"step": "1", "old": "0.5", "wall_time_s": "2.0", "new": ""}
     assert rows[2] == {"step": "3", "old": "", "wall_time_s": "4.0", "new": "30.0"}
     assert {path.name for path in tmp_path.iterdir()} == {"metrics.csv", "tensorboard"}
+
+
+def rows_of(run_dir):
+    with (run_dir / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_resumed_log_is_cut_to_the_checkpoint(tmp_path):
+    log = MetricsLog(tmp_path)
+    for step in (10, 20, 30):
+        log.write(step, {"loss": 0.5})
+    log.close()
+    log = MetricsLog(tmp_path, resumed_step=20)
+    log.write(20, {"loss": 0.25})
+    log.close()
+    assert [(row["step"], row["loss"]) for row in rows_of(tmp_path)] == [("10", "0.5"), ("20", "0.25")]
+
+
+def test_a_half_written_row_is_removed(tmp_path):
+    log = MetricsLog(tmp_path)
+    for step in (10, 20):
+        log.write(step, {"loss": 0.5, "reward": 1.0})
+    log.close()
+    path = tmp_path / "metrics.csv"
+    path.write_bytes(path.read_bytes()[:-7])
+    log = MetricsLog(tmp_path, resumed_step=30)
+    log.write(30, {"loss": 0.5, "reward": 1.0})
+    log.close()
+    assert [row["step"] for row in rows_of(tmp_path)] == ["10", "30"]
+
+
+def test_a_row_that_cannot_be_written_leaves_the_file_as_it_was(tmp_path, monkeypatch):
+    log = MetricsLog(tmp_path)
+    log.write(10, {"loss": 0.5})
+    before = (tmp_path / "metrics.csv").read_bytes()
+
+    class FullDisk(csv.DictWriter):
+        def writerow(self, row):
+            super().writerow({**row, "loss": 0.5})
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(csv, "DictWriter", FullDisk)
+    with pytest.raises(OSError, match="No space left"):
+        log.write(20, {"loss": 0.25})
+    log.close()
+    assert (tmp_path / "metrics.csv").read_bytes() == before

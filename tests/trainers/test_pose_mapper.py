@@ -139,10 +139,10 @@ def test_the_paper_overfits_and_early_stopping_goes_back_to_the_best(tmp_path):
 def test_evaluation_poses_are_not_training_poses(tmp_path):
     jobs = [PoseMapperTrainer(run_config(tmp_path, seed=seed)) for seed in (0, 1)]
     for job in jobs:
-        seen = np.asarray(job._poses["train"])
+        training_poses = np.asarray(job._poses["train"])
         for split in ("validation", "held_out"):
             unseen = np.asarray(job._poses[split])
-            assert not (unseen[:, None] == seen[None, :512]).all(axis=-1).any()
+            assert not (unseen[:, None] == training_poses[None, :512]).all(axis=-1).any()
     np.testing.assert_array_equal(jobs[0]._poses["held_out"], jobs[1]._poses["held_out"])
     assert not np.array_equal(jobs[0]._poses["train"], jobs[1]._poses["train"])
 
@@ -152,9 +152,9 @@ def test_limited_joints_stay_within_their_limits():
     large = jax.tree.map(lambda x: 10 * x, model.init(jax.random.key(0)))  # most outputs near their ends
     mapper = mimic.PoseMapper(model, large)
     lower, upper = mapper.learner.joint_range.T
-    found = mapper(poses(mapper, 64))
-    assert np.any(found < lower + 1e-3) and np.any(found > upper - 1e-3)
-    assert np.all((found >= lower - 1e-5) & (found <= upper + 1e-5))
+    learner_poses = mapper(poses(mapper, 64))
+    assert np.any(learner_poses < lower + 1e-3) and np.any(learner_poses > upper - 1e-3)
+    assert np.all((learner_poses >= lower - 1e-5) & (learner_poses <= upper + 1e-5))
     with pytest.raises(ValueError, match="joint1 at 3.0000 rad is outside of its range"):
         mapper(np.array([3.0, 0, 0, -1, 0, 1, 0]))
 
@@ -163,7 +163,7 @@ def test_weights_decay_and_biases_do_not():
     settings = {**SMALL, "learning_rate": 1e-2, "final_learning_rate": 1.0, "weight_decay": 0.5}
     model = make_model(env_config("planar4dof"), PoseMapperConfig(**settings).resolve())
     params = jax.tree.map(jnp.ones_like, model.init(jax.random.key(0)))
-    optimiser = training._optimiser(model, 0)
+    optimiser = training._optimiser(model)
     change, _ = optimiser.update(jax.tree.map(jnp.zeros_like, params), optimiser.init(params), params)
     for path, value in jax.tree_util.tree_leaves_with_path(change):
         expected = -1e-2 * 0.5 if "kernel" in jax.tree_util.keystr(path) else 0.0

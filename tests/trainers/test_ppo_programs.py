@@ -48,10 +48,10 @@ def one_batch():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(updates, "value_loss", of_value)
         patch.setattr(updates, "policy_loss", of_policy)
-        begin, learn = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
-        start = begin()(7)
-        before = jax.device_get(start)
-        after, metrics = jax.device_get(learn()(start))
+        start, _, epoch = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+        state = start(7)
+        before = jax.device_get(state)
+        after, metrics = jax.device_get(epoch()(state))
     shown = {"now": metrics["value_loss"], "next": metrics["policy_loss"]}
     shown["elapsed"] = [metrics[name] for name in ppo_loss.METRICS[1:3]]
     return before, after, shown, along
@@ -66,8 +66,8 @@ def test_each_pass_uses_each_transition(one_batch):
 def test_the_next_observation_belongs_to_its_transition(one_batch):
     """In unrolls of one step, the next observation of the first is the first one of the second."""
     before, after, shown, along = one_batch
-    seen = UNROLLS * ARMS * after.statistics.mean - before.episodes.obs.sum(0) + after.episodes.obs.sum(0)
-    assert shown["next"] == pytest.approx(along @ seen / (UNROLLS * ARMS), abs=1e-5)
+    total = UNROLLS * ARMS * after.statistics.mean - before.episodes.obs.sum(0) + after.episodes.obs.sum(0)
+    assert shown["next"] == pytest.approx(along @ total / (UNROLLS * ARMS), abs=1e-5)
 
 
 def test_the_elapsed_time_belongs_to_the_observation(one_batch):
@@ -129,8 +129,8 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     (loss, shown), gradient = jax.jit(jax.value_and_grad(own, has_aux=True))(params)
     (expected, named), expected_gradient = jax.jit(jax.value_and_grad(of_brax, has_aux=True))(params)
     assert loss == pytest.approx(float(expected), rel=1e-12)
-    for found, wanted in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    for actual, reference in zip(jax.tree.leaves(gradient), jax.tree.leaves(expected_gradient), strict=True):
+        np.testing.assert_allclose(actual, reference, rtol=1e-9, atol=1e-12)
     assert -entropy_cost * shown["entropy"] == pytest.approx(float(named["entropy_loss"]), rel=1e-12, abs=1e-12)
     assert shown["policy_loss"] == pytest.approx(float(named["policy_loss"]), rel=1e-12)
     assert shown["value_loss"] == pytest.approx(float(named["v_loss"]), rel=1e-12)
@@ -169,10 +169,10 @@ env = mimic.make("planar4dof", physics=sys.argv[1], demonstrations={"count": 3, 
 config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
                    hidden_layers=[8]).resolve("cpu", 2)
 networks = training.make_networks(config, env.observation_size, env.action_size)
-begin, learn = programs.compile_training(env, config, networks, 2, optax.constant_schedule(1e-3), None)
-start = begin()(7)
-before = jax.device_get(start.params)
-after, metrics = learn()(start)
+start, _, epoch = programs.compile_training(env, config, networks, 2, optax.constant_schedule(1e-3), None)
+state = start(7)
+before = jax.device_get(state.params)
+after, metrics = epoch()(state)
 changed = jax.tree.map(lambda x, y: not np.array_equal(x, y), before, jax.device_get(after.params))
 assert any(jax.tree.leaves(changed))
 for x in jax.tree.leaves((after.policy, after.value, after.statistics, metrics)):
@@ -210,10 +210,10 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
         config = PPOConfig(**small, **settings).resolve("cpu")  # type: ignore[arg-type]
         networks = training.make_networks(config, env.observation_size, env.action_size)
         rate = optax.constant_schedule(1e-3)
-        begin, learn = programs.compile_training(env, config, networks, 1, rate, None, lambda count: count / 2)
-        state, learn = begin()(7), learn()
+        start, _, epoch = programs.compile_training(env, config, networks, 1, rate, None, lambda count: count / 2)
+        state = start(7)
         for _ in range(batches):
-            state, _ = learn(state)
+            state, _ = epoch()(state)
         return jax.device_get(state.params)
 
     constant, decayed = {"entropy_cost": 0.2}, {"entropy_cost": 0.2, "final_entropy_cost": 0.0}
@@ -229,9 +229,10 @@ def test_both_functions_are_compiled_with_the_options_of_a_run(monkeypatch):
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    for program in programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None):
+    start, _, epoch = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+    for compiled in (lambda: start(7), epoch):
         with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
-            program()
+            compiled()
 
 
 @pytest.mark.gpu
@@ -241,10 +242,10 @@ def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypat
     env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
     config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
-    given, learned = compiler_options(), []
-    for scheduling in ("SERIALIZE", given[_SCHEDULING]):
-        options = {**given, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
+    defaults, learned = compiler_options(), []
+    for scheduling in ("SERIALIZE", defaults[_SCHEDULING]):
+        options = {**defaults, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
         monkeypatch.setattr(programs, "compiler_options", lambda options=options: options)
-        begin, learn = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
-        learned.append(jax.device_get(learn()(begin()(7))))
+        start, _, epoch = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
+        learned.append(jax.device_get(epoch()(start(7))))
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))

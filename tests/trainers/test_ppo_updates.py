@@ -50,11 +50,11 @@ class Case:
             gradients, shown = [], []
             for device in range(DEVICES):
                 minibatch = jax.tree.map(lambda x, at=self.order[device, i], device=device: x[device][at], self.unrolls)
-                given = self.statistics, minibatch
+                data = self.statistics, minibatch
                 of = self.networks, self.config
-                (error, advantages), of_value = jax.value_and_grad(value_loss, has_aux=True)(params[1], *given, *of)
+                (error, advantages), of_value = jax.value_and_grad(value_loss, has_aux=True)(params[1], *data, *of)
                 of_policy, of_loss = jax.grad(policy_loss, has_aux=True)(
-                    params[0], *given, advantages, keys[device, i], *of
+                    params[0], *data, advantages, keys[device, i], *of
                 )
                 gradients.append((of_policy, of_value))
                 shown.append(jnp.append(error, of_loss))
@@ -89,10 +89,10 @@ def test_updates_equal_those_of_each_minibatch_in_turn(case, staggered, unroll):
     params, expected_metrics = case.expected()
     np.testing.assert_allclose(metrics, expected_metrics, rtol=1e-5, atol=1e-7)
     for learner, expected, before in zip(learners, params, case.params, strict=True):
-        for found, wanted, old in zip(*map(jax.tree.leaves, (learner.params, expected, before)), strict=True):
-            np.testing.assert_array_equal(found[0], found[1])  # on both devices
-            np.testing.assert_allclose(found[0], wanted, rtol=1e-5, atol=1e-7)
-            assert not np.array_equal(wanted, old)
+        for actual, reference, old in zip(*map(jax.tree.leaves, (learner.params, expected, before)), strict=True):
+            np.testing.assert_array_equal(actual[0], actual[1])  # on both devices
+            np.testing.assert_allclose(actual[0], reference, rtol=1e-5, atol=1e-7)
+            assert not np.array_equal(reference, old)
         assert set(np.ravel(learner.optimizer[0].count)) == {UPDATES}
 
 
@@ -100,9 +100,9 @@ def test_each_all_reduce_waits_for_the_one_before(case, monkeypatch):
     """Else NCCL could get two in parallel, in a different order on each GPU."""
     scan = jax.lax.scan
 
-    def in_a_row(body, carry, inputs, **how):
-        if how.get("reverse"):  # the advantages
-            return scan(body, carry, inputs, **how)
+    def in_a_row(body, carry, inputs, **options):
+        if options.get("reverse"):  # the advantages
+            return scan(body, carry, inputs, **options)
         outputs = []
         for i in range(UPDATES):
             carry, output = body(carry, jax.tree.map(lambda x, i=i: x[i], inputs))
@@ -113,17 +113,17 @@ def test_each_all_reduce_waits_for_the_one_before(case, monkeypatch):
     of_one = jax.tree.map(lambda x: x[0], (case.unrolls, case.order, case.keys))
     on_one = functools.partial(case.on_device, True, 1)
     program = jax.make_jaxpr(on_one, axis_env=[("devices", DEVICES)])(*of_one).jaxpr
-    messages = [equation for equation in program.eqns if equation.primitive.name.startswith("psum")]
-    assert len(messages) == 2 * UPDATES + 1
-    for before, message in itertools.pairwise(messages):
-        assert message.outvars[0] in _made_of(before.outvars, program)
+    reductions = [equation for equation in program.eqns if equation.primitive.name.startswith("psum")]
+    assert len(reductions) == 2 * UPDATES + 1
+    for before, after in itertools.pairwise(reductions):
+        assert after.outvars[0] in _made_of(before.outvars, program)
     *_, metrics = program.outvars  # whose mean is sent next
-    assert metrics in _made_of(messages[-1].outvars, program)
+    assert metrics in _made_of(reductions[-1].outvars, program)
 
 
 def _made_of(variables, program):
-    made = set(variables)
+    dependent = set(variables)
     for equation in program.eqns:
-        if made.intersection(v for v in equation.invars if not hasattr(v, "val")):
-            made.update(equation.outvars)
-    return made
+        if dependent.intersection(v for v in equation.invars if not hasattr(v, "val")):
+            dependent.update(equation.outvars)
+    return dependent

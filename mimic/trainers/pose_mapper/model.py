@@ -21,7 +21,7 @@ from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
-from mimic.retargeting.pose import continuous_joints, pose_limits, wrap_angles
+from mimic.retargeting.pose import checked_poses, continuous_joints, pose_limits, wrap_angles
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings
 from mimic.trainers.run_config import load_config
@@ -217,15 +217,10 @@ def check_poses(arm: Embodiment, qpos: ArrayLike) -> Array:
     Raises:
       ValueError: poses of the wrong shape, not finite, or outside of the arm's joint range.
     """
-    poses = jnp.asarray(qpos)
-    poses = poses if jnp.issubdtype(poses.dtype, jnp.floating) else poses.astype(float)
-    if poses.ndim < 1 or poses.shape[-1] != arm.num_joints:
-        raise ValueError(f"qpos: expected shape [..., {arm.num_joints}] for {arm.name}, got {poses.shape}")
+    poses = checked_poses(arm, jnp.asarray(qpos))
     if isinstance(poses, Tracer):
         return poses
     values = np.asarray(poses)
-    if not np.all(np.isfinite(values)):
-        raise ValueError("qpos: expected finite angles [rad], got some that are not")
     lower, upper = pose_limits(arm, values.dtype)
     outside = (values < lower - _LIMIT_TOLERANCE) | (values > upper + _LIMIT_TOLERANCE)
     if outside.any():

@@ -75,7 +75,7 @@ class TrainingFunctions(NamedTuple):
       epoch: state -> state after a training epoch, and the means of the training metrics.
     """
 
-    start: Callable[[int, Params | None, int], TrainingState]
+    start: Callable[..., TrainingState]
     restore: Callable[[Sequence[np.ndarray]], TrainingState | None]
     epoch: Background[Callable[[TrainingState], tuple[TrainingState, Metrics]]]
 
@@ -127,11 +127,10 @@ def compile_training(
         shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), partitions)
         return jax.device_put(state, shardings)
 
-    return TrainingFunctions(
-        start=lambda seed, params, done_updates: compiled_start()(seed, params, done_updates, expert_states),
-        restore=restore,
-        epoch=compiled_learn,
-    )
+    def start_from(seed: int, params: Params | None = None, done_updates: int = 0) -> TrainingState:
+        return compiled_start()(seed, params, done_updates, expert_states)
+
+    return TrainingFunctions(start_from, restore, compiled_learn)
 
 
 def _over_devices(mesh: Mesh, function: Any, inputs: Any, outputs: Any, **options: Any) -> Any:
