@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import typing
+from typing import Any
 
 import jax
 import numpy as np
@@ -86,7 +87,8 @@ def test_numbers_out_of_range_are_rejected(config_class, settings, message):
 
 
 def test_numbers_in_range_are_accepted():
-    config = Base(count=np.int32(10_000), rate=1.0, widths=[1, 9], sharpness=-1e6)
+    count: Any = np.int32(10_000)
+    config = Base(count=count, rate=1.0, widths=[1, 9], sharpness=-1e6)
     assert config.count == 10_000 and Base().rate is None and ranges(Redeclared)["count"] == Range(1, 10_000)
 
 
