@@ -17,10 +17,11 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import compat
+from mimic.commands.arguments import check_arguments
 from mimic.commands.config import (
     CollectConfig,
     EvaluateConfig,
@@ -32,14 +33,16 @@ from mimic.commands.config import (
     RetargetConfig,
     ViewConfig,
 )
-from mimic.config import explain, schema
+from mimic.config import explain, schema, typed
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals
+from mimic.sweeps.hydra_plugins import bound_config_files
 from mimic.sweeps.launchers import check_launcher, register_launchers
 from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import TRAINERS, TrainConfig
 
 BAD_INPUT = 2
+_LONGEST_MESSAGE = 1000  # characters: Hydra repeats the argument
 ARM_KEYS = {  # keys of each command whose value may be just the name or file of an arm
     "train": ("env.expert", "env.learner"),
     "demonstrations": ("env.expert", "env.learner"),
@@ -57,7 +60,7 @@ Work = Callable[[], int | None]  # returns the exit code, 0 for None
 
 
 def run(prepare: Callable[[Any], Work], config_name: str) -> None:
-    """Runs a command; for bad input it prints one line and exits with 2.
+    """Runs a command; for bad input it prints one line and exits with 2, and with 1 if files fail later (disk full).
 
     Args:
       prepare: checks the typed config and returns the work. Errors that it raises are user errors and print one line;
@@ -70,38 +73,52 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     _register_schemas()
     register_sweeper()
     register_launchers()
+    bound_config_files()
+    began = False  # whether the config was composed: all errors before are user errors
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
     def command(config: DictConfig) -> Outcome:
+        nonlocal began
+        began = True
         if is_sweep():
             return _sweep_run(prepare, config)
         try:
             check_launcher(HydraConfig.get().runtime.choices["hydra/launcher"])
-            work = prepare(OmegaConf.to_object(config))
+            work = prepare(typed(config))
         except _BAD_INPUT as error:
             _exit_with_error(error)
-        exit_code = work()
+        try:
+            exit_code = work()
+        except OSError as error:  # disk full, quota, permission
+            _exit_with_error(error, FAILED)
         if exit_code:
             sys.exit(exit_code)
         return Outcome()
 
     try:
         with watched_signals():
+            check_arguments(sys.argv[1:])
             command()
     except _CONFIG_ERRORS as error:
+        _exit_with_error(error)
+    except OSError as error:  # of Hydra or our sweeper
+        _exit_with_error(error, FAILED if began else BAD_INPUT)
+    except (ValueError, RecursionError) as error:
+        if began:
+            raise
         _exit_with_error(error)
 
 
 def _sweep_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
     """One run of a sweep in this process. The other runs continue after a failure, but a signal ends them all."""
     try:
-        work = prepare(OmegaConf.to_object(config))
+        work = prepare(typed(config))
     except _BAD_INPUT as error:
-        reason = _one_line(error)
-        print(f"error: {reason}", file=sys.stderr)
-        return Outcome(BAD_INPUT, reason)
+        return _failed_run(error, BAD_INPUT)
     try:
         exit_code = work() or 0
+    except OSError as error:
+        return _failed_run(error, FAILED)
     except Exception as error:
         traceback.print_exc()
         return Outcome(FAILED, " ".join(f"{type(error).__name__}: {error}".split()))
@@ -119,9 +136,15 @@ def _expand_shorthand(argument: str, command: str) -> str:
     return f"{key}.model={value}" if equals and is_arm else argument
 
 
-def _exit_with_error(error: BaseException) -> NoReturn:
+def _failed_run(error: BaseException, exit_code: int) -> Outcome:
+    reason = _one_line(error)
+    print(f"error: {reason}", file=sys.stderr)
+    return Outcome(exit_code, reason)
+
+
+def _exit_with_error(error: BaseException, exit_code: int = BAD_INPUT) -> NoReturn:
     print(f"error: {_one_line(error)}", file=sys.stderr)
-    sys.exit(BAD_INPUT)
+    sys.exit(exit_code)
 
 
 def process_started() -> float:
@@ -177,9 +200,9 @@ def _one_line(error: BaseException) -> str:
     causes = [error]
     while causes[-1].__cause__ is not None:
         causes.append(causes[-1].__cause__)
-    typed = [cause for cause in causes if isinstance(cause, OmegaConfBaseException)]
-    if typed:
-        return explain(typed[-1])
+    typed_errors = [cause for cause in causes if isinstance(cause, OmegaConfBaseException)]
+    if typed_errors:
+        return explain(typed_errors[-1])
     if isinstance(error, FrozenInstanceError):
         return f"unknown keys cannot be added: {error}"
     message = str(error)
@@ -188,4 +211,4 @@ def _one_line(error: BaseException) -> str:
         group, name, options = choice.groups()
         valid = ", ".join(sorted(option for option in set(options.split()) if not option.endswith("schema")))
         return f"unknown {group} {name!r}; valid are {valid}"
-    return " ".join(message.split())
+    return " ".join(message.split())[:_LONGEST_MESSAGE]

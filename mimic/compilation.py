@@ -5,6 +5,7 @@ Compilers release the GIL, so that Python does other work meanwhile.
 
 import contextlib
 import os
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import jax
+
+from mimic.config import check_writable
 
 WAITED = "/mimic/prepared/wait"  # an event of `jax.monitoring`
 
@@ -105,8 +108,13 @@ def use_compilation_cache(folder: str) -> None:
     Small functions are cached too: on a GPU each takes a tenth of a second to compile, and there are dozens.
 
     Args:
-      folder: created if it does not exist; empty for no cache.
+      folder: created if it does not exist; empty for no cache. One that cannot be written is not used.
     """
     if folder:
+        try:
+            check_writable("compilation_cache", Path(folder).expanduser())
+        except ValueError as error:  # a run does without
+            print(f"warning: {error}; all functions are compiled anew", file=sys.stderr)
+            return
         jax.config.update("jax_compilation_cache_dir", str(Path(folder).expanduser()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -1,10 +1,18 @@
 """Typed configs: frozen dataclasses as OmegaConf schemas, checks of values, and one-line error messages."""
 
+import dataclasses
+import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
+
+from mimic.config_files import check_references
+from mimic.ranges import ranges
+
+_LONGEST_IN_RUN = 200  # characters of the longest path within a run directory
 
 
 def schema(config_class: type) -> DictConfig:
@@ -23,6 +31,33 @@ def _unfreeze(node: DictConfig) -> None:
             _unfreeze(child)
 
 
+def typed(config: DictConfig) -> Any:
+    """Returns a config as its frozen dataclass.
+
+    Raises:
+      ValueError: a number out of range, or a ${...} other than a reference to a key. The line names the full key.
+    """
+    check_references(config)
+    _check_ranges(config)
+    return OmegaConf.to_object(config)
+
+
+def _check_ranges(node: DictConfig, prefix: str = "") -> None:
+    config_class = OmegaConf.get_type(node)
+    limits = ranges(config_class) if config_class is not None else {}
+    for key in node:
+        if OmegaConf.is_missing(node, key):
+            continue
+        value, name = node[key], f"{prefix}{key}"
+        expected = node._get_node(key)._metadata.ref_type  # type: ignore[union-attr]
+        if dataclasses.is_dataclass(expected) and expected not in (OmegaConf.get_type(value) or object).__mro__:
+            raise ValueError(f"{name}: expected keys and values of its own, got {value!s:.80}")  # by a reference
+        if isinstance(value, DictConfig):
+            _check_ranges(value, f"{name}.")
+        elif key in limits and value is not None:
+            limits[key].check(name, value)
+
+
 def explain(error: Exception) -> str:
     """Returns a config error as one line: the key, what is wrong with it, and for an unknown key the valid keys."""
     message = " ".join(str(getattr(error, "msg", None) or error).splitlines()[0].split())
@@ -36,7 +71,7 @@ def explain(error: Exception) -> str:
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """Raises a ValueError that lists the choices if the value is none of them."""
     if value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r:.80}")
 
 
 def new_file(name: str, path: str) -> Path:
@@ -64,18 +99,38 @@ def _new_path(name: str, path: str, kind: str) -> Path:
     check_new(name, new, f"name a new {kind}")
     if not new.parent.is_dir():
         raise ValueError(f"{name}: {str(new)!r}: there is no folder {str(new.parent)!r}")
+    check_writable(name, new)
     return new
 
 
 def check_new(name: str, path: Path, advice: str) -> None:
     """Raises a ValueError with some advice if a path exists: no output is ever overwritten."""
-    if path.exists():
+    if os.path.lexists(path):
         raise ValueError(f"{name}: {str(path)!r} exists; {advice}")
+
+
+def check_writable(name: str, path: Path) -> None:
+    """Raises a ValueError if a file or folder cannot be written: a new one, or what is in an existing folder.
+
+    Tried with a temporary folder in the nearest folder that exists: permissions alone do not tell.
+    """
+    folder = path.absolute()
+    while not os.path.lexists(folder):
+        folder = folder.parent
+    try:
+        longest = os.pathconf(folder, "PC_PATH_MAX") - _LONGEST_IN_RUN
+        if len(os.fsencode(path.absolute())) > longest or any(
+            len(os.fsencode(part)) > os.pathconf(folder, "PC_NAME_MAX") for part in path.parts
+        ):
+            raise ValueError(f"{name}: {str(path)[:80]!r}...: expected a shorter path")
+        tempfile.TemporaryDirectory(prefix=".mimic-", dir=folder).cleanup()
+    except OSError as error:
+        raise ValueError(f"{name}: {str(path)!r}: cannot write in {str(folder)!r}: {error.strerror}") from error
 
 
 def to_dict(config: Any) -> dict[str, Any]:
     """Returns a config as dicts and lists, for files."""
-    return OmegaConf.to_container(OmegaConf.structured(config), resolve=True)  # type: ignore[return-value]
+    return OmegaConf.to_container(OmegaConf.structured(config))  # type: ignore[return-value]
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -18,17 +18,20 @@ import mimic
         (["seed=one"], "could not be converted to Integer"),
         (["env.learner.locked=[joint9]"], "unknown joint 'joint9'"),
         (["trainer.num_envs=500"], "must be a multiple of num_envs = 500"),
-        (["trainer.learning_rate=inf"], "trainer.learning_rate: expected a number above 0, got inf"),
+        (["trainer.learning_rate=inf"], "trainer.learning_rate: expected a number above 0 and at most 1, got inf"),
         (["env.demonstrations.path=missing.npz"], "no file"),
         (["resume=missing"], "not a run directory"),
         (["+foo=1"], "foo"),
         (["env.metric.correspondence=soft", "env.metric.xi=1"], "below 0"),
-        (["env.metric.rotation=inf"], "finite weight"),
-        (["env=planar4dof", "env.learner.link_lengths=[0.5,0]"], "above 0 [m]"),
+        (["env.metric.rotation=inf"], "env.metric.rotation: expected a number from 0 to 1e+06, got inf"),
+        (
+            ["env=planar4dof", "env.learner.link_lengths=[0.5,0]"],
+            "each from 0.001 to 100, got [0.5, 0.0]",
+        ),
         (["env.learner.model=missing.xml"], "missing.xml"),
         (["trainer=pose_mapper", "trainer.preset=huge"], "expected one of paper, large, got 'huge'"),
         (["trainer=pose_mapper", "trainer.batch_size=1000"], "expected a divisor of samples = 65536, got 1000"),
-        (["trainer=pose_mapper", "trainer.heads=0"], "trainer.heads: expected at least 1, got 0"),
+        (["trainer=pose_mapper", "trainer.heads=0"], "trainer.heads: expected a whole number from 1 to 1,000, got 0"),
         (["trainer=pose_mapper", "trainer.inputs=pixels"], "expected one of angles, link_states"),
         (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),
     ],
@@ -53,6 +56,7 @@ def test_a_bad_arm_file(rejected, tmp_path):
 def test_bad_run_directories(rejected, tmp_path):
     run_dir = tmp_path / "run"
     run_dir.mkdir()
+    (run_dir / "notes.txt").touch()
     assert "exists" in rejected("train", f"run_dir={run_dir}")
 
 
@@ -61,7 +65,6 @@ def test_bad_run_directories(rejected, tmp_path):
     ("config", "message"),
     [
         (None, "not a run directory"),
-        ("trainer: {name: ppo}\n", "no checkpoint"),
         ("trainer: {name: sac}\n", "expected one of"),
         ("trainer: {name: ppo, previw: 1}\n", "previw"),
         ("a: [\n", "cannot be read"),
@@ -73,6 +76,12 @@ def test_unreadable_run_directories(rejected, tmp_path, command, key, config, me
     if config is not None:
         (run_dir / "config.yaml").write_text(config)
     assert message in rejected(command, f"{key}={run_dir}")
+
+
+@pytest.mark.parametrize("command", ["evaluate", "render"])
+def test_run_directories_without_a_checkpoint(rejected, tmp_path, command):
+    (tmp_path / "config.yaml").write_text("trainer: {name: ppo}\n")
+    assert "no checkpoint" in rejected(command, f"run={tmp_path}")
 
 
 def test_all_commands_are_listed():

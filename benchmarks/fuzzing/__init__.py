@@ -30,6 +30,8 @@ MakeCase = Callable[[int], Case]  # case number n
 KINDS = {  # module and function
     "npz": ("benchmarks.fuzzing.files", "npz_case"),
     "models": ("benchmarks.fuzzing.files", "model_case"),
+    "command_lines": ("benchmarks.fuzzing.configs", "command_line_case"),
+    "runs": ("benchmarks.fuzzing.runs", "run_case"),
 }
 
 

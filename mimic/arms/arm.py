@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import math
 import os
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
@@ -17,6 +16,7 @@ from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, plan
 from mimic.arms.ignored_elements import ignored_elements
 from mimic.arms.model_files import read_spec
 from mimic.arms.simulation_model import effective_inertia, simulation_model
+from mimic.ranges import check_ranges, number
 
 # Planar arms are slender rods; relative to their size, their joints have about the effective inertia of the Panda's.
 _PLANAR_MASS = 1.0  # kg/m
@@ -49,19 +49,19 @@ class ArmConfig:
 
     model: str = "panda"
     locked: Any = None  # not a list, which OmegaConf would let no mapping replace
-    link_lengths: list[float] = dataclasses.field(default_factory=list)
+    # From a micromanipulator's links to a crane's; the kinematics of 100 links take minutes to compile.
+    link_lengths: list[float] = number(list, at_least=1e-3, at_most=100.0, entries=(0, 100))
     base: str | None = None
     tip: str | None = None
-    armature: float = 0.0
-    damping: float = 0.0
+    # Joints of the largest industrial robots have some 1000 kg m^2 and 1000 N m s/rad.
+    armature: float = number(0.0, at_least=0.0, at_most=1e4)
+    damping: float = number(0.0, at_least=0.0, at_most=1e4)
     base_segment: bool = True
 
     def __post_init__(self) -> None:
         if not self.model:
             raise ValueError(f"model: expected {', '.join(BUILT_IN)} or the path of an MJCF or URDF file, got nothing")
-        for name in ("armature", "damping"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
+        check_ranges(self)
         if self.is_file:  # absolute, so that a run can be loaded from any folder
             object.__setattr__(self, "model", os.path.abspath(os.path.expanduser(self.model)))
 

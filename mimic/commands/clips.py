@@ -130,8 +130,6 @@ def _mapper_clip(config: RenderConfig) -> ClipPlan:
         _check_number(config.demonstration, demonstrations)
         name = f"{Path(config.demonstrations).stem}-{config.demonstration}"
     else:
-        if config.demonstration < 0 or config.seed < 0:
-            raise ValueError(f"demonstration, seed: expected at least 0, got {config.demonstration} and {config.seed}")
         demonstrations = None
         name = f"{env.demonstrations.kind}-seed{config.seed}-{config.demonstration}"
 

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mimic.commands.config import CollectConfig
+from mimic.config import check_writable
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import REPORT, write_atomically
 from mimic.sweeps.finished_runs import QUALITY_METRICS, FinishedRun, LeftOut, QualityMetric, find_runs
@@ -45,6 +46,7 @@ def prepare_collection(config: CollectConfig) -> Callable[[], int]:
     out = Path(config.out).expanduser() if config.out else folder
     if out.exists() and not out.is_dir():
         raise ValueError(f"out: {str(out)!r} is a file; expected a folder")
+    check_writable("out", out)
     finished, left_out = find_runs(folder)
     finished = [run for run in finished if config.only in ("", run.trainer)]
     if not finished:

@@ -14,11 +14,21 @@ from mimic.envs import env_config, environments
 from mimic.envs.config import PHYSICS, EnvConfig
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
+from mimic.ranges import check_ranges, number, seed_number
 from mimic.trainers.config import TRAINERS
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "searched")
 EXPORT_FORMATS = ("onnx", "jax")
-_LAST_PORT = 65535
+
+
+def _steps() -> Any:
+    """Field for the steps of a checkpoint."""
+    return number(None, at_least=0, at_most=10**15)
+
+
+def _factor() -> Any:
+    """Field for a factor on masses or damping, as in `RandomizationConfig`."""
+    return number(None, at_least=1e-3, at_most=1e3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,18 +49,19 @@ class EvaluateConfig:
     """
 
     run: str = ""
-    checkpoint: int | None = None
+    checkpoint: int | None = _steps()
     controller: str = "policy"
     search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
     demonstrations: str = ""
     physics: str = ""
-    mass: float | None = None
-    damping: float | None = None
-    torque_noise: float | None = None
+    mass: float | None = _factor()
+    damping: float | None = _factor()
+    torque_noise: float | None = number(None, at_least=0.0, at_most=10.0)
     out: str = ""
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         check_choice("controller", self.controller, CONTROLLERS)
         if self.physics:
             check_choice("physics", self.physics, PHYSICS)
@@ -72,8 +83,11 @@ class FiguresConfig:
     out: str = ""
     only: list[str] = dataclasses.field(default_factory=list)
     runs: str = ""
-    seed: int = 0
+    seed: int = seed_number()
     compilation_cache: str = "~/.cache/mimic/jax"
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,11 +111,11 @@ class RenderConfig:
     """
 
     run: str = ""
-    checkpoint: int | None = None
+    checkpoint: int | None = _steps()
     split: str = "held_out"
-    demonstration: int = 0
+    demonstration: int = number(0, at_least=0, at_most=1_000_000)
     demonstrations: str = ""
-    seed: int = 0
+    seed: int = number(0, at_least=0, at_most=2**63 - 1)
     retargeted: str = ""
     learner: str = ""
     limits: str = "none"
@@ -110,6 +124,7 @@ class RenderConfig:
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         check_choice("split", self.split, SPLITS)
 
 
@@ -129,9 +144,10 @@ class ExportConfig:
     out: str = ""
     format: str = "onnx"
     learner: str = ""
-    checkpoint: int | None = None
+    checkpoint: int | None = _steps()
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         check_choice("format", self.format, EXPORT_FORMATS)
 
 
@@ -170,13 +186,16 @@ class RecordingConfig:
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     kind: str | None = None
-    count: int | None = None
-    seed: int | None = None
+    count: int | None = number(None, at_least=1, at_most=100_000)
+    seed: int | None = number(None, at_least=0, at_most=2**63 - 1)
     limits: str | None = None
     source: str = ""
     joints: list[str] = dataclasses.field(default_factory=list)
     out: str = ""
     plot: str = ""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
     def resolve(self) -> EnvConfig:
         """Returns the environment with the values set in this config.
@@ -230,7 +249,10 @@ class RetargetConfig:
     mapper: str = ""
     limits: str = "none"
     out: str = ""
-    seed: int = 0
+    seed: int = seed_number()
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,16 +276,15 @@ class ViewConfig:
     learner: str = ""
     mapper: str = ""
     run: str = ""
-    checkpoint: int | None = None
+    checkpoint: int | None = _steps()
     split: str = "held_out"
     host: str = "127.0.0.1"
-    port: int = 8080
+    port: int = number(8080, at_least=1, at_most=65_535)
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         check_choice("split", self.split, SPLITS)
-        if not 1 <= self.port <= _LAST_PORT:
-            raise ValueError(f"port: expected 1 to {_LAST_PORT}, got {self.port}")
         if self.run and self.mapper:
             raise ValueError(f"run, mapper: expected one of them, got {self.run!r} and {self.mapper!r}")
         if (self.run or self.mapper) and (self.expert or self.learner):

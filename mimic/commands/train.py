@@ -8,13 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
 from mimic.commands.progress import TrainingProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
-from mimic.config import flatten, to_dict
+from mimic.config import check_writable, flatten, to_dict, typed
 from mimic.runs.checkpoints import (
     Checkpoint,
     checkpoint_steps,
@@ -67,6 +67,7 @@ def prepare_training(
     resumed_dir = Path(config.resume).expanduser() if config.resume else None
     if resumed_dir:
         config = _resumed_config(resumed_dir, config, overrides)
+        check_writable("resume", resumed_dir)
     if group and config.trainer.name != "ppo":
         raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
     is_first = group is None or group.first
@@ -97,7 +98,7 @@ def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[s
             f"got {rejected[0]!r}"
         )
     merged = OmegaConf.merge(run_schema(config.trainer.name), to_dict(config), OmegaConf.from_dotlist(changes))
-    config = cast(TrainConfig, OmegaConf.to_object(merged))
+    config: TrainConfig = typed(cast(DictConfig, merged))
     return dataclasses.replace(
         config, compilation_cache=requested.compilation_cache, distributed=requested.distributed, **logger
     )

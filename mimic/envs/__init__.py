@@ -7,7 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import compat
-from mimic.config import check_choice, explain, schema
+from mimic.config import check_choice, explain, schema, typed
 from mimic.envs.config import EnvConfig
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     arms = {key: {"model": overrides[key]} for key in ("expert", "learner") if isinstance(overrides.get(key), str)}
     try:
         merged = OmegaConf.merge(schema(EnvConfig), preset, {**overrides, **arms, **presets})
-        return OmegaConf.to_object(merged)  # type: ignore[return-value]
+        return typed(merged)  # type: ignore[arg-type]
     except OmegaConfBaseException as error:
         raise ValueError(explain(error)) from error
 

@@ -1,15 +1,16 @@
 """The config of an environment. The presets in mimic/conf/env, `make` and the command line set its fields."""
 
 import dataclasses
-import math
 
 from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
 from mimic.config import check_choice
 from mimic.envs.recording import KINDS
 from mimic.metric.config import MetricConfig
+from mimic.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
+_MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,18 +27,14 @@ class DemonstrationConfig:
 
     path: str = ""
     kind: str = "pd"
-    count: int = 124
-    held_out: int = 32
-    seed: int = 0
+    # A core records some hundred in a second.
+    count: int = number(124, at_least=1, at_most=100_000)
+    held_out: int = number(32, at_least=1, at_most=100_000)
+    seed: int = number(0, at_least=0, at_most=2**63 - 1)
 
     def __post_init__(self) -> None:
         check_choice("demonstrations.kind", self.kind, KINDS)
-        if self.count < 1 or self.held_out < 1:
-            raise ValueError(
-                f"demonstrations: expected count and held_out of at least 1, got {self.count}, {self.held_out}"
-            )
-        if self.seed < 0:
-            raise ValueError(f"demonstrations.seed: expected at least 0, got {self.seed}")
+        check_ranges(self, "demonstrations.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,17 +47,17 @@ class RandomizationConfig:
       torque_noise: standard deviation of the noise on each torque, as a fraction of the maximum torque.
     """
 
-    mass: list[float] = dataclasses.field(default_factory=lambda: [1.0, 1.0])
-    damping: list[float] = dataclasses.field(default_factory=lambda: [1.0, 1.0])
-    torque_noise: float = 0.0
+    # Beyond these factors the arm is another one, and float32 no longer simulates it.
+    mass: list[float] = number(lambda: [1.0, 1.0], at_least=1e-3, at_most=1e3, entries=(2, 2))
+    damping: list[float] = number(lambda: [1.0, 1.0], at_least=1e-3, at_most=1e3, entries=(2, 2))
+    torque_noise: float = number(0.0, at_least=0.0, at_most=10.0)
 
     def __post_init__(self) -> None:
+        check_ranges(self, "randomization.")
         for name in ("mass", "damping"):
-            bounds = list(getattr(self, name))
-            if len(bounds) != 2 or not 0 < bounds[0] <= bounds[1] < math.inf:
-                raise ValueError(f"randomization.{name}: expected [minimum, maximum] factor above 0, got {bounds}")
-        if not 0 <= self.torque_noise < math.inf:
-            raise ValueError(f"randomization.torque_noise: expected at least 0, got {self.torque_noise}")
+            minimum, maximum = getattr(self, name)
+            if minimum > maximum:
+                raise ValueError(f"randomization.{name}: expected [minimum, maximum], got [{minimum}, {maximum}]")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,27 +90,27 @@ class EnvConfig:
     limits: str = "none"
     metric: MetricConfig = dataclasses.field(default_factory=MetricConfig)
     demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
-    horizon: int = 50
-    control_dt: float = 0.1
-    substeps: int = 10
+    horizon: int = number(50, at_least=1, at_most=10_000)
+    control_dt: float = number(0.1, at_least=1e-4, at_most=10.0)  # robots are controlled at 10 kHz at most
+    substeps: int = number(10, at_least=1, at_most=1000)  # 0.1 ms for the default control step
     physics: str = "mjx"
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
-    preview: int = 1
-    limit_weight: float = 1.0
-    action_scale: float = 1.0
-    speed_bound: float = 30.0
+    preview: int = number(1, at_least=0, at_most=100)  # each step adds an expert to the observation
+    limit_weight: float = number(1.0, at_least=0.0, at_most=1e6)
+    action_scale: float = number(1.0, at_least=1e-3, at_most=1000.0)  # the torque is cut at the torque limit anyway
+    speed_bound: float = number(30.0, at_least=1e-3, at_most=1000.0)  # the fastest joints of robots reach some 30 rad/s
 
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)
         check_choice("physics", self.physics, PHYSICS)
-        for name, minimum in (("horizon", 1), ("substeps", 1), ("preview", 0)):
-            if getattr(self, name) < minimum:
-                raise ValueError(f"{name}: expected at least {minimum}, got {getattr(self, name)}")
-        for name in ("control_dt", "action_scale", "speed_bound"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a number above 0, got {getattr(self, name)}")
-        if not 0 <= self.limit_weight < math.inf:
-            raise ValueError(f"limit_weight: expected at least 0, got {self.limit_weight}")
+        check_ranges(self)
+        recorded = 0 if self.demonstrations.path else self.demonstrations.count + self.demonstrations.held_out
+        steps = recorded * self.horizon * self.substeps
+        if steps > _MAX_RECORDED_STEPS:
+            raise ValueError(
+                f"demonstrations: expected (count + held_out) * horizon * substeps of at most {_MAX_RECORDED_STEPS:,} "
+                f"physics steps to record, got {steps:,}"
+            )
 
     def build_arms(self) -> ArmPair:
         """Both arms, with the links that the metric compares.

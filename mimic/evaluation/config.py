@@ -2,6 +2,8 @@
 
 import dataclasses
 
+from mimic.ranges import check_ranges, number
+
 
 @dataclasses.dataclass(frozen=True)
 class SearchConfig:
@@ -13,10 +15,8 @@ class SearchConfig:
         order, then of the policy with noise.
     """
 
-    iterations: int = 40
-    starts: int = 8
+    iterations: int = number(40, at_least=1, at_most=100_000)
+    starts: int = number(8, at_least=1, at_most=1000)
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "starts"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"search.{name}: expected at least 1, got {getattr(self, name)}")
+        check_ranges(self, "search.")

@@ -1,7 +1,6 @@
 """The config of a metric, and the metric that it describes."""
 
 import dataclasses
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import cast
@@ -29,6 +28,7 @@ from mimic.metric.distance import (
     Weights,
     adaptive_weights,
 )
+from mimic.ranges import check_ranges, number
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")
 
@@ -48,14 +48,15 @@ class MetricConfig:
       reduction: "mean" or "frobenius".
     """
 
-    translation: float = 1.0
-    rotation: float = 1.0
-    linear_velocity: float = 0.001
-    angular_velocity: float = 0.01
+    # The sum of weighted squares stays far from float32's maximum of 3e38.
+    translation: float = number(1.0, at_least=0.0, at_most=1e6)
+    rotation: float = number(1.0, at_least=0.0, at_most=1e6)
+    linear_velocity: float = number(0.001, at_least=0.0, at_most=1e6)
+    angular_velocity: float = number(0.01, at_least=0.0, at_most=1e6)
     adaptive: bool = False
     rotation_measure: str = "cosine"
     correspondence: str = "arc_length"
-    xi: float = -10.0
+    xi: float = number(-10.0, at_least=-1e6, below=0.0)  # a soft minimum
     reduction: str = "mean"
     links: str = "kept"
 
@@ -64,11 +65,7 @@ class MetricConfig:
         check_choice("correspondence", self.correspondence, CORRESPONDENCES)
         check_choice("rotation_measure", self.rotation_measure, ROTATION_MEASURES)
         check_choice("reduction", self.reduction, REDUCTIONS)
-        if not -math.inf < self.xi < 0:
-            raise ValueError(f"xi: expected a finite number below 0 (soft minimum), got {self.xi}")
-        for name in ("translation", "rotation", "linear_velocity", "angular_velocity"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a finite weight of at least 0, got {getattr(self, name)}")
+        check_ranges(self, "metric.")
 
     def make_weights(self) -> Weights:
         """The weights: constants, or a function of the distances."""

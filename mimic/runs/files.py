@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 CONFIG, REPORT, METRICS, DEMONSTRATIONS = "config.yaml", "report.json", "metrics.csv", "demonstrations.npz"
+_MAX_JSON_BYTES = 10_000_000  # a report has some 20 kB, the plan of a large sweep 1 MB
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -22,10 +23,28 @@ def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:
     write_atomically(run_dir / REPORT, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON file that holds an object.
+
+    Raises:
+      FileNotFoundError: there is no file.
+      ValueError: the file is too large, or not such a file.
+    """
+    if path.stat().st_size > _MAX_JSON_BYTES:
+        raise ValueError(f"expected at most {_MAX_JSON_BYTES:,} bytes, got {path.stat().st_size:,}")
+    try:
+        content = json.loads(path.read_text())
+    except RecursionError as error:
+        raise ValueError("expected values that are not nested as deeply") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"expected an object, got {content!r:.80}")
+    return content
+
+
 def reported_steps(run_dir: Path, unit: str) -> int:
     """Training steps of the parameters in a run's report; -1 without a report."""
     try:
-        return int(json.loads((run_dir / REPORT).read_text())[unit])
+        return int(read_json(run_dir / REPORT)[unit])
     except (OSError, ValueError, LookupError, TypeError):
         return -1
 

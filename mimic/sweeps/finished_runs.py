@@ -2,7 +2,7 @@
 
 import csv
 import dataclasses
-import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -10,10 +10,9 @@ from typing import Any
 
 from mimic.config import flatten, to_dict
 from mimic.evaluation.labels import SPLITS
-from mimic.runs.files import CONFIG, METRICS, REPORT
+from mimic.runs.files import CONFIG, METRICS, REPORT, read_json
 from mimic.runs.provenance import versions
 from mimic.sweeps.sweeper import LOGS, SWEEP
-from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config
 
 # Keys that no result depends on.
@@ -108,13 +107,13 @@ def _name(path: Path, folder: Path) -> str:
 def _planned(folder: Path) -> dict[Path, tuple[str, str]]:
     """Label of each run of a sweep by its folder, and the reason why it failed, if known."""
     try:
-        entries = json.loads((folder / SWEEP).read_text())["runs"]
+        entries = read_json(folder / SWEEP)["runs"]
         return {
             Path(os.path.normpath(folder / entry["run_dir"])): (entry["label"], _reason(folder, entry))
             for entry in entries
             if entry["run_dir"]
         }
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, LookupError, TypeError, OSError):
         return {}  # a sweep of another version; its run directories are read anyway
 
 
@@ -130,21 +129,25 @@ def _reason(folder: Path, entry: Mapping[str, Any]) -> str:
 
 def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     try:
-        report = json.loads((path / REPORT).read_text())
+        report = read_json(path / REPORT)
     except FileNotFoundError:
         report = None
     except (ValueError, OSError) as error:
         return LeftOut(name, f"{REPORT} cannot be read: {error}")
-    version = str((report or {}).get("versions", {}).get("mimic-mjx", "unknown"))
+    version = _version(report or {})
     try:
         config = load_config(path, saved_models=False)  # runs of one arm are compared by its original path
+        total = config.trainer.resolve().total_steps
     except ValueError as error:
         this = versions()["mimic-mjx"]
         written = f"of mimic {version}, and this is {this}: " if report and version != this else ""
         return LeftOut(name, f"{written}{error}")
-    history = _history(path / METRICS)
+    try:
+        history = _history(path / METRICS)
+    except (ValueError, OSError, csv.Error) as error:
+        return LeftOut(name, f"{METRICS} cannot be read: {error}")
     if report is None:
-        return LeftOut(name, _progress(path, config, history))
+        return LeftOut(name, _progress(path, total, history))
     metric = QUALITY_METRICS[config.trainer.name]
     numbers = _numbers(report)
     missing = [key for split in SPLITS if (key := f"{metric.key}.{split}") not in numbers]
@@ -153,12 +156,15 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
         return LeftOut(name, f"{reason}: {REPORT} has no number {missing[0]}")
     settings = flatten(to_dict(config))
     if "evaluated" in report:
-        is_policy = report["trainer"] == config.trainer.name
-        settings |= {
-            "controller": "policy" if is_policy else report["trainer"],
-            "demonstrations": report["evaluated"]["demonstrations"],
-            metric.unit: numbers[metric.unit],
-        }
+        is_policy = report.get("trainer") == config.trainer.name
+        try:
+            settings |= {
+                "controller": "policy" if is_policy else str(report["trainer"]),
+                "demonstrations": str(report["evaluated"]["demonstrations"]),
+                metric.unit: numbers[metric.unit],
+            }
+        except (LookupError, TypeError) as error:
+            return LeftOut(name, f"{REPORT} cannot be read: {error!r}")
     return FinishedRun(
         name=name,
         trainer=config.trainer.name,
@@ -171,26 +177,48 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     )
 
 
-def _progress(path: Path, config: TrainConfig, history: Mapping[str, Mapping[int, float]]) -> str:
+def _progress(path: Path, total: int, history: Mapping[str, Mapping[int, float]]) -> str:
     step = max((step for column in history.values() for step in column), default=0)
-    total = config.trainer.resolve().total_steps
     return f"no {REPORT}: stopped or still running, at {step:,} of {total:,} steps; resume={path} continues it"
 
 
+def _version(report: Mapping[str, Any]) -> str:
+    versions = report.get("versions")
+    return str(versions.get("mimic-mjx", "unknown")) if isinstance(versions, Mapping) else "unknown"
+
+
 def _history(path: Path) -> dict[str, dict[int, float]]:
-    """Columns of metrics.csv by step; for steps that a resumed run repeated, the last row."""
+    """Columns of metrics.csv by step; for steps that a resumed run repeated, the last row.
+
+    A last row without a line end is still being written, or was when the run was killed, and is left out.
+
+    Raises:
+      ValueError: a row that is damaged.
+    """
     columns: dict[str, dict[int, float]] = {}
     if path.is_file():
-        with path.open(newline="") as file:
-            for row in csv.DictReader(file):
-                step = int(row.pop("step"))
-                for key, value in row.items():
-                    if value:
-                        columns.setdefault(key, {})[step] = float(value)
+        header, *rows = list(csv.reader(_complete_lines(path))) or [[]]
+        for number, row in enumerate(rows, start=2):
+            if len(row) != len(header):
+                raise ValueError(f"line {number} has {len(row)} cells, expected {len(header)}")
+            values = dict(zip(header, row, strict=True))
+            step = int(values.pop("step", ""))
+            for key, value in values.items():
+                if value:
+                    columns.setdefault(key, {})[step] = float(value)
     return columns
+
+
+def _complete_lines(path: Path) -> list[str]:
+    with path.open(newline="") as file:
+        return [line for line in file if line.endswith("\n")]
 
 
 def _numbers(report: Mapping[str, Any]) -> dict[str, float]:
     """The numbers of a report by dotted keys; null, which replaces values that are not finite, is left out."""
     flat = flatten({key: report[key] for key in report if key not in ("worst_demonstrations", "seed")})
-    return {key: x for key, x in flat.items() if isinstance(x, int | float) and not key.startswith("hardware")}
+    return {key: x for key, x in flat.items() if _is_number(x) and not key.startswith("hardware")}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and abs(value) < math.inf

@@ -1,4 +1,4 @@
-"""Registration of our sweeper and launchers as Hydra plugins, in this process only.
+"""Registration of our sweeper, launchers and reader of config files with Hydra, in this process only.
 
 Hydra loads plugins only from the package `hydra_plugins`, whose modules every Hydra application in an environment
 imports. Ours is not on disk there, so that other applications do not import mimic and JAX.
@@ -7,10 +7,16 @@ imports. Ours is not on disk there, so that other applications do not import mim
 import importlib
 import sys
 import types
+from pathlib import Path
 
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.plugin import Plugin
+
+from mimic.config_files import read_config
 
 _PACKAGE, _MODULE = "hydra_plugins", "mimic"
 
@@ -39,3 +45,27 @@ def _plugins() -> types.ModuleType:
         package = types.ModuleType(_PACKAGE)
         package.__path__ = []
         return sys.modules.setdefault(_PACKAGE, package)
+
+
+class BoundedFileSource(FileConfigSource):
+    """Hydra's reader of the YAML files in a user's `--config-dir`, which are bounded like the config of a run."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        """See Hydra's ConfigSource.
+
+        Raises:
+          ValueError: see `read_config`.
+        """
+        path = Path(self.path, self._normalize_file_name(config_path))
+        if path.exists():  # a missing file is reported by Hydra
+            try:
+                read_config(path, may_be_empty=True)
+            except ValueError as error:
+                raise ValueError(f"{str(path)!r} cannot be read: {error}") from error
+        return super().load_config(config_path)
+
+
+def bound_config_files() -> None:
+    """Replaces Hydra's reader of config files by ours."""
+    Plugins.instance()  # registers Hydra's own, which could not replace ours
+    SourcesRegistry.instance().types[BoundedFileSource.scheme()] = BoundedFileSource

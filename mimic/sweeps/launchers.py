@@ -17,14 +17,16 @@ from typing import Any
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
+from mimic.ranges import Range
 from mimic.sweeps.hydra_plugins import register, target
 from mimic.sweeps.launcher import LOCAL, CommandLauncher
 from mimic.sweeps.run_command import RunCommand
-from mimic.sweeps.sweeper import Outcome
+from mimic.sweeps.sweeper import MAX_RUNS, Outcome
 
 _GPUS = "CUDA_VISIBLE_DEVICES"
 _NO_TIMEOUT_MIN = 365 * 24 * 60  # submitit requires a time limit
 _CONNECT_TIMEOUT_S = 10
+_PARALLEL = Range(1, MAX_RUNS)  # more processes than runs have nothing to do
 
 
 @dataclasses.dataclass
@@ -119,8 +121,11 @@ class SubmititLocalLauncher(_SubmititLauncher):
 
     def connect(self) -> None:
         """Checks the number of parallel runs, and that there are enough GPUs for them."""
-        if self.max_parallel is None or self.max_parallel < 1:
-            raise HydraException(f"hydra.launcher.parallel: expected at least 1, got {self.max_parallel}")
+        try:
+            _PARALLEL.check("hydra.launcher.parallel", self.max_parallel)
+        except ValueError as error:
+            raise HydraException(str(error)) from error
+        assert self.max_parallel is not None
         gpus_of(self.max_parallel - 1, self._gpus_per_run, os.environ.get(_GPUS))
 
     def start(self, commands: Sequence[RunCommand], slots: Sequence[int]) -> list[Any]:

@@ -4,6 +4,7 @@ Hydra's own sweeper stops at the first run that fails, and writes files before a
 """
 
 import dataclasses
+import itertools
 import json
 import os
 import re
@@ -15,18 +16,22 @@ from typing import Any
 import hydra.plugins.sweeper
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.runs.files import CONFIG, REPORT
+from mimic.config import check_writable
+from mimic.config_files import check_references
+from mimic.runs.files import CONFIG, REPORT, read_json
 from mimic.runs.signals import exit_hook
 from mimic.sweeps.hydra_plugins import register, target
 
 SWEEP, LOGS = "sweep.json", "logs"
 FAILED = 1
+MAX_RUNS = 1000  # each is composed before the first one starts, in a tenth of a second
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +93,7 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         """
         assert self.config is not None
         folder = Path(self.config.hydra.sweep.dir)
+        check_writable("hydra.sweep.dir", folder)
         planned = self.plan(arguments, folder)
         remaining = _remaining(folder, planned)
         folder.mkdir(parents=True, exist_ok=True)
@@ -113,12 +119,14 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         assert self.config is not None and self.hydra_context is not None
         loader = self.hydra_context.config_loader
         parsed = OverridesParser.create(config_loader=loader).parse_overrides([*self._params, *arguments])
+        _check_count(parsed)
         (combinations,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
         shared = set(combinations[0]).intersection(*combinations)
         width = len(str(len(combinations) - 1))
         runs = []
         for number, overrides in enumerate(combinations):
             config = loader.load_sweep_config(self.config, overrides)
+            check_references(OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"]))
             run_dir, added = _run_dir(config, folder, f"{number:0{width}d}")
             label = " ".join(override for override in overrides if override not in shared)
             runs.append(PlannedRun(label or f"run {number}", [*overrides, *added], run_dir))
@@ -137,6 +145,18 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
 
 def _report_stop(folder: Path) -> None:
     print(f"the sweep was stopped; what there is of it: {folder}", file=sys.stderr)
+
+
+def _check_count(overrides: Sequence[Override]) -> None:
+    """Raises a HydraException if a sweep has too many runs; counted without listing them."""
+    count = 1
+    for override in overrides:
+        if override.is_sweep_override():
+            count *= sum(1 for _ in itertools.islice(override.sweep_iterator(), MAX_RUNS + 1))
+    if count == 0:
+        raise HydraException("expected at least 1 run in a sweep, got none")
+    if count > MAX_RUNS:
+        raise HydraException(f"expected at most {MAX_RUNS:,} runs in a sweep, got at least {count:,}")
 
 
 def _run_dir(config: DictConfig, folder: Path, number: str) -> tuple[str, list[str]]:
@@ -168,7 +188,7 @@ def _remaining(folder: Path, planned: Sequence[PlannedRun]) -> dict[int, list[st
     if not (folder / SWEEP).exists():
         return {number: run.overrides for number, run in enumerate(planned)}
     try:
-        known = [entry["overrides"] for entry in json.loads((folder / SWEEP).read_text())["runs"]]
+        known = [entry["overrides"] for entry in read_json(folder / SWEEP)["runs"]]
     except (ValueError, LookupError, TypeError):
         known = []
     if known != [run.overrides for run in planned]:

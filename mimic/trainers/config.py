@@ -1,13 +1,13 @@
 """The config of a training run. `python -m mimic.train` composes it from mimic/conf and the command line."""
 
 import dataclasses
-import math
 from typing import Any, ClassVar
 
 from omegaconf import MISSING
 
 from mimic.config import check_choice
 from mimic.envs.config import EnvConfig
+from mimic.ranges import check_ranges, number, seed_number
 from mimic.trainers.distributed.process_group import DistributedConfig
 
 LOGGERS = ("local", "wandb", "mlflow")
@@ -67,7 +67,7 @@ class TrainerConfig:
 
     name: str = MISSING
     preset: str = MISSING
-    keep: int = 50
+    keep: int = number(50, at_least=2, at_most=1_000_000)
 
     @property
     def total_steps(self) -> int:
@@ -119,31 +119,34 @@ class PPOConfig(TrainerConfig):
 
     name: str = "ppo"
     preset: str = "auto"
-    num_timesteps: int | None = None
-    num_envs: int | None = None
-    unroll_length: int | None = None
-    batch_size: int | None = None
-    num_minibatches: int | None = None
-    num_updates_per_batch: int | None = None
-    learning_rate: float | None = None
-    final_learning_rate: float | None = None
-    discounting: float | None = None
-    final_discounting: float | None = None
-    gae_lambda: float = 0.9
-    entropy_cost: float | None = None
-    final_entropy_cost: float | None = None
-    clipping_epsilon: float = 0.2
-    max_grad_norm: float = 1.0
-    reward_scaling: float = 10.0
-    hidden_layers: list[int] | None = None
-    crossovers: int | None = None
+    # Sizes: `check_training_memory` rejects products that do not fit.
+    num_timesteps: int | None = number(None, at_least=1, at_most=10**12)  # a week on eight GPUs
+    num_envs: int | None = number(None, at_least=1, at_most=2**22)
+    unroll_length: int | None = number(None, at_least=1, at_most=10_000)
+    batch_size: int | None = number(None, at_least=1, at_most=2**22)
+    num_minibatches: int | None = number(None, at_least=1, at_most=100_000)
+    num_updates_per_batch: int | None = number(None, at_least=1, at_most=1000)
+    # Adam's steps are about as large as its rate, and the initial weights are below 1.
+    learning_rate: float | None = number(None, above=0.0, at_most=1.0)
+    final_learning_rate: float | None = number(None, at_least=0.0, at_most=1.0)
+    discounting: float | None = number(None, at_least=0.0, at_most=1.0)
+    final_discounting: float | None = number(None, at_least=0.0, at_most=1.0)
+    gae_lambda: float = number(0.9, at_least=0.0, at_most=1.0)
+    entropy_cost: float | None = number(None, at_least=0.0, at_most=1000.0)
+    final_entropy_cost: float | None = number(None, at_least=0.0, at_most=1.0)
+    clipping_epsilon: float = number(0.2, above=0.0, at_most=10.0)
+    max_grad_norm: float = number(1.0, above=0.0, at_most=1e6)
+    reward_scaling: float = number(10.0, above=0.0, at_most=1e6)  # its square is in the loss
+    hidden_layers: list[int] | None = number(None, at_least=1, at_most=2**16, entries=(1, 32))
+    crossovers: int | None = number(None, at_least=0, at_most=100_000)
     timed_critic: bool = True
-    target_gap: float = 0.0
-    evaluations: int | None = None
+    target_gap: float = number(0.0, at_least=0.0, at_most=100.0)
+    evaluations: int | None = number(None, at_least=1, at_most=1_000_000)
 
     def __post_init__(self) -> None:
         check_choice("trainer.preset", self.preset, ("auto", *PRESETS))
         check_choice("trainer.name", self.name, ("ppo",))
+        check_ranges(self, "trainer.")
 
     def resolve(self, backend: str = "cpu", devices: int = 1) -> "PPOSettings":
         """Returns the settings: every field has a value, and `preset` is never "auto".
@@ -188,19 +191,7 @@ class PPOSettings(PPOConfig):
     evaluations: int = MISSING
 
     def check(self, devices: int) -> None:
-        """Raises a ValueError for numbers out of range, or batch sizes that the devices cannot divide."""
-        counts = "num_timesteps", "num_envs", "unroll_length", "batch_size", "num_minibatches", "num_updates_per_batch"
-        _check_counts(self, *counts, "evaluations")
-        for key in ("learning_rate", "max_grad_norm", "reward_scaling", "clipping_epsilon"):
-            if not 0 < getattr(self, key) < math.inf:
-                raise ValueError(f"trainer.{key}: expected a number above 0, got {getattr(self, key)}")
-        for key in ("discounting", "final_discounting", "gae_lambda", "final_learning_rate", "final_entropy_cost"):
-            if not 0 <= getattr(self, key) <= 1:
-                raise ValueError(f"trainer.{key}: expected a number in [0, 1], got {getattr(self, key)}")
-        for key in ("target_gap", "crossovers"):
-            if not getattr(self, key) >= 0:
-                raise ValueError(f"trainer.{key}: expected at least 0, got {getattr(self, key)}")
-        _check_layers(self.hidden_layers)
+        """Raises a ValueError for batch sizes that the environments or the devices cannot divide."""
         unrolls = self.batch_size * self.num_minibatches
         if unrolls % self.num_envs:
             raise ValueError(
@@ -313,26 +304,29 @@ class PoseMapperConfig(TrainerConfig):
     preset: str = "large"
     inputs: str | None = None
     outputs: str | None = None
-    heads: int | None = None
-    hidden_layers: list[int] | None = None
+    # Sizes: `check_training_memory` rejects products that do not fit.
+    heads: int | None = number(None, at_least=1, at_most=1000)
+    hidden_layers: list[int] | None = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     activation: str | None = None
-    samples: int | None = None
-    batch_size: int | None = None
+    samples: int | None = number(None, at_least=1, at_most=10**9)
+    batch_size: int | None = number(None, at_least=1, at_most=10**9)
     fresh: bool | None = None
-    epochs: int | None = None
-    learning_rate: float | None = None
-    final_learning_rate: float | None = None
-    dropout: float = 0.0
-    weight_decay: float = 0.0
-    patience: int | None = None
-    target_quality: float = 0.0
-    evaluations: int | None = None
-    validation_poses: int = 1024
-    held_out_poses: int = 10_000
+    epochs: int | None = number(None, at_least=1, at_most=10_000_000)
+    # Adam's steps are about as large as its rate, and the initial weights are below 1.
+    learning_rate: float | None = number(None, above=0.0, at_most=1.0)
+    final_learning_rate: float | None = number(None, at_least=0.0, at_most=1.0)
+    dropout: float = number(0.0, at_least=0.0, below=1.0)
+    weight_decay: float = number(0.0, at_least=0.0, at_most=1000.0)  # an update subtracts its product with the rate
+    patience: int | None = number(None, at_least=0, at_most=1_000_000)
+    target_quality: float = number(0.0, at_least=0.0, at_most=100.0)
+    evaluations: int | None = number(None, at_least=1, at_most=1_000_000)
+    validation_poses: int = number(1024, at_least=1, at_most=10_000_000)
+    held_out_poses: int = number(10_000, at_least=1, at_most=10_000_000)
 
     def __post_init__(self) -> None:
         check_choice("trainer.preset", self.preset, tuple(MAPPER_PRESETS))
         check_choice("trainer.name", self.name, ("pose_mapper",))
+        check_ranges(self, "trainer.")
 
     def resolve(self) -> "PoseMapperSettings":
         """Returns the settings: every field has a value.
@@ -364,29 +358,10 @@ class PoseMapperSettings(PoseMapperConfig):
     evaluations: int = MISSING
 
     def check(self) -> None:
-        """Raises a ValueError for numbers out of range, or a batch size that does not divide the samples."""
+        """Raises a ValueError for an unknown choice, or a batch size that does not divide the samples."""
         check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
         check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
         check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
-        _check_counts(
-            self, "heads", "samples", "batch_size", "epochs", "evaluations", "validation_poses", "held_out_poses"
-        )
-        _check_layers(self.hidden_layers)
-        if not 0 < self.learning_rate < math.inf:
-            raise ValueError(f"trainer.learning_rate: expected a number above 0, got {self.learning_rate}")
-        if not 0 <= self.final_learning_rate <= 1:
-            raise ValueError(
-                f"trainer.final_learning_rate: expected a number in [0, 1], got {self.final_learning_rate}"
-            )
-        if not 0 <= self.dropout < 1:
-            raise ValueError(f"trainer.dropout: expected a fraction in [0, 1), got {self.dropout}")
-        if not 0 <= self.weight_decay < math.inf:
-            raise ValueError(f"trainer.weight_decay: expected a finite number of at least 0, got {self.weight_decay}")
-        if self.patience < 0 or not self.target_quality >= 0:
-            raise ValueError(
-                f"trainer: expected patience and target_quality of at least 0, got {self.patience}, "
-                f"{self.target_quality}"
-            )
         if self.samples % self.batch_size:
             raise ValueError(
                 f"trainer.batch_size: expected a divisor of samples = {self.samples}, got {self.batch_size}"
@@ -405,17 +380,6 @@ def _filled_in(config: TrainerConfig, preset: dict[str, Any]) -> dict[str, Any]:
     """All fields; where one is None, the preset's value."""
     fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
     return {key: preset.get(key) if value is None else value for key, value in fields.items()}
-
-
-def _check_counts(config: TrainerConfig, *keys: str) -> None:
-    for key in keys:
-        if getattr(config, key) < 1:
-            raise ValueError(f"trainer.{key}: expected at least 1, got {getattr(config, key)}")
-
-
-def _check_layers(layers: list[int] | None) -> None:
-    if not layers or min(layers) < 1:
-        raise ValueError(f"trainer.hidden_layers: expected one or more widths above 0, got {layers}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -437,7 +401,7 @@ class TrainConfig:
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     trainer: TrainerConfig = dataclasses.field(default_factory=TrainerConfig)
-    seed: int = 0
+    seed: int = seed_number()
     run_dir: str = ""
     resume: str = ""
     init: str = ""
@@ -446,6 +410,7 @@ class TrainConfig:
     distributed: DistributedConfig = dataclasses.field(default_factory=DistributedConfig)
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         for name in self.loggers:
             check_choice("logger", name, LOGGERS)
 

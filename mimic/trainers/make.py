@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from mimic import compat
 from mimic.envs.demonstrations import Demonstrations
 from mimic.trainers.config import TrainConfig
+from mimic.trainers.memory import check_training_memory
 from mimic.trainers.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -21,8 +22,9 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
       run_dir: directory of an existing run, whose inputs are used; None for a new run.
 
     Raises:
-      ValueError: a config that cannot be trained.
+      ValueError: a config that cannot be trained, or not in the memory that there is.
     """
+    check_training_memory(config)
     return _MAKERS[config.trainer.name](config, run_dir)
 
 

@@ -1,13 +1,15 @@
 """The config of a run: its directory, and saving and loading the config there."""
 
 import dataclasses
+import os
 import time
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
 from mimic.arms.arm import BUILT_IN
-from mimic.config import check_new, explain, schema, to_dict
+from mimic.config import check_new, check_writable, explain, schema, to_dict, typed
+from mimic.config_files import check_references, read_config
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
 from mimic.runs.lock import LOCK
@@ -19,17 +21,19 @@ def new_run_dir(config: TrainConfig) -> Path:
     """The directory of a new run, which is not created yet.
 
     Raises:
-      ValueError: it exists and is more than a run that ended while it was created.
+      ValueError: it exists and is more than a run that ended while it was created, or cannot be written.
     """
     if config.run_dir:
         path = Path(config.run_dir).expanduser()
         if not _is_unfinished(path):
             check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
+        check_writable("run_dir", path)
         return path
     stem = f"{config.env.name}-{config.trainer.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     path, number = Path("runs") / stem, 1
     while path.exists():
         path, number = Path("runs") / f"{stem}-{number}", number + 1
+    check_writable("run_dir", path)
     return path
 
 
@@ -37,7 +41,7 @@ def _is_unfinished(path: Path) -> bool:
     """Whether a folder has nothing but what a run writes before its config."""
     inputs = DEMONSTRATIONS, MODELS
     before_config = {LOCK, *inputs, *(f"{name}.partial" for name in (*inputs, CONFIG))}
-    return path.is_dir() and {file.name for file in path.iterdir()} <= before_config
+    return os.path.isdir(path) and {file.name for file in path.iterdir()} <= before_config
 
 
 def save_config(run_dir: Path, config: TrainConfig) -> None:
@@ -70,12 +74,16 @@ def _read_config(run_dir: Path) -> TrainConfig:
     if not (run_dir / CONFIG).is_file():
         raise ValueError(f"{str(run_dir)!r} is not a run directory: it has no {CONFIG}")
     try:
-        content = OmegaConf.load(run_dir / CONFIG)
+        content = read_config(run_dir / CONFIG)
+        check_references(content)  # before anything resolves them
+        for group in {"env", "trainer"}.intersection(content):
+            if not OmegaConf.is_dict(content[group]):
+                raise ValueError(f"{group}: expected keys and values, got {content[group]}")
         name = OmegaConf.select(content, "trainer.name")
         if name not in TRAINERS:
             raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
         merged = OmegaConf.merge(run_schema(name), _with_old_defaults(content))  # type: ignore[arg-type]
-        return OmegaConf.to_object(merged)  # type: ignore[return-value]
+        return typed(merged)  # type: ignore[arg-type]
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
 

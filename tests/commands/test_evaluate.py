@@ -95,8 +95,8 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
         (["checkpoint=7"], "has no checkpoint 7; it has 0"),
         (["out=."], "exists; name a new folder"),
         (["out=no/new"], "there is no folder 'no'"),
-        (["mass=0"], "randomization.mass: expected [minimum, maximum] factor above 0, got [0.0, 0.0]"),
-        (["torque_noise=-1"], "randomization.torque_noise: expected at least 0, got -1"),
+        (["mass=0"], "mass: expected a number from 0.001 to 1000, got 0.0"),
+        (["torque_noise=-1"], "torque_noise: expected a number from 0 to 10, got -1"),
         (["mass=[0,1]"], "mass"),
         (["demonstrations=missing.npz"], "no file at 'missing.npz'"),
     ],
@@ -108,11 +108,11 @@ def test_bad_evaluations(rejected, run_dir, arguments, message):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("mass=[0,1]", "randomization.mass: expected [minimum, maximum] factor above 0, got [0.0, 1.0]"),
-        ("damping=[2,1]", "randomization.damping: expected [minimum, maximum] factor above 0, got [2.0, 1.0]"),
-        ("mass=[1]", "randomization.mass: expected [minimum, maximum] factor above 0, got [1.0]"),
-        ("torque_noise=-1", "randomization.torque_noise: expected at least 0, got -1"),
-        ("torque_noise=nan", "randomization.torque_noise: expected at least 0, got nan"),
+        ("mass=[0,1]", "randomization.mass: expected 2 numbers, each from 0.001 to 1000, got [0.0, 1.0]"),
+        ("damping=[2,1]", "randomization.damping: expected [minimum, maximum], got [2.0, 1.0]"),
+        ("mass=[1]", "randomization.mass: expected 2 numbers, each from 0.001 to 1000, got [1.0]"),
+        ("torque_noise=-1", "randomization.torque_noise: expected a number from 0 to 10, got -1"),
+        ("torque_noise=nan", "randomization.torque_noise: expected a number from 0 to 10, got nan"),
     ],
 )
 def test_bad_randomization(rejected, override, message):

@@ -95,7 +95,7 @@ def test_an_equal_arm_reaches_the_poses_of_the_expert(inspected):
         (["arm.xml", "learner.tip=hand"], "the model has no body 'hand'; valid are table, pan_link"),
         (["arm.xml", "learner.base=foot"], "the model has no body 'foot'; valid are table, pan_link"),
         (["arm.xml", "expert=missing.urdf"], "no MJCF or URDF file at '"),
-        (["arm.xml", "learner.armature=-1"], "armature: expected a finite number of at least 0, got -1"),
+        (["arm.xml", "learner.armature=-1"], "armature: expected a number from 0 to 10000, got -1"),
         (["arm.xml", "limits=soft"], "limits: expected one of none, hardware, got 'soft'"),
         (["arm.xml", "out=missing/out"], "there is no folder 'missing'"),
         (["arm.xml", "tip=hand"], "tip"),

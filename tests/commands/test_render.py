@@ -156,7 +156,7 @@ def test_motions_of_another_length_are_rejected(files, tmp_path):
 def test_bad_input_for_a_mapper_is_rejected(mapper_run, files):
     bad: list[tuple[dict[str, Any], str]] = [
         ({"split": "train"}, "split: has no effect with a run of trainer=pose_mapper"),
-        ({"seed": -1}, "demonstration, seed: expected at least 0"),
+        ({"seed": -1}, "seed: expected a whole number from 0"),
         ({"checkpoint": 7}, "checkpoint"),
         ({"demonstrations": files["retargeted"]}, "demonstrations: expected motions of planar7"),
         ({"demonstrations": files["demonstrations"], "demonstration": 3}, "from 0 to 1"),

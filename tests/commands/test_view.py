@@ -17,7 +17,7 @@ from mimic.runs.signals import Signals
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["port=0"], "port: expected 1 to 65535, got 0"),
+        (["port=0"], "port: expected a whole number from 1 to 65,535, got 0"),
         (["host=nowhere.invalid"], "host: expected an address of this machine"),
         (["env=panda5dof"], "unknown env 'panda5dof'; valid are"),
         (["learner=missing.xml"], "learner: expected panda, an MJCF file, or an environment (pair, panda3dof,"),

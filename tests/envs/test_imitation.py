@@ -114,7 +114,7 @@ def test_training_and_held_out_demonstrations_differ():
         ({"limits": "soft"}, "expected one of none, hardware"),
         ({"demonstrations": {"kind": "dance"}}, "expected one of pd, reach"),
         ({"metric": {"xi": 1.0}}, "below 0"),
-        ({"metric": {"xi": float("-inf")}}, "finite number below 0"),
+        ({"metric": {"xi": float("-inf")}}, "metric.xi: expected a number of at least -1e.06 and below 0, got -inf"),
         ({"learner": {"locked": [9]}}, "unknown joint 9"),
     ],
 )

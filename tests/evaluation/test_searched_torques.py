@@ -185,8 +185,8 @@ def test_the_report_of_a_search(tmp_path):
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("search.iterations=0", "search.iterations: expected at least 1, got 0"),
-        ("search.starts=-1", "search.starts: expected at least 1, got -1"),
+        ("search.iterations=0", "search.iterations: expected a whole number from 1 to 100,000, got 0"),
+        ("search.starts=-1", "search.starts: expected a whole number from 1 to 1,000, got -1"),
         ("search.starts=many", "search.starts"),
     ],
 )

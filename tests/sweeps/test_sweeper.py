@@ -96,7 +96,10 @@ def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
         (["-m", "hydra/launcher=slurm"], "unknown hydra/launcher 'slurm'; valid are basic, ray, submitit_local, submi"),
         (["hydra/launcher=submitit_local"], "expected only with a sweep; add -m"),
         (["-m", "hydra/launcher=submitit_local", "hydra.launcher.paralel=2"], "valid are _target_, parallel, gpus_per"),
-        (["-m", "hydra/launcher=submitit_local", "hydra.launcher.parallel=0"], "parallel: expected at least 1, got 0"),
+        (
+            ["-m", "hydra/launcher=submitit_local", "hydra.launcher.parallel=0"],
+            "a whole number from 1 to 1,000, got 0",
+        ),
     ],
 )
 def test_bad_sweeps_write_nothing(rejected, arguments, message):

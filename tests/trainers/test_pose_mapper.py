@@ -201,9 +201,9 @@ def test_a_regularised_run_differs_in_training_and_repeats_its_report(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"dropout": 1.0}, r"trainer.dropout: expected a fraction in \[0, 1\), got 1.0"),
+        ({"dropout": 1.0}, r"trainer.dropout: expected a number of at least 0 and below 1, got 1.0"),
         ({"dropout": float("nan")}, "trainer.dropout"),
-        ({"weight_decay": -0.1}, "trainer.weight_decay: expected a finite number of at least 0, got -0.1"),
+        ({"weight_decay": -0.1}, "trainer.weight_decay: expected a number from 0 to 1000, got -0.1"),
         ({"weight_decay": float("inf")}, "trainer.weight_decay"),
     ],
 )

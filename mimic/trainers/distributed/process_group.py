@@ -20,6 +20,7 @@ from collections.abc import Callable
 import jax
 
 from mimic import compat
+from mimic.ranges import check_ranges, number
 from mimic.runs.signals import EXIT_HOOKS, STOPPED_BY_SIGNAL, Signals, with_patience
 from mimic.trainers.distributed.heartbeats import Heartbeats
 from mimic.trainers.distributed.local_processes import LocalProcesses, gpu_count, local_process
@@ -48,8 +49,8 @@ class DistributedConfig:
     """
 
     coordinator: str = ""
-    processes: int | None = None
-    process: int | None = None
+    processes: int | None = number(None, at_least=1, at_most=100_000)
+    process: int | None = number(None, at_least=0, at_most=100_000)
 
     def __post_init__(self) -> None:
         numbers = {"processes": self.processes, "process": self.process}
@@ -59,8 +60,7 @@ class DistributedConfig:
                 raise ValueError(
                     f"distributed.{key}: not expected, got {value} with distributed.coordinator={self.coordinator!r}"
                 )
-        if self.processes is not None and self.processes < 1:
-            raise ValueError(f"distributed.processes: expected at least 1, got {self.processes}")
+        check_ranges(self, "distributed.")
         if self.coordinator in ("", AUTO, LOCAL):
             return
         if not re.fullmatch(r"\S+:\d+", self.coordinator):

@@ -1,0 +1,64 @@
+"""Checks of a command line before Hydra composes the config: Hydra would answer with a traceback or a usage text.
+
+Hydra also composes what nobody means: an environment without a preset for `~env` or `env=[]`, an unchanged one for
+`env={}`.
+"""
+
+from typing import Any, NoReturn
+
+from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+
+GROUPS = {"env": "panda4dof", "trainer": "ppo", "metric": "paper"}  # config groups, with the example of messages
+_MAX_LENGTH = 10_000  # characters of an argument: Hydra's parser takes a second for 50,000
+
+
+def check_arguments(arguments: list[str]) -> None:
+    """Raises a ValueError for the first argument that is invalid in every command.
+
+    Args:
+      arguments: those of the command line, in Hydra's syntax.
+
+    Raises:
+      ValueError: an unknown option, a removed key, an empty value, or a config group without the name of a preset.
+      HydraException: an argument that is not in Hydra's syntax.
+    """
+    for argument in arguments:
+        if len(argument) > _MAX_LENGTH:
+            raise ValueError(f"{argument[:40]}...: expected at most {_MAX_LENGTH:,} characters, got {len(argument):,}")
+    parser = get_args_parser()
+    parser.error = _raise_value_error  # type: ignore[method-assign]  # in place of a usage text
+    options = parser.parse_args(arguments)
+    if options.experimental_rerun:
+        raise ValueError("--experimental-rerun: not supported, because it loads a pickle")
+    for override in OverridesParser.create().parse_overrides(options.overrides):
+        _check(override)
+
+
+def _check(override: Override) -> None:
+    key = override.key_or_group
+    if not key:
+        raise ValueError(f"expected KEY=VALUE, got {override.input_line!r}")
+    if key.replace("/", ".").partition(".")[0] == "hydra":
+        return
+    if override.is_delete():
+        raise ValueError(f"{override.input_line}: keys cannot be removed; expected KEY=VALUE")
+    if override.is_sweep_override():
+        return
+    value = override.value()
+    if value == {}:
+        raise ValueError(f"{key}: expected a value, got {{}}")
+    if key in GROUPS and not _is_preset(key, value):
+        raise ValueError(f"{key}: expected the name of a preset, as in {key}={GROUPS[key]}, got {value!r}")
+
+
+def _is_preset(group: str, value: Any) -> bool:
+    """Whether the value of a group may name a preset; a mapping changes keys in the group."""
+    if isinstance(value, str):
+        return "$" not in value and not value.endswith("schema")
+    return isinstance(value, dict) or (value is None and group == "metric")  # none is the default
+
+
+def _raise_value_error(message: str) -> NoReturn:
+    raise ValueError(message)

@@ -1,0 +1,72 @@
+"""Lower bounds on the memory that a training needs, compared with what there is before anything is compiled."""
+
+import itertools
+from collections.abc import Sequence
+
+import jax
+
+from mimic.arms.embodiment import Embodiment
+from mimic.memory import check_memory, device_memory, host_memory
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+
+_FLOAT32, _FLOAT64 = 4, 8  # bytes
+_COPIES = 4  # of the parameters: themselves, their gradients, Adam's two moments
+_NETWORKS = 2  # policy and value
+
+
+def check_training_memory(config: TrainConfig) -> None:
+    """Raises a ValueError that names the settings of the largest part if a training cannot fit into the memory.
+
+    Raises:
+      ValueError: also where the settings or the arms are invalid.
+    """
+    expert, learner = config.env.build_arms().embodiments
+    if isinstance(config.trainer, PPOConfig):
+        _check("host", _demonstration_bytes(config, expert), host_memory())
+        _check("device", _ppo_bytes(config, config.trainer, expert, learner), device_memory())
+    elif isinstance(config.trainer, PoseMapperConfig):
+        _check("device", _mapper_bytes(config.trainer, expert, learner), device_memory())
+
+
+def _check(where: str, parts: dict[str, float], available: int | None) -> None:
+    check_memory(max(parts, key=lambda part: parts[part]), sum(parts.values()), available, where)
+
+
+def _demonstration_bytes(config: TrainConfig, expert: Embodiment) -> dict[str, float]:
+    """Angles and velocities at each step of the demonstrations that are recorded."""
+    settings = config.env.demonstrations
+    count = 0 if settings.path else settings.count + settings.held_out
+    numbers = 2.0 * count * config.env.horizon * expert.num_joints
+    return {"env.demonstrations.count, env.horizon": numbers * _FLOAT64}
+
+
+def _ppo_bytes(config: TrainConfig, trainer: PPOConfig, expert: Embodiment, learner: Embodiment) -> dict[str, float]:
+    """Networks; observations of a batch and of the environments; hidden units of a minibatch."""
+    settings = trainer.resolve(jax.default_backend(), jax.device_count())
+    observation = 12 * (learner.num_links + (config.env.preview + 1) * expert.num_links)
+    widths = [observation, *settings.hidden_layers, 1]
+    units = float(settings.batch_size * settings.unroll_length * sum(settings.hidden_layers))
+    return {
+        "trainer.hidden_layers": _network_bytes(widths) * _NETWORKS,
+        "trainer.batch_size, trainer.unroll_length, trainer.hidden_layers": units * _NETWORKS * _FLOAT32,
+        "trainer.batch_size, trainer.num_minibatches, trainer.unroll_length": (
+            float(settings.steps_per_batch) * observation * _FLOAT32
+        ),
+        "trainer.num_envs": float(settings.num_envs) * observation * _FLOAT32,
+    }
+
+
+def _mapper_bytes(trainer: PoseMapperConfig, expert: Embodiment, learner: Embodiment) -> dict[str, float]:
+    """Network; poses of all splits; hidden units of a minibatch."""
+    settings = trainer.resolve()
+    poses = float(settings.samples + settings.validation_poses + settings.held_out_poses)
+    widths = [expert.num_joints, *settings.hidden_layers, settings.heads * learner.num_joints]
+    return {
+        "trainer.hidden_layers, trainer.heads": _network_bytes(widths),
+        "trainer.samples, trainer.validation_poses, trainer.held_out_poses": poses * expert.num_joints * _FLOAT32,
+        "trainer.batch_size, trainer.hidden_layers": float(settings.batch_size) * sum(widths) * _FLOAT32,
+    }
+
+
+def _network_bytes(widths: Sequence[int]) -> float:
+    return float(sum(a * b for a, b in itertools.pairwise(widths))) * _COPIES * _FLOAT32

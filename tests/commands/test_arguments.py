@@ -1,0 +1,149 @@
+"""Odd command lines: one line and exit code 2, without a traceback, a usage text or a training that nobody meant."""
+
+import errno
+import os
+import sys
+
+import pytest
+
+from mimic import cli
+from mimic.commands.arguments import check_arguments
+
+ODD = [
+    (["env=null"], "env: expected the name of a preset, as in env=panda4dof, got None"),
+    (["env=[]"], "env: expected the name of a preset"),
+    (["env=[panda4dof,pair]"], "env: expected the name of a preset"),
+    (["env=1"], "env: expected the name of a preset"),
+    (["env={}"], "env: expected a value, got {}"),
+    (["env=schema"], "env: expected the name of a preset"),
+    (["~env"], "~env: keys cannot be removed"),
+    (["~trainer=ppo"], "keys cannot be removed"),
+    (["trainer=null"], "trainer: expected the name of a preset, as in trainer=ppo, got None"),
+    (["trainer=[ppo]"], "trainer: expected the name of a preset"),
+    (["env.learner={}"], "env.learner: expected a value, got {}"),
+    (["env.learner=null"], "env.learner.model"),
+    (["env.demonstrations=null"], "env.demonstrations"),
+    (["=1"], "expected KEY=VALUE, got '=1'"),
+    (["@=1"], "expected KEY=VALUE, got '@=1'"),
+    (["hydra=null"], "must be a string or a list"),
+    (["trainer.hidden_layers=[[1]]"], "trainer.hidden_layers: expected 1 to 32 whole numbers"),
+    (["env.learner.locked=[[1]]"], "locked: unknown joint [1]"),
+    (["--bogus"], "unrecognized arguments: --bogus"),
+    (["--cfg"], "expected one argument"),
+    (["--cfg=bogus"], "invalid choice: 'bogus'"),
+    (["--info=x"], "invalid choice: 'x'"),
+    (["--resolve"], "--resolve"),
+    (["--shell-completion"], "subcommand"),
+    (["--experimental-rerun=x"], "loads a pickle"),
+    (["seed=[" + "1," * 6000 + "1]"], "expected at most 10,000 characters, got 12,"),
+    (["seed=" + "[" * 3000], "error"),
+    (["-m", "seed=range(1000000000)"], "expected at most 1,000 runs in a sweep"),
+    (["-m", "seed=glob(*)"], "expected at least 1 run"),
+    (["-m", "hydra/launcher=submitit_local", "hydra.launcher.parallel=1000000000"], "from 1 to 1,000, got 1000000000"),
+    (["-m", "seed=1,2", "hydra.sweep.dir=/dev/null/x"], "hydra.sweep.dir: '/dev/null/x': cannot write in '/dev/null'"),
+    (["run_dir=${oc.env:SECRET_TOKEN}"], "run_dir: expected no ${...} other than a reference to a key"),
+    ([r"run_dir='\${oc.env:SECRET_TOKEN}'"], "run_dir: expected no ${...} other than a reference to a key"),
+    (["env=${oc.env:SECRET_TOKEN}"], "env: expected the name of a preset"),
+    (["-m", "run_dir='${oc.env:SECRET_TOKEN}',b"], "run_dir: expected no ${...} other than a reference to a key"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), ODD, ids=[" ".join(arguments)[:50] for arguments, _ in ODD])
+@pytest.mark.usefixtures("unchecked")
+def test_odd_command_lines(rejected, monkeypatch, arguments, message):
+    monkeypatch.setenv("SECRET_TOKEN", "not-for-others")
+    error = rejected("train", *arguments)
+    assert message in error and "not-for-others" not in error and len(error) < 1100
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("trainer.entropy_cost=nan", "trainer.entropy_cost: expected a number from 0 to 1000, got nan"),
+        ("trainer.entropy_cost=1e38", "trainer.entropy_cost: expected a number from 0 to 1000, got 1e+38"),
+        ("env.learner.damping=1e30", "env.learner.damping: expected a number from 0 to 10000, got 1e+30"),
+        ("env.metric.translation=1e30", "env.metric.translation: expected a number from 0 to 1e+06, got 1e+30"),
+        ("env.substeps=1000000000", "env.substeps: expected a whole number from 1 to 1,000, got 1000000000"),
+        ("env.demonstrations.count=1000000000", "env.demonstrations.count: expected a whole number from 1 to 100,000"),
+        ("trainer.hidden_layers=[1000000,1000000]", "trainer.hidden_layers: expected 1 to 32 whole numbers"),
+        (
+            "trainer.hidden_layers=[65536,65536,65536,65536,65536]",
+            "trainer.hidden_layers: expected to fit into the mem",
+        ),
+        ("seed=99999999999999999999", "seed: expected a whole number from"),
+    ],
+)
+def test_absurd_settings(rejected, setting, message):
+    assert message in rejected("train", setting)
+
+
+def test_absurd_products(rejected):
+    sizes = ["trainer.num_envs=4194304", "trainer.batch_size=4194304", "trainer.num_minibatches=1000"]
+    assert "trainer.batch_size, trainer.num_minibatches, trainer.unroll_length: expected" in rejected("train", *sizes)
+
+
+def test_absurd_recordings(rejected):
+    steps = ["env.demonstrations.count=100000", "env.horizon=10000"]
+    assert "physics steps to record, got 10,003,200,000" in rejected("train", *steps)
+
+
+@pytest.mark.parametrize("run_dir", ["/proc/x", "/dev/null/x", "/etc/passwd/x", "x" * 300, "a/" * 3000])
+def test_run_directories_that_cannot_be_written(rejected, run_dir):
+    error = rejected("train", "env=planar4dof", f"run_dir={run_dir}")
+    assert "run_dir: " in error and ("cannot write in" in error or "expected a shorter path" in error)
+
+
+def test_a_read_only_folder(rejected, tmp_path, monkeypatch):
+    def mkdtemp(*args, **kwargs):  # permissions do not stop root, who runs many containers
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr("tempfile.mkdtemp", mkdtemp)
+    assert "cannot write in" in rejected("train", "compilation_cache=''", f"run_dir={tmp_path}/run")
+
+
+def test_a_dangling_link_as_a_run_directory(rejected, tmp_path):
+    os.symlink(tmp_path / "missing", tmp_path / "run")
+    assert "exists; name a new folder" in rejected("train", "env=planar4dof", f"run_dir={tmp_path}/run")
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EACCES])
+def test_errors_of_files_during_the_work_are_one_line(monkeypatch, capsys, tmp_path, number):
+    def work():
+        raise OSError(number, os.strerror(number), "metrics.csv")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["mimic.collect"])
+    with pytest.raises(SystemExit) as stop:
+        cli.run(lambda config: work, "collect")
+    error = capsys.readouterr().err
+    assert stop.value.code == 1 and error == f"error: [Errno {number}] {os.strerror(number)}: 'metrics.csv'\n"
+
+
+def test_bugs_in_the_work_keep_their_traceback(monkeypatch, tmp_path):
+    def work():
+        raise ValueError("a bug")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["mimic.collect"])
+    with pytest.raises(ValueError, match="a bug"):
+        cli.run(lambda config: work, "collect")
+
+
+def test_a_hostile_file_in_a_folder_of_configs(rejected, tmp_path):
+    (tmp_path / "configs" / "env").mkdir(parents=True)
+    aliases = "".join(f"{new}: &{new} [*{old},*{old},*{old}]\n" for old, new in zip("abcdef", "bcdefg", strict=True))
+    (tmp_path / "configs" / "env" / "mine.yaml").write_text("a: &a [1,1]\n" + aliases)
+    assert "expected at most 8 aliases" in rejected("train", f"--config-dir={tmp_path}/configs", "env=mine")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["env=pair", "metric=null", "seed=1", "run_dir=runs/${seed}", "env.learner.locked=[3,6]"],
+        ["-m", "metric=paper", "env={horizon: 30}", "hydra.sweep.dir=runs/${now:%Y}", "seed=1,2", "env=pair,panda4dof"],
+        ["--config-dir=/tmp", "--cfg=job"],
+        ["resume=run", "logger=[wandb,mlflow]", "env.learner.locked={joint3: 0.5}"],
+    ],
+)
+def test_usual_command_lines_pass(arguments):
+    check_arguments(arguments)
