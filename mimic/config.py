@@ -5,7 +5,7 @@ import os
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -128,9 +128,14 @@ def check_writable(name: str, path: Path) -> None:
         raise ValueError(f"{name}: {str(path)!r}: cannot write in {str(folder)!r}: {error.strerror}") from error
 
 
+def merged(*configs: Any) -> DictConfig:
+    """Configs merged into one node; later ones replace values of earlier ones."""
+    return cast(DictConfig, OmegaConf.merge(*configs))
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Returns a config as dicts and lists, for files."""
-    return OmegaConf.to_container(OmegaConf.structured(config))  # type: ignore[return-value]
+    return cast(dict[str, Any], OmegaConf.to_container(OmegaConf.structured(config)))
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

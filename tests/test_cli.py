@@ -50,7 +50,7 @@ def test_bad_input_ends_the_process_with_one_line():
 def test_a_bad_arm_file(rejected, tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text("<mujoco><worldbody><body")
-    assert "XML" in rejected("train", "env=planar4dof", f"env.learner.model={path}")
+    assert "unclosed token" in rejected("train", "env=planar4dof", f"env.learner.model={path}")
 
 
 def test_bad_run_directories(rejected, tmp_path):

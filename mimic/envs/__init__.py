@@ -7,7 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import compat
-from mimic.config import check_choice, explain, schema, typed
+from mimic.config import check_choice, explain, merged, schema, typed
 from mimic.envs.config import EnvConfig
 
 if TYPE_CHECKING:
@@ -41,8 +41,7 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     presets = {"metric": _metric_preset(overrides["metric"])} if isinstance(overrides.get("metric"), str) else {}
     arms = {key: {"model": overrides[key]} for key in ("expert", "learner") if isinstance(overrides.get(key), str)}
     try:
-        merged = OmegaConf.merge(schema(EnvConfig), preset, {**overrides, **arms, **presets})
-        return typed(merged)  # type: ignore[arg-type]
+        return typed(merged(schema(EnvConfig), preset, {**overrides, **arms, **presets}))
     except OmegaConfBaseException as error:
         raise ValueError(explain(error)) from error
 

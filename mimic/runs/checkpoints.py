@@ -70,7 +70,7 @@ def save_checkpoint(
         with _checkpointer() as checkpointer:
             checkpointer.save(partial, plain, force=True)
         if state is not None:  # not by orbax, which takes 100 ms for the 10 MB of 4096 arms; NumPy takes 6
-            np.savez(partial / _STATE, *state)  # type: ignore[arg-type]
+            np.savez(partial / _STATE, *state)
         content = {"run": _run_id(run_dir), "metrics": dict(metrics or {}), "sha256": _checksums(partial)}
         (partial / _CONTENT).write_text(json.dumps(content, indent=1))
         if path.exists():  # a damaged one, since a run never writes a step twice

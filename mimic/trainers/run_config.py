@@ -8,7 +8,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from mimic.arms.arm import BUILT_IN
-from mimic.config import check_new, check_writable, explain, schema, to_dict, typed
+from mimic.config import check_new, check_writable, explain, merged, schema, to_dict, typed
 from mimic.config_files import check_references, read_config
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
@@ -52,7 +52,7 @@ def save_config(run_dir: Path, config: TrainConfig) -> None:
 
 def run_schema(trainer: str) -> DictConfig:
     """The typed OmegaConf node of a run with this trainer."""
-    return OmegaConf.merge(schema(TrainConfig), {"trainer": schema(TRAINERS[trainer])})  # type: ignore[return-value]
+    return merged(schema(TrainConfig), {"trainer": schema(TRAINERS[trainer])})
 
 
 def load_config(run_dir: Path, *, saved_models: bool = True) -> TrainConfig:
@@ -82,8 +82,8 @@ def _read_config(run_dir: Path) -> TrainConfig:
         name = OmegaConf.select(content, "trainer.name")
         if name not in TRAINERS:
             raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
-        merged = OmegaConf.merge(run_schema(name), _with_old_defaults(content))  # type: ignore[arg-type]
-        return typed(merged)  # type: ignore[arg-type]
+        content = merged(run_schema(name), _with_old_defaults(content))
+        return typed(content)
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
 
@@ -94,7 +94,7 @@ def _with_old_defaults(content: DictConfig) -> DictConfig:
     trainer = OmegaConf.select(content, "trainer")
     if trainer.name == "ppo":
         trainer = {"timed_critic": False, "final_entropy_cost": 1.0, **trainer}
-        content = OmegaConf.merge(content, {"trainer": trainer})  # type: ignore[assignment]
+        content = merged(content, {"trainer": trainer})
     return content
 
 
@@ -105,7 +105,7 @@ def _without_base_segments(content: DictConfig) -> DictConfig:
     """
     models = {role: OmegaConf.select(content, f"env.{role}.model") for role in ("expert", "learner")}
     old = {role: {"base_segment": False} for role, model in models.items() if model not in (None, *BUILT_IN)}
-    return OmegaConf.merge({"env": old}, content) if old else content  # type: ignore[return-value]
+    return merged({"env": old}, content) if old else content
 
 
 def _with_old_default_metric(content: DictConfig) -> DictConfig:
@@ -115,7 +115,7 @@ def _with_old_default_metric(content: DictConfig) -> DictConfig:
     old = {"translation": 0.0, "correspondence": "overlap", **(OmegaConf.select(content, "env.metric") or {})}
     correspondence = "chord_overlap" if old["correspondence"] == "overlap" else old["correspondence"]
     metric = {**old, "correspondence": correspondence, "links": "merged"}
-    return OmegaConf.merge(content, {"env": {"metric": metric}})  # type: ignore[return-value]
+    return merged(content, {"env": {"metric": metric}})
 
 
 def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:

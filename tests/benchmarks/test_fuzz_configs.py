@@ -1,6 +1,7 @@
 """The first inputs of `benchmarks.fuzz`: command lines and run directories."""
 
 import os
+from typing import Any
 
 import pytest
 
@@ -22,10 +23,11 @@ def test_odd_inputs_end_in_one_line(kind):
 
 
 def test_cases_are_the_same_in_each_process():
-    assert [command_line_case(n).read.keywords for n in range(20)] == [  # type: ignore[attr-defined]
-        command_line_case(n).read.keywords
-        for n in range(20)  # type: ignore[attr-defined]
-    ]
+    def arguments() -> list[Any]:
+        readers: list[Any] = [command_line_case(n).read for n in range(20)]
+        return [reader.keywords for reader in readers]
+
+    assert arguments() == arguments()
     assert len({run_directory_case(n).name for n in range(200)}) > 20
 
 

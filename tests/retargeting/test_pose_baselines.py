@@ -1,5 +1,7 @@
 """Baselines for poses reach their closed forms and stay within the limits of the learner."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -51,7 +53,7 @@ def test_copying_stays_within_limits():
 
 def test_copying_is_not_available_without_a_common_joint():
     other = planar_arm([0.5, 0.5])
-    renamed = other.replace(joint_names=("a", "b"))  # type: ignore[attr-defined]
+    renamed = dataclasses.replace(other, joint_names=("a", "b"))
     assert copy_joints(PANDA, renamed, motion(PANDA, 2)) is None
 
 

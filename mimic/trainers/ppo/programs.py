@@ -63,7 +63,7 @@ class TrainingState:
     @property
     def saved(self) -> "TrainingState":
         """The state without what follows from the demonstrations."""
-        return self.replace(expert_states=None)  # type: ignore[attr-defined]
+        return dataclasses.replace(self, expert_states=None)
 
 
 class TrainingFunctions(NamedTuple):

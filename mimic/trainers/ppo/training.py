@@ -1,5 +1,6 @@
 """PPO on an imitation environment: networks, training epochs, checkpoints."""
 
+import dataclasses
 import functools
 import time
 from collections.abc import Callable, Iterator
@@ -33,7 +34,7 @@ def make_networks(config: PPOSettings, observation_size: int, action_size: int) 
     if not config.timed_critic:
         return networks
     timed = make(observation_size + 1, preprocess_observations_fn=_normalize_all_but_last)
-    return networks.replace(value_network=timed.value_network)  # type: ignore[attr-defined]
+    return dataclasses.replace(networks, value_network=timed.value_network)
 
 
 def _normalize_all_but_last(observation: Array, statistics: running_statistics.RunningStatisticsState) -> Array:
@@ -157,7 +158,7 @@ def _leaves(state: TrainingState) -> list[np.ndarray]:
     if jax.process_count() == 1:
         return jax.tree.leaves(jax.device_get(state.saved))
     episodes = multihost_utils.process_allgather(state.episodes, tiled=True)
-    return jax.tree.leaves(jax.device_get(state.saved.replace(episodes=episodes)))  # type: ignore[attr-defined]
+    return jax.tree.leaves(jax.device_get(dataclasses.replace(state.saved, episodes=episodes)))
 
 
 def _batches_per_epoch(config: PPOSettings) -> int:
