@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
@@ -22,10 +22,11 @@ from mimic.runs.checkpoints import (
     delete_partial_checkpoints,
     load_checkpoint,
     load_training,
+    set_aside_checkpoints_after,
 )
 from mimic.runs.divergence import EXIT_CODE as DIVERGED
 from mimic.runs.divergence import Diverged
-from mimic.runs.files import reported_steps, write_report
+from mimic.runs.files import CONFIG, reported_steps, write_report
 from mimic.runs.lock import RunLock
 from mimic.runs.loggers import check_loggers, make_loggers
 from mimic.runs.metrics_log import MetricsLog
@@ -35,9 +36,15 @@ from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.distributed.process_group import ProcessGroup
 from mimic.trainers.make import make_trainer
-from mimic.trainers.run_config import load_config, new_run_dir, run_schema, save_config
+from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, run_schema, save_config
 from mimic.trainers.run_models import save_models
 from mimic.trainers.trainer import Params, Trainer
+
+FAILED, BAD_INPUT = 1, 2  # exit codes
+
+
+class RunExists(Exception):
+    """The run directory of a new run has been created by another process."""
 
 
 def prepare_training(
@@ -76,7 +83,7 @@ def prepare_training(
     lock = RunLock(run_dir) if resumed_dir and is_first else None  # before its checkpoints are read
     with stopwatch.stage("build"):
         trainer = make_trainer(config, resumed_dir)
-        restored = _start(config, resumed_dir, trainer)
+        restored = _start(config, resumed_dir, trainer, any(key.startswith("trainer.") for key in overrides))
     config = dataclasses.replace(config, trainer=trainer.settings)
     if group and not is_first:
         return lambda: _follow(trainer, restored, group)
@@ -104,15 +111,23 @@ def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[s
     )
 
 
-def _start(config: TrainConfig, resumed_dir: Path | None, trainer: Trainer) -> Checkpoint | None:
-    """The checkpoint that a resumed run continues from, or the parameters that a new run starts from."""
-    if config.init and not resumed_dir:
+def _start(config: TrainConfig, resumed_dir: Path | None, trainer: Trainer, is_changed: bool) -> Checkpoint | None:
+    """The checkpoint that a resumed run continues from, or the parameters that a new run starts from, if any.
+
+    Args:
+      config: config of the run.
+      resumed_dir: directory of a resumed run.
+      trainer: trainer of the run.
+      is_changed: whether settings of the resumed run are changed.
+    """
+    if not resumed_dir or not checkpoint_steps(resumed_dir):  # new, or ended before its first checkpoint
+        if not config.init:
+            return None
         _, params = load_checkpoint(Path(config.init).expanduser(), trainer.params_template())
         return Checkpoint(0, params, None, {})
-    if not resumed_dir or not checkpoint_steps(resumed_dir):  # a run that ended before its first checkpoint
-        return None
     restored = load_training(resumed_dir, trainer.params_template())
-    if restored.step >= trainer.total_steps and reported_steps(resumed_dir, trainer.unit) >= restored.step:
+    is_complete = restored.step >= trainer.total_steps or not is_changed
+    if is_complete and reported_steps(resumed_dir, trainer.unit) == restored.step:
         raise ValueError(
             f"resume: {str(resumed_dir)!r} has been trained for {restored.step} of {trainer.total_steps} steps; "
             f"increase trainer.{config.trainer.length_key}"
@@ -143,43 +158,65 @@ def _train(
     console = Console()
     with noted_signals(signals), contextlib.ExitStack() as stack:  # also during the report, where they have no effect
         try:
-            lock = lock or _new_run(run_dir, trainer)
-            stack.callback(lock.close)
+            stack.callback((lock or _new_run(run_dir, trainer)).close)
             save_models(run_dir, config.env)
             save_config(run_dir, config)  # after the inputs: a folder without it is no run yet
             headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
             console.print(f"{headline}\nrun directory: {run_dir}", highlight=False, soft_wrap=True)
             steps, params = _train_and_log(config, trainer, run_dir, signals, restored, stopwatch, console)
-            exit_code = 0
-        except (Interrupted, Diverged, OSError) as error:
+            if group:
+                group.end(0)
+            trained = steps - (restored.step if restored else 0)
+            report = _evaluate(config, trainer, run_dir, steps, params, trained, stopwatch)
+        except (Interrupted, Diverged, OSError, RunExists) as error:
             exit_code = _stopped(console, run_dir, error)
-        if group:
-            group.end(exit_code)
-        if exit_code:
+            if group:
+                group.end(exit_code)
             return exit_code
-        with stopwatch.stage("evaluate"):
-            outcome = trainer.evaluate(params)
-            metrics = {**trainer.metrics(outcome), **trainer.details(outcome)}
-        report = make_report(config, trainer, metrics, stopwatch, steps, steps - (restored.step if restored else 0))
-        write_report(run_dir, report)
-        for step in checkpoint_steps(run_dir):  # the last checkpoint is the result
-            if step > steps:
-                delete_checkpoint(run_dir, step)
-        trainer.save_outcome(run_dir, outcome)
     show_report(console, report, trainer)
     console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
     return 0
 
 
+def _evaluate(
+    config: TrainConfig,
+    trainer: Trainer,
+    run_dir: Path,
+    steps: int,
+    params: Params,
+    trained: int,
+    stopwatch: Stopwatch,
+) -> dict[str, Any]:
+    """Evaluates the result of a training; writes plots and tables, and last the report, which completes the run."""
+    with stopwatch.stage("evaluate"):
+        outcome = trainer.evaluate(params)
+        metrics = {**trainer.metrics(outcome), **trainer.details(outcome)}
+    for step in checkpoint_steps(run_dir):  # the last checkpoint is the result
+        if step > steps:
+            delete_checkpoint(run_dir, step)
+    trainer.save_outcome(run_dir, outcome)
+    report = make_report(config, trainer, metrics, stopwatch, steps, trained)
+    write_report(run_dir, report)
+    return report
+
+
 def _new_run(run_dir: Path, trainer: Trainer) -> RunLock:
-    """Creates and locks a run directory, and writes the inputs of the run."""
+    """Creates and locks a run directory, and writes the inputs of the run.
+
+    Raises:
+      RunExists: another process has created it since the start of this one.
+    """
     run_dir.mkdir(parents=True, exist_ok=True)
-    lock = RunLock(run_dir)
+    try:
+        lock = RunLock(run_dir)
+        check_new_run(run_dir)
+    except ValueError as error:
+        raise RunExists(str(error)) from error
     trainer.save_inputs(run_dir)
     return lock
 
 
-def _stopped(console: Console, run_dir: Path, error: Interrupted | Diverged | OSError) -> int:
+def _stopped(console: Console, run_dir: Path, error: Interrupted | Diverged | OSError | RunExists) -> int:
     """Prints why a training stopped and how to continue; returns the exit code."""
     command = f"python -m mimic.train resume={run_dir}"
     if isinstance(error, Interrupted):
@@ -188,8 +225,12 @@ def _stopped(console: Console, run_dir: Path, error: Interrupted | Diverged | OS
     if isinstance(error, Diverged):
         print(f"error: {error}; the checkpoints before it are kept in {run_dir}", file=sys.stderr)
         return DIVERGED
-    print(f"error: {error}; once this is solved, continue with: {command}", file=sys.stderr)
-    return 1
+    if isinstance(error, RunExists):
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    again = f"continue with: {command}" if (run_dir / CONFIG).is_file() else "start the run again"
+    print(f"error: {error}; once this is solved, {again}", file=sys.stderr)
+    return FAILED
 
 
 def _train_and_log(
@@ -203,9 +244,12 @@ def _train_and_log(
 ) -> tuple[int, Params]:
     """Trains; evaluates and logs after each training epoch. Returns the steps and the parameters of the result."""
     resumed_step = restored.step if restored else 0
+    # The restored step is evaluated again, unless its training metrics are unknown.
+    first_step = resumed_step if not restored or restored.metrics else resumed_step + 1
     delete_partial_checkpoints(run_dir)
+    set_aside_checkpoints_after(run_dir, resumed_step)
     with contextlib.ExitStack() as stack:
-        loggers = [MetricsLog(run_dir, resumed_step), *make_loggers(config.loggers, run_dir, to_dict(config))]
+        loggers = [MetricsLog(run_dir, first_step), *make_loggers(config.loggers, run_dir, to_dict(config))]
         for logger in loggers:
             stack.callback(logger.close)  # also where training is interrupted
         progress = stack.enter_context(TrainingProgress(console, trainer.total_steps, resumed_step))

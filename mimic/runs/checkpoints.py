@@ -25,8 +25,11 @@ from mimic.runs.npz import read_arrays
 
 FOLDER = "checkpoints"
 WITH_STATE = 2  # newest checkpoints of a run that have the state of the training
+STATE_UNUSED = (
+    "warning: the checkpoint has no state of the training that fits the settings; optimizer and environments start anew"
+)
 _STATE, _CONTENT, _RUN = "training.npz", "checkpoint.json", "run_id"
-_PARTIAL = ".partial"
+_PARTIAL, _DAMAGED = ".partial", ".damaged"
 _MAX_ARRAYS = 1000  # of a training's state; PPO has some 60
 
 
@@ -83,7 +86,7 @@ def save_checkpoint(
 
 
 def thin_checkpoints(run_dir: Path, keep: int, best: int | None = None) -> None:
-    """Keeps the newest checkpoints of a run, and the training's state in the last two of them.
+    """Keeps the newest checkpoints of a run, and the training's state in the last two of them and in the best one.
 
     Args:
       run_dir: the run directory.
@@ -95,20 +98,33 @@ def thin_checkpoints(run_dir: Path, keep: int, best: int | None = None) -> None:
         if step != best:
             delete_checkpoint(run_dir, step)
     for step in steps[-keep:-WITH_STATE]:
-        (_path(run_dir, step) / _STATE).unlink(missing_ok=True)
+        if step != best:
+            (_path(run_dir, step) / _STATE).unlink(missing_ok=True)
 
 
 def delete_checkpoint(run_dir: Path, step: int) -> None:
     """Removes a checkpoint."""
     path = _path(run_dir, step)
-    os.replace(path, path.with_name(path.name + _PARTIAL))  # never a checkpoint with some of its files
-    shutil.rmtree(path.with_name(path.name + _PARTIAL))
+    partial = path.with_name(path.name + _PARTIAL)
+    shutil.rmtree(partial, ignore_errors=True)
+    os.replace(path, partial)  # never a checkpoint with some of its files
+    shutil.rmtree(partial, ignore_errors=True)  # NFS keeps files that others read
 
 
 def delete_partial_checkpoints(run_dir: Path) -> None:
     """Removes what processes left that ended while they wrote or removed a checkpoint."""
     for path in (run_dir / FOLDER).glob(f"*{_PARTIAL}*"):  # orbax appends to the name while it writes
         shutil.rmtree(path, ignore_errors=True)
+
+
+def set_aside_checkpoints_after(run_dir: Path, step: int) -> None:
+    """Renames the later checkpoints of a run, which were damaged, so that the run can write these steps again."""
+    for later in checkpoint_steps(run_dir):
+        if later > step:
+            path = _path(run_dir, later)
+            damaged = path.with_name(path.name + _DAMAGED)
+            shutil.rmtree(damaged, ignore_errors=True)
+            os.replace(path, damaged)
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:
@@ -148,8 +164,9 @@ def load_training(run_dir: Path, template: Any) -> Checkpoint:
     if not (path / _STATE).is_file():
         return Checkpoint(step, params, None, metrics)
     names = [f"arr_{i}" for i in range(_MAX_ARRAYS)]  # as NumPy names them
-    state = read_arrays(path / _STATE, names)
-    return Checkpoint(step, params, [state[name] for name in names if name in state], metrics)
+    size = (path / _STATE).stat().st_size
+    arrays = read_arrays(path / _STATE, names, max_bytes=8 * size)  # each value counts as 8 bytes at least
+    return Checkpoint(step, params, [arrays[name] for name in names if name in arrays], metrics)
 
 
 def _first_undamaged(run_dir: Path, step: int | None, read: Any) -> tuple[int, Any]:

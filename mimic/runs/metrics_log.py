@@ -15,17 +15,17 @@ class MetricsLog:
 
     Args:
       run_dir: the run directory.
-      resumed_step: training steps that a resumed run continues from; rows from there on are removed, and rows that were
-        not written to their end.
+      first_step: training steps of the first row that a resumed run writes; rows from there on are removed, and rows
+        that were not written to their end.
     """
 
-    def __init__(self, run_dir: Path, resumed_step: int | None = None):
+    def __init__(self, run_dir: Path, first_step: int | None = None):
         self._path = run_dir / METRICS
-        purge = {} if resumed_step is None else {"purge_step": resumed_step}
+        purge = {} if first_step is None else {"purge_step": first_step}
         self._writer = compat.import_tensorboard().SummaryWriter(str(run_dir / "tensorboard"), **purge)
         self._columns, rows = _read(self._path)
-        if resumed_step is not None and self._columns:
-            self._rewrite([row for row in rows if row["step"].isdigit() and int(row["step"]) < resumed_step])
+        if first_step is not None and self._columns:
+            self._rewrite([row for row in rows if row["step"].isdigit() and int(row["step"]) < first_step])
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Appends one row; columns without a metric are empty.

@@ -41,13 +41,15 @@ class _Header(NamedTuple):
         return self.count * self.dtype.itemsize
 
 
-def read_arrays(path: str | os.PathLike[str], names: Collection[str]) -> dict[str, np.ndarray]:
+def read_arrays(
+    path: str | os.PathLike[str], names: Collection[str], max_bytes: int = MAX_BYTES
+) -> dict[str, np.ndarray]:
     """The arrays of an npz file with these names, as far as it has them.
 
     Nothing is unpickled. Entries must be stored or deflated and not encrypted, and all sizes must fit the file's own.
 
     Raises:
-      ValueError: no npz file, a damaged one, or arrays of objects, of more than `MAX_BYTES`, or with text that cannot
+      ValueError: no npz file, a damaged one, or arrays of objects, of more than `max_bytes`, or with text that cannot
         be printed. The message is one line, without the file's name.
     """
     try:
@@ -59,7 +61,7 @@ def read_arrays(path: str | os.PathLike[str], names: Collection[str]) -> dict[st
             with zipfile.ZipFile(file) as archive:
                 entries = _entries(archive, size)
                 wanted = {name: entries[f"{name}.npy"] for name in names if f"{name}.npy" in entries}
-                return _read_all(archive, wanted)
+                return _read_all(archive, wanted, max_bytes)
     except Exception as error:  # zipfile and zlib have many types of error for damaged files
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise ValueError("".join(c if c.isprintable() else "?" for c in reason)) from error
@@ -97,7 +99,7 @@ def _entries(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
     return entries
 
 
-def _read_all(archive: zipfile.ZipFile, entries: dict[str, zipfile.ZipInfo]) -> dict[str, np.ndarray]:
+def _read_all(archive: zipfile.ZipFile, entries: dict[str, zipfile.ZipInfo], max_bytes: int) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
     total = 0
     for name, entry in entries.items():
@@ -106,8 +108,10 @@ def _read_all(archive: zipfile.ZipFile, entries: dict[str, zipfile.ZipInfo]) -> 
             total += max(header.nbytes, 8 * header.count)
             if header_size + header.nbytes != entry.file_size:
                 raise ValueError(f"{name} states {header.nbytes} bytes, its entry has {entry.file_size - header_size}")
-            if total > MAX_BYTES:
-                raise ValueError(f"its arrays need {total / 2**30:.3g} GiB; expected at most {MAX_BYTES // 2**30} GiB")
+            if total > max_bytes:
+                raise ValueError(
+                    f"its arrays need {total / 2**30:.3g} GiB; expected at most {max_bytes / 2**30:.3g} GiB"
+                )
             if header.dtype.kind == "U" and total > MAX_TEXT:
                 raise ValueError(f"{name} has {header.nbytes} bytes of text; expected at most {MAX_TEXT}")
             arrays[name] = _read_values(stream, header, name)

@@ -206,7 +206,8 @@ def _resumed(run: PlannedRun) -> list[str]:
     run_dir = Path(run.run_dir)
     if not run.run_dir or not (run_dir / CONFIG).is_file():
         return run.overrides
-    return [path_override("resume", run.run_dir)]
+    of_process = [override for override in run.overrides if override.startswith(("compilation_cache=", "logger="))]
+    return [path_override("resume", run.run_dir), *of_process]
 
 
 def _write_sweep(folder: Path, planned: Sequence[PlannedRun], outcomes: Sequence[Outcome]) -> None:

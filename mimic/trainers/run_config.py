@@ -4,6 +4,7 @@ import dataclasses
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -25,8 +26,7 @@ def new_run_dir(config: TrainConfig) -> Path:
     """
     if config.run_dir:
         path = Path(config.run_dir).expanduser()
-        if not _is_unfinished(path):
-            check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
+        check_new_run(path)
         check_writable("run_dir", path)
         return path
     stem = f"{config.env.name}-{config.trainer.name}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -37,11 +37,12 @@ def new_run_dir(config: TrainConfig) -> Path:
     return path
 
 
-def _is_unfinished(path: Path) -> bool:
-    """Whether a folder has nothing but what a run writes before its config."""
+def check_new_run(path: Path) -> None:
+    """Raises a `ValueError` if a path exists, unless it is a folder of a run that ended before it wrote its config."""
     inputs = DEMONSTRATIONS, MODELS
     before_config = {LOCK, *inputs, *(f"{name}.partial" for name in (*inputs, CONFIG))}
-    return os.path.isdir(path) and {file.name for file in path.iterdir()} <= before_config
+    if not (os.path.isdir(path) and {file.name for file in path.iterdir()} <= before_config):
+        check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
 
 
 def save_config(run_dir: Path, config: TrainConfig) -> None:
@@ -92,10 +93,10 @@ def _with_old_defaults(content: DictConfig) -> DictConfig:
     """Completes the config of an older run with the defaults of its time."""
     content = _without_base_segments(_with_old_default_metric(content))
     trainer = OmegaConf.select(content, "trainer")
+    defaults: dict[str, Any] = {"keep": 1_000_000}
     if trainer.name == "ppo":
-        trainer = {"timed_critic": False, "final_entropy_cost": 1.0, **trainer}
-        content = merged(content, {"trainer": trainer})
-    return content
+        defaults |= {"timed_critic": False, "final_entropy_cost": 1.0}
+    return merged(content, {"trainer": {**defaults, **trainer}})
 
 
 def _without_base_segments(content: DictConfig) -> DictConfig:

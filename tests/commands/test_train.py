@@ -1,5 +1,7 @@
 """`python -m mimic.train`: the run directory, evaluation, resuming and signals."""
 
+import csv
+import dataclasses
 import json
 import os
 import re
@@ -15,10 +17,11 @@ import pytest
 from PIL import Image
 
 from benchmarks.interruptions import differences
+from mimic.commands.train import prepare_training
 from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint
 from mimic.runs.lock import RunLock
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.run_config import new_run_dir
+from mimic.trainers.run_config import load_config, new_run_dir
 from tests.helpers.tiny import TINY
 
 BY_SPLIT = {
@@ -38,6 +41,11 @@ def command(module, *arguments, **more):
         check=False,
         **more,
     )
+
+
+def rows_of(run_dir):
+    with (run_dir / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")
@@ -162,6 +170,58 @@ def test_a_run_starts_from_the_parameters_of_another_run(finished, tmp_path):
         np.testing.assert_array_equal(file["arr_0"], policy)
     other = command("train", "env=panda3dof", f"init={finished[0]}", f"run_dir={tmp_path / 'other'}")
     assert other.returncode == 2 and "another network" in other.stderr
+
+
+def test_a_damaged_last_checkpoint_is_trained_again(finished, tmp_path):
+    reference, _ = finished
+    run_dir = shutil.copytree(reference, tmp_path / "run")
+    state = run_dir / "checkpoints" / f"{max(checkpoint_steps(run_dir)):012d}" / "training.npz"
+    state.write_bytes(state.read_bytes() + b"0")
+    result = command("train", f"resume={run_dir}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert "is damaged" in result.stderr and differences(reference, run_dir) == ""
+
+
+def test_an_old_run_is_resumed_from_its_parameters(finished, tmp_path):
+    """Its checkpoints have neither state nor metrics. No row of metrics.csv is lost; a line says what starts anew."""
+    run_dir = shutil.copytree(finished[0], tmp_path / "run")
+    for step in checkpoint_steps(run_dir):
+        for name in ("training.npz", "checkpoint.json"):
+            (run_dir / "checkpoints" / f"{step:012d}" / name).unlink(missing_ok=True)
+    before = rows_of(run_dir)
+    result = command("train", f"resume={run_dir}", "trainer.num_timesteps=8000")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert "optimizer and environments start anew" in result.stderr
+    assert rows_of(run_dir)[: len(before)] == before and len(rows_of(run_dir)) > len(before)
+
+
+def test_init_is_kept_by_a_run_without_a_checkpoint(finished, tmp_path):
+    run_dir = tmp_path / "run"
+    result = command("train", *TINY, "trainer.evaluations=1", f"init={finished[0]}", f"run_dir={run_dir}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    again = shutil.copytree(run_dir, tmp_path / "again")
+    shutil.rmtree(again / "checkpoints")
+    (again / "report.json").unlink()
+    assert command("train", f"resume={again}").returncode == 0
+    assert differences(run_dir, again) == ""
+
+
+def test_a_folder_that_another_process_has_taken_is_not_written(finished, tmp_path):
+    """Between the check of a new run and its start."""
+    config = dataclasses.replace(load_config(finished[0]), run_dir=str(tmp_path / "run"))
+    work = prepare_training(config, time.perf_counter())
+    shutil.copytree(finished[0], tmp_path / "run")
+    before = (tmp_path / "run" / "report.json").read_bytes()
+    assert work() == 2
+    assert (tmp_path / "run" / "report.json").read_bytes() == before
+
+
+def test_a_report_that_cannot_be_written_is_one_line(finished, tmp_path):
+    run_dir = shutil.copytree(finished[0], tmp_path / "run")
+    (run_dir / "report.json").unlink()
+    (run_dir / "report.json.partial").mkdir()
+    result = command("train", f"resume={run_dir}")
+    assert result.returncode == 1 and len(result.stderr.splitlines()) == 1 and "continue with: python" in result.stderr
 
 
 def test_a_run_that_another_process_writes_is_not_resumed(finished):

@@ -40,7 +40,7 @@ def test_a_resumed_log_is_cut_to_the_checkpoint(tmp_path):
     for step in (10, 20, 30):
         log.write(step, {"loss": 0.5})
     log.close()
-    log = MetricsLog(tmp_path, resumed_step=20)
+    log = MetricsLog(tmp_path, first_step=20)
     log.write(20, {"loss": 0.25})
     log.close()
     assert [(row["step"], row["loss"]) for row in rows_of(tmp_path)] == [("10", "0.5"), ("20", "0.25")]
@@ -53,7 +53,7 @@ def test_a_half_written_row_is_removed(tmp_path):
     log.close()
     path = tmp_path / "metrics.csv"
     path.write_bytes(path.read_bytes()[:-7])
-    log = MetricsLog(tmp_path, resumed_step=30)
+    log = MetricsLog(tmp_path, first_step=30)
     log.write(30, {"loss": 0.5, "reward": 1.0})
     log.close()
     assert [row["step"] for row in rows_of(tmp_path)] == ["10", "30"]

@@ -224,6 +224,37 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
     assert max(jax.tree.leaves(apart)) > 1e-4  # Adam moves by 1e-3 an update, whatever the gradient's size
 
 
+def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
+    """Compiled anew, its numbers may differ in the last bits: on a GPU, XLA chooses matrix products by their speed."""
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")
+    networks = training.make_networks(config, env.observation_size, env.action_size)
+    lowered = []
+    monkeypatch.setattr(programs, "in_background", lambda compiled: lowered.append(compiled.__self__.as_text()))
+    params = jax.device_get(programs.initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
+    for initial in (None, params):
+        schedule = optax.constant_schedule(1e-3)
+        programs.compile_training(env, config, networks, 1, schedule, initial, restored=True)
+    assert lowered[0] == lowered[1]
+
+
+def test_schedules_of_a_restored_state_begin_at_its_updates():
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")
+    networks = training.make_networks(config, env.observation_size, env.action_size)
+    functions = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+    state = functions.start(7, None, 5)
+    leaves = jax.tree.leaves(jax.device_get(state.saved))
+    restored = functions.restore(leaves, 9)
+    assert restored is not None
+    for network in (restored.policy, restored.value):
+        adam, schedule = network.optimizer  # type: ignore[misc]
+        assert (int(adam.count), int(schedule.count)) == (0, 9)
+    for leaf, saved in zip(jax.tree.leaves(functions.restore(leaves, 5)), jax.tree.leaves(state), strict=True):
+        np.testing.assert_array_equal(leaf, saved)
+    assert functions.restore([*leaves[:-1], leaves[-1][:1]], 5) is None
+
+
 def test_both_functions_are_compiled_with_the_options_of_a_run(monkeypatch):
     monkeypatch.setattr(programs, "compiler_options", lambda: {"no_option_of_xla": True})
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})

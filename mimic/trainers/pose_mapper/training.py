@@ -1,7 +1,8 @@
 """Training of a pose mapper: the embodiment distance is the loss, and there are no labels (paper, eq. 23)."""
 
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ import optax
 from jaxtyping import Array, Float
 
 from mimic.compilation import Background, compiling
-from mimic.runs.checkpoints import Checkpoint, checkpoint_steps, load_checkpoint, save_checkpoint, thin_checkpoints
+from mimic.runs.checkpoints import STATE_UNUSED, Checkpoint, checkpoint_steps, save_checkpoint, thin_checkpoints
 from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
 from mimic.trainers.pose_mapper.model import MapperModel, Params
@@ -86,16 +87,17 @@ def train(
     functions = _compile(model, interval, seed, initial)
     state = functions.start()(seed, initial, steps // config.batch_size)
     training, validation = poses()
-    if leaves is None:
-        best = _Best(float(functions.validate()(state[0], validation)), steps, state[0])
-    else:
-        *leaves, distance, best_steps = leaves
-        state = jax.tree.unflatten(jax.tree.structure(state), leaves)
-        best_params = state[0] if best_steps == steps else load_checkpoint(run_dir, state[0], int(best_steps))[1]
+    best = _Best(float(functions.validate()(state[0], validation)), steps, state[0])
+    saved = _unflatten((state, tuple(best)), leaves)
+    if saved is None and steps:
+        print(STATE_UNUSED, file=sys.stderr)
+    elif saved is not None:
+        (params, optimiser_state), (distance, best_steps, best_params) = saved
+        state = params, schedules_from(optimiser_state, steps // config.batch_size)
         best = _Best(float(distance), int(best_steps), best_params)
     while True:
         if steps not in checkpoint_steps(run_dir):
-            saved = [*jax.tree.leaves(jax.device_get(state)), np.array(best.distance), np.array(best.steps)]
+            saved = [np.asarray(leaf) for leaf in jax.tree.leaves(jax.device_get((state, tuple(best))))]
             save_checkpoint(run_dir, steps, state[0], saved, metrics)
             thin_checkpoints(run_dir, config.keep, best.steps)
         stop = on_evaluation(steps, state[0], metrics)
@@ -115,6 +117,14 @@ def train(
         metrics = {"loss": loss, "validation_distance": distance, "sps": speed}
         if distance < best.distance:
             best = _Best(distance, steps, state[0])
+
+
+def _unflatten(template: Any, leaves: Sequence[np.ndarray] | None) -> Any:
+    """A pytree with the template's structure; None without leaves, or where their shapes do not fit."""
+    expected, structure = jax.tree.flatten(template)
+    if leaves is None or [np.shape(leaf) for leaf in leaves] != [np.shape(leaf) for leaf in expected]:
+        return None
+    return jax.tree.unflatten(structure, leaves)
 
 
 def _compile(model: MapperModel, interval: int, seed: int, initial: Params | None) -> _Functions:

@@ -28,6 +28,7 @@ from mimic.metric.kinematics import LinkStates
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo import updates
 from mimic.trainers.ppo.losses import Unrolls
+from mimic.trainers.schedules import schedules_from
 
 Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, value parameters
 Metrics = dict[str, Array]
@@ -71,12 +72,13 @@ class TrainingFunctions(NamedTuple):
 
     Attributes:
       start: (seed, parameters to start from or None, updates that were done with them) -> state.
-      restore: leaves of `TrainingState.saved` -> state; None where they do not fit the settings.
+      restore: (leaves of `TrainingState.saved`, updates that were done) -> state; None where they do not fit the
+        settings.
       epoch: state -> state after a training epoch, and the means of the training metrics.
     """
 
     start: Callable[..., TrainingState]
-    restore: Callable[[Sequence[np.ndarray]], TrainingState | None]
+    restore: Callable[[Sequence[np.ndarray], int], TrainingState | None]
     epoch: Background[Callable[[TrainingState], tuple[TrainingState, Metrics]]]
 
 
@@ -113,17 +115,26 @@ def compile_training(
     epoch = functools.partial(training.epoch, batches)
     learn = _over_devices(mesh, epoch, (partitions,), (partitions, replicated), donate_argnums=0)
     expert_states = jax.device_get(env.expert_states)
-    shapes = jax.eval_shape(start, 0, initial, 0, expert_states)
+    # Without weak types, so that the compiled epoch is that of a restored state.
+    shapes = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding),
+        jax.eval_shape(start, 0, initial, 0, expert_states),
+    )
     compiled_learn = in_background(learn.lower(shapes).compile)  # before the other, because it takes longer
     compiled_start = Background(lambda: start.lower(0, initial, 0, expert_states).compile())
     if not restored:
         compiled_start.start()
 
-    def restore(leaves: Sequence[np.ndarray]) -> TrainingState | None:
+    def restore(leaves: Sequence[np.ndarray], done_updates: int) -> TrainingState | None:
         expected, structure = jax.tree.flatten(shapes.saved)
         if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in expected]:
             return None
-        state = jax.tree.unflatten(structure, leaves).replace(expert_states=expert_states)
+        state: TrainingState = jax.tree.unflatten(structure, leaves)
+        policy, value = (  # the settings of the batches may have changed, and with them the updates so far
+            network._replace(optimizer=schedules_from(network.optimizer, done_updates))
+            for network in (state.policy, state.value)
+        )
+        state = dataclasses.replace(state, policy=policy, value=value, expert_states=expert_states)
         shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), partitions)
         return jax.device_put(state, shardings)
 

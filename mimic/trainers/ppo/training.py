@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +18,7 @@ from jaxtyping import Array
 
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.evaluator import Controller
-from mimic.runs.checkpoints import Checkpoint, checkpoint_steps, save_checkpoint, thin_checkpoints
+from mimic.runs.checkpoints import STATE_UNUSED, Checkpoint, checkpoint_steps, save_checkpoint, thin_checkpoints
 from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOSettings
@@ -126,6 +127,7 @@ def _checkpoints(
 ) -> Iterator[Checkpoint]:
     """The checkpoint at the start of a training or the restored one, and that after each training epoch."""
     step, initial, leaves, metrics = restored or Checkpoint(0, None, None, {})
+    del restored
     batches = _batches_per_epoch(config)
     networks = make_networks(config, env.observation_size, env.action_size)
     progress = _progress(config)
@@ -134,8 +136,11 @@ def _checkpoints(
         env, config, networks, batches, learning_rate, initial, progress, restored=leaves is not None
     )
     on_compiling()
-    state = functions.restore(leaves) if leaves is not None else None
+    state = None if leaves is None else functions.restore(leaves, _updates(config, step))
+    leaves = None  # frees their memory
     if state is None:
+        if step and jax.process_index() == 0:
+            print(STATE_UNUSED, file=sys.stderr)
         state = functions.start((seed + step) % 2**31, initial, _updates(config, step))  # the range of a 32-bit integer
     yield Checkpoint(step, jax.device_get(state.params), _leaves(state), metrics)
     walltime = metrics.get("walltime", 0.0)
