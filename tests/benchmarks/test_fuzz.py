@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+from pathlib import Path
 
 import pytest
 
@@ -68,7 +69,8 @@ def harmful_case(number):
 def test_harm_is_counted_and_the_next_inputs_run(monkeypatch):
     monkeypatch.setitem(fuzzing.KINDS, "npz", ("tests.benchmarks.test_fuzz", "harmful_case"))
     monkeypatch.setattr(runner, "TIME_LIMIT", 5.0)
-    monkeypatch.setattr(runner, "MEMORY_LIMIT", runner._peak_memory() + 200 * 2**20)
+    resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    monkeypatch.setattr(runner, "MEMORY_LIMIT", resident + 200 * 2**20)  # a forked process starts with as much
     fork = multiprocessing.get_context("fork")  # the processes know of what is replaced here
     monkeypatch.setattr(runner.multiprocessing, "get_context", lambda _: fork)
     rows = run_cases("npz", len(READS), 1)

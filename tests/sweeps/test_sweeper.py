@@ -143,8 +143,8 @@ def test_the_same_sweep_continues(tmp_path, monkeypatch, capsys):
     write_run(tmp_path / "2", [0.5], seed=2, report=False)
     sweep("0,1,2,3")
     assert [len(runs) for runs in launched] == [4, 3]
-    assert launched[1] == [[f"resume={tmp_path}/1"], *launched[0][2:]]
-    assert not (tmp_path / "2").exists()  # it had no checkpoint
+    resumed = [[f"resume={tmp_path}/{number}"] for number in (1, 2)]  # also the run without a checkpoint
+    assert launched[1] == [*resumed, launched[0][3]]
     assert "4 of 4 runs done" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         sweep("0,1")
