@@ -70,7 +70,7 @@ def prepare_replay(config: InspectConfig) -> Callable[[], None]:
         console.print("\n".join(lines), highlight=False, soft_wrap=True, markup=False)
         for table in (
             _metrics_table(divergence, record.trace.metrics),
-            _largest_table(record, finding or divergence.finding),
+            _largest_table(record, finding),
             _settings_table(dataclasses.replace(trained, trainer=trainer.settings)),
         ):
             console.print(table)
@@ -108,17 +108,15 @@ def _metrics_table(divergence: Divergence, replayed: np.ndarray) -> Table:
     return table
 
 
-def _largest_table(record: BatchRecord, finding: Finding) -> Table:
+def _largest_table(record: BatchRecord, finding: Finding | None) -> Table:
     """Largest magnitudes in the replay, up to the step where a value is not finite; nan where one of them is."""
-    values = arm_values(record)
-    of_arms = len(finding.arms) > 0
-    steps = finding.index + 1 if of_arms else finding.of
+    values, last = arm_values(record), None
     groups: dict[str, Any] = {"all arms": slice(None)}
-    if of_arms:
-        groups = {"arms at fault": finding.arms, **groups}
+    if finding and len(finding.arms):
+        groups, last = {"arms at fault": finding.arms, **groups}, finding.index + 1
     table = _table("largest magnitudes in the replay", "value", *groups)
     for name in ("qpos", "qvel", "action", "reward"):
-        largest = (np.abs(values[name][:steps, arms]).max(initial=0.0) for arms in groups.values())
+        largest = (np.abs(values[name][:last, arms]).max(initial=0.0) for arms in groups.values())
         table.add_row(escape(f"{name} {_UNITS.get(name, '')}".strip()), *(f"{value:.4g}" for value in largest))
     return table
 

@@ -258,11 +258,18 @@ def load_divergence(path: Path) -> Divergence:
         counts = {name: int(arrays[name]) for name in _COUNTS}
         what, metrics, arms = str(arrays["what"]), arrays["metrics"], arrays["bad_arms"]
         state = [arrays[name] for name in leaves if name in arrays]
-        valid = what in _CAUSES and metrics.ndim == 2 and metrics.shape[1] == len(TRACED) and arms.ndim == 1
-        if not (valid and metrics.dtype.kind == "f" and arms.dtype.kind == "i" and min(counts.values()) >= 0):
-            raise ValueError("its values have other types or shapes")
-    except (ValueError, TypeError, LookupError) as error:
+        finding = Finding(what, counts.pop("index"), counts.pop("of"), arms)
+        steps = finding.of if what in _UNROLLED else len(metrics) - 1
+        valid = (
+            what in _CAUSES
+            and (metrics.dtype.kind, metrics.ndim, metrics.shape[-1]) == ("f", 2, len(TRACED))
+            and (arms.dtype.kind, arms.ndim) == ("i", 1)
+            and 0 <= finding.index <= steps
+            and min(counts.values()) >= 0
+        )
+        if not valid:
+            raise ValueError("its values have other types, shapes or ranges")
+    except (ValueError, TypeError, LookupError, OverflowError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else error
         raise ValueError(f"{str(path)!r} is no file of a training that diverged: {reason}") from error
-    finding = Finding(what, counts.pop("index"), counts.pop("of"), arms)
     return Divergence(run=str(arrays["run"]), finding=finding, metrics=metrics, state=state, **counts)
