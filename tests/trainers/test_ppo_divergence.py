@@ -1,11 +1,21 @@
 """The first batch of a training that is not finite: what is at fault, and its file."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from mimic.runs.divergence import FILE
 from mimic.trainers.ppo import divergence
-from mimic.trainers.ppo.divergence import BadBatch, Epoch, examine, load_divergence, record_divergence, save_divergence
+from mimic.trainers.ppo.divergence import (
+    BadBatch,
+    Epoch,
+    Finding,
+    examine,
+    load_divergence,
+    record_divergence,
+    save_divergence,
+)
 from mimic.trainers.ppo.losses import Unrolls
 from mimic.trainers.ppo.programs import BatchRecord
 from mimic.trainers.ppo.updates import TRACED, UpdateTrace
@@ -19,12 +29,20 @@ def record():
     """A batch whose values are all finite."""
     rng = np.random.default_rng(0)
 
-    def normal(*shape):
+    def normal(*shape) -> Any:
         return rng.normal(size=(ROUNDS, TIME + 1, ARMS, *shape)).astype(np.float32)
 
     unrolls = Unrolls(normal(OBSERVED), normal(JOINTS), normal(), normal(), normal(), normal())
-    trace = UpdateTrace(rng.normal(size=(UPDATES, len(TRACED))), np.ones(UPDATES, bool))
+    metrics: Any = rng.normal(size=(UPDATES, len(TRACED)))
+    finite: Any = np.ones(UPDATES, bool)
+    trace = UpdateTrace(metrics, finite)
     return BatchRecord(unrolls, normal(JOINTS)[:, :-1], normal(JOINTS)[:, :-1], trace)
+
+
+def found(record, **options) -> Finding:
+    finding = examine(record, **options)
+    assert finding is not None
+    return finding
 
 
 def test_a_finite_batch_is_found_finite(record):
@@ -45,14 +63,14 @@ def test_a_finite_batch_is_found_finite(record):
 def test_the_first_value_of_an_arm_is_found(record, field, place, what, step, value):
     getattr(record.unrolls, field)[place] = value
     record.trace.metrics[:] = np.nan  # of the updates, which come later
-    finding = examine(record, statistics_are_finite=False)
+    finding = found(record, statistics_are_finite=False)
     assert finding[:3] == (what, step, ROUNDS * TIME)
     np.testing.assert_array_equal(finding.arms, [13])
 
 
 def test_an_earlier_step_comes_first(record):
     record.unrolls.observation[1, 1, :4] = record.unrolls.reward[1, 0, 6:8] = np.nan
-    finding = examine(record)
+    finding = found(record)
     assert str(finding) == "reward in step 6 of 15"
     np.testing.assert_array_equal(finding.arms, [6, 7])
 
@@ -60,9 +78,9 @@ def test_an_earlier_step_comes_first(record):
 def test_in_a_step_the_observation_comes_before_the_action_and_the_reward(record):
     for values in record.unrolls[:4]:
         values[1, 1, 4] = np.nan
-    assert str(examine(record)) == "observation in step 7 of 15"
+    assert str(found(record)) == "observation in step 7 of 15"
     record.unrolls.observation[1, 1, 4] = 0
-    assert str(examine(record)) == "action in step 7 of 15"
+    assert str(found(record)) == "action in step 7 of 15"
 
 
 @pytest.mark.parametrize("name", TRACED)
@@ -70,17 +88,17 @@ def test_the_first_metric_is_found(record, name):
     record.trace.metrics[2, TRACED.index(name) :] = np.inf
     record.trace.metrics[3:] = np.nan
     record.trace.finite[2:] = False
-    assert examine(record)[:3] == (name, 2, UPDATES)
+    assert found(record)[:3] == (name, 2, UPDATES)
 
 
 def test_parameters_and_statistics_are_found(record):
     record.trace.finite[3] = False
-    assert str(examine(record)) == "parameter in update 4 of 4"
-    assert examine(record, statistics_are_finite=False).what == "observation statistics"
+    assert str(found(record)) == "parameter in update 4 of 4"
+    assert found(record, statistics_are_finite=False).what == "observation statistics"
 
 
 def saved(record, folder, state=STATE):
-    finding = examine(record)
+    finding = found(record)
     bad = BadBatch(2, state, np.array([1, 2], np.uint32), finding, record)
     save_divergence(folder / FILE, bad, "run", Epoch(100, 3, state))
     return folder / FILE

@@ -152,7 +152,8 @@ def replay_batch(replay: Replay, state: TrainingState) -> tuple[TrainingState, B
     statistics_are_finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(statistics))
     if trace.finite.all() and np.isfinite(trace.metrics).all() and statistics_are_finite:
         return state, record, None
-    record = BatchRecord(*of_all_processes(record[:-1]), trace)
+    unrolls, qpos, qvel = of_all_processes((record.unrolls, record.qpos, record.qvel))
+    record = BatchRecord(unrolls, qpos, qvel, trace)
     return state, record, examine(record, statistics_are_finite)
 
 
@@ -166,7 +167,7 @@ def examine(record: BatchRecord, statistics_are_finite: bool = True) -> Finding 
     steps = record.qpos.shape[0] * record.qpos.shape[1]
     findings = []
     for order, (what, values) in enumerate(_unrolled(record).items()):
-        bad = ~np.isfinite(values).all(axis=tuple(range(2, values.ndim)))
+        bad = ~np.asarray(np.isfinite(values.reshape(*values.shape[:2], -1)).all(axis=2))
         if bad.any():
             step = int(bad.any(axis=1).argmax())
             findings.append((step, order, Finding(what, step, steps, np.flatnonzero(bad[step]))))
@@ -197,8 +198,9 @@ def arm_values(record: BatchRecord) -> dict[str, np.ndarray]:
       record: on the host. Rewards belong to the step, all others to the time before it.
     """
     unrolls, steps = record.unrolls, record.qpos.shape[1]
-    values = record.qpos, record.qvel, unrolls.observation, np.tanh(unrolls.raw_action), unrolls.reward
-    return {name: x[:, :steps].reshape(-1, *x.shape[2:]) for name, x in zip(_OF_ARMS, values, strict=True)}
+    values = record.qpos, record.qvel, unrolls.observation, np.tanh(np.asarray(unrolls.raw_action)), unrolls.reward
+    arrays = zip(_OF_ARMS, map(np.asarray, values), strict=True)
+    return {name: x[:, :steps].reshape(-1, *x.shape[2:]) for name, x in arrays}
 
 
 def save_divergence(path: Path, bad: BadBatch, run: str, epoch: Epoch) -> None:
