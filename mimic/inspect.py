@@ -1,7 +1,4 @@
-"""`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and kinematic bound.
-
-`python -m mimic.inspect RUN/divergence.npz` replays the batch at which a training diverged.
-"""
+"""`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and kinematic bound."""
 
 from mimic import cli, compat
 from mimic.commands.config import InspectConfig
