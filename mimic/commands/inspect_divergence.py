@@ -97,7 +97,7 @@ def _outcome(divergence: Divergence, record: BatchRecord, finding: Finding | Non
 def _metrics_table(divergence: Divergence, replayed: np.ndarray) -> Table:
     """Training metrics of the last update that is finite, and of the first one that is not."""
     recorded, finding = divergence.metrics, divergence.finding
-    bad = finding.index if not len(finding.arms) else 0
+    bad = 0 if finding.in_unrolls else finding.index
     columns = {"recorded": recorded[bad], "replayed": replayed[bad] if len(replayed) > bad else None}
     if bad:
         columns = {"update before": recorded[bad - 1], **columns}
@@ -112,7 +112,7 @@ def _largest_table(record: BatchRecord, finding: Finding | None) -> Table:
     """Largest magnitudes in the replay, up to the step where a value is not finite; nan where one of them is."""
     values, last = arm_values(record), None
     groups: dict[str, Any] = {"all arms": slice(None)}
-    if finding and len(finding.arms):
+    if finding and finding.in_unrolls:
         groups, last = {"arms at fault": finding.arms, **groups}, finding.index + 1
     table = _table("largest magnitudes in the replay", "value", *groups)
     for name in ("qpos", "qvel", "action", "reward"):

@@ -141,6 +141,7 @@ def test_a_file_holds_no_arms_where_an_update_is_at_fault(record, tmp_path):
         ({"batch": np.array(-1)}, "other types, shapes or ranges"),
         ({"metrics": np.zeros(3)}, "other types, shapes or ranges"),
         ({"metrics": np.zeros((3, len(TRACED)), np.int64)}, "other types, shapes or ranges"),
+        ({"metrics": np.zeros((0, len(TRACED))), "what": np.array("action")}, "other types, shapes or ranges"),
         ({"bad_arms": np.zeros(3)}, "other types, shapes or ranges"),
         ({"index": np.array(np.inf)}, "infinity"),
         ({"index": np.array(9)}, "other types, shapes or ranges"),

@@ -40,8 +40,13 @@ class Finding(NamedTuple):
     of: int
     arms: np.ndarray
 
+    @property
+    def in_unrolls(self) -> bool:
+        """Whether arms are at fault, and not an update."""
+        return self.what in _UNROLLED
+
     def __str__(self) -> str:
-        place = f"{'step' if self.what in _UNROLLED else 'update'} {min(self.index + 1, self.of)} of {self.of}"
+        place = f"{'step' if self.in_unrolls else 'update'} {min(self.index + 1, self.of)} of {self.of}"
         return f"{self.what.replace('_', ' ')} in {place}"
 
 
@@ -212,20 +217,9 @@ def save_divergence(path: Path, bad: BadBatch, run: str, epoch: Epoch) -> None:
       run: name of the run in its checkpoints.
       epoch: its training epoch.
     """
-    finding, values = bad.finding, arm_values(bad.record)
-    of_bad = finding.arms[:_BAD_ARMS]
-    others = np.setdiff1d(np.arange(bad.record.qpos.shape[2]), finding.arms)[: _OTHER_ARMS if len(of_bad) else 0]
-    arms = np.concatenate([of_bad, others]).astype(int)
-    steps = np.arange(max(finding.index + 1 - _STEPS, 0), min(finding.index + 1, finding.of))
-    counts = (
-        epoch.env_steps,
-        bad.batch,
-        epoch.batches,
-        jax.device_count(),
-        finding.index,
-        finding.of,
-        len(finding.arms),
-    )
+    finding = bad.finding
+    place = epoch.env_steps, bad.batch, epoch.batches, jax.device_count()
+    counts = *place, finding.index, finding.of, len(finding.arms)
     arrays = {
         "run": run,
         "what": finding.what,
@@ -233,10 +227,7 @@ def save_divergence(path: Path, bad: BadBatch, run: str, epoch: Epoch) -> None:
         "key": bad.key,
         "metric_names": np.array(TRACED),
         "metrics": bad.record.trace.metrics,
-        "bad_arms": of_bad,
-        "arms": arms,
-        "steps": steps if len(arms) else steps[:0],
-        **{name: x[steps][:, arms] if len(arms) else x[:0, :0] for name, x in values.items()},
+        **_last_steps(bad.record, finding),
         **{_LEAF.format(i): leaf for i, leaf in enumerate(bad.state)},
     }
     partial = path.with_name(path.name + ".partial")
@@ -246,6 +237,17 @@ def save_divergence(path: Path, bad: BadBatch, run: str, epoch: Epoch) -> None:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _last_steps(record: BatchRecord, finding: Finding) -> dict[str, np.ndarray]:
+    """The last steps of some arms at fault and of some others; empty arrays where an update is at fault."""
+    bad_arms = finding.arms[:_BAD_ARMS]
+    others = np.setdiff1d(np.arange(record.qpos.shape[2]), finding.arms)[:_OTHER_ARMS]
+    arms, steps = np.concatenate([bad_arms, others]), np.arange(finding.of)[: finding.index + 1][-_STEPS:]
+    if not finding.in_unrolls:
+        arms, steps = bad_arms, steps[:0]
+    of_arms = {name: values[steps][:, arms] for name, values in arm_values(record).items()}
+    return {"bad_arms": bad_arms, "arms": arms, "steps": steps, **of_arms}
 
 
 def load_divergence(path: Path) -> Divergence:
@@ -261,12 +263,13 @@ def load_divergence(path: Path) -> Divergence:
         what, metrics, arms = str(arrays["what"]), arrays["metrics"], arrays["bad_arms"]
         state = [arrays[name] for name in leaves if name in arrays]
         finding = Finding(what, counts.pop("index"), counts.pop("of"), arms)
-        steps = finding.of if what in _UNROLLED else len(metrics) - 1
+        last = finding.of if finding.in_unrolls else len(metrics) - 1
         valid = (
             what in _CAUSES
             and (metrics.dtype.kind, metrics.ndim, metrics.shape[-1]) == ("f", 2, len(TRACED))
             and (arms.dtype.kind, arms.ndim) == ("i", 1)
-            and 0 <= finding.index <= steps
+            and 0 <= finding.index <= last
+            and len(metrics) > 0
             and min(counts.values()) >= 0
         )
         if not valid:
