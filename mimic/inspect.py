@@ -1,11 +1,16 @@
 """`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and kinematic bound."""
 
-from mimic import cli
+from mimic import cli, compat
 from mimic.commands.config import InspectConfig
 
 
 def prepare(config: InspectConfig) -> cli.Work:
-    """Prepares an inspection. See `mimic.commands.inspect`."""
+    """Prepares an inspection, see `mimic.commands.inspect`, or a replay, see `mimic.commands.inspect_divergence`."""
+    if config.divergence:
+        compat.import_mjx()
+        from mimic.commands import inspect_divergence
+
+        return inspect_divergence.prepare_replay(config)
     from mimic.commands import inspect  # slow to import, and not needed for --help
 
     return inspect.prepare_inspection(config)

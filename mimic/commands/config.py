@@ -219,6 +219,7 @@ class InspectConfig:
       bound: whether to compute the kinematic bound of the distance, which takes a minute.
       out: new folder for a picture of both arms with their correspondence, a picture of expert poses with the
         learner's nearest poses (only with `bound`), and a JSON file of all results.
+      divergence: file that a training that diverged has written, to replay instead of an inspection.
     """
 
     learner: ArmConfig = dataclasses.field(default_factory=ArmConfig)
@@ -226,6 +227,7 @@ class InspectConfig:
     limits: str = "none"
     bound: bool = True
     out: str = ""
+    divergence: str = ""
 
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)

@@ -5,7 +5,6 @@ checkpoint.json: the run that it belongs to, the metrics of its training epoch, 
 its name when it is complete, and is never written again.
 """
 
-import contextlib
 import hashlib
 import json
 import os
@@ -74,7 +73,7 @@ def save_checkpoint(
             checkpointer.save(partial, plain, force=True)
         if state is not None:  # not by orbax, which takes 100 ms for the 10 MB of 4096 arms; NumPy takes 6
             np.savez(partial / _STATE, *state)
-        content = {"run": _run_id(run_dir), "metrics": dict(metrics or {}), "sha256": _checksums(partial)}
+        content = {"run": _new_run_id(run_dir), "metrics": dict(metrics or {}), "sha256": _checksums(partial)}
         (partial / _CONTENT).write_text(json.dumps(content, indent=1))
         if path.exists():  # a damaged one, since a run never writes a step twice
             shutil.rmtree(path)
@@ -140,6 +139,14 @@ def check_checkpoint(run_dir: Path, step: int | None = None) -> int:
       ValueError: the run has no such checkpoint, or it is damaged.
     """
     return _first_undamaged(run_dir, step, lambda path: None)[0]
+
+
+def run_id(run_dir: Path) -> str:
+    """The random name of a run in its checkpoints; empty for a run without any."""
+    try:
+        return (run_dir / FOLDER / _RUN).read_text()
+    except FileNotFoundError:
+        return ""
 
 
 def load_checkpoint(run_dir: Path, template: Any, step: int | None = None) -> tuple[int, Any]:
@@ -247,14 +254,13 @@ def _path(run_dir: Path, step: int) -> Path:
     return (run_dir / FOLDER / f"{step:012d}").absolute()
 
 
-def _run_id(run_dir: Path) -> str:
+def _new_run_id(run_dir: Path) -> str:
     """A random name of the run, created with its first checkpoint."""
-    path = run_dir / FOLDER / _RUN
-    with contextlib.suppress(FileNotFoundError):
-        return path.read_text()
-    path.parent.mkdir(exist_ok=True)
-    write_atomically(path, uuid.uuid4().hex)
-    return path.read_text()
+    if not run_id(run_dir):
+        path = run_dir / FOLDER / _RUN
+        path.parent.mkdir(exist_ok=True)
+        write_atomically(path, uuid.uuid4().hex)
+    return run_id(run_dir)
 
 
 def _reason(error: Exception) -> str:

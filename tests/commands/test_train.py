@@ -12,15 +12,17 @@ import sys
 import time
 
 import imageio_ffmpeg
+import jax
 import numpy as np
 import pytest
 from PIL import Image
 
 from benchmarks.interruptions import differences
 from mimic.commands.train import prepare_training
-from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint
+from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint, load_checkpoint, save_checkpoint
 from mimic.runs.lock import RunLock
 from mimic.trainers.config import TrainConfig
+from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.run_config import load_config, new_run_dir
 from tests.helpers.tiny import TINY
 
@@ -234,14 +236,25 @@ def test_a_run_that_another_process_writes_is_not_resumed(finished):
     assert len(result.stderr.splitlines()) == 1
 
 
-def test_a_training_that_diverges_stops(tmp_path):
-    """The value loss is beyond float32."""
-    run_dir = tmp_path / "run"
-    result = command("train", *TINY, "trainer.reward_scaling=1e30", f"run_dir={run_dir}")
+def test_a_training_that_diverges_stops_and_leaves_a_batch_to_replay(finished, tmp_path):
+    """It starts from a policy whose actions are beyond float32, although its parameters are not."""
+    start, run_dir = tmp_path / "start", tmp_path / "run"
+    start.mkdir()
+    template = make_ppo_trainer(load_config(finished[0]), finished[0]).params_template()
+    step, (statistics, policy, value) = load_checkpoint(finished[0], template)
+    save_checkpoint(start, step, (statistics, jax.tree.map(lambda x: 1e30 * x, policy), value))
+    result = command("train", *TINY, "env.physics=fused", f"init={start}", f"run_dir={run_dir}")
     assert result.returncode == 3, result.stderr[-2000:]
+    file = run_dir / "divergence.npz"
     (line,) = result.stderr.splitlines()
     assert re.match(r"error: training diverged: \w+ is not finite after \d+ steps; the checkpoints before it", line)
+    assert line.endswith(f"; replay it with: python -m mimic.inspect {file}")
     assert checkpoint_steps(run_dir) == [0] and not (run_dir / "report.json").exists()
+    assert "training diverged: looking for the first of 1 batches after 0 steps that is not finite" in result.stdout
+    replayed = command("inspect", str(file))
+    assert replayed.returncode == 0, replayed.stderr[-2000:]
+    assert replayed.stdout.startswith("first not finite: action in step 1 of 20, of 64 of 64 arms\n")
+    assert "replay on cpu: reproduces it, with the same metrics to the bit" in replayed.stdout
 
 
 @pytest.mark.slow

@@ -11,12 +11,19 @@ import subprocess
 import sys
 import time
 
+import jax
 import pytest
 from omegaconf import OmegaConf
 
+import mimic
+from mimic.runs.checkpoints import save_checkpoint
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.distributed import process_group
 from mimic.trainers.distributed.local_processes import LocalProcess, LocalProcesses, local_process
 from mimic.trainers.distributed.process_group import DistributedConfig
+from mimic.trainers.ppo.divergence import load_divergence
+from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.ppo.training import make_networks
 from mimic.trainers.run_config import run_schema
 from tests.helpers.repository import REPOSITORY
 from tests.helpers.tiny import TINY
@@ -79,6 +86,21 @@ def test_the_variables_of_slurm_are_enough(tmp_path):
     (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run", "trainer.evaluations=1", slurm=True))
     assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
     assert json.loads((tmp_path / "run" / "report.json").read_text())["hardware"]["processes"] == 2
+
+
+@pytest.mark.slow
+def test_the_first_process_records_a_divergence(tmp_path):
+    """All take part in the search for the first batch that is not finite."""
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    networks = make_networks(PPOConfig(hidden_layers=[16]).resolve(), env.observation_size, env.action_size)
+    statistics, policy, value = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
+    (tmp_path / "start").mkdir()
+    save_checkpoint(tmp_path / "start", 0, (statistics, jax.tree.map(lambda x: 1e30 * x, policy), value))
+    (first, shown), (second, silent) = finish(start(tmp_path, "init=start", "run_dir=run"))
+    assert (first, second) == (3, 3), shown[-2000:] + silent[-2000:]
+    assert "replay it with: python -m mimic.inspect run/divergence.npz" in shown and "diverged" not in silent
+    recorded = load_divergence(tmp_path / "run" / "divergence.npz")
+    assert (str(recorded.finding), recorded.num_bad_arms) == ("action in step 1 of 20", 64) and recorded.devices == 2
 
 
 def alone(tmp_path, *arguments):

@@ -8,7 +8,7 @@ and with the evaluation's functions.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from brax.envs.base import State, Wrapper
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from flax import struct
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
@@ -32,8 +33,10 @@ from mimic.trainers.schedules import schedules_from
 
 Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, value parameters
 Metrics = dict[str, Array]
+T = TypeVar("T")
 
 _AXIS = "devices"
+_REPLICATED, _SHARDED = PartitionSpec(), PartitionSpec(_AXIS)
 
 
 @struct.dataclass
@@ -67,18 +70,21 @@ class TrainingState:
         return dataclasses.replace(self, expert_states=None)
 
 
+_PARTITIONS = TrainingState(_REPLICATED, _REPLICATED, _REPLICATED, _SHARDED, _REPLICATED, _REPLICATED)  # type: ignore[arg-type]
+
+
 class TrainingFunctions(NamedTuple):
     """The functions of a training. Those that compile do so in the background.
 
     Attributes:
       start: (seed, parameters to start from or None, updates that were done with them) -> state.
-      restore: (leaves of `TrainingState.saved`, updates that were done) -> state; None where they do not fit the
-        settings.
+      restore: (leaves of `TrainingState.saved`, updates that were done if the schedules are to begin there) -> state;
+        None where they do not fit the settings.
       epoch: state -> state after a training epoch, and the means of the training metrics.
     """
 
     start: Callable[..., TrainingState]
-    restore: Callable[[Sequence[np.ndarray], int], TrainingState | None]
+    restore: Callable[..., TrainingState | None]
     epoch: Background[Callable[[TrainingState], tuple[TrainingState, Metrics]]]
 
 
@@ -104,44 +110,129 @@ def compile_training(
       learning_rate: Adam's learning rate at each update from 0 on.
       initial: parameters to start from, or their shapes; random ones where None.
       progress: fraction of the training that is done at each update, see `PPOSettings.at`.
-
       restored: whether a saved state is to be restored, so that `start` is not needed.
     """
+    setup = _set_up(env, config, networks, learning_rate, progress, initial)
+    epoch = functools.partial(setup.training.epoch, batches)
+    learn = _over_devices(setup.mesh, epoch, (_PARTITIONS,), (_PARTITIONS, _REPLICATED), donate_argnums=0)
+    compiled_learn = in_background(learn.lower(setup.shapes).compile)  # before the other, because it takes longer
+    compiled_start = Background(lambda: setup.start.lower(0, initial, 0, setup.expert_states).compile())
+    if not restored:
+        compiled_start.start()
+
+    def start_from(seed: int, params: Params | None = None, done_updates: int = 0) -> TrainingState:
+        return compiled_start()(seed, params, done_updates, setup.expert_states)
+
+    return TrainingFunctions(start_from, setup.restore, compiled_learn)
+
+
+class BatchRecord(NamedTuple):
+    """What happened in a batch.
+
+    Attributes:
+      unrolls: [rounds, time + 1, arms, ...].
+      qpos, qvel: [rounds, time, arms, joints] before each step.
+      trace: the updates.
+    """
+
+    unrolls: Unrolls
+    qpos: Array
+    qvel: Array
+    trace: updates.UpdateTrace
+
+
+class Replay(NamedTuple):
+    """The functions that repeat single batches of a training.
+
+    Attributes:
+      restore: see `TrainingFunctions`.
+      batch: state -> state after a batch, and a record of the batch; compiles in the background.
+    """
+
+    restore: Callable[..., TrainingState | None]
+    batch: Background[Callable[[TrainingState], tuple[TrainingState, BatchRecord]]]
+
+
+def compile_replay(
+    env: ImitationEnv,
+    config: PPOSettings,
+    networks: ppo_networks.PPONetworks,
+    learning_rate: optax.Schedule,
+    progress: optax.Schedule,
+) -> Replay:
+    """Compiles the functions that repeat single batches; for the arguments see `compile_training`."""
+    setup = _set_up(env, config, networks, learning_rate, progress, None)
+    of_arms = PartitionSpec(None, None, _AXIS)
+    outputs = _PARTITIONS, BatchRecord(of_arms, of_arms, of_arms, _REPLICATED)  # type: ignore[arg-type]
+    batch = _over_devices(setup.mesh, setup.training.recorded_batch, (_PARTITIONS,), outputs, donate_argnums=0)
+    return Replay(setup.restore, in_background(batch.lower(setup.shapes).compile))
+
+
+def saved_leaves(state: TrainingState) -> list[np.ndarray]:
+    """The leaves of `TrainingState.saved` on the host, those of all processes."""
+    replicated = jax.device_get(dataclasses.replace(state.saved, episodes=None))
+    return jax.tree.leaves(dataclasses.replace(replicated, episodes=of_all_processes(state.episodes)))
+
+
+def of_all_processes(distributed: Any) -> Any:
+    """Arrays that are distributed over the devices, on the host."""
+    if jax.process_count() == 1:
+        return jax.device_get(distributed)
+    return jax.device_get(multihost_utils.process_allgather(distributed, tiled=True))
+
+
+class _Setup(NamedTuple):
+    """What all compiled functions of a training need.
+
+    Attributes:
+      training: the training on one device.
+      mesh: the devices.
+      start: see `_Training.start`, over all devices.
+      shapes: those of the state.
+      expert_states: of the environment, on the host.
+    """
+
+    training: "_Training"
+    mesh: Mesh
+    start: Any
+    shapes: TrainingState
+    expert_states: LinkStates
+
+    def restore(self, leaves: Sequence[np.ndarray], done_updates: int | None = None) -> TrainingState | None:
+        """The state with these leaves, on the devices; None where they do not fit. See `TrainingFunctions`."""
+        expected, structure = jax.tree.flatten(self.shapes.saved)
+        if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in expected]:
+            return None
+        state: TrainingState = jax.tree.unflatten(structure, leaves)
+        if done_updates is not None:  # the settings of the batches may have changed, and with them the updates so far
+            policy, value = (
+                network._replace(optimizer=schedules_from(network.optimizer, done_updates))
+                for network in (state.policy, state.value)
+            )
+            state = dataclasses.replace(state, policy=policy, value=value)
+        state = dataclasses.replace(state, expert_states=self.expert_states)
+        shardings = jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), _PARTITIONS)
+        return jax.device_put(state, shardings)
+
+
+def _set_up(
+    env: ImitationEnv,
+    config: PPOSettings,
+    networks: ppo_networks.PPONetworks,
+    learning_rate: optax.Schedule,
+    progress: optax.Schedule,
+    initial: Params | None,
+) -> _Setup:
     mesh = Mesh(np.array(jax.devices()), (_AXIS,))
     training = _Training(env, config, networks, optax.adam(learning_rate), progress, mesh.size)
-    replicated, sharded = PartitionSpec(), PartitionSpec(_AXIS)
-    partitions = TrainingState(replicated, replicated, replicated, sharded, replicated, replicated)  # type: ignore[arg-type]
-    start = _over_devices(mesh, training.start, (replicated,) * 4, partitions)
-    epoch = functools.partial(training.epoch, batches)
-    learn = _over_devices(mesh, epoch, (partitions,), (partitions, replicated), donate_argnums=0)
+    start = _over_devices(mesh, training.start, (_REPLICATED,) * 4, _PARTITIONS)
     expert_states = jax.device_get(env.expert_states)
     # Without weak types, so that the compiled epoch is that of a restored state.
     shapes = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding),
         jax.eval_shape(start, 0, initial, 0, expert_states),
     )
-    compiled_learn = in_background(learn.lower(shapes).compile)  # before the other, because it takes longer
-    compiled_start = Background(lambda: start.lower(0, initial, 0, expert_states).compile())
-    if not restored:
-        compiled_start.start()
-
-    def restore(leaves: Sequence[np.ndarray], done_updates: int) -> TrainingState | None:
-        expected, structure = jax.tree.flatten(shapes.saved)
-        if [(x.shape, x.dtype) for x in leaves] != [(x.shape, x.dtype) for x in expected]:
-            return None
-        state: TrainingState = jax.tree.unflatten(structure, leaves)
-        policy, value = (  # the settings of the batches may have changed, and with them the updates so far
-            network._replace(optimizer=schedules_from(network.optimizer, done_updates))
-            for network in (state.policy, state.value)
-        )
-        state = dataclasses.replace(state, policy=policy, value=value, expert_states=expert_states)
-        shardings = jax.tree.map(lambda spec: NamedSharding(mesh, spec), partitions)
-        return jax.device_put(state, shardings)
-
-    def start_from(seed: int, params: Params | None = None, done_updates: int = 0) -> TrainingState:
-        return compiled_start()(seed, params, done_updates, expert_states)
-
-    return TrainingFunctions(start_from, restore, compiled_learn)
+    return _Setup(training, mesh, start, shapes, expert_states)
 
 
 def _over_devices(mesh: Mesh, function: Any, inputs: Any, outputs: Any, **options: Any) -> Any:
@@ -187,11 +278,11 @@ class _Training(NamedTuple):
         env = fresh_episodes(self.env.with_expert_states(state.expert_states))
         make_policy = ppo_networks.make_inference_fn(self.networks)
 
-        def unroll(state: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
-            return self._unroll(env, make_policy(state.params), state, key)
+        def unroll(state: TrainingState, key: Array) -> tuple[TrainingState, tuple[Unrolls, tuple[()]]]:
+            return self._unroll(env, make_policy(state.params), state, key, lambda episodes: ())
 
         def batch(state: TrainingState, _: None) -> tuple[TrainingState, Array]:
-            return self._batch(unroll, state)
+            return self._batch(unroll, updates.updated, state)[:2]
 
         state, metrics = jax.lax.scan(batch, state, None, length=batches)
         means = dict(zip(updates.METRICS, jax.lax.pmean(metrics.mean(axis=0), _AXIS), strict=True))
@@ -199,16 +290,32 @@ class _Training(NamedTuple):
         loss = means["policy_loss"] + means["value_loss"] - entropy_cost * means["entropy"]
         return state, {"loss": loss, **means}
 
-    def _unroll(self, env: Wrapper, policy: Any, state: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
-        """Steps of all arms, [time + 1, arms, ...]."""
+    def recorded_batch(self, state: TrainingState) -> tuple[TrainingState, BatchRecord]:
+        """A batch of an epoch, with a record."""
+        env = fresh_episodes(self.env.with_expert_states(state.expert_states))
+        make_policy = ppo_networks.make_inference_fn(self.networks)
+
+        def joints(episodes: State) -> tuple[Array, Array]:
+            return arm_state(episodes).qpos, arm_state(episodes).qvel
+
+        def unroll(state: TrainingState, key: Array) -> tuple[TrainingState, tuple[Unrolls, tuple[Array, Array]]]:
+            return self._unroll(env, make_policy(state.params), state, key, joints)
+
+        state, trace, (unrolls, (qpos, qvel)) = self._batch(unroll, updates.traced, state)
+        return state, BatchRecord(unrolls, qpos, qvel, trace)
+
+    def _unroll(
+        self, env: Wrapper, policy: Any, state: TrainingState, key: Array, record: Callable[[State], T]
+    ) -> tuple[TrainingState, tuple[Unrolls, T]]:
+        """Steps of all arms, [time + 1, arms, ...], and a record of the episodes before each, [time, arms, ...]."""
 
         def elapsed(episodes: State) -> Array:
             return arm_state(episodes).step / self.env.config.horizon
 
-        def step(episodes: State, key: Array) -> tuple[State, Unrolls]:
+        def step(episodes: State, key: Array) -> tuple[State, tuple[Unrolls, T]]:
             action, extras = policy(episodes.obs, key)
             after = env.step(episodes, action)
-            return after, Unrolls(
+            taken = Unrolls(
                 episodes.obs,  # type: ignore[arg-type]
                 extras["raw_action"],
                 extras["log_prob"],
@@ -216,16 +323,19 @@ class _Training(NamedTuple):
                 1 - after.done,
                 elapsed(episodes),
             )
+            return after, (taken, record(episodes))
 
         keys = jax.random.split(key, self.config.unroll_length)
-        episodes, steps = jax.lax.scan(step, state.episodes, keys)
+        episodes, (steps, recorded) = jax.lax.scan(step, state.episodes, keys)
         last = jax.tree.map(lambda x: jnp.zeros_like(x[:1]), steps)
         last = last._replace(observation=episodes.obs[None], elapsed=elapsed(episodes)[None])
         steps = jax.tree.map(lambda *x: jnp.concatenate(x), steps, last)
-        return dataclasses.replace(state, episodes=episodes), steps
+        return dataclasses.replace(state, episodes=episodes), (steps, recorded)
 
-    def _batch(self, unroll: Callable[..., Any], state: TrainingState) -> tuple[TrainingState, Array]:
-        """Collects unrolls, and learns from them."""
+    def _batch(
+        self, unroll: Callable[..., Any], update: Callable[..., tuple[updates.TrainStates, T]], state: TrainingState
+    ) -> tuple[TrainingState, T, Any]:
+        """Collects unrolls, and learns from them; returns also what `update` and `unroll` return."""
         config = self.config
         rounds = config.batch_size * config.num_minibatches // config.num_envs
         minibatch = config.batch_size // self.devices
@@ -234,7 +344,7 @@ class _Training(NamedTuple):
             jax.random.fold_in(k, jax.lax.axis_index(_AXIS)) for k in (key_unroll, key_order, key_loss)
         )
         state, collected = jax.lax.scan(unroll, state, jax.random.split(key_unroll, rounds))
-        unrolls = jax.tree.map(lambda x: jnp.moveaxis(x, 2, 1).reshape(-1, x.shape[1], *x.shape[3:]), collected)
+        unrolls = jax.tree.map(lambda x: jnp.moveaxis(x, 2, 1).reshape(-1, x.shape[1], *x.shape[3:]), collected[0])
         statistics = running_statistics.update(state.statistics, unrolls.observation[:, :-1], pmap_axis_name=_AXIS)
         passes = jax.random.split(key_order, config.num_updates_per_batch)
         count = len(unrolls.observation)
@@ -250,8 +360,9 @@ class _Training(NamedTuple):
             unroll=2 if self.devices > 1 else 1,
         )
         states = state.policy, state.value
-        (policy, value), metrics = updates.updated(states, statistics, unrolls, order, key_loss, update_config)
-        return dataclasses.replace(state, policy=policy, value=value, statistics=statistics, key=key), metrics
+        (policy, value), metrics = update(states, statistics, unrolls, order, key_loss, update_config)
+        state = dataclasses.replace(state, policy=policy, value=value, statistics=statistics, key=key)
+        return state, metrics, collected
 
     def _settings_now(self, state: TrainingState) -> PPOSettings:
         """The settings at the present update."""

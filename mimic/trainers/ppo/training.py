@@ -9,20 +9,26 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import networks as ppo_networks
-from jax.experimental import multihost_utils
 from jaxtyping import Array
 
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.evaluator import Controller
 from mimic.runs.checkpoints import STATE_UNUSED, Checkpoint, checkpoint_steps, save_checkpoint, thin_checkpoints
-from mimic.runs.divergence import check_finite
+from mimic.runs.divergence import Diverged, check_finite
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOSettings
-from mimic.trainers.ppo.programs import Params, TrainingState, compile_training, initial_params
+from mimic.trainers.ppo.divergence import Epoch, record_divergence
+from mimic.trainers.ppo.programs import (
+    Params,
+    Replay,
+    compile_replay,
+    compile_training,
+    initial_params,
+    saved_leaves,
+)
 from mimic.trainers.trainer import OnEvaluation
 
 
@@ -96,7 +102,7 @@ def train(
       OSError: a checkpoint cannot be written.
     """
     pending: list[Checkpoint] = []
-    for checkpoint in _checkpoints(env, config, seed, restored, on_compiling):
+    for checkpoint in _checkpoints(env, config, seed, restored, on_compiling, run_dir):
         if checkpoint.step not in checkpoint_steps(run_dir):
             save_checkpoint(run_dir, *checkpoint)
             thin_checkpoints(run_dir, config.keep)
@@ -114,7 +120,7 @@ def train(
 
 def follow(env: ImitationEnv, config: PPOSettings, *, seed: int, restored: Checkpoint | None = None) -> None:
     """Runs the same training epochs as the first process, where `train` runs."""
-    for _ in _checkpoints(env, config, seed, restored, lambda: None):
+    for _ in _checkpoints(env, config, seed, restored, lambda: None, None):
         pass
 
 
@@ -124,8 +130,12 @@ def _checkpoints(
     seed: int,
     restored: Checkpoint | None,
     on_compiling: Callable[[], None],
+    run_dir: Path | None,
 ) -> Iterator[Checkpoint]:
-    """The checkpoint at the start of a training or the restored one, and that after each training epoch."""
+    """The checkpoint at the start of a training or the restored one, and that after each training epoch.
+
+    The first process, which has a run directory, writes the first batch that is not finite there.
+    """
     step, initial, leaves, metrics = restored or Checkpoint(0, None, None, {})
     del restored
     batches = _batches_per_epoch(config)
@@ -142,7 +152,8 @@ def _checkpoints(
         if step and jax.process_index() == 0:
             print(STATE_UNUSED, file=sys.stderr)
         state = functions.start((seed + step) % 2**31, initial, _updates(config, step))  # the range of a 32-bit integer
-    yield Checkpoint(step, jax.device_get(state.params), _leaves(state), metrics)
+    leaves = saved_leaves(state)
+    yield Checkpoint(step, jax.device_get(state.params), leaves, metrics)
     walltime = metrics.get("walltime", 0.0)
     while step < config.num_timesteps:
         run_epoch = functions.epoch()
@@ -153,17 +164,23 @@ def _checkpoints(
         walltime += seconds
         step += batches * config.steps_per_batch
         params = jax.device_get(state.params)
-        check_finite(step, metrics, params)
+        try:
+            check_finite(step, metrics, params)
+        except Diverged as error:
+            del state  # it is as large as that of the replay
+            epoch = Epoch(step - batches * config.steps_per_batch, batches, leaves)
+            error.file = record_divergence(run_dir, lambda: make_replay(env, config), epoch)
+            raise
+        leaves = saved_leaves(state)
         speed = {"sps": batches * config.steps_per_batch / seconds, "walltime": walltime}
-        yield Checkpoint(step, params, _leaves(state), {**speed, **metrics})
+        yield Checkpoint(step, params, leaves, {**speed, **metrics})
 
 
-def _leaves(state: TrainingState) -> list[np.ndarray]:
-    """The leaves of a state on the host, those of all processes."""
-    if jax.process_count() == 1:
-        return jax.tree.leaves(jax.device_get(state.saved))
-    episodes = multihost_utils.process_allgather(state.episodes, tiled=True)
-    return jax.tree.leaves(jax.device_get(dataclasses.replace(state.saved, episodes=episodes)))
+def make_replay(env: ImitationEnv, config: PPOSettings) -> Replay:
+    """Compiles the functions that repeat single batches of a training."""
+    progress = _progress(config)
+    networks = make_networks(config, env.observation_size, env.action_size)
+    return compile_replay(env, config, networks, _learning_rate(config, progress), progress)
 
 
 def _batches_per_epoch(config: PPOSettings) -> int:
