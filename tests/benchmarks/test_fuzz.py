@@ -69,8 +69,9 @@ def harmful_case(number):
 def test_harm_is_counted_and_the_next_inputs_run(monkeypatch):
     monkeypatch.setitem(fuzzing.KINDS, "npz", ("tests.benchmarks.test_fuzz", "harmful_case"))
     monkeypatch.setattr(runner, "TIME_LIMIT", 5.0)
-    resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    monkeypatch.setattr(runner, "MEMORY_LIMIT", resident + 200 * 2**20)  # a forked process starts with as much
+    resident, shared = map(int, Path("/proc/self/statm").read_text().split()[1:3])
+    private = (resident - shared) * os.sysconf("SC_PAGE_SIZE")  # a forked process starts with as much
+    monkeypatch.setattr(runner, "MEMORY_LIMIT", private + 200 * 2**20)
     fork = multiprocessing.get_context("fork")  # the processes know of what is replaced here
     monkeypatch.setattr(runner.multiprocessing, "get_context", lambda _: fork)
     rows = run_cases("npz", len(READS), 1)
