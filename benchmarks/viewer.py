@@ -83,8 +83,8 @@ class Client:
         if message["type"] == "GuiSliderMessage":
             props = message["props"]
             self.sliders[props["label"]] = message["uuid"], props["min"], props["max"]
-        elif message["type"] == "GuiUpdateMessage" and (found := _NOTE.search(str(message["updates"].get("content")))):
-            self.note = found[1]
+        elif message["type"] == "GuiUpdateMessage" and (match := _NOTE.search(str(message["updates"].get("content")))):
+            self.note = match[1]
             return True
         return False
 
