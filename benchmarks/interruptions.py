@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def interrupted_runs(folder: Path, arguments: Sequence[str], kills: int, seed: int) -> list[Row]:
-    """Trains the reference, and interrupted runs until there were so many kills; one row for each run.
+    """Trains the reference, and interrupted runs up to a number of kills; one row for each run.
 
     Args:
       folder: for the run directories; those of runs that differ from the reference are kept.

@@ -96,7 +96,7 @@ class Client:
 
 
 async def drive(client: Client, rate: float, until: float, seed: int) -> None:
-    """Moves the joints' sliders at random, so many times per second."""
+    """Moves the joints' sliders at random, at a rate [1/s]."""
     random = np.random.default_rng(seed)
     joints = [name for name in client.sliders if name not in ("rotation", "translation")]
     while time.monotonic() < until:
