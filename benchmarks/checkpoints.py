@@ -2,7 +2,7 @@
 
     python -m benchmarks.checkpoints --arms 512 4096 65536 --out FILE
 
-The state is that of `env=panda4dof trainer.preset=gpu` with each number of arms. The last column is the time that the state
+The state is that of `env=panda4dof trainer.preset=gpu` with each number of arms. The last column is the time that it
 adds to a checkpoint, as a fraction of a training epoch (19 million steps) at `--steps-per-second`.
 """
 
