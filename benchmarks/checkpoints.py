@@ -2,7 +2,7 @@
 
     python -m benchmarks.checkpoints --arms 512 4096 65536 --out FILE
 
-The state is that of `env=panda4dof trainer.preset=gpu` with so many arms. The last column is the time that the state
+The state is that of `env=panda4dof trainer.preset=gpu` with each number of arms. The last column is the time that it
 adds to a checkpoint, as a fraction of a training epoch (19 million steps) at `--steps-per-second`.
 """
 
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def measure(arms: int) -> Row:
-    """Median times [s] and sizes [MB] of a checkpoint with so many arms."""
+    """Median times [s] and sizes [MB] of a checkpoint with a number of arms."""
     state = training_state(arms)
     params = jax.tree.map(np.asarray, state.params)
     leaves = jax.tree.leaves(state.saved)

@@ -53,7 +53,7 @@ def main() -> None:
 
 
 def interrupted_runs(folder: Path, arguments: Sequence[str], kills: int, seed: int) -> list[Row]:
-    """Trains the reference, and interrupted runs until there were so many kills; one row for each run.
+    """Trains the reference, and interrupted runs up to a number of kills; one row for each run.
 
     Args:
       folder: for the run directories; those of runs that differ from the reference are kept.
@@ -117,10 +117,10 @@ def _stage(run_dir: Path) -> str:
 
 def differences(reference: Path, run_dir: Path) -> str:
     """How the last checkpoint and the metrics of a run differ from the reference's; "" for equal ones."""
-    expected, found = (_content(folder) for folder in (reference, run_dir))
-    if expected.keys() != found.keys():
-        return f"checkpoints or arrays: {sorted(expected.keys() ^ found.keys())[:5]}"
-    different = [name for name, value in expected.items() if not np.array_equal(value, found[name])]
+    expected, actual = (_content(folder) for folder in (reference, run_dir))
+    if expected.keys() != actual.keys():
+        return f"checkpoints or arrays: {sorted(expected.keys() ^ actual.keys())[:5]}"
+    different = [name for name, value in expected.items() if not np.array_equal(value, actual[name])]
     return f"values of {different[:5]}" if different else ""
 
 

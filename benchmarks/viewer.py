@@ -83,8 +83,8 @@ class Client:
         if message["type"] == "GuiSliderMessage":
             props = message["props"]
             self.sliders[props["label"]] = message["uuid"], props["min"], props["max"]
-        elif message["type"] == "GuiUpdateMessage" and (found := _NOTE.search(str(message["updates"].get("content")))):
-            self.note = found[1]
+        elif message["type"] == "GuiUpdateMessage" and (match := _NOTE.search(str(message["updates"].get("content")))):
+            self.note = match[1]
             return True
         return False
 
@@ -96,7 +96,7 @@ class Client:
 
 
 async def drive(client: Client, rate: float, until: float, seed: int) -> None:
-    """Moves the joints' sliders at random, so many times per second."""
+    """Moves the joints' sliders at random, at a rate [1/s]."""
     random = np.random.default_rng(seed)
     joints = [name for name in client.sliders if name not in ("rotation", "translation")]
     while time.monotonic() < until:

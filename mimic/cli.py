@@ -75,26 +75,13 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     register_sweeper()
     register_launchers()
     bound_config_files()
-    began = False  # whether the config was composed: all errors before are user errors
+    is_composed = False  # all errors before that are user errors
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
     def command(config: DictConfig) -> Outcome:
-        nonlocal began
-        began = True
-        if is_sweep():
-            return _sweep_run(prepare, config)
-        try:
-            check_launcher(HydraConfig.get().runtime.choices["hydra/launcher"])
-            work = prepare(typed(config))
-        except _BAD_INPUT as error:
-            _exit_with_error(error)
-        try:
-            exit_code = work()
-        except OSError as error:  # disk full, quota, permission
-            _exit_with_error(error, FAILED)
-        if exit_code:
-            sys.exit(exit_code)
-        return Outcome()
+        nonlocal is_composed
+        is_composed = True
+        return _sweep_run(prepare, config) if is_sweep() else _single_run(prepare, config)
 
     try:
         with watched_signals():
@@ -103,11 +90,27 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     except _CONFIG_ERRORS as error:
         _exit_with_error(error)
     except OSError as error:  # of Hydra or our sweeper
-        _exit_with_error(error, FAILED if began else BAD_INPUT)
+        _exit_with_error(error, FAILED if is_composed else BAD_INPUT)
     except (ValueError, RecursionError) as error:
-        if began:
+        if is_composed:
             raise
         _exit_with_error(error)
+
+
+def _single_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
+    """The run of a command without a sweep; ends the process where it fails."""
+    try:
+        check_launcher(HydraConfig.get().runtime.choices["hydra/launcher"])
+        work = prepare(typed(config))
+    except _BAD_INPUT as error:
+        _exit_with_error(error)
+    try:
+        exit_code = work()
+    except OSError as error:  # disk full, quota, permission
+        _exit_with_error(error, FAILED)
+    if exit_code:
+        sys.exit(exit_code)
+    return Outcome()
 
 
 def _sweep_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:

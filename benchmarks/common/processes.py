@@ -49,7 +49,7 @@ def time_to_goal(run_dir: Path, quality: str, goal: float) -> float | None:
 
 
 def run_parallel(commands: Mapping[Path, Sequence[str]], jobs: int, devices: int) -> list[Path]:
-    """Runs commands, several per GPU or on the CPU, given by their log files; returns the logs of those that failed."""
+    """Runs commands by their log files, several per GPU or on the CPU; returns the logs of those that failed."""
     slots: queue.Queue[int] = queue.Queue()
     for slot in range(jobs * max(devices, 1)):
         slots.put(slot % max(devices, 1))

@@ -19,6 +19,7 @@ _WORLD = 0  # body
 _ALONG_AXIS = 1e-3  # rad; files round directions
 
 
+# Above 40 lines because of its docstring.
 def read_chain(
     model: mujoco.MjModel, base: str | None = None, tip: str | None = None, *, base_segment: bool = True
 ) -> Chain:

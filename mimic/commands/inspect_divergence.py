@@ -43,13 +43,7 @@ def prepare_replay(config: InspectConfig) -> Callable[[], None]:
         raise ValueError(f"divergence: expected no other keys, since its run has them; got some with {str(path)!r}")
     divergence = load_divergence(path)
     run_dir = path.absolute().parent
-    if not (run_dir / CONFIG).is_file():
-        raise ValueError(f"{str(path)!r}: expected a file in its run directory; {str(run_dir)!r} has no {CONFIG}")
-    if run_id(run_dir) != divergence.run:
-        raise ValueError(f"{str(path)!r} is of another run than {str(run_dir)!r}, where it is")
-    trained = load_config(run_dir)
-    if trained.trainer.name != "ppo":
-        raise ValueError(f"{str(path)!r}: expected a run of trainer=ppo, got one of {trained.trainer.name}")
+    trained = _config_of_its_run(path, run_dir, divergence)
     use_compilation_cache(trained.compilation_cache)
     trainer = make_ppo_trainer(trained, run_dir)
     replay = trainer.replay()
@@ -70,12 +64,24 @@ def prepare_replay(config: InspectConfig) -> Callable[[], None]:
         console.print("\n".join(lines), highlight=False, soft_wrap=True, markup=False)
         for table in (
             _metrics_table(divergence, record.trace.metrics),
-            _largest_table(record, finding),
+            _magnitudes_table(record, finding),
             _settings_table(dataclasses.replace(trained, trainer=trainer.settings)),
         ):
             console.print(table)
 
     return run
+
+
+def _config_of_its_run(path: Path, run_dir: Path, divergence: Divergence) -> TrainConfig:
+    """The config of the run of a divergence file, which must be in its run directory."""
+    if not (run_dir / CONFIG).is_file():
+        raise ValueError(f"{str(path)!r}: expected a file in its run directory; {str(run_dir)!r} has no {CONFIG}")
+    if run_id(run_dir) != divergence.run:
+        raise ValueError(f"{str(path)!r} is of another run than {str(run_dir)!r}, where it is")
+    trained = load_config(run_dir)
+    if trained.trainer.name != "ppo":
+        raise ValueError(f"{str(path)!r}: expected a run of trainer=ppo, got one of {trained.trainer.name}")
+    return trained
 
 
 def _described(finding: Finding, num_bad_arms: int, record: BatchRecord) -> str:
@@ -108,16 +114,16 @@ def _metrics_table(divergence: Divergence, replayed: np.ndarray) -> Table:
     return table
 
 
-def _largest_table(record: BatchRecord, finding: Finding | None) -> Table:
-    """Largest magnitudes in the replay, up to the step where a value is not finite; nan where one of them is."""
+def _magnitudes_table(record: BatchRecord, finding: Finding | None) -> Table:
+    """Maximum magnitudes in the replay, up to the step where a value is not finite; nan where one of them is."""
     values, last = arm_values(record), None
     groups: dict[str, Any] = {"all arms": slice(None)}
     if finding and finding.in_unrolls:
         groups, last = {"arms at fault": finding.arms, **groups}, finding.index + 1
-    table = _table("largest magnitudes in the replay", "value", *groups)
+    table = _table("maximum magnitudes in the replay", "value", *groups)
     for name in ("qpos", "qvel", "action", "reward"):
-        largest = (np.abs(values[name][:last, arms]).max(initial=0.0) for arms in groups.values())
-        table.add_row(escape(f"{name} {_UNITS.get(name, '')}".strip()), *(f"{value:.4g}" for value in largest))
+        maxima = (np.abs(values[name][:last, arms]).max(initial=0.0) for arms in groups.values())
+        table.add_row(escape(f"{name} {_UNITS.get(name, '')}".strip()), *(f"{value:.4g}" for value in maxima))
     return table
 
 

@@ -26,6 +26,7 @@ from mimic.retargeting.pose import continuous_joints, wrap_angles
 from mimic.trainers.pose_mapper.model import PoseMapper
 
 
+# Above 40 lines because of its docstring.
 def retarget(
     demonstrations: Demonstrations,
     expert: Embodiment,
@@ -34,7 +35,7 @@ def retarget(
     *,
     mapper: PoseMapper | None = None,
     seed: int = 0,
-) -> tuple[Demonstrations, dict[str, Any]]:  # longer than 40 lines for its docstring
+) -> tuple[Demonstrations, dict[str, Any]]:
     """Retargets demonstrations of the expert to the learner, pose by pose, with bounded joint velocities.
 
     No joint exceeds its velocity limit, or pi rad/s where the limit is unknown. Velocities are central differences.

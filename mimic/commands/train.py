@@ -22,7 +22,7 @@ from mimic.runs.checkpoints import (
     delete_partial_checkpoints,
     load_checkpoint,
     load_training,
-    set_aside_checkpoints_after,
+    mark_damaged_after,
 )
 from mimic.runs.divergence import EXIT_CODE as DIVERGED
 from mimic.runs.divergence import Diverged
@@ -47,6 +47,7 @@ class RunExists(Exception):
     """The run directory of a new run has been created by another process."""
 
 
+# Above 40 lines because of its docstring.
 def prepare_training(
     config: TrainConfig,
     started: float,
@@ -248,7 +249,7 @@ def _train_and_log(
     # The restored step is evaluated again, unless its training metrics are unknown.
     first_step = resumed_step if not restored or restored.metrics else resumed_step + 1
     delete_partial_checkpoints(run_dir)
-    set_aside_checkpoints_after(run_dir, resumed_step)
+    mark_damaged_after(run_dir, resumed_step)
     with contextlib.ExitStack() as stack:
         loggers = [MetricsLog(run_dir, first_step), *make_loggers(config.loggers, run_dir, to_dict(config))]
         for logger in loggers:

@@ -14,7 +14,7 @@ from mimic.runs.npz import read_arrays
 FORMAT = "mimic-demonstrations-1"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
 _OPTIONAL_ARRAYS = ("torque",)
-LARGEST = 1e6  # rad, rad/s, N m, s: no arm's motion has larger values
+MAX_VALUE = 1e6  # rad, rad/s, N m, s: no arm's motion has larger values
 _ROUNDING = 1e-6  # relative tolerance of a value above its limit: a file in float32 rounds by 6e-8
 
 
@@ -206,8 +206,8 @@ def _check_trajectories(content: dict[str, np.ndarray], name: str, joints: int) 
             raise ValueError(f"demonstrations: {key} in {name!r} must be floating point, got {array.dtype}")
         if not np.all(np.isfinite(array)):
             raise ValueError(f"demonstrations: {key} in {name!r} has values that are not finite")
-        if float(np.abs(array).max(initial=0)) > LARGEST:
-            raise ValueError(f"demonstrations: {key} in {name!r} has values above {LARGEST:g}, which no arm has")
+        if float(np.abs(array).max(initial=0)) > MAX_VALUE:
+            raise ValueError(f"demonstrations: {key} in {name!r} has values above {MAX_VALUE:g}, which no arm has")
     if qpos.ndim != 3 or qpos.shape[0] < 1 or qpos.shape[1] < 2 or qpos.shape[2] != joints:
         raise ValueError(
             f"demonstrations: qpos in {name!r} must be [demonstrations, samples >= 2, {joints} joints], "

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.envs.demonstrations import LARGEST, Demonstrations, check_effort
+from mimic.envs.demonstrations import MAX_VALUE, Demonstrations, check_effort
 from mimic.runs.npz import read_arrays
 
 SOURCES = (".csv", ".npz")
@@ -174,8 +174,8 @@ def _npz_content(path: Path) -> dict[str, Any]:
                 f"source: {key} in {str(path)!r} has type {array.dtype} and shape {list(array.shape)}; "
                 f"expected {'text' if kinds == 'U' else 'numbers'} of {dimensions[-1]} dimensions"
             )
-        if key in ("qpos", "qvel") and not float(np.abs(array).max(initial=0)) <= LARGEST:
-            raise ValueError(f"source: {key} in {str(path)!r} has values that are not finite or above {LARGEST:g}")
+        if key in ("qpos", "qvel") and not float(np.abs(array).max(initial=0)) <= MAX_VALUE:
+            raise ValueError(f"source: {key} in {str(path)!r} has values that are not finite or above {MAX_VALUE:g}")
     return content
 
 
@@ -196,8 +196,10 @@ def _read_npz(path: Path, names: Sequence[str]) -> list[Motion]:
                 f"source: {key} in {str(path)!r} must be {expected} for its joints, got {list(values.shape)}"
             )
     rate = content["dt"] if "dt" in content else content["frequency"]
-    if not 1 / LARGEST <= float(rate) <= LARGEST:
-        raise ValueError(f"source: frequency or dt in {str(path)!r} must be in [{1 / LARGEST}, {LARGEST}], got {rate}")
+    if not 1 / MAX_VALUE <= float(rate) <= MAX_VALUE:
+        raise ValueError(
+            f"source: frequency or dt in {str(path)!r} must be in [{1 / MAX_VALUE}, {MAX_VALUE}], got {rate}"
+        )
     step = float(rate) if "dt" in content else 1 / float(rate)
     indices = [present.index(name) for name in names]
     qpos = np.asarray(qpos, float)[:, angle_at[indices]]

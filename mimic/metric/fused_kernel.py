@@ -163,6 +163,7 @@ class Columns:
         triton.store(self._at(column), values, mask=mask)
 
 
+# Above 40 lines because of its docstring.
 def by_columns(
     body: Callable[..., None], widths: Sequence[int], *tables: np.ndarray, launch: LaunchConfig = DEFAULT
 ) -> Callable[..., tuple[Array, ...]]:

@@ -30,6 +30,7 @@ Values = Callable[..., tuple[Array, ...]]  # motions -> distance, gradients
 MotionDistance = Callable[..., Float[Array, ""]]  # expert_qpos, expert_qvel, learner_qpos, learner_qvel
 
 
+# Above 40 lines because of its docstring.
 def motion_distance(
     expert: Embodiment,
     learner: Embodiment,

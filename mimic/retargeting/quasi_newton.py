@@ -28,6 +28,7 @@ class Descent(NamedTuple):
     inverse_hessian: Float[Array, "n n"]
 
 
+# Above 40 lines because of its docstring.
 def bfgs(
     objective: Callable[[Array], Array],
     start: Float[Array, " n"],

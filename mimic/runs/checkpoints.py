@@ -66,7 +66,7 @@ def save_checkpoint(
     """
     path = _path(run_dir, step)
     partial = path.with_name(path.name + _PARTIAL)
-    # Orbax refuses the arrays of one process among several, but not NumPy's; plain containers let them be that.
+    # Orbax rejects JAX's arrays of one process among several, but not NumPy's; it takes those in plain containers.
     plain = jax.tree.map(np.asarray, ocp.tree.serialize_tree(params, keep_empty_nodes=True))
     try:
         with _checkpointer() as checkpointer:
@@ -111,13 +111,13 @@ def delete_checkpoint(run_dir: Path, step: int) -> None:
 
 
 def delete_partial_checkpoints(run_dir: Path) -> None:
-    """Removes what processes left that ended while they wrote or removed a checkpoint."""
+    """Removes the remains of checkpoints that were being written or removed when a process ended."""
     for path in (run_dir / FOLDER).glob(f"*{_PARTIAL}*"):  # orbax appends to the name while it writes
         shutil.rmtree(path, ignore_errors=True)
 
 
-def set_aside_checkpoints_after(run_dir: Path, step: int) -> None:
-    """Renames the later checkpoints of a run, which were damaged, so that the run can write these steps again."""
+def mark_damaged_after(run_dir: Path, step: int) -> None:
+    """Renames the damaged checkpoints of a run, those after a step: no longer used, and the steps are written again."""
     for later in checkpoint_steps(run_dir):
         if later > step:
             path = _path(run_dir, later)
@@ -200,9 +200,9 @@ def _verify(path: Path) -> None:
     """Raises a `DamagedCheckpoint` for files that were changed, and for a checkpoint of another run."""
     content = _content(path)
     checksums = content.get("sha256", {})  # older checkpoints have none
-    found = _checksums(path)
+    actual = _checksums(path)
     for name, expected in checksums.items():
-        if (name in found or name != _STATE) and found.get(name) != expected:
+        if (name in actual or name != _STATE) and actual.get(name) != expected:
             raise DamagedCheckpoint(f"checkpoint {str(path)!r} is damaged: {name} is missing or was changed")
     run = path.parent / _RUN
     if checksums and run.is_file() and content.get("run") != run.read_text():
@@ -244,7 +244,7 @@ def _read_params(path: Path, template: Any) -> Any:
 
 
 def _checkpointer() -> ocp.StandardCheckpointer:
-    """Of this process by itself: orbax would wait for the others that train with it, of which one alone writes."""
+    """Of this process alone: orbax would wait for those that train with it, which do not write."""
     this = jax.process_index()
     options = ocp.options.MultiprocessingOptions(primary_host=this, active_processes={this})
     return ocp.StandardCheckpointer(multiprocessing_options=options)

@@ -60,8 +60,8 @@ def read_arrays(
             _check_directory(file, size)
             with zipfile.ZipFile(file) as archive:
                 entries = _entries(archive, size)
-                wanted = {name: entries[f"{name}.npy"] for name in names if f"{name}.npy" in entries}
-                return _read_all(archive, wanted, max_bytes)
+                requested = {name: entries[f"{name}.npy"] for name in names if f"{name}.npy" in entries}
+                return _read_all(archive, requested, max_bytes)
     except Exception as error:  # zipfile and zlib have many types of error for damaged files
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise ValueError("".join(c if c.isprintable() else "?" for c in reason)) from error

@@ -139,9 +139,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
         config = load_config(path, saved_models=False)  # runs of one arm are compared by its original path
         total = config.trainer.resolve().total_steps
     except ValueError as error:
-        this = versions()["mimic-mjx"]
-        written = f"of mimic {version}, and this is {this}: " if report and version != this else ""
-        return LeftOut(name, f"{written}{error}")
+        return LeftOut(name, f"{_other_version(version) if report else ''}{error}")
     try:
         history = _history(path / METRICS)
     except (ValueError, OSError, csv.Error) as error:
@@ -154,17 +152,10 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     if missing:
         reason = f"diverged, without a meaningful gap, or of another version ({version})"
         return LeftOut(name, f"{reason}: {REPORT} has no number {missing[0]}")
-    settings = flatten(to_dict(config))
-    if "evaluated" in report:
-        is_policy = report.get("trainer") == config.trainer.name
-        try:
-            settings |= {
-                "controller": "policy" if is_policy else str(report["trainer"]),
-                "demonstrations": str(report["evaluated"]["demonstrations"]),
-                metric.unit: numbers[metric.unit],
-            }
-        except (LookupError, TypeError) as error:
-            return LeftOut(name, f"{REPORT} cannot be read: {error!r}")
+    try:
+        settings = flatten(to_dict(config)) | _evaluation_settings(report, config.trainer.name, metric, numbers)
+    except (LookupError, TypeError) as error:
+        return LeftOut(name, f"{REPORT} cannot be read: {error!r}")
     return FinishedRun(
         name=name,
         trainer=config.trainer.name,
@@ -175,6 +166,25 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
         curves={split: history.get(f"quality/{metric.key}.{split}", {}) for split in SPLITS},
         finished=(path / REPORT).stat().st_mtime,
     )
+
+
+def _other_version(version: str) -> str:
+    """The beginning of a reason, where the run is of another version of mimic than this one."""
+    this = versions()["mimic-mjx"]
+    return f"of mimic {version}, and this is {this}: " if version != this else ""
+
+
+def _evaluation_settings(
+    report: Mapping[str, Any], trainer: str, metric: QualityMetric, numbers: Mapping[str, float]
+) -> dict[str, Any]:
+    """Controller, demonstrations and steps of an evaluation in a folder of its own; empty for a training."""
+    if "evaluated" not in report:
+        return {}
+    return {
+        "controller": "policy" if report.get("trainer") == trainer else str(report["trainer"]),
+        "demonstrations": str(report["evaluated"]["demonstrations"]),
+        metric.unit: numbers[metric.unit],
+    }
 
 
 def _progress(path: Path, total: int, history: Mapping[str, Mapping[int, float]]) -> str:

@@ -144,7 +144,7 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
 
 
 def _report_stop(folder: Path) -> None:
-    print(f"the sweep was stopped; what there is of it: {folder}", file=sys.stderr)
+    print(f"the sweep was stopped; its results so far: {folder}", file=sys.stderr)
 
 
 def _check_count(overrides: Sequence[Override]) -> None:

@@ -114,12 +114,12 @@ def _read_record(folder: Path) -> Mapping[str, Any]:
 
 def _check_files(folder: Path, expected: Mapping[str, str]) -> None:
     """Rejects a folder whose files are not those that the record lists."""
-    found = [path for path in _files(folder) if path != folder / RECORD]
-    names = {str(path.relative_to(folder)) for path in found}
+    files = [path for path in _files(folder) if path != folder / RECORD]
+    names = {str(path.relative_to(folder)) for path in files}
     for name in sorted(names ^ set(expected)):
         what = "is missing" if name in expected else "was added"
         raise ValueError(f"{str(folder / name)!r} {what} since the training started; {_ADVICE}")
-    for path in found:
+    for path in files:
         name = str(path.relative_to(folder))
         is_same = path.is_file() and not path.is_symlink() and file_digest(path) == expected[name]
         if not is_same:

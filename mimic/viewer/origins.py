@@ -65,7 +65,7 @@ def _is_address(name: str) -> bool:
 
 def _addresses(host: str) -> set[str]:
     try:
-        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+        entries = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except OSError:
         return set()
-    return {str(entry[4][0]).partition("%")[0] for entry in found}
+    return {str(entry[4][0]).partition("%")[0] for entry in entries}

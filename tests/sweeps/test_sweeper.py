@@ -296,15 +296,15 @@ def test_a_sweep_of_2_x_3_runs_is_collected(launcher, tmp_path):
     assert "python -m mimic.collect runs/mine" in result.stdout
     result = command("collect", "runs/mine", folder=tmp_path)
     assert result.returncode == 0, result.stderr[-2000:]
-    found = json.loads((tmp_path / "runs" / "mine" / "collected.json").read_text())
-    assert [(group["label"], group["seeds"]) for group in found["groups"]] == [
+    collected = json.loads((tmp_path / "runs" / "mine" / "collected.json").read_text())
+    assert [(group["label"], group["seeds"]) for group in collected["groups"]] == [
         ("planar4dof", [0, 1, 2]),
         ("planar7dof", [0, 1, 2]),
     ]
-    assert found["groups"][0]["runs"][1] == "1-planar4dof-ppo-seed1"
-    imports = [group["numbers"]["wall_time_s.import"]["max"] for group in found["groups"]]
+    assert collected["groups"][0]["runs"][1] == "1-planar4dof-ppo-seed1"
+    imports = [group["numbers"]["wall_time_s.import"]["max"] for group in collected["groups"]]
     assert max(imports) < 60  # from the start of each run, not of the sweep
-    gap = found["groups"][1]["numbers"]["optimality_gap.held_out"]
+    gap = collected["groups"][1]["numbers"]["optimality_gap.held_out"]
     assert gap["low"] < gap["min"] < gap["mean"] < gap["max"] < gap["high"]  # of three, t / sqrt(3) is 2.5
     for name in ("collected.csv", "collected.png"):
         assert (tmp_path / "runs" / "mine" / name).stat().st_size > 0
@@ -338,12 +338,12 @@ def test_ctrl_c_ends_a_sweep_at_the_next_checkpoint(launcher, tmp_path):
 
 def running(text):
     """Ids of the processes with this in their command."""
-    found = []
+    numbers = []
     for path in pathlib.Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             if text in (path / "cmdline").read_bytes().decode(errors="replace"):
-                found.append(int(path.name))
-    return found
+                numbers.append(int(path.name))
+    return numbers
 
 
 @pytest.mark.slow

@@ -39,13 +39,13 @@ def record():
     return BatchRecord(unrolls, normal(JOINTS)[:, :-1], normal(JOINTS)[:, :-1], trace)
 
 
-def found(record, **options) -> Finding:
+def finding_of(record, **options) -> Finding:
     finding = examine(record, **options)
     assert finding is not None
     return finding
 
 
-def test_a_finite_batch_is_found_finite(record):
+def test_a_finite_batch_is_finite(record):
     assert examine(record) is None
 
 
@@ -63,14 +63,14 @@ def test_a_finite_batch_is_found_finite(record):
 def test_the_first_value_of_an_arm_is_found(record, field, place, what, step, value):
     getattr(record.unrolls, field)[place] = value
     record.trace.metrics[:] = np.nan  # of the updates, which come later
-    finding = found(record, statistics_are_finite=False)
+    finding = finding_of(record, statistics_are_finite=False)
     assert finding[:3] == (what, step, ROUNDS * TIME)
     np.testing.assert_array_equal(finding.arms, [13])
 
 
 def test_an_earlier_step_comes_first(record):
     record.unrolls.observation[1, 1, :4] = record.unrolls.reward[1, 0, 6:8] = np.nan
-    finding = found(record)
+    finding = finding_of(record)
     assert str(finding) == "reward in step 6 of 15"
     np.testing.assert_array_equal(finding.arms, [6, 7])
 
@@ -78,9 +78,9 @@ def test_an_earlier_step_comes_first(record):
 def test_in_a_step_the_observation_comes_before_the_action_and_the_reward(record):
     for values in record.unrolls[:4]:
         values[1, 1, 4] = np.nan
-    assert str(found(record)) == "observation in step 7 of 15"
+    assert str(finding_of(record)) == "observation in step 7 of 15"
     record.unrolls.observation[1, 1, 4] = 0
-    assert str(found(record)) == "action in step 7 of 15"
+    assert str(finding_of(record)) == "action in step 7 of 15"
 
 
 @pytest.mark.parametrize("name", TRACED)
@@ -88,17 +88,17 @@ def test_the_first_metric_is_found(record, name):
     record.trace.metrics[2, TRACED.index(name) :] = np.inf
     record.trace.metrics[3:] = np.nan
     record.trace.finite[2:] = False
-    assert found(record)[:3] == (name, 2, UPDATES)
+    assert finding_of(record)[:3] == (name, 2, UPDATES)
 
 
 def test_parameters_and_statistics_are_found(record):
     record.trace.finite[3] = False
-    assert str(found(record)) == "parameter in update 4 of 4"
-    assert found(record, statistics_are_finite=False).what == "observation statistics"
+    assert str(finding_of(record)) == "parameter in update 4 of 4"
+    assert finding_of(record, statistics_are_finite=False).what == "observation statistics"
 
 
 def saved(record, folder, state=STATE):
-    finding = found(record)
+    finding = finding_of(record)
     bad = BadBatch(2, state, np.array([1, 2], np.uint32), finding, record)
     save_divergence(folder / FILE, bad, "run", Epoch(100, 3, state))
     return folder / FILE

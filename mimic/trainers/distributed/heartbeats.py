@@ -1,4 +1,4 @@
-"""Which of several processes is lost: each gives a sign of life regularly, and one that is silent too long is lost."""
+"""Which of several processes is lost: each sends heartbeats, and one that is silent too long is lost."""
 
 import threading
 import time
@@ -9,7 +9,7 @@ _OWN_PAUSE_S = 5  # a longer time between two calls means that this process itse
 
 
 class Heartbeats:
-    """When each process last gave a sign of life. The methods are thread-safe.
+    """When each process last sent a heartbeat. The methods are thread-safe.
 
     Args:
       processes: number of processes.
@@ -24,13 +24,13 @@ class Heartbeats:
         self._last: dict[int, str] = {}
 
     def hear(self, process: int, sign: str) -> None:
-        """Notes the latest sign of a process; it lives if that is another one than before."""
+        """Records the latest heartbeat of a process; it lives if that differs from the one before."""
         with self._lock:
             if self._last.get(process) != sign:
                 self._last[process], self._heard[process] = sign, time.monotonic()
 
     def lost(self) -> tuple[int, float] | None:
-        """A lost process and the time since its last sign [s]; None while all live.
+        """A lost process and the time since its last heartbeat [s]; None while all live.
 
         If the first process is stopped, nothing is heard of any, so that of several it is the first one that is named.
         """

@@ -140,7 +140,7 @@ class ProcessGroup:
         while not self._left.wait(_POLL_S):
             if lost := self._heartbeats.lost():
                 process, silent_s = lost
-                reason = f"is lost or stopped: no sign of life for {silent_s:.0f} s"
+                reason = f"is lost or stopped: no heartbeat for {silent_s:.0f} s"
             elif self._relay and self._relay.lost.is_set():
                 process, reason = 0, "is lost: its connection has closed"
                 if self._left.wait(_GRACE_S):
@@ -157,7 +157,7 @@ class ProcessGroup:
             _exit(_FAILED)
 
     def _beat(self) -> None:
-        """Gives a sign of life, and reads those of the others."""
+        """Sends a heartbeat, and reads those of the others."""
         with contextlib.suppress(jax.errors.JaxRuntimeError):
             self._client.key_value_set(f"{_ALIVE}{self.index}", f"{time.time()}", allow_overwrite=True)
             for key, sign in self._client.key_value_dir_get(_ALIVE):

@@ -22,8 +22,11 @@ from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo.divergence import Epoch, record_divergence
 from mimic.trainers.ppo.programs import (
+    Metrics,
     Params,
     Replay,
+    TrainingFunctions,
+    TrainingState,
     compile_replay,
     compile_training,
     initial_params,
@@ -139,28 +142,17 @@ def _checkpoints(
     step, initial, leaves, metrics = restored or Checkpoint(0, None, None, {})
     del restored
     batches = _batches_per_epoch(config)
-    networks = make_networks(config, env.observation_size, env.action_size)
-    progress = _progress(config)
-    learning_rate = _learning_rate(config, progress)
-    functions = compile_training(
-        env, config, networks, batches, learning_rate, initial, progress, restored=leaves is not None
-    )
+    functions = _compile(env, config, batches, initial, restored=leaves is not None)
     on_compiling()
     state = None if leaves is None else functions.restore(leaves, _updates(config, step))
     leaves = None  # frees their memory
     if state is None:
-        if step and jax.process_index() == 0:
-            print(STATE_UNUSED, file=sys.stderr)
-        state = functions.start((seed + step) % 2**31, initial, _updates(config, step))  # the range of a 32-bit integer
+        state = _start_anew(functions, config, seed, step, initial)
     leaves = saved_leaves(state)
     yield Checkpoint(step, jax.device_get(state.params), leaves, metrics)
     walltime = metrics.get("walltime", 0.0)
     while step < config.num_timesteps:
-        run_epoch = functions.epoch()
-        began = time.perf_counter()
-        state, means = run_epoch(state)
-        metrics = {name: float(value) for name, value in jax.device_get(means).items()}
-        seconds = time.perf_counter() - began
+        state, metrics, seconds = _timed(functions.epoch(), state)
         walltime += seconds
         step += batches * config.steps_per_batch
         params = jax.device_get(state.params)
@@ -174,6 +166,34 @@ def _checkpoints(
         leaves = saved_leaves(state)
         speed = {"sps": batches * config.steps_per_batch / seconds, "walltime": walltime}
         yield Checkpoint(step, params, leaves, {**speed, **metrics})
+
+
+def _compile(
+    env: ImitationEnv, config: PPOSettings, batches: int, initial: Params | None, *, restored: bool
+) -> TrainingFunctions:
+    networks = make_networks(config, env.observation_size, env.action_size)
+    progress = _progress(config)
+    learning_rate = _learning_rate(config, progress)
+    return compile_training(env, config, networks, batches, learning_rate, initial, progress, restored=restored)
+
+
+def _start_anew(
+    functions: TrainingFunctions, config: PPOSettings, seed: int, step: int, initial: Params | None
+) -> TrainingState:
+    """The state at a step where none is saved, or none that fits the settings."""
+    if step and jax.process_index() == 0:
+        print(STATE_UNUSED, file=sys.stderr)
+    return functions.start((seed + step) % 2**31, initial, _updates(config, step))  # the range of a 32-bit integer
+
+
+def _timed(
+    run_epoch: Callable[[TrainingState], tuple[TrainingState, Metrics]], state: TrainingState
+) -> tuple[TrainingState, dict[str, float], float]:
+    """The state after an epoch, its metrics on the host, and its time [s]."""
+    began = time.perf_counter()
+    state, means = run_epoch(state)
+    metrics = {name: float(value) for name, value in jax.device_get(means).items()}
+    return state, metrics, time.perf_counter() - began
 
 
 def make_replay(env: ImitationEnv, config: PPOSettings) -> Replay:
