@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+import jax
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
@@ -127,6 +128,12 @@ def _start(config: TrainConfig, resumed_dir: Path | None, trainer: Trainer, is_c
         _, params = load_checkpoint(Path(config.init).expanduser(), trainer.params_template())
         return Checkpoint(0, params, None, {})
     restored = load_training(resumed_dir, trainer.params_template())
+    if jax.default_backend() == "gpu" and not config.compilation_cache:
+        print(
+            "warning: without a compilation cache, XLA may choose other matrix products than before: the numbers may "
+            "differ in the last bits",
+            file=sys.stderr,
+        )
     is_complete = restored.step >= trainer.total_steps or not is_changed
     if is_complete and reported_steps(resumed_dir, trainer.unit) == restored.step:
         raise ValueError(

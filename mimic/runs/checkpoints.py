@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jaxlib
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -73,7 +74,8 @@ def save_checkpoint(
             checkpointer.save(partial, plain, force=True)
         if state is not None:  # not by orbax, which takes 100 ms for the 10 MB of 4096 arms; NumPy takes 6
             np.savez(partial / _STATE, *state)
-        content = {"run": _new_run_id(run_dir), "metrics": dict(metrics or {}), "sha256": _checksums(partial)}
+        content = {"run": _new_run_id(run_dir), "metrics": dict(metrics or {}), "made_with": _software_and_devices()}
+        content["sha256"] = _checksums(partial)
         (partial / _CONTENT).write_text(json.dumps(content, indent=1))
         if path.exists():  # a damaged one, since a run never writes a step twice
             shutil.rmtree(path)
@@ -167,7 +169,16 @@ def load_training(run_dir: Path, template: Any) -> Checkpoint:
     """Reads what a training continues from: the last undamaged checkpoint. See `load_checkpoint`."""
     step, params = load_checkpoint(run_dir, template)
     path = _path(run_dir, step)
-    metrics = _content(path).get("metrics", {})
+    content = _content(path)
+    metrics, made_with = content.get("metrics", {}), content.get("made_with", {})
+    now = _software_and_devices()
+    for name in made_with.keys() & now.keys():
+        if made_with[name] != now[name]:
+            print(
+                f"warning: the run was trained with {name} {made_with[name]}, now it is {now[name]}: it continues, but "
+                f"its numbers will differ in the last bits",
+                file=sys.stderr,
+            )
     if not (path / _STATE).is_file():
         return Checkpoint(step, params, None, metrics)
     names = [f"arr_{i}" for i in range(_MAX_ARRAYS)]  # as NumPy names them
@@ -217,6 +228,16 @@ def _content(path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise DamagedCheckpoint(f"checkpoint {str(path)!r} is damaged: {_CONTENT} cannot be read") from error
     return content
+
+
+def _software_and_devices() -> dict[str, str]:
+    """What the bits of a training depend on, apart from its config."""
+    devices = jax.devices()
+    return {
+        "jax": jax.__version__,
+        "jaxlib": jaxlib.__version__,
+        "device": f"{len(devices)} x {devices[0].device_kind}",
+    }
 
 
 def _checksums(path: Path) -> dict[str, str]:

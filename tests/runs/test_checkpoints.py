@@ -2,10 +2,12 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
@@ -96,6 +98,17 @@ def test_no_undamaged_checkpoint_is_an_error(run_dir):
         (run_dir / "checkpoints" / f"{step:012d}" / "_METADATA").unlink()
     with pytest.raises(ValueError, match="000000000000' is damaged: _METADATA is missing or was changed"):
         load_checkpoint(run_dir, PARAMS)
+
+
+def test_another_device_is_said(run_dir, monkeypatch, capsys):
+    load_training(run_dir, PARAMS)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(checkpoints, "_software_and_devices", lambda: {"device": "1 x other", "jax": jax.__version__})
+    assert load_training(run_dir, PARAMS).step == 20
+    assert re.fullmatch(
+        r"warning: the run was trained with device \d+ x cpu, now it is 1 x other: .*last bits\n",
+        capsys.readouterr().err,
+    )
 
 
 def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path):
