@@ -107,6 +107,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "ImitationEnv":  # imports brax and MJX, which takes seconds
+        compat.import_mjx()
         from mimic.envs.imitation import ImitationEnv
 
         return ImitationEnv
@@ -124,3 +125,7 @@ def __getattr__(name: str) -> Any:
 
         return export_run
     raise AttributeError(f"module 'mimic' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__doc__", "__version__"]

@@ -2,7 +2,10 @@
 
 import ast
 import re
+import sys
 from pathlib import Path
+
+from mimic import __version__
 
 _ENTRY_POINT = re.compile(r"`python -m (mimic\.\w+)[^`]*`: (.*)\.")  # the docstring of an entry point
 
@@ -17,8 +20,12 @@ def commands() -> dict[str, str]:
     return summaries
 
 
-if __name__ == "__main__":
+def _overview() -> str:
     summaries = commands()
-    print("Commands; python -m COMMAND --help shows the keys of each:\n")
-    for module, summary in summaries.items():
-        print(f"  {module:{max(map(len, summaries))}}  {summary}")
+    width = max(map(len, summaries))
+    lines = [f"  {module:{width}}  {summary}" for module, summary in summaries.items()]
+    return "\n".join(["Commands; python -m COMMAND --help shows the keys of each:", "", *lines])
+
+
+if __name__ == "__main__":
+    print(f"mimic {__version__}" if "--version" in sys.argv[1:] else _overview())

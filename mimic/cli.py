@@ -20,7 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from mimic import compat
+from mimic import __version__, compat
 from mimic.commands.arguments import check_arguments
 from mimic.commands.config import (
     CollectConfig,
@@ -68,6 +68,9 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         errors of the work are bugs and keep their traceback.
       config_name: name of the command and of its config in mimic/conf.
     """
+    if "--version" in sys.argv[1:]:  # Hydra would print its own
+        print(f"mimic {__version__}")
+        return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     sys.argv[1:] = [_expand_shorthand(argument, config_name) for argument in sys.argv[1:]]
     compat.share_config_store()

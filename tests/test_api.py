@@ -6,3 +6,7 @@ import mimic
 def test_every_public_name_exists():
     for name in mimic.__all__:
         assert getattr(mimic, name) is not None
+
+
+def test_dir_lists_the_public_names_alone():
+    assert set(dir(mimic)) == {*mimic.__all__, "__doc__", "__version__"}

@@ -1,5 +1,6 @@
 """Bad input of commands: one line that names what is valid, exit code 2, nothing written."""
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import mimic
+from mimic import cli
 
 
 @pytest.mark.parametrize(
@@ -45,6 +47,20 @@ def test_bad_input_ends_the_process_with_one_line():
         [sys.executable, "-m", "mimic.train", "env=panda5dof"], capture_output=True, text=True, timeout=60, check=False
     )
     assert result.returncode == 2 and result.stderr.count("\n") == 1 and "unknown env" in result.stderr
+
+
+@pytest.mark.parametrize("command", ["train", "inspect"])
+def test_the_version_is_that_of_mimic(command, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [f"mimic.{command}", "--version"])
+    cli.run(lambda config: pytest.fail("the command ran"), command)
+    assert capsys.readouterr().out == f"mimic {mimic.__version__}\n"
+
+
+def test_the_overview_lists_all_commands(monkeypatch, capsys):
+    for arguments, expected in (([], "  mimic.train  "), (["--version"], f"mimic {mimic.__version__}\n")):
+        monkeypatch.setattr(sys, "argv", ["mimic", *arguments])
+        runpy.run_module("mimic", run_name="__main__")
+        assert expected in capsys.readouterr().out
 
 
 def test_a_bad_arm_file(rejected, tmp_path):

@@ -48,6 +48,14 @@ def test_training_needs_no_meshes_and_no_contacts():
     assert "brax" in imported and not imported.intersection({"scipy.optimize", "scipy.spatial", "trimesh"})
 
 
+@pytest.mark.parametrize("name", ["ImitationEnv", "export_run"])
+def test_names_that_need_mjx_are_imported_without_a_word(name):
+    """MJX prints two lines about Warp, an optional backend, once in a process."""
+    code = f"import mimic\nmimic.{name}"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout == "" and "warp" not in result.stderr.lower()
+
+
 def test_the_process_started_before_now():
     code = "import time\nfrom mimic import cli\nprint(time.perf_counter() - cli.process_started())"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
