@@ -62,6 +62,9 @@ class ImitationEnv(Env):
     next `preview` steps, as one vector. Action: a torque for each joint in [-1, 1], scaled by `torque_scale`. The
     episode terminates at the horizon, because there is nothing to imitate after it; this is no truncation.
 
+    A subclass may override `observe`, as one vector of any length, and `start`: `reset`, `step` and `restart_done` call
+    them.
+
     Args:
       config: see `EnvConfig`.
       demonstrations: motions to imitate; the config's training demonstrations where None.
@@ -173,24 +176,20 @@ class ImitationEnv(Env):
             "runaway": runaway.astype(jnp.float32),
         }
         reward = -(distance + self.limit_penalty_weight * excess) * steps
-        obs = self._observation(states, after)
+        obs = self._observe_states(after, states)
         return state.replace(pipeline_state=after, obs=obs, reward=reward, done=done, metrics=metrics)
 
     def restart_done(self, states: State) -> State:
         """Starts a new episode, on a random demonstration, for each arm of a batch whose episode is done."""
         arms = arm_state(states)
-        new_arms, new_obs = jax.vmap(self._first_observation)(arms.key)
+        new = jax.vmap(self.reset)(arms.key)
         done = states.done.astype(bool)
 
         def where_done(new: Array, old: Array) -> Array:
             return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
 
-        obs = cast(Array, states.obs)
-        return states.replace(pipeline_state=jax.tree.map(where_done, new_arms, arms), obs=where_done(new_obs, obs))
-
-    def _first_observation(self, key: Array) -> tuple[ArmState, Array]:
-        arm = self.start(key)
-        return arm, self.observe_home(arm)
+        arms, obs = jax.tree.map(where_done, (new.pipeline_state, new.obs), (arms, states.obs))
+        return states.replace(pipeline_state=arms, obs=obs)
 
     def distance(
         self, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"], demonstration: Array, step: Array
@@ -233,14 +232,26 @@ class ImitationEnv(Env):
         return jax.tree.map(lambda table: table[demonstration, jnp.minimum(step, last)], self.expert_states)
 
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
-        """The observation: the learner's link states, then the expert's now and at each of the next `preview` steps."""
-        return self._observation(link_states(self.learner, state.qpos, state.qvel), state)
+        """The observation: the learner's link states, then the expert's now and at each of the next `preview` steps.
+
+        A subclass may override it: every observation of the environment is then the subclass's.
+        """
+        return self._link_observation(state, link_states(self.learner, state.qpos, state.qvel))
 
     def observe_home(self, state: ArmState) -> Float[Array, " observation"]:
         """The observation of an arm at rest in its home pose, with less to compute and to compile than `observe`."""
-        return self._observation(self._home_states, state)
+        return self._observe_states(state, self._home_states)
 
-    def _observation(self, learner_states: LinkStates, state: ArmState) -> Float[Array, " observation"]:
+    @property
+    def _has_own_observation(self) -> bool:
+        """Whether `observe` is overridden, in a subclass or on this object."""
+        return getattr(self.observe, "__func__", None) is not ImitationEnv.observe
+
+    def _observe_states(self, state: ArmState, learner_states: LinkStates) -> Float[Array, " observation"]:
+        """What `observe` returns; without an override it reuses the learner's link states, which are known."""
+        return self.observe(state) if self._has_own_observation else self._link_observation(state, learner_states)
+
+    def _link_observation(self, state: ArmState, learner_states: LinkStates) -> Float[Array, " observation"]:
         observed = [learner_states]
         observed += [
             self.expert_at(state.demonstration, state.step + ahead) for ahead in range(self.config.preview + 1)
@@ -249,7 +260,9 @@ class ImitationEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """Length of an observation: twelve numbers for each observed link."""
+        """Length of an observation: twelve numbers for each observed link, or what an overridden `observe` returns."""
+        if self._has_own_observation:
+            return jax.eval_shape(lambda: self.observe(self.start(jax.random.PRNGKey(0)))).size
         return 12 * (self.learner.num_links + (self.config.preview + 1) * self.expert.num_links)
 
     @property

@@ -7,6 +7,7 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
+from mimic.envs.wrappers import fresh_episodes
 
 FEW = {"count": 6, "held_out": 2}
 
@@ -67,6 +68,45 @@ def test_reward_and_observation_follow_the_demonstration_step_by_step():
             assert np.abs(others - distances[i]).min() > 1e-4  # another sample would be noticed
         if i < 6:
             state = step(state, actions[i])
+
+
+class JointsAndStep(mimic.ImitationEnv):
+    """An environment with an observation of its own."""
+
+    def observe(self, state):
+        return jnp.concatenate([state.qpos, state.qvel, state.step[None].astype(jnp.float32)])
+
+
+class MoreThanLinks(mimic.ImitationEnv):
+    """An environment that adds to the observation."""
+
+    def observe(self, state):
+        return jnp.append(super().observe(state), 7.0)
+
+
+def test_an_overridden_observation_is_observed_everywhere():
+    env = JointsAndStep(mimic.env_config("planar4dof", physics="fused", demonstrations=FEW))
+    assert env.observation_size == 9
+    episodes = fresh_episodes(env)
+    state = episodes.reset(jax.random.split(jax.random.PRNGKey(0), 3))  # at random steps
+    states = [state, jax.jit(episodes.step)(state, jnp.ones((3, 4)))]
+    states.append(env.restart_done(states[-1].replace(done=jnp.array([1.0, 0.0, 1.0]))))
+    for state in states:
+        np.testing.assert_array_equal(state.obs, jax.vmap(env.observe)(state.pipeline_state))
+    assert states[2].obs[:, 8].tolist() == [0, states[1].obs[1, 8], 0]
+    assert env.reset(jax.random.PRNGKey(0)).obs.shape == (9,)
+
+
+def test_an_observation_is_extended_and_others_stay():
+    config = mimic.env_config("planar4dof", physics="fused", demonstrations=FEW)
+    plain, extended = mimic.ImitationEnv(config), MoreThanLinks(config)
+    assert extended.observation_size == plain.observation_size + 1
+    first, action = plain.reset(jax.random.PRNGKey(0)), jnp.ones(4)
+    for state, expected in (
+        (extended.reset(jax.random.PRNGKey(0)), first),
+        (jax.jit(extended.step)(first, action), jax.jit(plain.step)(first, action)),
+    ):
+        np.testing.assert_allclose(state.obs, np.append(expected.obs, 7), atol=1e-5)  # float32, of a table in float64
 
 
 def test_a_runaway_ends_the_episode_and_never_pays(planar_env):
