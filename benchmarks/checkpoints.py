@@ -60,7 +60,9 @@ def measure(arms: int) -> Row:
 def training_state(arms: int) -> programs.TrainingState:
     """The state at the start of a training."""
     env = mimic.make("panda4dof", physics="fused", demonstrations={"count": 2, "held_out": 1})
-    config = dataclasses.replace(PPOConfig(preset="gpu").resolve(), num_envs=arms)
+    preset = PPOConfig(preset="gpu").resolve()
+    minibatch = max(preset.batch_size, arms // preset.num_minibatches)  # a batch has an unroll of each arm at least
+    config = dataclasses.replace(preset, num_envs=arms, batch_size=minibatch)
     networks = training.make_networks(config, env.observation_size, env.action_size)
     functions = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
     return jax.device_get(functions.start(0))
