@@ -296,7 +296,7 @@ def test_a_signal_to_one_process_stops_all_after_a_checkpoint(tmp_path):
 
 @pytest.mark.slow
 def test_a_process_with_bad_input_ends_the_others(tmp_path):
-    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "results").mkdir(parents=True)
     (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run"))
     assert first == 2 and "'run' exists" in shown
     assert second == 1 and "error: process 0 of the training failed" in silent

@@ -14,6 +14,7 @@ from mimic.commands import train as session
 from mimic.commands.config import EvaluateConfig, RetargetConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config
+from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model
@@ -132,7 +133,7 @@ def test_the_paper_overfits_and_early_stopping_goes_back_to_the_best(tmp_path):
     rows = [line.split(",") for line in lines[1:]]
     best = min(rows, key=lambda row: float(row[column]))
     assert len(rows) < 40 and rows.index(best) == len(rows) - 4  # stopped by patience
-    steps = [int(path.name) for path in (run_dir / "checkpoints").iterdir()]
+    steps = checkpoint_steps(run_dir)
     assert max(steps) == int(best[0]) == report["training_poses"]
 
 
