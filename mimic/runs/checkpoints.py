@@ -183,7 +183,10 @@ def load_training(run_dir: Path, template: Any) -> Checkpoint:
         return Checkpoint(step, params, None, metrics)
     names = [f"arr_{i}" for i in range(_MAX_ARRAYS)]  # as NumPy names them
     size = (path / _STATE).stat().st_size
-    arrays = read_arrays(path / _STATE, names, max_bytes=8 * size)  # each value counts as 8 bytes at least
+    try:
+        arrays = read_arrays(path / _STATE, names, max_bytes=8 * size)  # each value counts as 8 bytes at least
+    except ValueError as error:  # with a checksum that fits
+        raise DamagedCheckpoint(f"checkpoint {str(path)!r}: {_STATE} cannot be read: {error}") from error
     return Checkpoint(step, params, [arrays[name] for name in names if name in arrays], metrics)
 
 
@@ -227,6 +230,9 @@ def _content(path: Path) -> dict[str, Any]:
         return {}
     except ValueError as error:
         raise DamagedCheckpoint(f"checkpoint {str(path)!r} is damaged: {_CONTENT} cannot be read") from error
+    tables = "metrics", "made_with", "sha256"
+    if not isinstance(content, dict) or not all(isinstance(content.get(name, {}), dict) for name in tables):
+        raise DamagedCheckpoint(f"checkpoint {str(path)!r} is damaged: {_CONTENT} has other content")
     return content
 
 

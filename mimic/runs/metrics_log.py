@@ -65,7 +65,7 @@ def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     """Columns and rows of a metrics file, without rows that were not written to their end."""
     if not path.exists():
         return [], []
-    with path.open(newline="") as file:
+    with path.open(newline="", errors="replace") as file:
         lines = [line for line in file if line.endswith("\n")]
     header, *rows = csv.reader(lines) if lines else [[]]
     complete = [row for row in rows if len(row) == len(header)]

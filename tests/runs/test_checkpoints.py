@@ -80,6 +80,12 @@ def test_each_flipped_bit_is_noticed(run_dir):
     assert load_checkpoint(run_dir, PARAMS)[0] == 20
 
 
+@pytest.mark.parametrize("content", ["[]", "3", '{"sha256": []}', '{"metrics": 1}'])
+def test_other_json_is_noticed(run_dir, content):
+    (run_dir / "checkpoints" / "000000000020" / "checkpoint.json").write_text(content)
+    assert load_training(run_dir, PARAMS).step == 10
+
+
 def test_a_missing_file_is_noticed(run_dir):
     shutil.rmtree(run_dir / "checkpoints" / "000000000020" / "d")
     assert check_checkpoint(run_dir) == 10

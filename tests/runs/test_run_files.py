@@ -74,3 +74,11 @@ def test_a_row_that_cannot_be_written_leaves_the_file_as_it_was(tmp_path, monkey
         log.write(20, {"loss": 0.25})
     log.close()
     assert (tmp_path / "metrics.csv").read_bytes() == before
+
+
+def test_a_damaged_file_loses_its_damaged_rows_alone(tmp_path):
+    (tmp_path / "metrics.csv").write_bytes(b"step,loss\r\n10,0.5\r\n2\xff\xfe,0.5\r\n")
+    log = MetricsLog(tmp_path, first_step=30)
+    log.write(30, {"loss": 0.25})
+    log.close()
+    assert [row["step"] for row in rows_of(tmp_path)] == ["10", "30"]
