@@ -45,7 +45,7 @@ def test_a_checkpoint_is_read_as_it_was_written(run_dir):
         assert value.dtype == expected.dtype and value.tobytes() == expected.tobytes()
 
 
-@pytest.mark.parametrize("name", ["manifest.ocdbt", "training.npz", "_METADATA", "checkpoint.json"])
+@pytest.mark.parametrize("name", ["layer.kernel/0.0", "training.npz", "_METADATA", "checkpoint.json"])
 def test_a_damaged_last_checkpoint_is_replaced_by_the_one_before(run_dir, name, capsys):
     file = run_dir / "checkpoints" / "000000000020" / name
     content = bytearray(file.read_bytes())
@@ -86,8 +86,43 @@ def test_other_json_is_noticed(run_dir, content):
     assert load_training(run_dir, PARAMS).step == 10
 
 
+def test_orbax_default_format_is_read(tmp_path):
+    """Runs of mimic 0.1 have it."""
+    with ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save(tmp_path / "checkpoints" / "000000000030", PARAMS)
+    step, params = load_checkpoint(tmp_path, PARAMS)
+    assert step == 30
+    np.testing.assert_array_equal(params["layer"]["kernel"], PARAMS["layer"]["kernel"])
+
+
+def test_a_save_prints_nothing(tmp_path):
+    """Orbax warns of its own formats."""
+    program = (
+        "import sys; from pathlib import Path; from mimic.runs.checkpoints import *\n"
+        "save_checkpoint(Path(sys.argv[1]), 0, {'a': 1.0})"
+    )
+    run = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert (run.stdout, run.stderr) == ("", "")
+
+
+@pytest.mark.slow
+def test_memory_is_flat_over_saves(tmp_path):
+    """OCDBT, orbax's default, keeps 3 to 4 kB at each save."""
+    program = (
+        "import sys, numpy as np; from pathlib import Path; from mimic.runs.checkpoints import *\n"
+        "folder = Path(sys.argv[1])\n"
+        "params = {f'layer_{i}': {'kernel': np.ones((8, 8)), 'bias': np.ones(8)} for i in range(4)}\n"
+        "for step in range(2000):\n"
+        "    save_checkpoint(folder, step, params); thin_checkpoints(folder, 2)\n"
+        "    if step in (999, 1999): print(Path('/proc/self/statm').read_text().split()[1])"
+    )
+    run = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True)
+    pages = [int(line) for line in run.stdout.split()]
+    assert 4 * (pages[1] - pages[0]) < 1500  # kB; 0.3 at each save
+
+
 def test_a_missing_file_is_noticed(run_dir):
-    shutil.rmtree(run_dir / "checkpoints" / "000000000020" / "d")
+    shutil.rmtree(run_dir / "checkpoints" / "000000000020" / "layer.kernel")
     assert check_checkpoint(run_dir) == 10
 
 
