@@ -118,3 +118,9 @@ def use_compilation_cache(folder: str) -> None:
             return
         jax.config.update("jax_compilation_cache_dir", str(Path(folder).expanduser()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def compilation_cache() -> Path | None:
+    """The folder where JAX caches compiled functions, if any."""
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    return Path(folder) if folder else None

@@ -16,6 +16,7 @@ from mimic.commands.progress import TrainingProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
 from mimic.config import check_writable, flatten, to_dict, typed
+from mimic.runs.autotuning import use_kept_choices
 from mimic.runs.checkpoints import (
     Checkpoint,
     checkpoint_steps,
@@ -75,6 +76,7 @@ def prepare_training(
     use_compilation_cache(config.compilation_cache)
     resumed_dir = Path(config.resume).expanduser() if config.resume else None
     if resumed_dir:
+        use_kept_choices(resumed_dir)
         config = _resumed_config(resumed_dir, config, overrides)
         check_writable("resume", resumed_dir)
     if group and config.trainer.name != "ppo":
