@@ -162,4 +162,4 @@ def test_a_missing_package_is_named(rejected, tmp_path, monkeypatch):
     mapper_run(tmp_path / "run")
     monkeypatch.setitem(sys.modules, "onnx", None)
     message = rejected("export", f"run={tmp_path / 'run'}", "out=new.onnx")
-    assert "format=onnx needs the package onnx: pip install 'mimic-mjx[export]'" in message
+    assert "format=onnx needs the package onnx: pip install 'mimic-arms[export]'" in message
