@@ -33,7 +33,7 @@ from mimic.commands.config import (
     RetargetConfig,
     ViewConfig,
 )
-from mimic.config import explain, schema, typed
+from mimic.config import BAD_INPUT, explain, schema, suggestion, typed
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals
 from mimic.sweeps.hydra_plugins import bound_config_files
@@ -41,7 +41,6 @@ from mimic.sweeps.launchers import check_launcher, register_launchers
 from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import TRAINERS, TrainConfig
 
-BAD_INPUT = 2
 _LONGEST_MESSAGE = 1000  # characters: Hydra repeats the argument
 ARM_KEYS = {  # keys of each command whose value may be just the name or file of an arm
     "train": ("env.expert", "env.learner"),
@@ -72,12 +71,8 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         print(f"mimic {__version__}")
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
-    sys.argv[1:] = [_expand_shorthand(argument, config_name) for argument in sys.argv[1:]]
-    compat.share_config_store()
-    _register_schemas()
-    register_sweeper()
-    register_launchers()
-    bound_config_files()
+    sys.argv[1:] = [expand_shorthand(argument, config_name) for argument in sys.argv[1:]]
+    register()
     is_composed = False  # all errors before that are user errors
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
@@ -98,6 +93,15 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         if is_composed:
             raise
         _exit_with_error(error)
+
+
+def register() -> None:
+    """Registers with Hydra what the configs in mimic/conf refer to."""
+    compat.share_config_store()
+    _register_schemas()
+    register_sweeper()
+    register_launchers()
+    bound_config_files()
 
 
 def _single_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
@@ -134,7 +138,7 @@ def _sweep_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
     return Outcome(exit_code, f"exit code {exit_code}" if exit_code else "")
 
 
-def _expand_shorthand(argument: str, command: str) -> str:
+def expand_shorthand(argument: str, command: str) -> str:
     """Returns an argument in Hydra's syntax: env.learner=ARM.xml becomes env.learner.model=ARM.xml."""
     key, equals, value = argument.partition("=")
     if command in FIRST_KEY and not equals and not argument.startswith("-"):
@@ -218,5 +222,5 @@ def _one_line(error: BaseException) -> str:
     if choice:
         group, name, options = choice.groups()
         valid = ", ".join(sorted(option for option in set(options.split()) if not option.endswith("schema")))
-        return f"unknown {group} {name!r}; valid are {valid}"
+        return f"unknown {group} {name!r}; valid are {valid}{suggestion(name, valid.split(', '))}"
     return " ".join(message.split())[:_LONGEST_MESSAGE]

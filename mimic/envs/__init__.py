@@ -7,7 +7,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import compat
-from mimic.config import check_choice, explain, merged, schema, typed
+from mimic.config import check_choice, explain, merged, schema, suggestion, typed
 from mimic.envs.config import EnvConfig
 
 if TYPE_CHECKING:
@@ -33,8 +33,9 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     Raises:
       ValueError: an unknown name or field, or a value of the wrong type or out of range.
     """
-    if name not in environments():
-        raise ValueError(f"unknown environment {name!r}; valid are {', '.join(environments())}")
+    valid = environments()
+    if name not in valid:
+        raise ValueError(f"unknown environment {name!r}; valid are {', '.join(valid)}{suggestion(name, valid)}")
     preset = OmegaConf.load(str(_PRESETS / f"{name}.yaml"))
     assert isinstance(preset, DictConfig)
     del preset["defaults"]  # Hydra's defaults list; the schema is merged below
