@@ -10,14 +10,17 @@ import traceback
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
 from pathlib import Path
+from string import Template
 from typing import Any, NoReturn
 
 import hydra
+from hydra._internal.utils import get_args
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import __version__, compat
@@ -33,6 +36,7 @@ from mimic.commands.config import (
     RetargetConfig,
     ViewConfig,
 )
+from mimic.commands.key_help import key_lines
 from mimic.config import BAD_INPUT, explain, schema, suggestion, typed
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals
@@ -84,7 +88,8 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     try:
         with watched_signals():
             check_arguments(sys.argv[1:])
-            command()
+            if not _print_help(config_name):
+                command()
     except _CONFIG_ERRORS as error:
         _exit_with_error(error)
     except OSError as error:  # of Hydra or our sweeper
@@ -93,6 +98,21 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         if is_composed:
             raise
         _exit_with_error(error)
+
+
+def _print_help(config_name: str) -> bool:
+    """Prints the help if the command line asks for it; returns whether it did."""
+    options = get_args(sys.argv[1:])
+    if not options.help or options.config_dir or options.config_name or options.config_path:  # Hydra prints the help
+        return False
+    with hydra.initialize_config_module("mimic.conf", version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        config = loader.load_configuration(config_name, options.overrides, RunMode.RUN)
+    template = config.hydra.help.template
+    with open_dict(config):
+        del config["hydra"]
+    print(Template(template).substitute(CONFIG="\n".join(key_lines(config))).rstrip())
+    return True
 
 
 def register() -> None:
