@@ -98,7 +98,7 @@ def shell_lines(text):
 def dockerfile():
     """The instructions of the Dockerfile."""
     lines = [line for line in shell_lines((CONTAINERS / "Dockerfile").read_text()) if not line.startswith("#")]
-    return [tuple(line.split(maxsplit=1)) for line in lines]
+    return [(name, text) for name, text in (line.split(maxsplit=1) for line in lines)]
 
 
 def apptainer_sections():
@@ -123,7 +123,9 @@ def check_commands(text):
 
 
 def check_base(image):
-    name, version = re.fullmatch(r"(\w+):([\d.]+)-slim", image).groups()
+    match = re.fullmatch(r"(\w+):([\d.]+)-slim", image)
+    assert match, image
+    name, version = match.groups()
     assert name == "python" and f"Programming Language :: Python :: {version}" in PROJECT["classifiers"]
 
 

@@ -170,14 +170,12 @@ def _shown_model(arm: ArmConfig) -> str:
 
 def _arm_words(key: str, arm: ArmConfig) -> list[str]:
     words = [f"{key}={_shown_model(arm)}"]
-    words += [
-        f"{key}.{name}={value}" for name in ("base", "tip", "armature", "damping") if (value := getattr(arm, name))
-    ]
+    words += [f"{key}.{name}={value}" for name in ("base", "tip") if (value := getattr(arm, name))]
     words += [f"{key}.base_segment=false"] * (not arm.base_segment)
-    for name in ("locked", "link_lengths", "home"):
+    for name in ("armature", "damping", "locked", "link_lengths", "home"):
         value = getattr(arm, name)
         if value:
-            shown = value if isinstance(value, dict | str) else list(value)
+            shown = value if isinstance(value, dict | str | float | int) else list(value)
             words.append(f"{key}.{name}={str(shown).replace(' ', '')}")
     return [shlex.quote(word) if "{" in word else word for word in (word.replace("'", "") for word in words)]
 

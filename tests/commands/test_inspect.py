@@ -12,6 +12,7 @@ from PIL import Image
 
 import mimic
 from mimic import cli, inspect
+from mimic.commands import arm_checks
 from mimic.commands.config import InspectConfig
 from mimic.commands.inspect import train_command
 from mimic.envs.config import EnvConfig
@@ -76,7 +77,22 @@ def test_armature_is_suggested_for_an_arm_that_runs_away(inspected, tmp_path):
     file.write_text(original_model.ur_like(armature=0.0))
     said = inspected(file, "bound=false")
     assert "warning: random torques accelerate a joint to" in said
-    assert re.search(r"train it: .* env.learner.armature=\S+ env.learner.damping=\S+ env.physics=fused", said)
+    (armature,) = re.findall(r"train it: .* 'env.learner.armature={(\S+)}' 'env.learner.damping=\S+' env.phys", said)
+    proposed = {name: float(value) for name, value in (entry.split(":") for entry in armature.split(","))}
+    assert "wrist_3" in proposed and len(set(proposed.values())) > 1  # by joint
+
+
+def test_joints_that_are_slow_enough_stay_as_they_are(tmp_path):
+    """A joint gets rotor inertia only if it exceeds the bound itself, and then no joint does."""
+    file = tmp_path / "light.xml"
+    file.write_text(original_model.ur_like(armature=0.0))
+    env, config = EnvConfig(), mimic.ArmConfig(model=str(file), armature={"pan": 0.05})
+    arm = mimic.build_arm(config)
+    changed, reason = arm_checks.stabilised(config, arm, env)
+    speeds = arm_checks.random_torque_speeds(mimic.build_arm(changed), env)
+    assert reason and speeds.max() < env.speed_bound and changed.armature["pan"] >= 0.05
+    assert set(changed.armature) < set(arm.embodiment.joint_names)
+    assert arm_checks.stabilised(changed, mimic.build_arm(changed), env) == (changed, "")
 
 
 @pytest.mark.slow
@@ -95,7 +111,10 @@ def test_an_equal_arm_reaches_the_poses_of_the_expert(inspected):
         (["arm.xml", "learner.tip=hand"], "the model has no body 'hand'; valid are table, pan_link"),
         (["arm.xml", "learner.base=foot"], "the model has no body 'foot'; valid are table, pan_link"),
         (["arm.xml", "expert=missing.urdf"], "no MJCF or URDF file at '"),
-        (["arm.xml", "learner.armature=-1"], "armature: expected a number from 0 to 10000, got -1"),
+        (
+            ["arm.xml", "learner.armature=-1"],
+            "armature: expected a number from 0 to 10000, or a mapping from names to such numbers, got -1",
+        ),
         (["arm.xml", "limits=soft"], "limits: expected one of none, hardware, got 'soft'"),
         (["arm.xml", "out=missing/out"], "there is no folder 'missing'"),
         (["arm.xml", "tip=hand"], "tip"),
