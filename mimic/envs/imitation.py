@@ -12,6 +12,7 @@ from brax.envs.base import Env, State
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from mimic import compat
 from mimic.arms.arm import Arm, build_arm, torque_scale
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
@@ -82,6 +83,7 @@ class ImitationEnv(Env):
     """
 
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
+        compat.mend_brax()  # here: brax's trainers take any environment, wrapped by any function
         self.config = config
         arms = config.build_arms()
         self.expert, self.learner = arms.embodiments
