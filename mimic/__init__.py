@@ -30,6 +30,7 @@ from mimic.metric.correspondence import (  # noqa: E402
 from mimic.metric.distance import (  # noqa: E402
     PAPER_WEIGHTS,
     DistanceWeights,
+    LinkDistance,
     PairDistances,
     adaptive_weights,
     embodiment_distance,
@@ -46,6 +47,7 @@ from mimic.metric.kinematics import (  # noqa: E402
 )
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.metric.motion_distance import motion_distance  # noqa: E402
+from mimic.registry import register  # noqa: E402
 from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
 from mimic.retargeting.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
 
@@ -67,6 +69,7 @@ __all__ = [
     "Embodiment",
     "Frames",
     "ImitationEnv",
+    "LinkDistance",
     "LinkStates",
     "PairDistances",
     "PoseImitation",
@@ -100,6 +103,7 @@ __all__ = [
     "panda",
     "planar_arm",
     "record_demonstrations",
+    "register",
     "rotation_distance",
     "soft_correspondence",
 ]

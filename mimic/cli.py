@@ -20,8 +20,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from mimic import __version__, compat
-from mimic.commands.arguments import check_arguments
+from mimic import __version__, compat, registry
+from mimic.commands.arguments import check_arguments, load_plugins
 from mimic.commands.config import (
     CollectConfig,
     EvaluateConfig,
@@ -34,12 +34,13 @@ from mimic.commands.config import (
     ViewConfig,
 )
 from mimic.config import explain, schema, typed
+from mimic.envs import registered_preset
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals
 from mimic.sweeps.hydra_plugins import bound_config_files
 from mimic.sweeps.launchers import check_launcher, register_launchers
 from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
-from mimic.trainers.config import TRAINERS, TrainConfig
+from mimic.trainers.config import TrainConfig, trainer_config, trainers
 
 BAD_INPUT = 2
 _LONGEST_MESSAGE = 1000  # characters: Hydra repeats the argument
@@ -72,9 +73,16 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         print(f"mimic {__version__}")
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
+    try:
+        sys.argv[1:] = load_plugins(sys.argv[1:])
+    except ValueError as error:
+        _exit_with_error(error)
     sys.argv[1:] = [_expand_shorthand(argument, config_name) for argument in sys.argv[1:]]
     compat.share_config_store()
-    _register_schemas()
+    try:
+        _register_schemas()
+    except ValueError as error:  # of a plugin
+        _exit_with_error(error)
     register_sweeper()
     register_launchers()
     bound_config_files()
@@ -199,8 +207,12 @@ def _register_schemas() -> None:
     store.store(name="retarget_schema", node=schema(RetargetConfig))
     store.store(name="view_schema", node=schema(ViewConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
-    for name, config_class in TRAINERS.items():
-        store.store(group="trainer", name=f"{name}_schema", node=schema(config_class))
+    for name in trainers():
+        store.store(group="trainer", name=f"{name}_schema", node=schema(trainer_config(name)))
+    for name in registry.names("trainer"):
+        store.store(group="trainer", name=name, node={"defaults": [f"{name}_schema", "_self_"], "name": name})
+    for name in registry.names("environment"):
+        store.store(group="env", name=name, node={"defaults": ["schema", "_self_"], **registered_preset(name)})
 
 
 def _one_line(error: BaseException) -> str:

@@ -73,6 +73,11 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
                 f"got one of {trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)
+    if config.controller == "searched" and trained.env.metric.link_distance:
+        raise ValueError(
+            "controller=searched: expected a metric of weighted parts, got a run with "
+            f"metric.link_distance={trained.env.metric.link_distance}"
+        )
     env = dataclasses.replace(
         trained.env,
         physics=config.physics or trained.env.physics,

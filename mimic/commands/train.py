@@ -39,7 +39,9 @@ from mimic.trainers.config import TrainConfig
 from mimic.trainers.distributed.process_group import ProcessGroup
 from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, run_schema, save_config
+from mimic.trainers.run_correspondence import save_correspondence
 from mimic.trainers.run_models import save_models
+from mimic.trainers.run_plugins import save_plugins
 from mimic.trainers.trainer import Params, Trainer
 
 FAILED, BAD_INPUT = 1, 2  # exit codes
@@ -170,6 +172,8 @@ def _train(
         try:
             stack.callback((lock or _new_run(run_dir, trainer)).close)
             save_models(run_dir, config.env)
+            save_correspondence(run_dir, config.env)
+            save_plugins(run_dir, config)
             save_config(run_dir, config)  # after the inputs: a folder without it is no run yet
             headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
             console.print(f"{headline}\nrun directory: {run_dir}", highlight=False, soft_wrap=True)

@@ -11,7 +11,7 @@ import jax
 from mimic.compilation import Background, compiling
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
-from mimic.envs.imitation import ImitationEnv, training_and_held_out
+from mimic.envs.imitation import ImitationEnv, make_env, training_and_held_out
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
@@ -47,7 +47,7 @@ class PPOTrainer(Trainer):
         self._name, self._seed = config.env.name, config.seed
         self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count())
         self.total_steps = self.settings.total_steps
-        env, held_out = _environment(config.env, run_dir)
+        env, held_out = run_environment(config.env, run_dir)
         if unseen is not None:
             unseen.check_fits(env.expert, config.env.control_dt, config.env.horizon)
             check_effort(unseen, env.expert)
@@ -197,14 +197,14 @@ def _text(form: str, value: float) -> str:
     return form.format(value) if math.isfinite(value) else "none"
 
 
-def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
+def run_environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
     """The environment with its training demonstrations, and the held-out ones; an existing run has its own."""
     if run_dir is not None:
         path = str(run_dir / DEMONSTRATIONS)
         stored = dataclasses.replace(config.demonstrations, path=path)
         config = dataclasses.replace(config, demonstrations=stored)
     training, held_out = training_and_held_out(config)
-    return ImitationEnv(config, training), held_out
+    return make_env(config, training), held_out
 
 
 def _with_crossovers(env: ImitationEnv, count: int, seed: int) -> ImitationEnv:
