@@ -54,6 +54,7 @@ from mimic.retargeting.pose import PoseImitation, imitate_pose, imitate_trajecto
 if TYPE_CHECKING:
     from mimic.arms.rendering import ArmScene
     from mimic.commands.export import export_run
+    from mimic.commands.fit import Run, fit
     from mimic.envs.imitation import ImitationEnv
     from mimic.trainers.pose_mapper.model import PoseMapper
 
@@ -74,6 +75,7 @@ __all__ = [
     "PairDistances",
     "PoseImitation",
     "PoseMapper",
+    "Run",
     "adaptive_weights",
     "arc_length_correspondence",
     "body_twists",
@@ -86,6 +88,7 @@ __all__ = [
     "env_config",
     "environments",
     "export_run",
+    "fit",
     "forward_kinematics",
     "hard_correspondence",
     "imitate_pose",
@@ -128,6 +131,11 @@ def __getattr__(name: str) -> Any:
         from mimic.commands.export import export_run
 
         return export_run
+    if name in ("Run", "fit"):  # imports training
+        compat.import_mjx()
+        from mimic.commands import fit
+
+        return getattr(fit, name)
     raise AttributeError(f"module 'mimic' has no attribute {name!r}")
 
 

@@ -109,7 +109,9 @@ class MetricConfig:
         if self.correspondence in constructors:
             return constructors[self.correspondence]()
         made: Any = registry.find("correspondence", self.correspondence, "metric.correspondence")(expert, learner)
-        return made if callable(made) else checked_matrix(made, expert, learner, repr(self.correspondence))
+        if callable(made):
+            return cast(Correspondence, made)
+        return checked_matrix(made, expert, learner, repr(self.correspondence))
 
     def build(self, expert: Embodiment, learner: Embodiment) -> Metric:
         """The metric between two arms."""

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -72,6 +73,11 @@ class PPOTrainer(Trainer):
     def controller(self, params: Params) -> Controller:
         """The deterministic policy of these parameters."""
         return ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)(params)
+
+    def policy(self, params: Params) -> Callable[[Any], Any]:
+        """The deterministic policy: observation -> action in [-1, 1]."""
+        controller = self.controller(params)
+        return jax.jit(lambda observation: controller(SimpleNamespace(obs=observation)))  # type: ignore[arg-type]
 
     def _compile(self) -> Callable[[Params], Rollouts]:
         def rollouts(params: Params) -> Rollouts:
