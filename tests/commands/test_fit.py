@@ -1,6 +1,7 @@
 """`mimic.fit`: a training from Python, and the run that it returns."""
 
 import json
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -77,9 +78,9 @@ class Renamed(mimic.ImitationEnv):
 )
 def test_a_bad_training_is_one_line_and_writes_nothing(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    arguments = {key: value() if callable(value) else value for key, value in arguments.items()}
+    values: dict[str, Any] = {key: value() if callable(value) else value for key, value in arguments.items()}
     with pytest.raises(ValueError, match=message):
-        mimic.fit(**arguments)
+        mimic.fit(**values)
     assert not list(tmp_path.iterdir())
 
 

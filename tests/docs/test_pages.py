@@ -72,7 +72,7 @@ def test_commands_and_code_are_valid(page, monkeypatch, tmp_path, own_registry):
     [pytest.param(page, marks=() if page.name in QUICK else pytest.mark.slow) for page in PAGES],
     ids=named,
 )
-def test_pages_run(page, monkeypatch, tmp_path):
+def test_pages_run(page, monkeypatch, tmp_path, own_registry):
     monkeypatch.chdir(tmp_path)
     run_page(page, tmp_path)
 
