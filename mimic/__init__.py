@@ -31,6 +31,7 @@ from mimic.metric.correspondence import (  # noqa: E402
 from mimic.metric.distance import (  # noqa: E402
     PAPER_WEIGHTS,
     DistanceWeights,
+    LinkDistance,
     PairDistances,
     adaptive_weights,
     embodiment_distance,
@@ -47,12 +48,14 @@ from mimic.metric.kinematics import (  # noqa: E402
 )
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.metric.motion_distance import motion_distance  # noqa: E402
+from mimic.registry import register  # noqa: E402
 from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
 from mimic.retargeting.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:
     from mimic.arms.rendering import ArmScene
     from mimic.commands.export import export_run
+    from mimic.commands.fit import Run, fit
     from mimic.envs.imitation import ImitationEnv
     from mimic.trainers.pose_mapper.model import PoseMapper
 
@@ -68,10 +71,12 @@ __all__ = [
     "Embodiment",
     "Frames",
     "ImitationEnv",
+    "LinkDistance",
     "LinkStates",
     "PairDistances",
     "PoseImitation",
     "PoseMapper",
+    "Run",
     "adaptive_weights",
     "arc_length_correspondence",
     "body_twists",
@@ -84,6 +89,7 @@ __all__ = [
     "env_config",
     "environments",
     "export_run",
+    "fit",
     "forward_kinematics",
     "hard_correspondence",
     "imitate_pose",
@@ -101,6 +107,7 @@ __all__ = [
     "panda",
     "planar_arm",
     "record_demonstrations",
+    "register",
     "rotation_distance",
     "soft_correspondence",
 ]
@@ -125,6 +132,11 @@ def __getattr__(name: str) -> Any:
         from mimic.commands.export import export_run
 
         return export_run
+    if name in ("Run", "fit"):  # imports training
+        compat.import_mjx()
+        from mimic.commands import fit
+
+        return getattr(fit, name)
     raise AttributeError(f"module 'mimic' has no attribute {name!r}")
 
 

@@ -23,8 +23,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from mimic import __version__, compat
-from mimic.commands.arguments import check_arguments
+from mimic import __version__, compat, registry
+from mimic.commands.arguments import check_arguments, load_plugins
 from mimic.commands.config import (
     CollectConfig,
     EvaluateConfig,
@@ -38,12 +38,13 @@ from mimic.commands.config import (
 )
 from mimic.commands.key_help import key_lines
 from mimic.config import BAD_INPUT, explain, schema, suggestion, typed
+from mimic.envs import registered_preset
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals
 from mimic.sweeps.hydra_plugins import bound_config_files
 from mimic.sweeps.launchers import check_launcher, register_launchers
 from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
-from mimic.trainers.config import TRAINERS, TrainConfig
+from mimic.trainers.config import TrainConfig, trainer_config, trainers
 
 _LONGEST_MESSAGE = 1000  # characters: Hydra repeats the argument
 ARM_KEYS = {  # keys of each command whose value may be just the name or file of an arm
@@ -75,8 +76,11 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         print(f"mimic {__version__}")
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
-    sys.argv[1:] = [expand_shorthand(argument, config_name) for argument in sys.argv[1:]]
-    register()
+    try:
+        sys.argv[1:] = [expand_shorthand(argument, config_name) for argument in load_plugins(sys.argv[1:])]
+        register()
+    except ValueError as error:  # of a plugin
+        _exit_with_error(error)
     is_composed = False  # all errors before that are user errors
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
@@ -223,8 +227,12 @@ def _register_schemas() -> None:
     store.store(name="retarget_schema", node=schema(RetargetConfig))
     store.store(name="view_schema", node=schema(ViewConfig))
     store.store(group="env", name="schema", node=schema(EnvConfig))
-    for name, config_class in TRAINERS.items():
-        store.store(group="trainer", name=f"{name}_schema", node=schema(config_class))
+    for name in trainers():
+        store.store(group="trainer", name=f"{name}_schema", node=schema(trainer_config(name)))
+    for name in registry.names("trainer"):
+        store.store(group="trainer", name=name, node={"defaults": [f"{name}_schema", "_self_"], "name": name})
+    for name in registry.names("environment"):
+        store.store(group="env", name=name, node={"defaults": ["schema", "_self_"], **registered_preset(name)})
 
 
 def _one_line(error: BaseException) -> str:

@@ -150,7 +150,11 @@ def process_number() -> int:
 
 
 def mend_brax() -> None:
-    """Restores `jax.device_put_replicated`, which brax's training loop calls and JAX no longer has."""
+    """Restores `jax.device_put_replicated`, which brax's training loops call and JAX no longer has.
+
+    Called by each `ImitationEnv`, not by `import mimic`. brax looks the name up in `jax` itself. The name is added only
+    where it is missing, with JAX's own arguments and result; nothing that exists is replaced.
+    """
     import jax
 
     if not hasattr(jax, "device_put_replicated"):

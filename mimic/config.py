@@ -31,6 +31,8 @@ def _unfreeze(node: DictConfig) -> None:
         child = node._get_node(key)
         if isinstance(child, DictConfig) and not child._is_none():
             _unfreeze(child)
+            if OmegaConf.get_type(child) is dict:  # its keys are the user's; Hydra forbids new keys elsewhere
+                OmegaConf.set_struct(child, False)
 
 
 def typed(config: DictConfig) -> Any:

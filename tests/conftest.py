@@ -3,6 +3,7 @@
 import functools
 import importlib
 import importlib.util
+import os
 import sys
 
 import jax
@@ -87,6 +88,21 @@ def unchecked():
     jaxtyping_config.update("jaxtyping_disable", True)
     yield
     jaxtyping_config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture
+def own_registry(monkeypatch: pytest.MonkeyPatch):
+    """An empty registry for one test; installed plugins are not loaded."""
+    from mimic import registry
+
+    monkeypatch.setattr(registry, "_registered", {kind: {} for kind in registry.KINDS})
+    monkeypatch.setattr(registry, "_allowed", set())
+    monkeypatch.setattr(registry, "_is_loaded", True)
+    monkeypatch.setenv(registry.VARIABLE, "")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    yield registry
+    for plugin in os.environ[registry.VARIABLE].split(","):
+        sys.modules.pop(plugin, None)
 
 
 @pytest.fixture

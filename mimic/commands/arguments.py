@@ -4,14 +4,47 @@ Hydra also composes what nobody means: an environment without a preset for `~env
 `env={}`.
 """
 
+import re
 from typing import Any, NoReturn
 
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
+from mimic import registry
+
 GROUPS = {"env": "panda4dof", "trainer": "ppo", "metric": "paper"}  # config groups, with the example of messages
+# Keys whose value may be an import path, MODULE:NAME, which the command line then allows.
+_NAMING_KEYS = (
+    "env.environment",
+    "env.metric.correspondence",
+    "env.metric.link_distance",
+    "env.demonstrations.source",
+    "env.observation.terms",
+)
 _MAX_LENGTH = 10_000  # characters of an argument: Hydra's parser takes a second for 50,000
+
+
+def load_plugins(arguments: list[str]) -> list[str]:
+    """Loads what `--plugin MODULE` names, allows the import paths that arguments name, and returns the other arguments.
+
+    Raises:
+      ValueError: a plugin that cannot be imported, or the option without a module.
+    """
+    others, rest = [], iter(arguments)
+    for argument in rest:
+        option, equals, plugin = argument.partition("=")
+        if option == "--plugin":
+            plugin = plugin if equals else next(rest, "")
+            if not plugin:
+                raise ValueError("--plugin: expected a module, as in --plugin my_terms")
+            registry.load_plugin(plugin)
+        else:
+            others.append(argument)
+            if option.lstrip("+") in _NAMING_KEYS:
+                for path in re.findall(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", plugin):
+                    registry.allow(path)
+    return others
 
 
 def check_arguments(arguments: list[str]) -> None:

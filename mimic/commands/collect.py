@@ -17,7 +17,7 @@ from mimic.commands.config import CollectConfig
 from mimic.config import check_writable
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import REPORT, write_atomically
-from mimic.sweeps.finished_runs import QUALITY_METRICS, FinishedRun, LeftOut, QualityMetric, find_runs
+from mimic.sweeps.finished_runs import FinishedRun, LeftOut, QualityMetric, find_runs, quality_metric
 from mimic.sweeps.seed_groups import (
     CONFIDENCE,
     METHOD,
@@ -60,7 +60,9 @@ def prepare_collection(config: CollectConfig) -> Callable[[], int]:
             f"choose with only={trainers[0]}"
         )
     finished, repeated = drop_repeated(finished)
-    return lambda: _collect(finished, [*left_out, *repeated], out, QUALITY_METRICS[trainers[0]])
+    metric = quality_metric(trainers[0])
+    assert metric is not None  # of a finished run
+    return lambda: _collect(finished, [*left_out, *repeated], out, metric)
 
 
 def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path, metric: QualityMetric) -> int:

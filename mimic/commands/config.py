@@ -16,7 +16,7 @@ from mimic.envs.config import PHYSICS, EnvConfig
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.ranges import check_ranges, number, seed_number
-from mimic.trainers.config import TRAINERS
+from mimic.trainers.config import trainers
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "searched")
 EXPORT_FORMATS = ("onnx", "jax")
@@ -168,7 +168,7 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         if self.only:
-            check_choice("only", self.only, tuple(TRAINERS))
+            check_choice("only", self.only, trainers())
 
 
 @dataclasses.dataclass(frozen=True)

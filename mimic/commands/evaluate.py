@@ -29,6 +29,16 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
       ValueError: the run directory or the checkpoint is missing, `out` exists, or the options need a policy and the
         run has none.
     """
+    evaluate = prepare_report(config, started, Console())
+
+    def run() -> None:
+        evaluate()
+
+    return run
+
+
+def prepare_report(config: EvaluateConfig, started: float, console: Console) -> Callable[[], dict[str, Any]]:
+    """The same as `prepare_evaluation`, as a function that returns the report."""
     stopwatch = Stopwatch(started)
     use_compilation_cache(config.compilation_cache)
     if not config.run:
@@ -41,8 +51,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
         trained, trainer = _trainer_to_evaluate(trained, run_dir, config)
         steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
 
-    def run() -> None:
-        console = Console()
+    def run() -> dict[str, Any]:
         with stopwatch.stage("evaluate"):
             with SearchProgress(console, config.search.iterations) as progress:
                 outcome, controller = trainer.run_controller(config.controller, params, config.search, progress.update)
@@ -58,6 +67,7 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
             trainer.save_outcome(out, outcome, config.controller)
             write_report(out, report)
             console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
+        return report
 
     return run
 
@@ -75,6 +85,11 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
                 f"got one of {trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)
+    if config.controller == "searched" and trained.env.metric.link_distance:
+        raise ValueError(
+            "controller=searched: expected a metric of weighted parts, got a run with "
+            f"metric.link_distance={trained.env.metric.link_distance}"
+        )
     env = dataclasses.replace(
         trained.env,
         physics=config.physics or trained.env.physics,

@@ -18,12 +18,13 @@ from mimic.commands.config import EXPORT_FORMATS, ExportConfig
 from mimic.config import check_choice, new_file
 from mimic.distribution import VERSION, install_command
 from mimic.envs import env_config
-from mimic.envs.imitation import observation_layout, torque_scale
+from mimic.envs.imitation import layout_of, observation_layout, torque_scale
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_atomically
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo import training
+from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
 
 _PACKAGES = {"onnx": "onnx", "jax": "flatbuffers"}  # the package that writes each format
@@ -162,7 +163,10 @@ def _check_arms(name: str, expert: Embodiment, learner: Embodiment) -> None:
 def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str, Any]) -> ExportedFunction:
     arms = trained.env.build_arms()
     expert, learner = arms.embodiments
-    layout = observation_layout(expert, learner, trained.env.preview)
+    if trained.env.observation.terms or trained.env.environment:
+        layout = layout_of(run_environment(trained.env, run_dir)[0])
+    else:
+        layout = observation_layout(expert, learner, trained.env.preview)
     size = layout[-1]["stop"]
     config = cast(PPOConfig, trained.trainer).resolve()  # saved with all values resolved
     params = load_checkpoint(run_dir, training.params_template(config, size, learner.num_joints), steps)[1]

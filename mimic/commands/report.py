@@ -9,6 +9,7 @@ from mimic.commands.progress import report_table, similarity_table
 from mimic.runs.provenance import hardware, versions
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
+from mimic.trainers.run_plugins import used_plugins
 from mimic.trainers.trainer import Trainer
 
 
@@ -43,4 +44,5 @@ def make_report(
         "steps_per_second": trained / wall_time["train"] if wall_time["train"] else 0.0,
         "hardware": hardware(),
         "versions": versions(),
+        **({"plugins": used} if (used := used_plugins(config)) else {}),
     }

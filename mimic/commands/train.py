@@ -39,7 +39,9 @@ from mimic.trainers.config import TrainConfig
 from mimic.trainers.distributed.process_group import ProcessGroup
 from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, run_schema, save_config
+from mimic.trainers.run_correspondence import save_correspondence
 from mimic.trainers.run_models import save_models
+from mimic.trainers.run_plugins import save_plugins
 from mimic.trainers.trainer import Params, Trainer
 
 FAILED, BAD_INPUT = 1, 2  # exit codes
@@ -166,19 +168,20 @@ def _train(
 ) -> int:
     """Trains, evaluates and reports; returns the exit code."""
     console = Console()
-    with noted_signals(signals), contextlib.ExitStack() as stack:  # also during the report, where they have no effect
+    with noted_signals(signals):  # also during the report, where they have no effect
         try:
-            stack.callback((lock or _new_run(run_dir, trainer)).close)
-            save_models(run_dir, config.env)
-            save_config(run_dir, config)  # after the inputs: a folder without it is no run yet
-            headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
-            lines = filter(None, (headline, trainer.simulation, f"run directory: {run_dir}"))
-            console.print("\n".join(lines), highlight=False, soft_wrap=True)
-            steps, params = _train_and_log(config, trainer, run_dir, signals, restored, stopwatch, console)
-            if group:
-                group.end(0)
-            trained = steps - (restored.step if restored else 0)
-            report = _evaluate(config, trainer, run_dir, steps, params, trained, stopwatch)
+            on_trained = (lambda: group.end(0)) if group else None
+            report = run_training(
+                config,
+                trainer,
+                run_dir,
+                console,
+                stopwatch,
+                signals,
+                lock=lock,
+                restored=restored,
+                on_trained=on_trained,
+            )
         except (Interrupted, Diverged, OSError, RunExists) as error:
             exit_code = _stopped(console, run_dir, error)
             if group:
@@ -187,6 +190,53 @@ def _train(
     show_report(console, report, trainer)
     console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
     return 0
+
+
+# Above 40 lines because of its docstring.
+def run_training(
+    config: TrainConfig,
+    trainer: Trainer,
+    run_dir: Path,
+    console: Console,
+    stopwatch: Stopwatch,
+    signals: Signals,
+    *,
+    lock: RunLock | None = None,
+    restored: Checkpoint | None = None,
+    on_trained: Callable[[], Any] | None = None,
+) -> dict[str, Any]:
+    """Trains and evaluates, and writes everything to the run directory. Returns the report.
+
+    Args:
+      config: config of the run, with the trainer's resolved settings.
+      trainer: trainer of the run.
+      run_dir: the run directory; created, unless there is a lock.
+      console: where the progress is printed.
+      stopwatch: wall time of the process, by stage.
+      signals: signals of the process; after one, training ends at the next checkpoint.
+      lock: the lock of a resumed run.
+      restored: the checkpoint to continue from.
+      on_trained: called between training and final evaluation.
+
+    Raises:
+      Interrupted: a signal was received; a checkpoint has been written.
+      Diverged: a number is not finite; the checkpoints before it are kept.
+      OSError: a file cannot be written.
+      RunExists: another process has created the run directory.
+    """
+    with contextlib.closing(lock or _new_run(run_dir, trainer)):
+        save_models(run_dir, config.env)
+        save_correspondence(run_dir, config.env)
+        save_plugins(run_dir, config)
+        save_config(run_dir, config)  # after the inputs: a folder without it is no run yet
+        headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
+        lines = filter(None, (headline, trainer.simulation, f"run directory: {run_dir}"))
+        console.print("\n".join(lines), highlight=False, soft_wrap=True)
+        steps, params = _train_and_log(config, trainer, run_dir, signals, restored, stopwatch, console)
+        if on_trained:
+            on_trained()
+        trained = steps - (restored.step if restored else 0)
+        return _evaluate(config, trainer, run_dir, steps, params, trained, stopwatch)
 
 
 def _evaluate(

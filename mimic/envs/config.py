@@ -1,7 +1,9 @@
 """The config of an environment. The presets in mimic/conf/env, `make` and the command line set its fields."""
 
 import dataclasses
+import math
 
+from mimic import registry
 from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
 from mimic.config import check_choice
@@ -11,6 +13,7 @@ from mimic.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
 AUTO = "auto"
+_MAX_WEIGHT = 1e6  # of a reward term
 _MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
 
@@ -20,6 +23,7 @@ class DemonstrationConfig:
 
     Attributes:
       path: file of demonstrations; where empty, demonstrations are recorded in simulation.
+      source: registered function that makes the demonstrations, in place of a recording; only where `path` is empty.
       kind: controller of the recorded demonstrations: "pd" or "reach", see `record_demonstrations`.
       count: number of training demonstrations.
       held_out: number of held-out demonstrations, for evaluation only.
@@ -27,6 +31,7 @@ class DemonstrationConfig:
     """
 
     path: str = ""
+    source: str = ""
     kind: str = "pd"
     # A core records some hundred in a second.
     count: int = number(124, at_least=1, at_most=100_000)
@@ -62,6 +67,39 @@ class RandomizationConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class RewardConfig:
+    """What is added to the reward, see `mimic.register`.
+
+    Attributes:
+      terms: weights of registered reward terms, by name. A step that ends a runaway counts each term as minus the
+        weight's magnitude for all remaining steps; so terms should be in [-1, 1].
+    """
+
+    terms: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, weight in self.terms.items():
+            if not (math.isfinite(weight) and abs(weight) <= _MAX_WEIGHT):
+                raise ValueError(f"reward.terms.{name}: expected a number up to {_MAX_WEIGHT:g}, got {weight}")
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservationConfig:
+    """What is added to the observation, see `mimic.register`.
+
+    Attributes:
+      terms: names of registered observation terms, in the order of their numbers, after the link states.
+    """
+
+    terms: list[str] = dataclasses.field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        repeated = sorted({name for name in self.terms if self.terms.count(name) > 1})
+        if repeated:
+            raise ValueError(f"observation.terms: expected each term once, got {repeated[0]!r:.80} twice")
+
+
+@dataclasses.dataclass(frozen=True)
 class EnvConfig:
     """An imitation environment.
 
@@ -84,6 +122,8 @@ class EnvConfig:
       action_scale: factor on the torque range; at 1 the range is twice the torque that takes a joint from rest to its
         velocity limit in one step, cut at the torque limit.
       speed_bound: joint speed [rad/s] at which an episode ends as a runaway.
+      reward, observation: registered terms that are added.
+      environment: registered subclass of `ImitationEnv`; that class itself where empty.
     """
 
     name: str = ""
@@ -102,11 +142,22 @@ class EnvConfig:
     action_scale: float = number(1.0, at_least=1e-3, at_most=1000.0)  # the torque is cut at the torque limit anyway
     speed_bound: float = number(30.0, at_least=1e-3, at_most=1000.0)  # the fastest joints of robots reach some 30 rad/s
 
+    reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
+    observation: ObservationConfig = dataclasses.field(default_factory=ObservationConfig)
+    environment: str = ""
+
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)
         check_choice("physics", self.physics, (AUTO, *PHYSICS))
         check_ranges(self)
-        recorded = 0 if self.demonstrations.path else self.demonstrations.count + self.demonstrations.held_out
+        for name in self.reward.terms:
+            registry.check("reward_term", name, "reward.terms")
+        for name in self.observation.terms:
+            registry.check("observation_term", name, "observation.terms")
+        if self.environment:
+            registry.check("environment", self.environment, "environment")
+        is_recorded = not (self.demonstrations.path or self.demonstrations.source)
+        recorded = 0 if not is_recorded else self.demonstrations.count + self.demonstrations.held_out
         steps = recorded * self.horizon * self.substeps
         if steps > _MAX_RECORDED_STEPS:
             raise ValueError(

@@ -3,21 +3,24 @@
 import copy
 import dataclasses
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
-from flax import struct
 from jaxtyping import Array, Float, Int
 
+from mimic import compat, registry
 from mimic.arms.arm import Arm, build_arm, torque_scale
 from mimic.arms.embodiment import Embodiment
+from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.envs.physics import Load, PhysicsChoice, choose_physics, make_advance
 from mimic.envs.recording import record_demonstrations
+from mimic.envs.terms import Transition, observation_layout_of_terms, observation_terms, observed, reward_terms
+from mimic.metric.distance import LinkDistance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 
 # The limit penalty starts this margin inside a limit and is at its maximum a width further out; in rad for positions,
@@ -28,32 +31,6 @@ _LIMIT_MARGIN, _LIMIT_WIDTH = 0.03, 0.1
 _NOISE, FIRST_STEP = 3, 4
 
 
-@struct.dataclass
-class ArmState:
-    """The state of an episode.
-
-    Attributes:
-      qpos: learner's joint angles [rad].
-      qvel: learner's joint velocities [rad/s].
-      step: control steps since the start of the demonstration.
-      demonstration: index of the demonstration.
-      key: random key for the noise of this episode and for the following episodes.
-      load: factors on the arm's dynamics in this episode; None where all episodes have the same.
-    """
-
-    qpos: Float[Array, " joints"]
-    qvel: Float[Array, " joints"]
-    step: Int[Array, ""]
-    demonstration: Int[Array, ""]
-    key: Array
-    load: Load | None = None
-
-
-def arm_state(state: State) -> ArmState:
-    """The `ArmState` in a brax state, with its type."""
-    return cast(ArmState, state.pipeline_state)
-
-
 class ImitationEnv(Env):
     """One learner imitating one of the demonstrations; a brax environment.
 
@@ -61,6 +38,7 @@ class ImitationEnv(Env):
     times `limit_excess`. Observation: link states of the learner, of the expert now, and of the expert at each of the
     next `preview` steps, as one vector. Action: a torque for each joint in [-1, 1], scaled by `torque_scale`. The
     episode terminates at the horizon, because there is nothing to imitate after it; this is no truncation.
+    The config's `reward.terms` and `observation.terms` add to reward and observation.
 
     A subclass may override `observe`, as one vector of any length, and `start`: `reset`, `step` and `restart_done` call
     them.
@@ -77,6 +55,7 @@ class ImitationEnv(Env):
       metric: metric of the reward.
       demonstrations: motions to imitate.
       expert_states: link states of the demonstrations, [demonstrations, time, links, 3] each.
+      reward_terms, observation_terms: the functions that the config adds to reward and observation.
       torque_scale: [joints] maximum torque [N m].
 
     Raises:
@@ -84,9 +63,12 @@ class ImitationEnv(Env):
     """
 
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
+        compat.mend_brax()  # here: brax's trainers take any environment, wrapped by any function
         arms = config.build_arms()
         self.expert, self.learner = arms.embodiments
         self.metric = config.metric.build(self.expert, self.learner)
+        self.reward_terms = reward_terms(config.reward.terms)
+        self.observation_terms = observation_terms(config.observation.terms)
         self.arm = arms.learner
         self.torque_scale = jnp.asarray(torque_scale(self.arm, config.action_scale, config.control_dt))
         home = np.asarray(self.learner.home)
@@ -139,6 +121,7 @@ class ImitationEnv(Env):
         """The brax state of an episode that starts in a state of `start`."""
         zero = jnp.zeros(())
         metrics = {"distance": zero, "limit_excess": zero, "torque_saturation": zero, "runaway": zero}
+        metrics |= {term.metric: zero for term in self.reward_terms}
         return State(arm_state, self.observe_home(arm_state), zero, zero, metrics, {})
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
@@ -170,7 +153,8 @@ class ImitationEnv(Env):
             noise = jax.random.normal(key_noise, command.shape)
             torque = jnp.clip(command + randomization.torque_noise * noise, -1.0, 1.0)
         load = Load(randomization.mass[0], randomization.damping[0]) if before.load is None else before.load
-        qpos, qvel = self._advance(before.qpos, before.qvel, torque * self.torque_scale, load)
+        torque = torque * self.torque_scale
+        qpos, qvel = self._advance(before.qpos, before.qvel, torque, load)
         runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
         remaining = (self.config.horizon - step).astype(jnp.float32)
         states = link_states(self.learner, qpos, qvel)
@@ -189,6 +173,11 @@ class ImitationEnv(Env):
             "runaway": runaway.astype(jnp.float32),
         }
         reward = -(distance + self.limit_penalty_weight * excess) * steps
+        transition = Transition(before, after, command, torque, states, expert_states)
+        for term in self.reward_terms:
+            value = jnp.where(runaway, -np.sign(term.weight), term.value(self, transition))
+            metrics[term.metric] = value
+            reward = reward + term.weight * value * steps
         obs = self._observe_states(after, states)
         return state.replace(pipeline_state=after, obs=obs, reward=reward, done=done, metrics=metrics)
 
@@ -235,6 +224,9 @@ class ImitationEnv(Env):
         """Distance charged per step of a runaway: all corresponding links antiparallel, at opposite ends, at rest."""
         metric, n, n_hat = self.config.metric, self.expert.num_links, self.learner.num_links
         per_pair = np.pi * metric.rotation + 2 * metric.translation + 4 * metric.adaptive
+        if isinstance(self.metric.weights, LinkDistance):
+            with jax.ensure_compile_time_eval():
+                per_pair = float(self.metric.weights.function(*_opposite_links()))
         # The Frobenius norm is at most the sum of the entries; those of hard and soft W sum to n + n_hat.
         total = n + n_hat if callable(self.metric.correspondence) else np.asarray(self.metric.correspondence).sum()
         return float(per_pair * total / (n * n_hat if metric.reduction == "mean" else 1))
@@ -246,6 +238,8 @@ class ImitationEnv(Env):
 
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """The observation: the learner's link states, then the expert's now and at each of the next `preview` steps.
+
+        The values of the config's `observation.terms` follow.
 
         A subclass may override it: every observation of the environment is then the subclass's.
         """
@@ -265,16 +259,17 @@ class ImitationEnv(Env):
         return self.observe(state) if self._has_own_observation else self._link_observation(state, learner_states)
 
     def _link_observation(self, state: ArmState, learner_states: LinkStates) -> Float[Array, " observation"]:
-        observed = [learner_states]
-        observed += [
+        observed_states = [learner_states]
+        observed_states += [
             self.expert_at(state.demonstration, state.step + ahead) for ahead in range(self.config.preview + 1)
         ]
-        return jnp.concatenate([leaf.ravel() for states in observed for leaf in jax.tree.leaves(states)])
+        parts = [leaf.ravel() for states in observed_states for leaf in jax.tree.leaves(states)]
+        return jnp.concatenate([*parts, *(observed(*term, self, state) for term in self.observation_terms)])
 
     @property
     def observation_size(self) -> int:
-        """Length of an observation: twelve numbers for each observed link, or what an overridden `observe` returns."""
-        if self._has_own_observation:
+        """Length of an observation: twelve numbers for each observed link, and what terms or a subclass change."""
+        if self._has_own_observation or self.observation_terms:
             return jax.eval_shape(lambda: self.observe(self.start(jax.random.PRNGKey(0)))).size
         return 12 * (self.learner.num_links + (self.config.preview + 1) * self.expert.num_links)
 
@@ -287,6 +282,27 @@ class ImitationEnv(Env):
     def backend(self) -> str:
         """Name of the physics backend, for brax."""
         return self.physics.name
+
+
+def _opposite_links() -> tuple[LinkStates, LinkStates]:
+    """Two links that are antiparallel, at opposite ends of the reach and at rest."""
+    x, zero = jnp.array([[1.0, 0.0, 0.0]]), jnp.zeros((1, 3))
+    links = LinkStates(x, x, zero, zero), LinkStates(-x, -x, zero, zero)
+    return jax.tree.map(lambda leaf: leaf[0], links)
+
+
+def make_env(config: EnvConfig, demonstrations: Demonstrations | None = None) -> ImitationEnv:
+    """The environment of a config: an `ImitationEnv`, or an object of the registered class that the config names.
+
+    Raises:
+      ValueError: an unknown class, or what `ImitationEnv` rejects.
+    """
+    if not config.environment:
+        return ImitationEnv(config, demonstrations)
+    env_class = registry.find("environment", config.environment, "environment")
+    if not (isinstance(env_class, type) and issubclass(env_class, ImitationEnv)):
+        raise ValueError(f"environment: {config.environment!r}: expected a subclass of ImitationEnv, got {env_class!r}")
+    return env_class(config, demonstrations)
 
 
 def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
@@ -309,22 +325,32 @@ def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) ->
     return layout
 
 
+def layout_of(env: ImitationEnv) -> list[dict[str, Any]]:
+    """The parts of an environment's observation, as in `observation_layout`, with those of terms or of its class."""
+    if env._has_own_observation:
+        size = env.observation_size
+        name = f"observation of {type(env).__name__}"
+        return [{"name": name, "shape": [size], "unit": "", "start": 0, "stop": size}]
+    layout = observation_layout(env.expert, env.learner, env.config.preview)
+    return layout + observation_layout_of_terms(env, layout[-1]["stop"])
+
+
 def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple[Demonstrations, Demonstrations]:
     """The demonstrations of a config: the first `count` are for training, the next `held_out` for evaluation.
 
     Raises:
-      ValueError: a file that cannot be read, does not fit the expert, exceeds its limits, or has too few
+      ValueError: a file or source that cannot be read, does not fit the expert, exceeds its limits, or has too few
         demonstrations.
     """
     expert = expert or build_arm(config.expert, config.limits, config.metric.links)
     settings = config.demonstrations
-    if settings.path:
-        loaded = load_demonstrations(Path(settings.path).expanduser())
+    if settings.path or settings.source:
+        loaded, label = _demonstrations_of_others(config, expert)
         loaded.check_fits(expert.embodiment, config.control_dt, config.horizon)
         check_effort(loaded, expert.embodiment)
         if loaded.count < settings.count + settings.held_out:
             raise ValueError(
-                f"demonstrations: {settings.path!r} has {loaded.count}, expected at least "
+                f"demonstrations: {label!r} has {loaded.count}, expected at least "
                 f"count + held_out = {settings.count} + {settings.held_out}"
             )
     else:
@@ -340,3 +366,14 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
     training = loaded.select(slice(0, settings.count))
     held_out = loaded.select(slice(settings.count, settings.count + settings.held_out))
     return training, held_out
+
+
+def _demonstrations_of_others(config: EnvConfig, expert: Arm) -> tuple[Demonstrations, str]:
+    """The demonstrations of a file or of a registered source, and its name."""
+    settings = config.demonstrations
+    if settings.path:
+        return load_demonstrations(Path(settings.path).expanduser()), settings.path
+    made = registry.find("demonstrations", settings.source, "demonstrations.source")(expert, config)
+    if not isinstance(made, Demonstrations):
+        raise ValueError(f"demonstrations: source {settings.source!r}: expected Demonstrations, got {made!r:.80}")
+    return made, settings.source

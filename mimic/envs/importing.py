@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.demonstrations import MAX_VALUE, Demonstrations, check_effort
-from mimic.runs.npz import read_arrays
+from mimic.npz import read_arrays
 
 SOURCES = (".csv", ".npz")
 _TIME, _DEMONSTRATION = ("time", "t"), "demonstration"  # columns of a table

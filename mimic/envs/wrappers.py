@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
-from mimic import compat
 from mimic.envs.imitation import FIRST_STEP, ImitationEnv, arm_state
 
 
@@ -49,6 +48,7 @@ def fresh_episodes(env: ImitationEnv) -> Wrapper:
 def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, randomization_fn=None) -> Wrapper:
     """Wraps an environment for brax's trainers: the function to pass to them as `wrap_env_fn`.
 
+    Without it, they wrap it with brax's own `AutoResetWrapper`, see `FreshEpisodeWrapper`.
     `episode_length` is the horizon, at which the environment itself terminates the episode. The wrapper's time-out,
     which PPO would treat as a truncation, never comes first.
 
@@ -61,6 +61,5 @@ def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, ran
         raise TypeError(f"expected an ImitationEnv, got {type(imitation).__name__}")
     if randomization_fn is not None:
         raise ValueError("randomization_fn is not supported")
-    compat.mend_brax()  # here, because brax's trainers call this function first
     wrapped = EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat)
     return FreshEpisodeWrapper(wrapped, imitation)

@@ -3,11 +3,12 @@
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
 
+from mimic import registry
 from mimic.arms.chain import LINKS
 from mimic.arms.embodiment import Embodiment
 from mimic.config import check_choice
@@ -17,11 +18,13 @@ from mimic.metric.correspondence import (
     overlap_correspondence,
     soft_correspondence,
 )
+from mimic.metric.correspondence_files import checked_matrix, is_correspondence_file, load_correspondence
 from mimic.metric.distance import (
     REDUCTIONS,
     ROTATION_MEASURES,
     Correspondence,
     DistanceWeights,
+    LinkDistance,
     Metric,
     Reduction,
     RotationMeasure,
@@ -31,6 +34,13 @@ from mimic.metric.distance import (
 from mimic.ranges import check_ranges, number
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")
+registry.reserve("correspondence", CORRESPONDENCES)
+
+
+def check_correspondence(name: str) -> None:
+    """Raises a ValueError unless a correspondence is built in, registered, or named as a file."""
+    if not is_correspondence_file(name):
+        registry.check("correspondence", name, "correspondence")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +53,9 @@ class MetricConfig:
       rotation_measure: "cosine" or "angle".
       links: "kept" (a locked joint removes no link) or "merged" (its two links become one chord; paper).
       correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance); "chord_overlap" is the overlap
-        of old runs, which merged links.
+        of old runs, which merged links; or a registered name, or a .csv or .npz file with a matrix, see
+        `load_correspondence`.
+      link_distance: a registered function of two links, in place of the weighted parts; none where empty.
       xi: sharpness of the soft correspondence, below 0.
       reduction: "mean" or "frobenius".
     """
@@ -59,23 +71,34 @@ class MetricConfig:
     xi: float = number(-10.0, at_least=-1e6, below=0.0)  # a soft minimum
     reduction: str = "mean"
     links: str = "kept"
+    link_distance: str = ""
 
     def __post_init__(self) -> None:
         check_choice("links", self.links, LINKS)
-        check_choice("correspondence", self.correspondence, CORRESPONDENCES)
+        check_correspondence(self.correspondence)
+        if self.link_distance:
+            registry.check("link_distance", self.link_distance, "link_distance")
         check_choice("rotation_measure", self.rotation_measure, ROTATION_MEASURES)
         check_choice("reduction", self.reduction, REDUCTIONS)
         check_ranges(self, "metric.")
 
     def make_weights(self) -> Weights:
-        """The weights: constants, or a function of the distances."""
+        """The weights: constants, a function of the distances, or an own distance between links."""
+        if self.link_distance:
+            return LinkDistance(registry.find("link_distance", self.link_distance, "metric.link_distance"))
         velocities = {"linear_velocity": self.linear_velocity, "angular_velocity": self.angular_velocity}
         if self.adaptive:
             return lambda distances: dataclasses.replace(adaptive_weights(distances), **velocities)
         return DistanceWeights(self.translation, self.rotation, **velocities)
 
     def make_correspondence(self, expert: Embodiment, learner: Embodiment) -> Correspondence:
-        """W, or a function of the link distances that returns it."""
+        """W, or a function of the link distances that returns it.
+
+        Raises:
+          ValueError: a matrix, from a file or a registered function, that does not fit the arms.
+        """
+        if is_correspondence_file(self.correspondence):
+            return load_correspondence(self.correspondence, expert, learner)
         constructors: dict[str, Callable[[], Correspondence]] = {
             "arc_length": lambda: arc_length_correspondence(expert, learner),
             "overlap": lambda: overlap_correspondence(expert, learner),
@@ -83,7 +106,12 @@ class MetricConfig:
             "hard": lambda: hard_correspondence,
             "soft": lambda: partial(soft_correspondence, xi=self.xi),
         }
-        return constructors[self.correspondence]()
+        if self.correspondence in constructors:
+            return constructors[self.correspondence]()
+        made: Any = registry.find("correspondence", self.correspondence, "metric.correspondence")(expert, learner)
+        if callable(made):
+            return cast(Correspondence, made)
+        return checked_matrix(made, expert, learner, repr(self.correspondence))
 
     def build(self, expert: Embodiment, learner: Embodiment) -> Metric:
         """The metric between two arms."""
@@ -94,9 +122,10 @@ class MetricConfig:
     def link_fractions(self, expert: Embodiment, learner: Embodiment) -> Float[np.ndarray, "expert learner"]:
         """Fraction of each expert link in the target of a learner link; columns sum to 1.
 
-        From the static correspondence; equal fractions where W depends on the state.
+        From the static correspondence; equal fractions where W depends on the state. A column of W that is 0 stays 0.
         """
         correspondence = self.make_correspondence(expert, learner)
         shape = expert.num_links, learner.num_links
         matrix = np.ones(shape) if callable(correspondence) else np.asarray(correspondence)
-        return matrix / matrix.sum(axis=0)
+        sums = matrix.sum(axis=0)
+        return matrix / np.where(sums == 0, 1.0, sums)

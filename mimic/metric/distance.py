@@ -48,7 +48,19 @@ class PairDistances:
     angular_velocity: Float[Array, "*pairs"]
 
 
-Weights = DistanceWeights | Callable[[PairDistances], DistanceWeights]
+@dataclasses.dataclass(frozen=True)
+class LinkDistance:
+    """An own distance between two links, in place of weights: it replaces the weighted sum of the parts.
+
+    Attributes:
+      function: (state of an expert link, state of a learner link) -> distance, at least 0; `LinkStates` of one link,
+        [3] each. It must be differentiable, also where the links match.
+    """
+
+    function: Callable[[LinkStates, LinkStates], Float[Array, ""]]
+
+
+Weights = DistanceWeights | Callable[[PairDistances], DistanceWeights] | LinkDistance
 Correspondence = (
     Real[ArrayLike, "expert learner"] | Callable[[Float[Array, "expert learner"]], Float[Array, "expert learner"]]
 )
@@ -90,13 +102,17 @@ def link_distances(
     Args:
       expert_states: link states of the expert; normalized, to compare arms of different size.
       learner_states: link states of the learner.
-      weights: constants, or a function of the unweighted distances of one pair, such as `adaptive_weights`.
+      weights: constants, or a function of the unweighted distances of one pair, such as `adaptive_weights`; or a
+        `LinkDistance`.
       rotation: the rotational measure, see `rotation_distance`.
 
     Raises:
       ValueError: an unknown measure, or a weight on a part that candidate points lack.
     """
     check_choice("rotation", rotation, ROTATION_MEASURES)
+    if isinstance(weights, LinkDistance):
+        own = jax.vmap(jax.vmap(weights.function, in_axes=(None, 0)), in_axes=(0, None))
+        return own(expert_states, learner_states)
     if not callable(weights):
         _check_candidate_points(expert_states, learner_states, weights)
     over_learner = jax.vmap(lambda a, b: pair_distances(a, b, rotation), in_axes=(None, 0))

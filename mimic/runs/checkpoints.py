@@ -22,9 +22,9 @@ import jaxlib
 import numpy as np
 import orbax.checkpoint as ocp
 
+from mimic.npz import read_arrays
 from mimic.runs.autotuning import keep_choices
 from mimic.runs.files import write_atomically
-from mimic.runs.npz import read_arrays
 
 FOLDER = "checkpoints"
 WITH_STATE = 2  # newest checkpoints of a run that have the state of the training

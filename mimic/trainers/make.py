@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mimic import compat
+from mimic import compat, registry
 from mimic.envs.demonstrations import Demonstrations
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.memory import check_training_memory
@@ -25,7 +25,11 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
       ValueError: a config that cannot be trained, or not in the memory that there is.
     """
     check_training_memory(config)
-    return _MAKERS[config.trainer.name](config, run_dir)
+    name = config.trainer.name
+    if name in _MAKERS:
+        return _MAKERS[name](config, run_dir)
+    compat.import_mjx()  # first, and quietly: the trainer may import brax
+    return registry.find("trainer", name, "trainer.name")(config, run_dir)
 
 
 def make_ppo_trainer(config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None) -> "PPOTrainer":

@@ -8,14 +8,17 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from mimic import registry
 from mimic.arms.arm import BUILT_IN
 from mimic.config import check_new, check_writable, explain, merged, schema, to_dict, typed
 from mimic.config_files import check_references, read_config
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
 from mimic.runs.lock import LOCK
-from mimic.trainers.config import TRAINERS, TrainConfig
+from mimic.trainers.config import TrainConfig, trainer_config
+from mimic.trainers.run_correspondence import COPIES, with_saved_correspondence
 from mimic.trainers.run_models import MODELS, with_original_models, with_saved_models
+from mimic.trainers.run_plugins import PLUGINS, check_plugins
 
 
 def new_run_dir(config: TrainConfig) -> Path:
@@ -39,7 +42,7 @@ def new_run_dir(config: TrainConfig) -> Path:
 
 def check_new_run(path: Path) -> None:
     """Raises a `ValueError` if a path exists, unless it is a folder of a run that ended before it wrote its config."""
-    inputs = DEMONSTRATIONS, MODELS
+    inputs = DEMONSTRATIONS, MODELS, PLUGINS, *COPIES
     before_config = {LOCK, *inputs, *(f"{name}.partial" for name in (*inputs, CONFIG))}
     if not (os.path.isdir(path) and {file.name for file in path.iterdir()} <= before_config):
         check_new("run_dir", path, f"name a new folder, or continue the run with resume={path}")
@@ -53,7 +56,7 @@ def save_config(run_dir: Path, config: TrainConfig) -> None:
 
 def run_schema(trainer: str) -> DictConfig:
     """The typed OmegaConf node of a run with this trainer."""
-    return merged(schema(TrainConfig), {"trainer": schema(TRAINERS[trainer])})
+    return merged(schema(TrainConfig), {"trainer": schema(trainer_config(trainer))})
 
 
 def load_config(run_dir: Path, *, saved_models: bool = True) -> TrainConfig:
@@ -65,15 +68,18 @@ def load_config(run_dir: Path, *, saved_models: bool = True) -> TrainConfig:
         the run started from.
 
     Raises:
-      ValueError: no run directory, a config that cannot be read, or model files that were changed.
+      ValueError: no run directory, a config that cannot be read, a plugin that is not loaded, or model files that were
+        changed.
     """
     config = _read_config(run_dir)
+    config = dataclasses.replace(config, env=with_saved_correspondence(run_dir, config.env))
     return dataclasses.replace(config, env=with_saved_models(run_dir, config.env)) if saved_models else config
 
 
 def _read_config(run_dir: Path) -> TrainConfig:
     if not (run_dir / CONFIG).is_file():
         raise ValueError(f"{str(run_dir)!r} is not a run directory: it has no {CONFIG}")
+    check_plugins(run_dir)
     try:
         content = read_config(run_dir / CONFIG)
         check_references(content)  # before anything resolves them
@@ -81,8 +87,7 @@ def _read_config(run_dir: Path) -> TrainConfig:
             if not OmegaConf.is_dict(content[group]):
                 raise ValueError(f"{group}: expected keys and values, got {content[group]}")
         name = OmegaConf.select(content, "trainer.name")
-        if name not in TRAINERS:
-            raise ValueError(f"trainer.name: expected one of {', '.join(TRAINERS)}, got {name!r}")
+        registry.check("trainer", str(name), "trainer.name")
         content = merged(run_schema(name), _with_old_defaults(content))
         return typed(content)
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error

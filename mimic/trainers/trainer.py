@@ -67,6 +67,15 @@ class Trainer(abc.ABC):
           OSError: a checkpoint cannot be written.
         """
 
+    def policy(self, params: Params) -> Callable[[Any], Any]:
+        """The trained function, compiled: of an observation to an action, or of an expert's pose to a learner's.
+
+        Raises:
+          ValueError: the trainer has no such function.
+        """
+        del params
+        raise ValueError(f"trainer {self.settings.name} has no policy")
+
     def follow(self, restored: Checkpoint | None) -> None:
         """Trains in a process other than the first, which alone evaluates and writes; returns when training ends."""
         del restored

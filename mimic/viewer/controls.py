@@ -98,13 +98,15 @@ class LiveControls:
 
     def _add_metric(self) -> None:
         gui, session, settings = self._server.gui, self._session, self._session.settings
-        correspondence = gui.add_dropdown("correspondence", CORRESPONDENCES, initial_value=settings.correspondence)
+        choices = tuple(dict.fromkeys((*CORRESPONDENCES, settings.correspondence)))  # a run may have one of its own
+        correspondence = gui.add_dropdown("correspondence", choices, initial_value=settings.correspondence)
         correspondence.on_update(_by_user(lambda value: session.change(correspondence=value)))
         for term in ("rotation", "translation"):
             initial = getattr(settings, term)
             weight = gui.add_slider(
                 term, 0.0, max(_MAX_WEIGHT, initial), _WEIGHT_STEP, initial,
-                disabled=self._env.metric.adaptive, hint="weight of this term of the distance",
+                disabled=self._env.metric.adaptive or bool(self._env.metric.link_distance),
+                hint="weight of this term of the distance",
             )  # fmt: skip
             weight.on_update(_by_user(lambda value, term=term: session.change(**{term: float(value)})))
         gui.add_markdown("A new correspondence, and a first weight on translation, take some seconds to compile.")

@@ -13,9 +13,8 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
-from mimic.config import check_choice
 from mimic.envs.config import EnvConfig
-from mimic.metric.config import CORRESPONDENCES
+from mimic.metric.config import check_correspondence
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
@@ -43,7 +42,7 @@ class Settings:
     rotation: float
 
     def __post_init__(self) -> None:
-        check_choice("correspondence", self.correspondence, CORRESPONDENCES)
+        check_correspondence(self.correspondence)
         for name, weight in (("translation", self.translation), ("rotation", self.rotation)):
             if not 0 <= weight < math.inf:
                 raise ValueError(f"{name}: expected a finite weight of at least 0, got {weight}")
@@ -167,7 +166,7 @@ def _metric_of_weights(
     base_metric = dataclasses.replace(env.metric, correspondence=settings.correspondence).build(expert, learner)
 
     def metric(weights: Array) -> Metric:
-        if env.metric.adaptive:
+        if env.metric.adaptive or env.metric.link_distance:
             return base_metric
         # A constant weight of 0 removes its term, which makes the optimiser's derivatives much simpler.
         constant = DistanceWeights(0.0 if settings.translation == 0 else weights[0], weights[1])

@@ -150,6 +150,10 @@ class PoseMapperTrainer(Trainer):
         """Shapes of the network's parameters."""
         return jax.eval_shape(lambda: self._model.init(jax.random.key(0)))
 
+    def policy(self, params: Params) -> Callable[[Any], Any]:
+        """The mapper: pose of the expert -> pose of the learner [rad]."""
+        return jax.jit(lambda qpos: self._model(params, qpos))
+
     def train(
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restored: Checkpoint | None
     ) -> tuple[int, Params]:

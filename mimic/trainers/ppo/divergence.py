@@ -9,9 +9,9 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from mimic.npz import read_arrays
 from mimic.runs.checkpoints import run_id
 from mimic.runs.divergence import FILE
-from mimic.runs.npz import read_arrays
 from mimic.trainers.ppo.programs import BatchRecord, Replay, TrainingState, of_all_processes, saved_leaves
 from mimic.trainers.ppo.updates import TRACED
 

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ import jax
 from mimic.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
-from mimic.envs.imitation import ImitationEnv, training_and_held_out
+from mimic.envs.imitation import ImitationEnv, make_env, training_and_held_out
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
@@ -47,7 +48,7 @@ class PPOTrainer(Trainer):
         self._name, self._seed = config.env.name, config.seed
         self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count())
         self.total_steps = self.settings.total_steps
-        env, held_out = _environment(config.env, run_dir)
+        env, held_out = run_environment(config.env, run_dir)
         if unseen is not None:
             unseen.check_fits(env.expert, config.env.control_dt, config.env.horizon)
             check_effort(unseen, env.expert)
@@ -76,6 +77,11 @@ class PPOTrainer(Trainer):
     def controller(self, params: Params) -> Controller:
         """The deterministic policy of these parameters."""
         return ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)(params)
+
+    def policy(self, params: Params) -> Callable[[Any], Any]:
+        """The deterministic policy: observation -> action in [-1, 1]."""
+        controller = self.controller(params)
+        return jax.jit(lambda observation: controller(SimpleNamespace(obs=observation)))  # type: ignore[arg-type]
 
     def _compile(self) -> Callable[[Params], Rollouts]:
         def rollouts(params: Params) -> Rollouts:
@@ -239,14 +245,14 @@ def _text(form: str, value: float) -> str:
     return form.format(value) if math.isfinite(value) else "none"
 
 
-def _environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
+def run_environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
     """The environment with its training demonstrations, and the held-out ones; an existing run has its own."""
     if run_dir is not None:
         path = str(run_dir / DEMONSTRATIONS)
         stored = dataclasses.replace(config.demonstrations, path=path)
         config = dataclasses.replace(config, demonstrations=stored)
     training, held_out = training_and_held_out(config)
-    return ImitationEnv(config, training), held_out
+    return make_env(config, training), held_out
 
 
 def _with_crossovers(env: ImitationEnv, count: int, seed: int) -> ImitationEnv:

@@ -1,0 +1,145 @@
+"""Registered reward and observation terms, environment classes and demonstration sources."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.envs.imitation import layout_of, make_env
+from mimic.envs.wrappers import fresh_episodes
+
+SMALL = {"horizon": 5, "demonstrations": {"count": 2, "held_out": 1}}
+
+
+def height(env, transition):
+    """Height of the last link [chain lengths], and a part of the torque."""
+    return transition.learner_states.position[-1, 1] - 0.1 * jnp.abs(transition.action).max()
+
+
+def one_step(env, action):
+    return jax.jit(lambda key: env.step(env.reset(key), action))(jax.random.PRNGKey(0))
+
+
+def angles(env, state):
+    return state.qpos
+
+
+def demonstration(env, state):
+    return state.demonstration[None]
+
+
+@pytest.fixture
+def terms(own_registry):
+    mimic.register("reward_term", "height", height)
+    mimic.register("observation_term", "angles", angles)
+    mimic.register("observation_term", "demonstration", demonstration)
+    return {"reward": {"terms": {"height": 0.5}}, "observation": {"terms": ["angles", "demonstration"]}}
+
+
+@pytest.mark.parametrize("physics", ["mjx", "fused"])
+def test_terms_are_added_in_both_physics(terms, physics):
+    plain = mimic.make("planar4dof", physics=physics, **SMALL)
+    env = make_env(mimic.env_config("planar4dof", physics=physics, **SMALL, **terms))
+    action = jnp.array([0.5, -0.2, 0.1, 0.0])
+    states = [one_step(plain, action), one_step(env, action)]
+    arm = states[1].pipeline_state
+    expected = mimic.link_states(env.learner, arm.qpos, arm.qvel).position[-1, 1] - 0.05
+    np.testing.assert_allclose(states[1].metrics["reward/height"], expected, atol=1e-5)  # float32
+    np.testing.assert_allclose(states[1].reward, states[0].reward + 0.5 * expected, atol=1e-5)
+    np.testing.assert_array_equal(states[1].obs[: plain.observation_size], states[0].obs)
+    np.testing.assert_array_equal(states[1].obs[plain.observation_size :], [*arm.qpos, arm.demonstration])
+    assert env.observation_size == plain.observation_size + 5 == states[1].obs.size
+    layout = layout_of(env)
+    assert [part["name"] for part in layout[-2:]] == ["term: angles", "term: demonstration"]
+    assert layout[-1]["stop"] == env.observation_size and layout_of(plain)[-1]["stop"] == plain.observation_size
+
+
+def test_terms_are_in_batches_that_restart(terms):
+    env = mimic.make("planar4dof", physics="fused", **SMALL, **terms)
+    wrapped = fresh_episodes(env)
+
+    @jax.jit
+    def rollout(keys):
+        def step(state, _):
+            state = wrapped.step(state, jnp.zeros((3, 4)))
+            return state, (state.obs, jax.vmap(env.observe)(state.pipeline_state))
+
+        return jax.lax.scan(step, wrapped.reset(keys), None, length=7)[1]
+
+    obs, observed = rollout(jax.random.split(jax.random.PRNGKey(0), 3))
+    np.testing.assert_allclose(obs, observed, atol=1e-5)
+
+
+@pytest.mark.parametrize("weight", [0.5, -0.5])
+def test_ending_an_episode_early_is_never_better(own_registry, weight):
+    mimic.register("reward_term", "one", lambda env, transition: jnp.ones(()))
+    env = mimic.make("planar4dof", physics="fused", speed_bound=0.001, reward={"terms": {"one": weight}}, **SMALL)
+    state = one_step(env, jnp.ones(4))
+    assert state.done == 1 and state.metrics["reward/one"] == -np.sign(weight)
+    np.testing.assert_allclose(state.reward, -5 * (env._worst_distance + 0.5), rtol=1e-6)
+
+
+def test_a_runaway_is_charged_the_own_distance(own_registry):
+    mimic.register("link_distance", "squared", lambda a, b: ((a.position - b.position) ** 2).sum())
+    env = mimic.make("planar4dof", physics="fused", metric={"link_distance": "squared"}, **SMALL)
+    matrix = np.asarray(env.metric.correspondence)
+    assert env._worst_distance == pytest.approx(4 * matrix.mean())  # opposite ends: 2 chain lengths
+
+
+@pytest.mark.parametrize(
+    ("kind", "thing", "settings", "message"),
+    [
+        ("reward_term", lambda env, t: t.after.qpos, {"reward": {"terms": {"bad": 1.0}}}, r"a number, got shape \[4\]"),
+        ("observation_term", lambda env, s: s.step, {"observation": {"terms": ["bad"]}}, r"a vector, got shape \[\]"),
+        ("demonstrations", lambda expert, config: None, {"demonstrations": {"source": "bad"}}, "expected Demonst"),
+        ("environment", dict, {"environment": "bad"}, "expected a subclass of ImitationEnv"),
+    ],
+)  # fmt: skip
+def test_a_thing_that_returns_something_else_is_one_line(own_registry, kind, thing, settings, message):
+    mimic.register(kind, "bad", thing)
+    with pytest.raises(ValueError, match=message):
+        env = mimic.make("planar4dof", physics="fused", **{**SMALL, **settings})
+        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(4)), jax.random.PRNGKey(0))
+
+
+def test_terms_are_named_once_with_finite_weights(terms):
+    with pytest.raises(ValueError, match="expected each term once, got 'angles' twice"):
+        mimic.env_config("planar4dof", observation={"terms": ["angles", "angles"]})
+    with pytest.raises(ValueError, match="expected a number up to 1e.06, got inf"):
+        mimic.env_config("planar4dof", reward={"terms": {"height": float("inf")}})
+
+
+def test_a_registered_class_is_made(own_registry):
+    class Angles(mimic.ImitationEnv):
+        preset = {
+            "learner": {"model": "planar", "link_lengths": [0.5, 0.5]},
+            "expert": {"model": "planar", "link_lengths": [1.0]},
+        }
+
+        def observe(self, state):
+            return state.qpos
+
+    mimic.register("environment", "angles", Angles)
+    env = mimic.make("angles", physics="fused", **SMALL)
+    assert isinstance(env, Angles) and env.config.environment == env.config.name == "angles"
+    assert env.observation_size == 2 and layout_of(env)[0]["name"] == "observation of Angles"
+
+
+def test_demonstrations_are_those_of_a_source(own_registry):
+    recorded = mimic.make("planar4dof", physics="fused", **SMALL).demonstrations
+
+    def slower(expert, config):
+        count = config.demonstrations.count + config.demonstrations.held_out
+        motions = recorded.select([0] * count)
+        return dataclasses.replace(motions, qpos=0.5 * motions.qpos, qvel=0.5 * motions.qvel, torque=None)
+
+    mimic.register("demonstrations", "slower", slower)
+    settings = {**SMALL, "demonstrations": {**SMALL["demonstrations"], "source": "slower"}}
+    env = mimic.make("planar4dof", physics="fused", **settings)
+    np.testing.assert_array_equal(env.demonstrations.qpos[1], 0.5 * recorded.qpos[0])
+    mimic.register("demonstrations", "slower", lambda expert, config: recorded, replace=True)
+    with pytest.raises(ValueError, match="'slower' has 2, expected at least count . held_out = 2 . 1"):
+        mimic.make("planar4dof", physics="fused", **settings)
