@@ -102,7 +102,8 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
     title = f"{trained.env.name}, {config.split.replace('_', '-')} demonstration {config.demonstration}"
 
     def compute() -> Clip:
-        rollout = RolloutFrames(trainer.evaluator, trainer.evaluate(params), index, FRAMES_PER_SECOND)
+        rollouts = jax.tree.map(lambda x: x[index : index + 1], trainer.evaluate(params))
+        rollout = RolloutFrames(trainer.evaluator.only(index), rollouts, 0, FRAMES_PER_SECOND)
         curves = (
             Curve("holding the start pose", rollout.hold, _HOLD),
             Curve("policy", rollout.distance, {"color": "tab:blue"}),

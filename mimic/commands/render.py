@@ -31,6 +31,8 @@ _SCENE = 760  # pixels, width of the arms' picture
 _GIF_EVERY, _GIF_SCALE = 3, 0.5
 _LEGEND_ROOM = 1.25  # height of the axes relative to the maximum distance, so that the legend hides no curve
 
+_LINES = 5  # of progress where there is no terminal
+_Frame = UInt8[np.ndarray, "height width 3"]
 Bounds = tuple[float, float, float, float]  # left, bottom, width, height as fractions of the frame
 
 
@@ -43,21 +45,39 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
     use_compilation_cache(config.compilation_cache)
     env, default_out, compute_clip = prepare_clip(config)
     out = _new_video(config, default_out)
-    scene = ArmScene([env.expert, env.learner], limits=env.limits, width=_SCENE, height=_SIZE[1])
+    scene = ArmScene([env.expert, env.learner], limits=env.limits, width=_SCENE, height=_SIZE[1], fast=True)
 
     def run() -> None:
         console = Console()
-        with console.status("computing the motion and its distances"):
-            clip = compute_clip()
+        clip = _with_status(console, "computing the motion and its distances", compute_clip)
         out.parent.mkdir(exist_ok=True)
         with scene:
             frames = draw_frames(scene, clip)
-            thumbnails = _write_video(out, track(frames, total=len(clip.time), description="rendering"))
+            thumbnails = _write_video(out, _tracked(console, frames, len(clip.time)))
         if config.gif:
             _write_gif(out.with_suffix(".gif"), thumbnails)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
+
+
+def _with_status(console: Console, text: str, compute: Callable[[], Clip]) -> Clip:
+    """Computes a clip behind a status line; without a terminal, the line is printed."""
+    if not console.is_terminal:
+        console.print(text, highlight=False)
+    with console.status(text):
+        return compute()
+
+
+def _tracked(console: Console, frames: Iterator[_Frame], total: int) -> Iterator[_Frame]:
+    """The frames, behind a progress bar; without a terminal, a line after each fifth of them."""
+    if console.is_terminal:
+        yield from track(frames, total=total, description="rendering", console=console)
+        return
+    for number, frame in enumerate(frames, start=1):
+        yield frame
+        if number * _LINES // total > (number - 1) * _LINES // total:
+            console.print(f"rendering: {number} of {total} frames", highlight=False)
 
 
 def _new_video(config: RenderConfig, default_out: Path | None) -> Path:

@@ -4,8 +4,11 @@ import os
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
+import pytest
 
+from mimic.arms import rendering
 from mimic.arms.arm import ArmConfig
 from mimic.arms.rendering import ArmScene
 
@@ -55,3 +58,13 @@ def test_points_as_the_camera_sees_them():
     assert up[1] > 0.9 and abs(up[0]) < 1e-12  # seen from slightly above, upright
     assert aside[0] > 0.9  # the camera looks against the x-axis, so that y is to its right
     assert abs(ahead[0]) < 0.3 and ahead[1] < 0  # x comes towards it, and down as it looks from above
+
+
+@pytest.mark.parametrize("is_software", [True, False])
+def test_videos_are_plain_where_the_cpu_renders(monkeypatch, is_software):
+    monkeypatch.setattr(rendering, "is_software_renderer", lambda: is_software)
+    for fast in (True, False):
+        with ArmScene([ArmConfig()], width=32, height=32, fast=fast) as scene:
+            is_plain = fast and is_software
+            assert scene._renderer.scene.flags[int(mujoco.mjtRndFlag.mjRND_SHADOW)] == (not is_plain)
+            assert bool(scene._model.vis.quality.offsamples) == (not is_plain)
