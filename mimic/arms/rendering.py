@@ -100,7 +100,9 @@ class ArmScene:
             self._move(index, shift)
             points[index] = arm_points + shift
             left += sizes[index, 0] + gap
-        self._centres = [float(np.ptp(x) / 2 + x.min()) for x in (self.flattened(arm_points)[:, 0] for arm_points in points)]
+        self._centres = [
+            float(np.ptp(x) / 2 + x.min()) for x in (self.flattened(arm_points)[:, 0] for arm_points in points)
+        ]
         self._look_at(np.concatenate(points), margin)
 
     def centres(self) -> list[float]:

@@ -1,6 +1,7 @@
 """`python -m mimic.view`: serves a live view or the playback of a policy until it is interrupted."""
 
 import contextlib
+import dataclasses
 import importlib.util
 import io
 import socket
@@ -112,10 +113,15 @@ def serve(
     with noted_signals(signals, "view: ending; repeat to stop immediately"):
         server, gatekeeper = make_server(config.host, config.port)
         try:
-            shapes = [ArmShape(arm, env.limits) for arm in (env.expert, env.learner)]
+            free = build_arm(dataclasses.replace(env.learner, locked=()), env.limits)  # joints are locked in the view
+            match = env.metric.match_links(build_arm(env.expert, env.limits).embodiment, free.embodiment)
+            colours = match.expert_colours, match.learner_colours
+            shapes = [
+                ArmShape(arm, env.limits, links) for arm, links in zip((env.expert, env.learner), colours, strict=True)
+            ]
             names = [build_arm(arm, env.limits).embodiment.name.partition("-")[0] for arm in (env.expert, env.learner)]
             is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
-            page = Page(server, shapes, names, _title(config, env), is_flat)
+            page = Page(server, shapes, names, _title(config, env), is_flat, match)
             print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
             show(page, ticks(signals))
         finally:

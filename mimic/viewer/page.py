@@ -7,9 +7,10 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
+from mimic.arms.link_match import LinkMatch
 from mimic.viewer import html
 from mimic.viewer.live_session import Frame
-from mimic.viewer.meshes import ArmShape, Part, places
+from mimic.viewer.meshes import ArmShape, Part, along_z, capsule_mesh, places
 
 _ROLES = ("expert", "learner")
 _GRID = 0.1, 0.5  # m, sizes of a cell and of a section
@@ -27,10 +28,17 @@ class Page:
       names: names of expert and learner.
       title: title of the page.
       is_flat: whether the camera looks from above.
+      match: which links correspond.
     """
 
     def __init__(
-        self, server: viser.ViserServer, shapes: Sequence[ArmShape], names: Sequence[str], title: str, is_flat: bool
+        self,
+        server: viser.ViserServer,
+        shapes: Sequence[ArmShape],
+        names: Sequence[str],
+        title: str,
+        is_flat: bool,
+        match: LinkMatch,
     ):
         self.server = server
         _set_stage(server, max(shape.reach for shape in shapes), is_flat)
@@ -38,6 +46,7 @@ class Page:
             _DrawnArm(server, f"/{role}", shape, place, f"{role}: {name}")
             for role, shape, place, name in zip(_ROLES, shapes, places(shapes), names, strict=True)
         ]
+        self._ghost = _Ghost(server, shapes[1], match)
         server.gui.add_markdown(f"**{title}**")
         self._numbers = server.gui.add_html(html.numbers(float("nan"), float("nan"), "compiling …"))
         self._chart = server.gui.add_html("")
@@ -48,6 +57,7 @@ class Page:
         with self.server.atomic():
             self._arms[0].move_to(frame.expert, ())
             self._arms[1].move_to(frame.learner, frame.locked)
+            self._ghost.move_to(frame)
             self._numbers.content = html.numbers(frame.distance, frame.bound, note, frame.similarity)
             self._maps.content = html.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
             self._chart.content = chart
@@ -80,6 +90,40 @@ class _DrawnArm:
                 mark.visible = name in locked
 
 
+class _Ghost:
+    """The expert, translucent and scaled, at the learner, with lines between corresponding links.
+
+    The learner's links keep their number while its joints are locked, so that the lines stay where they are.
+    """
+
+    def __init__(self, server: viser.ViserServer, shape: ArmShape, match: LinkMatch):
+        self._match = match
+        position, wxyz = shape.base_pose()
+        scene, path = server.scene, "/learner/ghost"
+        scene.add_frame(path, show_axes=False, position=position, wxyz=wxyz)
+        at_rest = match.ghost(np.zeros(match.expert.num_joints), np.zeros(match.learner.num_joints))
+        self._num_links = match.expert.num_links
+        self._links = []
+        for index, capsule in enumerate(at_rest[: self._num_links]):
+            (red, green, blue, alpha), mesh = capsule.rgba, capsule_mesh(capsule)
+            self._links.append(
+                scene.add_mesh_simple(f"{path}/link{index}", *mesh, color=(red, green, blue), opacity=alpha)
+            )
+        count = len(at_rest) - self._num_links
+        self._lines = scene.add_line_segments(
+            f"{path}/lines", np.zeros((count, 2, 3), np.float32), colors=(40, 40, 40), line_width=2.0
+        )
+
+    def move_to(self, frame: Frame) -> None:
+        arms = (self._match.expert, frame.expert), (self._match.learner, frame.learner)
+        poses = [np.array([angles[name] for name in arm.joint_names]) for arm, angles in arms]
+        capsules = self._match.ghost(*poses)
+        for mesh, capsule in zip(self._links, capsules, strict=False):
+            mesh.position, mesh.wxyz = capsule.start, along_z(capsule.end - capsule.start)
+        lines = [(capsule.start, capsule.end) for capsule in capsules[self._num_links :]]
+        self._lines.points = np.asarray(lines, np.float32).reshape(-1, 2, 3)
+
+
 def _mesh(scene: viser.SceneApi, path: str, part: Part) -> Any:
     red, green, blue, alpha = part.rgba
     return scene.add_mesh_simple(
@@ -94,7 +138,7 @@ def _mesh(scene: viser.SceneApi, path: str, part: Part) -> Any:
 
 
 def _set_stage(server: viser.ViserServer, reach: float, is_flat: bool) -> None:
-    server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+    server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(True, cast_shadow=True)
