@@ -81,9 +81,7 @@ def colours_along_arm(count: int) -> Float[np.ndarray, "links 3"]:
 
 def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "links 2 3"]:
     """Start and end of each link in a pose [rad], in the base frame [m]; merged links are chords."""
-    transforms = [np.eye(4)]
-    for axis, anchor, angle in zip(np.asarray(arm.joint_axis), np.asarray(arm.joint_anchor), qpos, strict=True):
-        transforms.append(transforms[-1] @ _rotation_about(axis, anchor, float(angle)))
+    transforms = joint_transforms(arm, qpos)
     ends = np.empty((arm.num_links, 2, 3))
     segment_link = np.asarray(arm.segment_link)
     for link, joint in enumerate(arm.link_joint):
@@ -92,6 +90,14 @@ def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.n
         transform = transforms[joint + 1]
         ends[link] = points @ transform[:3, :3].T + transform[:3, 3]
     return ends
+
+
+def joint_transforms(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> list[Float[np.ndarray, "4 4"]]:
+    """Transforms of what is distal to no joint, to the first joint, … from the zero pose to a pose [rad]."""
+    transforms = [np.eye(4)]
+    for axis, anchor, angle in zip(np.asarray(arm.joint_axis), np.asarray(arm.joint_anchor), qpos, strict=True):
+        transforms.append(transforms[-1] @ _rotation_about(axis, anchor, float(angle)))
+    return transforms
 
 
 def _rotation_about(axis: np.ndarray, anchor: np.ndarray, angle: float) -> np.ndarray:

@@ -19,7 +19,7 @@ from mimic.arms.visual_model import visual_spec
 
 SPACING, FLAT_SPACING = 0.9, 1.5  # chain lengths between two arms; planar ones are seen from above, and reach sideways
 LOCKED = (0.85, 0.12, 0.10, 1.0)
-_FLOOR, _GRID = (0.94, 0.95, 0.96), (0.91, 0.92, 0.935)
+_FLOOR, _GRID = (0.94, 0.95, 0.96), (0.88, 0.89, 0.91)
 _SHADOWS, _SAMPLES = 2048, 4  # pixels of the shadow map, samples of a pixel
 _SOFTWARE = "llvmpipe", "softpipe", "swrast", "SWR"  # names of Mesa's renderers on the CPU
 MARGIN = 0.13  # around the centre lines, for the bodies of the arms; chain lengths

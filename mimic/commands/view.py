@@ -23,6 +23,7 @@ from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
     from mimic.viewer.page import Page
+    from mimic.viewer.recorder import Recorder
 
 _MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
 _AT_BOUND = 1e-3  # fraction of the distance within which it counts as the bound
@@ -99,6 +100,7 @@ def serve(
     """Serves a page until a signal. Calls `before` before the server starts and `after` when it has ended."""
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
+    from mimic.viewer.recorder import Recorder
     from mimic.viewer.server import make_server
 
     if before is not None:
@@ -123,7 +125,7 @@ def serve(
             is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
             page = Page(server, shapes, names, _title(config, env), is_flat, match)
             print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
-            show(page, ticks(signals))
+            show(page, _recorded(Recorder(server), ticks(signals)))
         finally:
             with contextlib.redirect_stdout(io.StringIO()):
                 server.stop()
@@ -149,7 +151,7 @@ def _title(config: ViewConfig, env: EnvConfig) -> str:
 def _follow(page: "Page", times: Iterator[float], live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
     from mimic.viewer.controls import LiveControls
 
-    controls = LiveControls(page.server, live, env, can_lock)
+    controls = LiveControls(page.server, live, env, can_lock, page.expert)
     history, frame, was_compiling = History(), None, True
     for dt in times:
         try:
@@ -178,6 +180,13 @@ def _play(page: "Page", times: Iterator[float], playback: Any, split: str) -> No
             episode = player.split, player.demonstration
             frame = playback.frame(*episode, player.time)
             page.show(frame, playback.chart(*episode, player.time), playback.note(*episode))
+
+
+def _recorded(recorder: "Recorder", times: Iterator[float]) -> Iterator[float]:
+    """The time steps, also of the recording."""
+    for dt in times:
+        recorder.advance(dt)
+        yield dt
 
 
 def ticks(signals: Signals) -> Iterator[float]:

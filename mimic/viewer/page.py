@@ -16,6 +16,7 @@ _ROLES = ("expert", "learner")
 _GRID = 0.1, 0.5  # m, sizes of a cell and of a section
 _STANCE = np.array([2.5, -0.1, 0.75])  # camera position relative to its target, in arm lengths
 _FROM_ABOVE = np.array([0.55, -0.01, 2.9])
+_LAST = 1e12  # order of an element below all others, whose orders are times in seconds
 _FIELD_OF_VIEW = 0.75  # rad
 
 
@@ -29,6 +30,10 @@ class Page:
       title: title of the page.
       is_flat: whether the camera looks from above.
       match: which links correspond.
+
+    Attributes:
+      server: the server.
+      expert: meshes of the expert.
     """
 
     def __init__(
@@ -40,7 +45,7 @@ class Page:
         is_flat: bool,
         match: LinkMatch,
     ):
-        self.server = server
+        self.server, self.expert = server, shapes[0]
         _set_stage(server, max(shape.reach for shape in shapes), is_flat)
         self._arms = [
             _DrawnArm(server, f"/{role}", shape, place, f"{role}: {name}")
@@ -50,7 +55,7 @@ class Page:
         server.gui.add_markdown(f"**{title}**")
         self._numbers = server.gui.add_html(html.numbers(float("nan"), float("nan"), "compiling …"))
         self._chart = server.gui.add_html("")
-        self._maps = server.gui.add_html("")
+        self._maps = server.gui.add_html("", order=_LAST)  # below the controls, which then fit 800 pixels
 
     def show(self, frame: Frame, chart: str, note: str) -> None:
         """Shows a frame; all elements change together."""
@@ -110,9 +115,7 @@ class _Ghost:
                 scene.add_mesh_simple(f"{path}/link{index}", *mesh, color=(red, green, blue), opacity=alpha)
             )
         count = len(at_rest) - self._num_links
-        self._lines = scene.add_line_segments(
-            f"{path}/lines", np.zeros((count, 2, 3), np.float32), colors=(40, 40, 40), line_width=2.0
-        )
+        self._lines = scene.add_line_segments(f"{path}/lines", np.zeros((count, 2, 3), np.float32), colors=(40, 40, 40))
 
     def move_to(self, frame: Frame) -> None:
         arms = (self._match.expert, frame.expert), (self._match.learner, frame.learner)
@@ -138,7 +141,7 @@ def _mesh(scene: viser.SceneApi, path: str, part: Part) -> Any:
 
 
 def _set_stage(server: viser.ViserServer, reach: float, is_flat: bool) -> None:
-    server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
+    server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(True, cast_shadow=True)
