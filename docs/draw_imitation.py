@@ -3,14 +3,11 @@
     python docs/draw_imitation.py [--out FILE]
 
 The learners' motions are those of `imitate_trajectory` under the default metric. Each link of a learner has the colour
-of the expert's link that it corresponds with most; red discs are locked joints. Takes some minutes on two CPU cores and
+of the expert's links that it corresponds to; red discs are locked joints. Takes some minutes on two CPU cores and
 needs EGL or OSMesa (see docs/install.md).
 """
 
 import argparse
-import importlib.resources
-import tempfile
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,14 +18,15 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 import mimic
+from mimic.arms.link_match import LinkMatch
 
 OUT = Path(__file__).resolve().parent / "images" / "imitation.gif"
 LOCKED = (), (), (3, 6, 7), (2, 3, 6, 7)  # of the expert and the learners
 SEED, DEMONSTRATION = 7, 25  # a long motion, above the floor, that all learners can follow in part
 FRAME, LAST_FRAME = 60, 900  # ms; a GIF counts in 10 ms
-WIDTH, HEIGHT = 240, 330  # pixels of an arm's panel
+WIDTH, HEIGHT = 240, 290  # pixels of an arm's panel
 COLOURS = 128  # of the GIF
-PALETTE = ["#3b6fd4", "#f2a33a", "#2a9d6f", "#c94f9b", "#7a5cc4", "#1fb5c9", "#8a6d3b"]  # of the expert's links
+CAPTION = 52  # pixels below the panels
 INK = "#333333"
 
 
@@ -42,11 +40,11 @@ def main() -> None:
     solutions = [_retarget(expert, learner, motion) for learner in learners]
     labels = ["expert: 7 joints", *(f"learner: {learner.num_joints} joints" for learner in learners)]
     poses = [motion, *(qpos for qpos, _ in solutions)]
-    with tempfile.TemporaryDirectory() as folder:
-        panels = [
-            _draw(Path(folder) / f"arm{index}.xml", _link_colours(expert, arm), LOCKED[index], qpos)
-            for index, (arm, qpos) in enumerate(zip([expert, *learners], poses, strict=True))
-        ]
+    metric = mimic.env_config("panda4dof").metric
+    panels = [
+        _draw(metric.match_links(expert, arm), LOCKED[index], index == 0, qpos)
+        for index, (arm, qpos) in enumerate(zip([expert, *learners], poses, strict=True))
+    ]
     frames = [
         _annotate(np.hstack(images), labels, [float(distance[step]) for _, distance in solutions])
         for step, images in enumerate(zip(*panels, strict=True))
@@ -77,32 +75,14 @@ def _retarget(
     return np.asarray(solution.qpos), np.asarray(solution.distance)
 
 
-def _link_colours(expert: mimic.Embodiment, arm: mimic.Embodiment) -> list[str]:
-    """The colour of each link of an arm: that of the expert's link that it corresponds with most."""
-    matrix = np.asarray(mimic.arc_length_correspondence(expert, arm))
-    return [PALETTE[link] for link in matrix.argmax(axis=0)]
-
-
-def _write_coloured(path: Path, colours: Sequence[str]) -> None:
-    """The Panda's model with coloured links: link i is on body i."""
-    tree = ElementTree.parse(str(importlib.resources.files("mimic") / "xml" / "panda.xml"))
-    for number, colour in enumerate(colours, start=1):
-        body = tree.find(f".//body[@name='body{number}']")
-        assert body is not None
-        geoms = [geom for geom in body.findall("geom") if geom.get("class") != "housing"] or body.findall("geom")
-        channels = (int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
-        for geom in geoms:
-            geom.set("rgba", " ".join(f"{channel:.3f}" for channel in (*channels, 1.0)))
-    tree.write(path)
-
-
 def _draw(
-    model: Path, colours: Sequence[str], locked: tuple[int, ...], poses: Float[np.ndarray, "frames joints"]
+    match: LinkMatch, locked: tuple[int, ...], is_expert: bool, poses: Float[np.ndarray, "frames joints"]
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """An arm in its poses; its coloured model is written to a file."""
-    _write_coloured(model, colours)
-    arm = mimic.ArmConfig(model=str(model), locked=locked)
-    with mimic.ArmScene([arm], width=WIDTH, height=HEIGHT) as scene:
+    """An arm in its poses, its links in the colours of the expert's links that they correspond to."""
+    colours = match.expert_colours if is_expert else match.learner_colours
+    arm = mimic.ArmConfig(locked=locked)
+    with mimic.ArmScene([arm], width=WIDTH, height=HEIGHT, colours=[colours]) as scene:
+        scene.fit([poses])
         return [scene.image([pose]) for pose in poses]
 
 
@@ -110,7 +90,8 @@ def _annotate(
     image: UInt8[np.ndarray, "height width 3"], labels: Sequence[str], distances: Sequence[float]
 ) -> Image.Image:
     """A frame with a label below each arm, and below each learner its distance."""
-    frame = Image.fromarray(image)
+    frame = Image.new("RGB", (image.shape[1], image.shape[0] + CAPTION), "white")
+    frame.paste(Image.fromarray(image))
     draw, font = ImageDraw.Draw(frame), _font(16)
     values = ["", *(f"distance {distance:.3f}" for distance in distances)]
     for index, (label, value) in enumerate(zip(labels, values, strict=True)):

@@ -208,7 +208,10 @@ class _Renderer:
         """The learner next to its expert."""
         env = self._env
         if self._scene is None:
-            self._scene = ArmScene([env.config.expert, env.config.learner], limits=env.config.limits)
+            match = env.config.metric.match_links(env.expert, env.learner)
+            colours = [match.expert_colours, match.learner_colours]
+            arms = [env.config.expert, env.config.learner]
+            self._scene = ArmScene(arms, limits=env.config.limits, fast=True, colours=colours)
         sample = min(int(state.step), env.demonstrations.horizon)
         return self._scene.image([env.demonstrations.qpos[int(state.demonstration), sample], state.qpos])
 

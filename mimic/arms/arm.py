@@ -25,7 +25,8 @@ _PLANAR_MASS = 1.0  # kg/m
 _PLANAR_ARMATURE = 0.02  # kg m^2
 _PLANAR_DAMPING = 0.1  # N m s/rad
 _PLANAR_VELOCITY_LIMIT = 2.5  # rad/s
-_PLANAR_RADIUS, _PLANAR_COLOUR = 0.03, [0.35, 0.55, 0.85, 1.0]  # as drawn [m]
+_PLANAR_RADIUS, _PLANAR_COLOUR = 0.035, [0.35, 0.55, 0.85, 1.0]  # of links, as drawn; chain lengths
+_PLANAR_JOINT, _PLANAR_HEIGHT, _PLANAR_DARK = 0.045, 0.045, [0.25, 0.27, 0.3, 1.0]  # of the housings of joints
 
 # The maximum torque accelerates a joint from rest to this multiple of its velocity limit in one step.
 _SPEED_FACTOR = 2.0
@@ -212,14 +213,19 @@ def torque_scale(arm: Arm, action_scale: float, control_dt: float) -> Float[np.n
 def _planar_spec(arm: Embodiment) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = arm.name
-    parent, start = spec.worldbody, 0.0
+    parent, start, reach = spec.worldbody, 0.0, float(arm.chain_length)
     for name, joint_name, length in zip(arm.link_names, arm.joint_names, arm.link_lengths, strict=True):
         body = parent.add_body(pos=[start, 0, 0])
         body.add_joint(name=joint_name, axis=[0, 0, 1], armature=_PLANAR_ARMATURE, damping=_PLANAR_DAMPING)
         body.add_site(name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, length, 0, 0], size=[0.01, 0, 0])
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, length, 0, 0], size=[_PLANAR_RADIUS, 0, 0],
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, length, 0, 0], size=[_PLANAR_RADIUS * reach, 0, 0],
             rgba=_PLANAR_COLOUR, contype=0, conaffinity=0,
+        )  # fmt: skip
+        is_base = parent is spec.worldbody
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[(1.5 if is_base else 1) * _PLANAR_JOINT * reach,
+            _PLANAR_HEIGHT * reach, 0], rgba=_PLANAR_DARK, contype=0, conaffinity=0,
         )  # fmt: skip
         mass = _PLANAR_MASS * length
         inertia = mass * length**2 / 12

@@ -1,23 +1,40 @@
 """An arm's model prepared for rendering: without its scene, and with shapes to draw."""
 
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
-from mimic.arms.arm import ArmConfig, arm_spec
-from mimic.arms.kinematic_tree import ChainIds, ancestors, find_chain
+from mimic.arms.arm import ArmConfig, arm_spec, build_arm
+from mimic.arms.embodiment import Embodiment
+from mimic.arms.kinematic_tree import ChainIds, ancestors, body_id, find_chain
+from mimic.arms.link_match import Colour
 from mimic.arms.mujoco_chain import zero_pose
 
 _THICKNESS, _COLOUR = 0.03, (0.55, 0.62, 0.70, 1.0)  # of links without geoms; fraction of the chain length
+_DARK = 0.4  # maximum channel of a dark colour
 _SCENE_ELEMENTS = ("keys", "equalities", "actuators", "sensors", "tendons", "excludes", "pairs", "lights", "cameras")
 
 
-def visual_spec(config: ArmConfig) -> tuple[mujoco.MjSpec, np.ndarray]:
-    """The model of an arm without the scene around it, and the position of its base [m].
+def visual_spec(
+    config: ArmConfig, limits: str = "none", colours: Mapping[str, Colour] | None = None
+) -> tuple[mujoco.MjSpec, Float[np.ndarray, "4 4"]]:
+    """The model of an arm without the scene around it, and the transform from its base frame to the world.
+
+    Args:
+      config: of the arm.
+      limits: see `EnvConfig`.
+      colours: colours of links by name. Default None: those of the model.
 
     Raises:
       ValueError: what `arm_spec` and `find_chain` reject.
     """
     spec = arm_spec(config)
+    for number, body in enumerate(spec.bodies):  # links are found by the names of their bodies
+        body.name = body.name or f"unnamed body {number}"
     model = spec.compile()
     chain_ids = find_chain(model, config.base, config.tip)
     data = mujoco.MjData(model)
@@ -27,7 +44,54 @@ def visual_spec(config: ArmConfig) -> tuple[mujoco.MjSpec, np.ndarray]:
         _remove_scene(spec, model, chain_ids)
     if not any(bool(body.geoms) for body in spec.bodies[1:]):
         _draw_links(model, data, spec, chain_ids)
-    return spec, data.xpos[model.body_parentid[chain_ids.bodies[0]]].copy()
+    if colours:
+        links = body_links(model, config, limits)
+        by_body = {model.body(body).name: colours[link] for body, link in links.items() if link in colours}
+        for body in spec.bodies[1:]:
+            if body.name in by_body:
+                _colour_geoms(spec, body, by_body[body.name])
+    base = int(model.body_parentid[chain_ids.bodies[0]]) if config.base is None else body_id(model, config.base)
+    T_world_base = np.eye(4)
+    T_world_base[:3, :3], T_world_base[:3, 3] = data.xmat[base].reshape(3, 3), data.xpos[base]
+    return spec, T_world_base
+
+
+def body_links(model: mujoco.MjModel, config: ArmConfig, limits: str) -> dict[int, str]:
+    """The link that each moving body belongs to, by the body's id.
+
+    A body between two joints belongs to the longest link that its joint moves; where that joint moves none, because the
+    joints are at one point, to the next link.
+    """
+    free = build_arm(dataclasses.replace(config, locked=()), limits).embodiment
+    chain_ids = find_chain(model, config.base, config.tip)
+    bodies = [int(model.jnt_bodyid[joint]) for joint in chain_ids.joints]
+    links = {}
+    for body in range(1, model.nbody):
+        line = ancestors(model, body)
+        joints = [joint for joint, moved in enumerate(bodies) if moved in line]
+        if joints:
+            links[body] = free.link_names[_moved_link(free, joints[-1])]
+    return links
+
+
+def _moved_link(arm: Embodiment, joint: int) -> int:
+    moved = [link for link, mover in enumerate(arm.link_joint) if mover == joint]
+    if moved:
+        return max(moved, key=lambda link: float(arm.link_lengths[link]))
+    return next((link for link, mover in enumerate(arm.link_joint) if mover > joint), arm.num_links - 1)
+
+
+def is_dark(rgba: Sequence[float] | np.ndarray) -> bool:
+    """Whether a geom keeps its colour where links are coloured: dark parts are joints, which structure the arm."""
+    return max(rgba[:3]) < _DARK
+
+
+def _colour_geoms(spec: mujoco.MjSpec, body: Any, colour: Colour) -> None:
+    """Colours the visible geoms of a body, except dark ones where it has others."""
+    rgba = {geom: np.asarray(spec.material(geom.material).rgba if geom.material else geom.rgba) for geom in body.geoms}
+    visible = [geom for geom in body.geoms if rgba[geom][3] > 0]
+    for geom in [geom for geom in visible if not is_dark(rgba[geom])] or visible:
+        geom.material, geom.rgba = "", [*colour, 1.0]
 
 
 def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, chain_ids: ChainIds) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.link_match import LinkMatch
 from mimic.commands.config import RenderConfig
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
@@ -51,6 +52,7 @@ class Clip:
       bars: contribution of each link of the learner to the distance, [samples, links].
       bar_names: names of these links.
       similarity: measures of `mimic.metric.similarity` of the poses, each of shape [frames].
+      match: which links correspond.
     """
 
     title: str
@@ -62,6 +64,7 @@ class Clip:
     bars: Float[np.ndarray, "samples links"]
     bar_names: tuple[str, ...]
     similarity: Mapping[str, Float[np.ndarray, " frames"]]
+    match: LinkMatch
 
 
 class ClipPlan(NamedTuple):
@@ -102,7 +105,8 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
     title = f"{trained.env.name}, {config.split.replace('_', '-')} demonstration {config.demonstration}"
 
     def compute() -> Clip:
-        rollout = RolloutFrames(trainer.evaluator, trainer.evaluate(params), index, FRAMES_PER_SECOND)
+        rollouts = jax.tree.map(lambda x: x[index : index + 1], trainer.evaluate(params))
+        rollout = RolloutFrames(trainer.evaluator.only(index), rollouts, 0, FRAMES_PER_SECOND)
         curves = (
             Curve("holding the start pose", rollout.hold, _HOLD),
             Curve("policy", rollout.distance, {"color": "tab:blue"}),
@@ -110,9 +114,10 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
         )
         steps = rollout.dt * np.arange(1, len(rollout.distance) + 1)
         poses = rollout.expert, rollout.learner
-        measures = _similarity((trainer.evaluator.env.expert, trainer.evaluator.env.learner), poses)
-        bars = rollout.by_link, rollout.link_names
-        return Clip(title, ("expert", "learner"), rollout.time, poses, steps, curves, *bars, measures)
+        arms = trainer.evaluator.env.expert, trainer.evaluator.env.learner
+        bars, match = (rollout.by_link, rollout.link_names), trained.env.metric.match_links(*arms)
+        measures = _similarity(arms, poses)
+        return Clip(title, ("expert", "learner"), rollout.time, poses, steps, curves, *bars, measures, match)
 
     return ClipPlan(trained.env, run_dir / "videos" / f"{config.split}-{config.demonstration}.mp4", compute)
 
@@ -204,7 +209,8 @@ def _static_clip(
     labels = "expert", f"learner, {by}"
     poses = qpos, learner_qpos
     measures = _similarity((expert, learner), poses)
-    return Clip(title, labels, time, poses, time, curves, by_link, learner.link_names, measures)
+    match = env.metric.match_links(expert, learner)
+    return Clip(title, labels, time, poses, time, curves, by_link, learner.link_names, measures, match)
 
 
 def _similarity(arms: tuple[Embodiment, Embodiment], poses: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:

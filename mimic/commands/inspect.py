@@ -69,11 +69,9 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
     env = EnvConfig(name="pair", expert=config.expert, learner=config.learner, limits=config.limits)
     expert, learner = env.build_arms()
     demonstrations = arm_checks.sample_demonstrations(expert, env) if config.bound else None
-    scene = (
-        ArmScene([config.expert, config.learner], limits=config.limits, width=_SCENE[0], height=_SCENE[1])
-        if out
-        else None
-    )
+    match = env.metric.match_links(expert.embodiment, learner.embodiment)
+    arms, colours = [config.expert, config.learner], [match.expert_colours, match.learner_colours]
+    scene = ArmScene(arms, limits=config.limits, width=_SCENE[0], height=_SCENE[1], colours=colours) if out else None
 
     def run() -> None:
         console = Console()
@@ -81,8 +79,10 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
         _print(console, inspection, expert, learner)
         if out and scene:
             out.mkdir()
+            home = [np.asarray(expert.embodiment.home), np.asarray(learner.embodiment.home)]
             with scene:
-                image = scene.image([expert.embodiment.home, learner.embodiment.home])
+                scene.fit([pose[None] for pose in home])
+                image = scene.image(home)
             _save_picture(out / _PICTURE, image, expert, learner, env)
             _write(out, inspection, expert, learner, env)
             console.print(f"results: {out}", soft_wrap=True, highlight=False)
@@ -265,7 +265,8 @@ def _save_picture(path: Path, image: np.ndarray, expert: Arm, learner: Arm, env:
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 5.6), width_ratios=(1.35, 1), layout="constrained")
     left.imshow(image)
     left.axis("off")
-    left.set_title(f"{expert.embodiment.name} (expert), {learner.embodiment.name} (learner)")
+    names = f"{expert.embodiment.name} (expert), {learner.embodiment.name} (learner)"
+    left.text(0.5, -0.02, f"{names}; same colour: corresponding links", transform=left.transAxes, ha="center", va="top")
     fractions = env.metric.link_fractions(expert.embodiment, learner.embodiment)
     right.imshow(fractions, cmap="Blues", vmin=0, vmax=1)
     for (row, column), fraction in np.ndenumerate(fractions):

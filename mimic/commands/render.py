@@ -27,10 +27,14 @@ from mimic.config import check_new  # noqa: E402
 from mimic.evaluation.labels import similarity_texts  # noqa: E402
 
 _SIZE, _DPI = (1280, 640), 100  # pixels
-_SCENE = 760  # pixels, width of the arms' picture
+_SCENE = 760, 548  # pixels of the arms' picture
+_LEGEND = "same colour: corresponding links; translucent: expert, scaled to the learner; red: locked joints"
+_CAPTIONS = 56  # pixels below it; the title is above it
 _GIF_EVERY, _GIF_SCALE = 3, 0.5
 _LEGEND_ROOM = 1.25  # height of the axes relative to the maximum distance, so that the legend hides no curve
 
+_LINES = 5  # of progress where there is no terminal
+_Frame = UInt8[np.ndarray, "height width 3"]
 Bounds = tuple[float, float, float, float]  # left, bottom, width, height as fractions of the frame
 
 
@@ -43,21 +47,43 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
     use_compilation_cache(config.compilation_cache)
     env, default_out, compute_clip = prepare_clip(config)
     out = _new_video(config, default_out)
-    scene = ArmScene([env.expert, env.learner], limits=env.limits, width=_SCENE, height=_SIZE[1])
+    match = env.metric.match_links(*env.build_arms().embodiments)
+    scene = ArmScene(
+        [env.expert, env.learner], limits=env.limits, width=_SCENE[0], height=_SCENE[1], fast=True,
+        colours=[match.expert_colours, match.learner_colours],
+    )  # fmt: skip
 
     def run() -> None:
         console = Console()
-        with console.status("computing the motion and its distances"):
-            clip = compute_clip()
+        clip = _with_status(console, "computing the motion and its distances", compute_clip)
         out.parent.mkdir(exist_ok=True)
         with scene:
             frames = draw_frames(scene, clip)
-            thumbnails = _write_video(out, track(frames, total=len(clip.time), description="rendering"))
+            thumbnails = _write_video(out, _tracked(console, frames, len(clip.time)))
         if config.gif:
             _write_gif(out.with_suffix(".gif"), thumbnails)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
+
+
+def _with_status(console: Console, text: str, compute: Callable[[], Clip]) -> Clip:
+    """Computes a clip behind a status line; without a terminal, the line is printed."""
+    if not console.is_terminal:
+        console.print(text, highlight=False)
+    with console.status(text):
+        return compute()
+
+
+def _tracked(console: Console, frames: Iterator[_Frame], total: int) -> Iterator[_Frame]:
+    """The frames, behind a progress bar; without a terminal, a line after each fifth of them."""
+    if console.is_terminal:
+        yield from track(frames, total=total, description="rendering", console=console)
+        return
+    for number, frame in enumerate(frames, start=1):
+        yield frame
+        if number * _LINES // total > (number - 1) * _LINES // total:
+            console.print(f"rendering: {number} of {total} frames", highlight=False)
 
 
 def _new_video(config: RenderConfig, default_out: Path | None) -> Path:
@@ -80,13 +106,15 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
     The static artists are drawn once and blitted: drawing all of them for each frame costs as much as rendering.
     """
     figure = plt.figure(figsize=(_SIZE[0] / _DPI, _SIZE[1] / _DPI), dpi=_DPI)
-    scene_width = _SCENE / _SIZE[0]  # fraction of the frame that shows the arms
+    scene_width = _SCENE[0] / _SIZE[0]  # fraction of the frame that shows the arms
+    scene.fit(clip.poses)
     left, width = scene_width + 0.07, 1 - scene_width - 0.09
-    picture, texts = _add_scene(figure, (0, 0, scene_width, 1), scene, clip)
+    bounds = 0, _CAPTIONS / _SIZE[1], scene_width, _SCENE[1] / _SIZE[1]
+    picture = _add_scene(figure, bounds, scene, clip)
     now = _add_curves(figure, (left, 0.66, width, 0.28), clip)
     similarity = _add_similarity(figure, (left, 0.42, width, 0.12), clip)
     bars = _add_bars(figure, (left, 0.09, width, 0.25), clip)
-    animated = [picture, *texts, now, *similarity.values(), *bars]
+    animated = [picture, now, *similarity.values(), *bars]
     for artist in animated:
         artist.set_animated(True)
     canvas: Any = figure.canvas
@@ -94,7 +122,7 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
     background = canvas.copy_from_bbox(figure.bbox)
     for frame, time in enumerate(clip.time):
         sample = min(int(np.searchsorted(clip.curve_time, time - 1e-9)), len(clip.curve_time) - 1)
-        picture.set_data(scene.image([poses[frame] for poses in clip.poses]))
+        picture.set_data(_image(scene, clip, frame))
         now.set_xdata([time, time])
         for bar, height in zip(bars, clip.bars[sample], strict=True):
             bar.set_height(height)
@@ -107,17 +135,23 @@ def draw_frames(scene: ArmScene, clip: Clip) -> Iterator[UInt8[np.ndarray, "heig
     plt.close(figure)
 
 
-def _add_scene(figure: Figure, bounds: Bounds, scene: ArmScene, clip: Clip) -> tuple[Any, list[Text]]:
-    """Adds the picture of the arms, and the title and labels, which are drawn over it in each frame."""
+def _image(scene: ArmScene, clip: Clip, frame: int) -> UInt8[np.ndarray, "height width 3"]:
+    """Both arms, and the expert's ghost at the learner."""
+    poses = [poses[frame] for poses in clip.poses]
+    return scene.image(poses, clip.match.ghost(*poses))
+
+
+def _add_scene(figure: Figure, bounds: Bounds, scene: ArmScene, clip: Clip) -> Any:
+    """Adds the picture of the arms, its title above it and the captions of the arms below it; returns the picture."""
     axes = figure.add_axes(bounds)
     axes.axis("off")
-    picture = axes.imshow(scene.image([poses[0] for poses in clip.poses]), interpolation="nearest")
-    texts = [
-        axes.text(place, 0.04, label, transform=axes.transAxes, ha="center", fontsize=13)
-        for place, label in zip((0.27, 0.73), clip.labels, strict=True)
-    ]
-    texts.append(axes.text(0.02, 0.95, clip.title, transform=axes.transAxes, fontsize=12))
-    return picture, texts
+    picture = axes.imshow(_image(scene, clip, 0), interpolation="nearest", aspect="auto")
+    left, bottom, width, height = bounds
+    for place, label in zip(scene.centres(), clip.labels, strict=True):
+        figure.text(left + place * width, 0.6 * bottom, label, ha="center", va="center", fontsize=13)
+    figure.text(left + width / 2, 0.2 * bottom, _LEGEND, ha="center", va="center", fontsize=9, color="dimgrey")
+    figure.text(left + 0.02, (1 + bottom + height) / 2, clip.title, va="center", fontsize=12)
+    return picture
 
 
 def _add_curves(figure: Figure, bounds: Bounds, clip: Clip) -> Any:
@@ -138,7 +172,8 @@ def _add_curves(figure: Figure, bounds: Bounds, clip: Clip) -> Any:
 def _add_bars(figure: Figure, bounds: Bounds, clip: Clip) -> Any:
     """Adds the bars of the learner's links and returns them."""
     axes = figure.add_axes(bounds)
-    bars = axes.bar(range(len(clip.bar_names)), clip.bars[0], color="tab:blue")
+    colours = [clip.match.learner_colours[name.split("+")[0]] for name in clip.bar_names]
+    bars = axes.bar(range(len(clip.bar_names)), clip.bars[0], color=colours)
     axes.set_xticks(range(len(clip.bar_names)), [name.replace("link", "") for name in clip.bar_names])
     axes.set(title="contribution of each learner link", ylim=(0, 1.05 * clip.bars.max()))
     return bars

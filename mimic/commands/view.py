@@ -1,6 +1,7 @@
 """`python -m mimic.view`: serves a live view or the playback of a policy until it is interrupted."""
 
 import contextlib
+import dataclasses
 import importlib.util
 import io
 import socket
@@ -23,6 +24,7 @@ from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
     from mimic.viewer.page import Page
+    from mimic.viewer.recorder import Recorder
 
 _MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
 _AT_BOUND = 1e-3  # fraction of the distance within which it counts as the bound
@@ -99,6 +101,7 @@ def serve(
     """Serves a page until a signal. Calls `before` before the server starts and `after` when it has ended."""
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
+    from mimic.viewer.recorder import Recorder
     from mimic.viewer.server import make_server
 
     if before is not None:
@@ -113,12 +116,17 @@ def serve(
     with noted_signals(signals, "view: ending; repeat to stop immediately"):
         server, gatekeeper = make_server(config.host, config.port)
         try:
-            shapes = [ArmShape(arm, env.limits) for arm in (env.expert, env.learner)]
+            free = build_arm(dataclasses.replace(env.learner, locked=()), env.limits)  # joints are locked in the view
+            match = env.metric.match_links(build_arm(env.expert, env.limits).embodiment, free.embodiment)
+            colours = match.expert_colours, match.learner_colours
+            shapes = [
+                ArmShape(arm, env.limits, links) for arm, links in zip((env.expert, env.learner), colours, strict=True)
+            ]
             names = [build_arm(arm, env.limits).embodiment.name.partition("-")[0] for arm in (env.expert, env.learner)]
             is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
-            page = Page(server, shapes, names, _title(config, env), is_flat)
+            page = Page(server, shapes, names, _title(config, env), is_flat, match)
             print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
-            show(page, ticks(signals))
+            show(page, _recorded(Recorder(server), ticks(signals)))
         finally:
             with contextlib.redirect_stdout(io.StringIO()):
                 server.stop()
@@ -144,7 +152,7 @@ def _title(config: ViewConfig, env: EnvConfig) -> str:
 def _follow(page: "Page", times: Iterator[float], live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
     from mimic.viewer.controls import LiveControls
 
-    controls = LiveControls(page.server, live, env, can_lock)
+    controls = LiveControls(page.server, live, env, can_lock, page.expert)
     history, frame, was_compiling = History(), None, True
     for dt in times:
         try:
@@ -173,6 +181,13 @@ def _play(page: "Page", times: Iterator[float], playback: Any, split: str) -> No
             episode = player.split, player.demonstration
             frame = playback.frame(*episode, player.time)
             page.show(frame, playback.chart(*episode, player.time), playback.note(*episode))
+
+
+def _recorded(recorder: "Recorder", times: Iterator[float]) -> Iterator[float]:
+    """The time steps, also of the recording."""
+    for dt in times:
+        recorder.advance(dt)
+        yield dt
 
 
 def ticks(signals: Signals) -> Iterator[float]:

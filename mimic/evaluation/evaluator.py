@@ -88,6 +88,11 @@ class Evaluator:
         """Embodiment distance at each step of a learner that stays at rest in its home pose."""
         return self._references().hold
 
+    def only(self, index: int) -> "Evaluator":
+        """An evaluator of one of the demonstrations, whose references take a fraction of the time; it is held out."""
+        demonstrations = self.env.demonstrations
+        return Evaluator(self.env.with_demonstrations(demonstrations.select([])), demonstrations.select([index]))
+
     def rollout(self, controller: Controller) -> Rollouts:
         """Runs a controller on every demonstration. Call it under `jax.jit`."""
         env = self.env

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from mimic import registry
 from mimic.arms.chain import LINKS
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.link_match import LinkMatch
 from mimic.config import check_choice
 from mimic.metric.correspondence import (
     arc_length_correspondence,
@@ -129,3 +130,9 @@ class MetricConfig:
         matrix = np.ones(shape) if callable(correspondence) else np.asarray(correspondence)
         sums = matrix.sum(axis=0)
         return matrix / np.where(sums == 0, 1.0, sums)
+
+    def match_links(self, expert: Embodiment, learner: Embodiment) -> LinkMatch:
+        """Which links correspond, for pictures; where W depends on the state, those of the arc length."""
+        is_static = not callable(self.make_correspondence(expert, learner))
+        metric = self if is_static else dataclasses.replace(self, correspondence="arc_length")
+        return LinkMatch(expert, learner, metric.link_fractions(expert, learner))

@@ -96,8 +96,11 @@ def save_poses(path: Path, expert: Arm, learner: Arm, env: EnvConfig, pairs: Pos
     figure, rows = plt.subplots(3, columns, figsize=(2.2 * columns, 6.9), layout="constrained")
     lines: list[tuple[str, Any]] = []
     arms = (env.expert, expert, pairs.expert_qpos, "expert"), (env.learner, learner, pairs.learner_qpos, "learner")
-    for row, (config, arm, poses, role) in zip(rows, arms, strict=False):
-        with ArmScene([config], limits=env.limits, width=_PIXELS, height=_PIXELS) as scene:
+    match = env.metric.match_links(expert.embodiment, learner.embodiment)
+    colours = match.expert_colours, match.learner_colours
+    for row, (config, arm, poses, role), arm_colours in zip(rows[:2], arms, colours, strict=True):
+        with ArmScene([config], limits=env.limits, width=_PIXELS, height=_PIXELS, colours=[arm_colours]) as scene:
+            scene.fit([poses])
             show_images(row, [scene.image([pose]) for pose in poses], f"{role}: {arm.embodiment.name}")
             lines.append((role, scene.flattened(_with_ends(centre_line_table(arm.embodiment, poses)))))
     for column, axes in enumerate(rows[2]):
@@ -106,7 +109,7 @@ def save_poses(path: Path, expert: Arm, learner: Arm, env: EnvConfig, pairs: Pos
             axes.plot(*points[column].T, color=colour, lw=width, alpha=alpha, label=role, solid_capstyle="round")
         axes.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.15, 0.95), xticks=[], yticks=[])
         measures = {name: float(values[column]) for name, values in pairs.similarity.items()}
-        rows[1][column].set_title(
+        rows[2][column].set_title(
             f"centre line {measures['centre_line_distance']:.3f}\n"
             f"hand {measures['hand_position_error']:.3f}, {measures['hand_angle_deg']:.0f}°",
             fontsize="medium",

@@ -111,15 +111,21 @@ def draw_panda(load_mapper: LoadMapper) -> Any:
     names = MAPPERS["panda"]
     expert = env_config(names[0]).expert
     figure, rows = plt.subplots(len(names) + 1, len(_PANDA_POSES), figsize=(7.6, 10.2), layout="constrained")
-    with ArmScene([expert], width=_PIXELS, height=_PIXELS) as scene:
+    mappers = {name: load_mapper(name) for name in names}
+    matches = {name: mapper.model.metric.match_links(mapper.expert, mapper.learner) for name, mapper in mappers.items()}
+    colours = matches[names[0]].expert_colours
+    with ArmScene([expert], width=_PIXELS, height=_PIXELS, colours=[colours]) as scene:
+        scene.fit([_PANDA_POSES])
         show_images(rows[0], [scene.image([pose]) for pose in _PANDA_POSES], "expert, 7 joints")
     for name, row in zip(names, rows[1:], strict=True):
-        mapper = load_mapper(name)
+        mapper = mappers[name]
         mapped, _, excess = _mapped_and_optimal(mapper, _PANDA_POSES)
-        with ArmScene([env_config(name).learner], width=_PIXELS, height=_PIXELS) as scene:
+        colours, learner = matches[name].learner_colours, env_config(name).learner
+        with ArmScene([learner], width=_PIXELS, height=_PIXELS, colours=[colours]) as scene:
+            scene.fit([mapped])
             show_images(row, [scene.image([pose]) for pose in mapped], f"learner, {mapper.learner.num_joints} joints")
         for axes, percent in zip(row, excess, strict=True):
-            axes.set_title(f"{percent:.2f} % above the optimum", fontsize="small")
+            axes.set_xlabel(f"{percent:.2f} % above the optimum", fontsize="small")
     return figure
 
 

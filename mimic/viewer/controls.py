@@ -1,6 +1,7 @@
 """The controls of a live view: sliders, buttons and switches that act on a `LiveSession`."""
 
 import functools
+import time
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,15 @@ from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.recording import record_demonstrations
 from mimic.metric.config import CORRESPONDENCES
 from mimic.viewer.follower import home_angles
+from mimic.viewer.hand import hand_position
 from mimic.viewer.live_session import LiveSession
+from mimic.viewer.meshes import ArmShape
+from mimic.viewer.messages import HAND
 
 _DEMONSTRATIONS = 8  # number to choose from; recorded when the first one is played
 _MAX_WEIGHT, _WEIGHT_STEP = 2.0, 0.05
 _ANGLE_STEP = 0.01  # rad
+_DRAG_PAUSE = 0.3  # s after the last message of a drag, for which the handle stays where the user holds it
 
 
 class LiveControls:
@@ -26,14 +31,18 @@ class LiveControls:
       server: server that shows the widgets.
       session: session that the widgets control.
       env: environment that defines the arms.
+      expert: meshes of the expert, at whose hand a handle is drawn.
       can_lock: whether the learner's joints can be locked; the joints of a trained pose mapper are fixed.
     """
 
-    def __init__(self, server: viser.ViserServer, session: LiveSession, env: EnvConfig, can_lock: bool):
+    def __init__(
+        self, server: viser.ViserServer, session: LiveSession, env: EnvConfig, can_lock: bool, expert: ArmShape
+    ):
         self._server, self._session, self._env = server, session, env
         self._random = np.random.default_rng()
         self._demonstrations: Demonstrations | None = None
         self._was_moving = False  # whether the expert moved by itself at the last update
+        self._add_hand(expert)
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Expert"):
             self._add_buttons()
@@ -48,7 +57,9 @@ class LiveControls:
 
         Otherwise the sliders are not set: a slider that the user drags is ahead of the session and would jump back.
         """
-        moving = self._session.moves_by_itself
+        moving = self._session.moves_by_itself or time.perf_counter() - self._dragged < _DRAG_PAUSE
+        if time.perf_counter() - self._dragged > _DRAG_PAUSE:  # otherwise the user holds it
+            self._hand.position = hand_position(self._session.expert, self._session.pose)
         if moving or self._was_moving:
             for slider, angle in zip(self._sliders, self._session.pose, strict=True):
                 slider.value = round(float(np.clip(angle, slider.min, slider.max)), 2)
@@ -58,6 +69,21 @@ class LiveControls:
         """Restores the checkboxes of the locked joints after an invalid choice."""
         for name, box in self._locks.items():
             box.value = name in self._session.settings.locked
+
+    def _add_hand(self, expert: ArmShape) -> None:
+        scene, session = self._server.scene, self._session
+        position, wxyz = expert.base_pose()
+        scene.add_frame(HAND.rpartition("/")[0], show_axes=False, position=position, wxyz=wxyz)
+        start = hand_position(session.expert, session.pose)
+        self._dragged = -_DRAG_PAUSE
+        self._hand = scene.add_transform_controls(
+            HAND, scale=0.15 * expert.reach, disable_rotations=True, depth_test=False, position=start
+        )
+
+        @self._hand.on_update
+        def _(event: Any) -> None:
+            self._dragged = time.perf_counter()
+            session.drag(np.asarray(event.target.position, float))
 
     def _add_buttons(self) -> None:
         gui, session = self._server.gui, self._session

@@ -22,6 +22,7 @@ from mimic.viewer.follower import (
     initial_settings,
     step_towards,
 )
+from mimic.viewer.hand import pose_of_hand
 
 _GLIDE = 1.0  # s, duration of the expert's motion to the pose of a button
 _REST_TIME = 0.25  # s that the expert rests before the learner may leave a local minimum
@@ -106,6 +107,15 @@ class LiveSession:
             pose = self.pose
             pose[joint] = np.clip(angle, *self.expert.joint_range[joint])
             self._pose, self._rest_time, self._goal = pose, 0.0, None
+
+    def drag(self, position: Float[np.ndarray, "3"]) -> None:
+        """Moves the expert's hand to a position in its base frame [m], or near it, and stops any motion."""
+        if not np.all(np.isfinite(position)):
+            return
+        with self._lock:
+            self._motion = None
+            pose = pose_of_hand(self.expert, self._pose, np.asarray(position, float))
+            self._pose, self._rest_time, self._goal = pose.astype(np.float32), 0.0, None
 
     def glide(self, pose: Float[np.ndarray, " joints"]) -> None:
         """Moves the expert to a pose [rad] within a second."""

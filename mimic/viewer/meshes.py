@@ -10,7 +10,10 @@ import trimesh
 from jaxtyping import Float, Int
 
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
+from mimic.arms.kinematic_tree import body_id, find_chain
+from mimic.arms.link_match import Capsule, Colour
 from mimic.arms.rendering import LOCKED, MARK, SPACING
+from mimic.arms.visual_model import body_links, is_dark
 
 _VISIBLE_GROUPS = 3  # MuJoCo draws groups 0, 1 and 2; collision geoms are in higher groups
 _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
@@ -44,6 +47,7 @@ class ArmShape:
     Args:
       config: config of the arm; locked joints can be moved too.
       limits: see `EnvConfig`.
+      colours: colours of links by name, see `LinkMatch`. Default None: those of the model.
 
     Attributes:
       joint_names: joints of the chain, base to tip.
@@ -55,15 +59,24 @@ class ArmShape:
       ValueError: the arm is invalid.
     """
 
-    def __init__(self, config: ArmConfig, limits: str = "none"):
+    def __init__(self, config: ArmConfig, limits: str = "none", colours: Mapping[str, Colour] | None = None):
         free = build_arm(dataclasses.replace(config, locked=()), limits).embodiment
         self._model = arm_spec(config).compile()
         self._data = mujoco.MjData(self._model)
+        mujoco.mj_kinematics(self._model, self._data)
+        first = find_chain(self._model, config.base, config.tip).bodies[0]
+        self._base = int(self._model.body_parentid[first]) if config.base is None else body_id(self._model, config.base)
         self.joint_names = free.joint_names
         self.num_bodies = int(self._model.nbody)
         self.reach = float(free.chain_length)
         marks = [_mark(self._model, name, self.reach) for name in free.joint_names]
-        self.parts: list[Part] = [*_visible_parts(self._model), *marks]
+        links = body_links(self._model, config, limits)
+        by_body = {body: colours[link] for body, link in links.items() if link in colours} if colours else {}
+        self.parts: list[Part] = [*_coloured(_visible_parts(self._model), by_body), *marks]
+
+    def base_pose(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]:
+        """Position [m] and quaternion of the arm's base frame, in the frame of the model."""
+        return self._data.xpos[self._base].copy(), self._data.xquat[self._base].copy()
 
     def bodies(
         self, angles: Mapping[str, float]
@@ -94,6 +107,32 @@ def _visible_parts(model: mujoco.MjModel) -> list[Part]:
         key = int(model.geom_bodyid[geom]), tuple(float(x) for x in rgba)
         groups.setdefault(key, []).append(mesh)
     return [_part(body, trimesh.util.concatenate(meshes), rgba) for (body, rgba), meshes in groups.items()]
+
+
+def _coloured(parts: Sequence[Part], colours: Mapping[int, Colour]) -> list[Part]:
+    """The parts in the colours of their bodies, except dark ones of bodies that have others."""
+    light = {part.body for part in parts if not is_dark(part.rgba)}
+    return [
+        dataclasses.replace(part, rgba=(*colours[part.body], 1.0))
+        if part.body in colours and not (is_dark(part.rgba) and part.body in light)
+        else part
+        for part in parts
+    ]
+
+
+def capsule_mesh(capsule: Capsule) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    """Vertices and triangles of a capsule along the z-axis, with its start in the origin."""
+    length = float(np.linalg.norm(capsule.end - capsule.start))
+    mesh = trimesh.creation.capsule(length, capsule.radius, count=[12, 12])
+    vertices = np.asarray(mesh.vertices, np.float32)
+    return vertices - [0, 0, vertices[:, 2].min() + capsule.radius], np.asarray(mesh.faces, np.int32)
+
+
+def along_z(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4"]:
+    """Quaternion (w, x, y, z) that turns the z-axis into a direction."""
+    quaternion = np.zeros(4)
+    mujoco.mju_quatZ2Vec(quaternion, direction)
+    return quaternion
 
 
 def _part(body: int, mesh: Any, rgba: tuple[float, ...], locked_joint: str | None = None) -> Part:

@@ -1,4 +1,4 @@
-"""Which messages of a browser a view accepts: new values of its widgets, and the camera. Needs no viser."""
+"""Which messages of a browser a view accepts: new values of its widgets, the camera, and drags. Needs no viser."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -8,6 +8,8 @@ _CAMERA = {"wxyz": 4, "position": 3, "look_at": 3, "up_direction": 3}  # lengths
 _CAMERA_NUMBERS = ("fov", "near", "far", "image_height", "image_width")
 _MIN_NORM = 1e-6  # of a quaternion and of a direction
 _MAX_NUMBER = 1e9  # of a camera; float32 holds its square
+
+HAND = "/expert/base/hand"  # of the handle that drags the expert's hand
 
 ValueCheck = Callable[[Any], bool]
 
@@ -23,7 +25,16 @@ def fault(message: Any, check_of: Callable[[str], ValueCheck | None]) -> str | N
         return "no message"
     if message["type"] == "ViewerCameraMessage":
         return None if _is_camera(message) else "bad camera"
+    if message["type"] == "TransformControlsUpdateMessage":
+        return None if _is_drag(message) else "bad drag"
     return _update_fault(message, check_of) if message["type"] == "GuiUpdateMessage" else ""
+
+
+def _is_drag(message: Mapping[str, Any]) -> bool:
+    """Whether a message moves the handle at the expert's hand."""
+    vectors = _is_vector(message.get("wxyz"), 4) and _is_vector(message.get("position"), 3)
+    names = {"type", "name", "wxyz", "position"}
+    return vectors and message.get("name") == HAND and names <= set(message) <= {*names, "owner"}
 
 
 def _update_fault(message: Mapping[str, Any], check_of: Callable[[str], ValueCheck | None]) -> str | None:

@@ -4,9 +4,13 @@ import os
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
+import pytest
 
+from mimic.arms import rendering
 from mimic.arms.arm import ArmConfig
+from mimic.arms.link_match import Capsule
 from mimic.arms.rendering import ArmScene
 
 
@@ -55,3 +59,36 @@ def test_points_as_the_camera_sees_them():
     assert up[1] > 0.9 and abs(up[0]) < 1e-12  # seen from slightly above, upright
     assert aside[0] > 0.9  # the camera looks against the x-axis, so that y is to its right
     assert abs(ahead[0]) < 0.3 and ahead[1] < 0  # x comes towards it, and down as it looks from above
+
+
+@pytest.mark.parametrize("is_software", [True, False])
+def test_videos_are_plain_where_the_cpu_renders(monkeypatch, is_software):
+    monkeypatch.setattr(rendering, "is_software_renderer", lambda: is_software)
+    for fast in (True, False):
+        with ArmScene([ArmConfig()], width=32, height=32, fast=fast) as scene:
+            is_plain = fast and is_software
+            assert scene._renderer.scene.flags[int(mujoco.mjtRndFlag.mjRND_SHADOW)] == (not is_plain)
+            assert bool(scene._model.vis.quality.offsamples) == (not is_plain)
+
+
+@pytest.mark.parametrize("config", [ArmConfig(), ArmConfig(model="planar", link_lengths=[0.5, 0.5])])
+def test_fitted_arms_fill_the_image(config):
+    """The arms at rest and bent, with a margin: a part of the background on all sides, and no wide empty frame."""
+    joints = 7 if config.model == "panda" else 2
+    motion = np.linspace(0, 0.7, 5)[:, None] * np.ones(joints)
+    with ArmScene([config, config], width=240, height=160) as scene:
+        scene.fit([motion, -motion])
+        images = np.stack([scene.image([pose, -pose]) for pose in motion]).astype(int)
+        left, right = scene.centres()
+    assert 0.15 < left < 0.45 and 0.55 < right < 0.85
+    moved = np.any(np.abs(images - images[0]).max(axis=-1) > 30, axis=0)
+    assert not moved[:3].any() and not moved[-3:].any() and not moved[:, :3].any() and not moved[:, -3:].any()
+    assert np.ptp(np.flatnonzero(moved.any(axis=0))) > 100
+
+
+def test_an_overlay_is_drawn_at_the_last_arm():
+    config = ArmConfig(model="planar", link_lengths=[0.5, 0.5])
+    capsule = Capsule(np.zeros(3), np.array([0, 0, 0.2]), 0.1, (1.0, 0.0, 0.0, 1.0))
+    with ArmScene([config, config], width=160, height=120) as scene:
+        image = scene.image([np.zeros(2), np.zeros(2)], [capsule])
+    assert red_share(image[:, 80:]) > 0.002 and red_share(image[:, :80]) == 0

@@ -267,6 +267,13 @@ def test_no_rollout_goes_below_the_bound():
         assert np.all(np.asarray(rollout(gain).distance) > evaluator.lower_bound - 1e-4)
 
 
+def test_one_demonstration_has_the_references_that_it_has_among_all(evaluator):
+    one = evaluator.only(COUNT + 1)
+    assert len(one.lower_bound) == 1 and one.parts["held_out"] == slice(0, None)
+    np.testing.assert_array_equal(one.lower_bound[0], evaluator.lower_bound[COUNT + 1])
+    np.testing.assert_allclose(one.hold_distance[0], evaluator.hold_distance[COUNT + 1], rtol=1e-5)  # float32
+
+
 def test_bound_and_hold_distance_belong_to_the_samples_after_each_step():
     """Closed forms for the directions of planar arms. 1e-4: the tolerance of the search."""
     metric = {"correspondence": "overlap", "translation": 0.0, "linear_velocity": 0.0, "angular_velocity": 0.0}

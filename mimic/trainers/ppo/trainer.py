@@ -217,7 +217,8 @@ class PPOTrainer(Trainer):
         ]
         if "mjx" in metrics:
             on_mjx = metrics["mjx"]["optimality_gap"]
-            rows.insert(1, ("  evaluated on MJX", *(_text("{:.2%}", on_mjx[split]) for split in SPLITS)))
+            train, held_out = (_text("{:.2%}", on_mjx[split]) for split in SPLITS)
+            rows.insert(1, ("  evaluated on MJX", train, held_out))
         if not all(math.isfinite(gap) for gap in metrics["optimality_gap"].values()):
             rows.insert(1, ("  none: the best motion saves less than", f"{MIN_SPAN:.0%} of holding", "the start pose"))
         train, held_out = (

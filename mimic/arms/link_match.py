@@ -1,0 +1,119 @@
+"""Which links of two arms correspond, as colours and as overlays: the one place that chooses the colours of links.
+
+The colours run along the expert from base to hand. A learner's link has the mean of the colours of the expert's links
+that it corresponds to, weighted by their fractions; these are neighbours, so that the mean is a colour between theirs.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.arms.embodiment import Embodiment
+
+# The palettes of Okabe and Ito and of Tol (indigo), which colour-blind people tell apart. Red is left to locked joints.
+PALETTE = "#332288", "#0072B2", "#56B4E9", "#009E73", "#F0E442", "#E69F00", "#CC79A7"  # base to hand
+THRESHOLD = 0.3  # fraction of an expert's link in the target of a learner's link from which a line joins them
+_GHOST_ALPHA, _LINE_ALPHA = 0.32, 0.9
+_GHOST_RADIUS, _LINE_RADIUS = 0.035, 0.004  # chain lengths of the learner
+_LINE_COLOUR = (0.15, 0.15, 0.15)
+
+Colour = tuple[float, float, float]  # red, green, blue, from 0 to 1
+
+
+class Capsule(NamedTuple):
+    """A capsule between two points, in the learner's base frame [m]."""
+
+    start: Float[np.ndarray, "3"]
+    end: Float[np.ndarray, "3"]
+    radius: float
+    rgba: tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LinkMatch:
+    """Corresponding links of an expert and a learner.
+
+    Attributes:
+      expert, learner: the arms.
+      fractions: fraction of each expert link in the target of a learner link; columns sum to 1.
+    """
+
+    expert: Embodiment
+    learner: Embodiment
+    fractions: Float[np.ndarray, "expert learner"]
+
+    @property
+    def expert_colours(self) -> dict[str, Colour]:
+        """Colour of each link of the expert, by name."""
+        return _by_name(self.expert, colours_along_arm(self.expert.num_links))
+
+    @property
+    def learner_colours(self) -> dict[str, Colour]:
+        """Colour of each link of the learner, by name."""
+        return _by_name(self.learner, self.fractions.T @ colours_along_arm(self.expert.num_links))
+
+    def ghost(
+        self, expert_qpos: Float[np.ndarray, " joints"], learner_qpos: Float[np.ndarray, " learner_joints"]
+    ) -> list[Capsule]:
+        """The expert's links, scaled to the learner's length and translucent, and lines to the learner's links."""
+        length = float(self.learner.chain_length)
+        links = link_ends(self.expert, expert_qpos) * length / float(self.expert.chain_length)
+        colours = colours_along_arm(self.expert.num_links)
+        joined = [
+            Capsule(start, end, _GHOST_RADIUS * length, (*colour, _GHOST_ALPHA))
+            for (start, end), colour in zip(links, colours, strict=True)
+        ]
+        learner_links = link_ends(self.learner, learner_qpos)
+        for expert_link, learner_link in zip(*np.nonzero(self.fractions >= THRESHOLD), strict=True):
+            middles = links[expert_link].mean(axis=0), learner_links[learner_link].mean(axis=0)
+            joined.append(Capsule(*middles, _LINE_RADIUS * length, (*_LINE_COLOUR, _LINE_ALPHA)))
+        return joined
+
+
+def colours_along_arm(count: int) -> Float[np.ndarray, "links 3"]:
+    """Colours of the links of an expert, base to hand."""
+    anchors = np.array([[int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)] for colour in PALETTE])
+    positions = np.linspace(0, len(PALETTE) - 1, count) if count > 1 else np.zeros(1)
+    return np.stack([np.interp(positions, range(len(PALETTE)), channel) for channel in anchors.T], axis=1)
+
+
+def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "links 2 3"]:
+    """Start and end of each link in a pose [rad], in the base frame [m]; merged links are chords."""
+    transforms = joint_transforms(arm, qpos)
+    ends = np.empty((arm.num_links, 2, 3))
+    segment_link = np.asarray(arm.segment_link)
+    for link, joint in enumerate(arm.link_joint):
+        first, *_, last = np.repeat(np.flatnonzero(segment_link == link), 2)
+        points = np.stack([np.asarray(arm.segment_start)[first], np.asarray(arm.segment_end)[last]])
+        transform = transforms[joint + 1]
+        ends[link] = points @ transform[:3, :3].T + transform[:3, 3]
+    return ends
+
+
+def joint_transforms(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> list[Float[np.ndarray, "4 4"]]:
+    """Transforms of what is distal to no joint, to the first joint, … from the zero pose to a pose [rad]."""
+    transforms = [np.eye(4)]
+    for axis, anchor, angle in zip(np.asarray(arm.joint_axis), np.asarray(arm.joint_anchor), qpos, strict=True):
+        transforms.append(transforms[-1] @ _rotation_about(axis, anchor, float(angle)))
+    return transforms
+
+
+def _rotation_about(axis: np.ndarray, anchor: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation about an axis through a point, as a transform (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    transform = np.eye(4)
+    transform[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    transform[:3, 3] = anchor - transform[:3, :3] @ anchor
+    return transform
+
+
+def _by_name(arm: Embodiment, colours: Float[np.ndarray, "links 3"]) -> dict[str, Colour]:
+    """Colours by the names of links; a merged link has the names of its parts."""
+    return {
+        part: (float(red), float(green), float(blue))
+        for name, (red, green, blue) in zip(arm.link_names, colours, strict=True)
+        for part in name.split("+")
+    }
