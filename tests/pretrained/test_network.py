@@ -39,10 +39,9 @@ def test_each_says_where_it_comes_from(folder):
     assert len(source["commit"]) == 40 and source["command"].startswith(f"python -m mimic.train env={network.name} ")
     assert {"python", "jax", "numpy"} <= set(source["versions"]) and source["hardware"]["device"]
     assert source["env_steps" if network.kind == "policy" else "training_poses"] > 0
-    assert (
-        network.report["copying_distance"]["held_out"]
-        >= network.report["lower_bound" if network.kind == "policy" else "optimal_distance"]["held_out"]
-    )
+    best = network.report["lower_bound" if network.kind == "policy" else "optimal_distance"]["held_out"]
+    # Between equal arms copying is the optimum, and what the optimiser stops at is above it by less than 1e-4.
+    assert network.report["copying_distance"]["held_out"] >= best - 1e-4
     assert network.name in repr(network) and len(repr(network)) < 100
 
 
