@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from mimic.commands.export import export_run
     from mimic.commands.fit import Run, fit
     from mimic.envs.imitation import ImitationEnv
+    from mimic.pretrained.network import Pretrained, load
     from mimic.trainers.pose_mapper.model import PoseMapper
 
 __version__ = VERSION
@@ -76,6 +77,7 @@ __all__ = [
     "PairDistances",
     "PoseImitation",
     "PoseMapper",
+    "Pretrained",
     "Run",
     "adaptive_weights",
     "arc_length_correspondence",
@@ -98,6 +100,7 @@ __all__ = [
     "kinematic_bound",
     "link_distances",
     "link_states",
+    "load",
     "load_demonstrations",
     "load_mjcf",
     "local_minima",
@@ -127,6 +130,10 @@ def __getattr__(name: str) -> Any:
         from mimic.trainers.pose_mapper.model import PoseMapper
 
         return PoseMapper
+    if name in ("Pretrained", "load"):  # imports the trainers' configs
+        from mimic.pretrained import network
+
+        return getattr(network, name)
     if name == "export_run":  # imports all of these
         compat.import_mjx()
         from mimic.commands.export import export_run

@@ -22,6 +22,7 @@ LAYERS = (
     ("envs",),
     ("evaluation",),
     ("trainers",),
+    ("pretrained",),
     ("sweeps",),
     ("viewer",),
     ("paper_figures",),

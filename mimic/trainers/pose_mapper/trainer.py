@@ -14,6 +14,7 @@ from mimic.compilation import Background, compiling
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import imitate_pose
+from mimic.retargeting.pose_baselines import copy_joints
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings, TrainConfig
@@ -218,6 +219,15 @@ class PoseMapperTrainer(Trainer):
         )
         poses = {"mapper": mapped, "nearest_poses": optimum}
         return {"similarity": pose_similarity(model.expert, model.learner, expert, poses, split="held_out")}
+
+    def copying_distance(self) -> dict[str, float] | None:
+        """Mean distance by split of copying the angles of joints with the same name; None without any such joint."""
+        model, poses = self._model, self._evaluation_poses
+        copied = copy_joints(model.expert, model.learner, poses)
+        if copied is None:
+            return None
+        distance = np.asarray(jax.jit(jax.vmap(model.distance))(poses, copied))
+        return {split: float(values.mean()) for split, values in self._by_split(distance).items()}
 
     def status(self, metrics: Metrics) -> str:
         """Distance and quality."""

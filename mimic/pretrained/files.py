@@ -1,0 +1,86 @@
+"""The folder of a trained network: the config and the report of its run, and the parameters in one npz file."""
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from mimic.runs.files import REPORT, read_json, write_report
+from mimic.npz import read_arrays
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.run_config import load_config, save_config
+
+PARAMETERS = "parameters.npz"
+SOURCE = "source"  # key of the report: command and commit that trained the network
+_MAX_BYTES = 2**26  # of the parameters, as float64; the largest network of a preset has 2 MB
+
+
+def write_network(
+    folder: Path, config: TrainConfig, params: Any, report: Mapping[str, Any], *, half: bool = False
+) -> None:
+    """Writes the folder of a trained network; files that exist are replaced.
+
+    Args:
+      folder: the folder, created if needed.
+      config: config of the run, with all values resolved.
+      params: the parameters, a pytree of arrays.
+      report: report of these parameters, with the key "source".
+      half: whether matrices are stored as float16, and so rounded to 11 bits.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    partial = folder / (PARAMETERS + ".partial")
+    with partial.open("wb") as file:
+        np.savez_compressed(file, **_stored(params, half))  # type: ignore[arg-type] - names of arrays, none a flag
+    save_config(folder, dataclasses.replace(config, run_dir="", resume="", init=""))
+    os.replace(partial, folder / PARAMETERS)
+    write_report(folder, report)
+
+
+def read_config_and_report(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:
+    """Config and report of a trained network.
+
+    Raises:
+      ValueError: a file is missing or cannot be read.
+    """
+    config = load_config(folder)
+    try:
+        report = read_json(folder / REPORT)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{str(folder / REPORT)!r} cannot be read: {error}") from error
+    return config, report
+
+
+def read_params(folder: Path, template: Any) -> Any:
+    """The parameters of a trained network, with the structure and the types of the template.
+
+    Raises:
+      ValueError: the file is missing, cannot be read, or has parameters of another network.
+    """
+    path, leaves = folder / PARAMETERS, _named(template)
+    try:
+        arrays = read_arrays(path, list(leaves), _MAX_BYTES)
+        for name, leaf in leaves.items():
+            if name not in arrays:
+                raise ValueError(f"expected the array {name!r}, got none")
+            if arrays[name].shape != leaf.shape:
+                raise ValueError(f"{name}: expected shape {leaf.shape}, got {arrays[name].shape}")
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r} cannot be read: {error}") from error
+    values = [arrays[name].astype(leaf.dtype) for name, leaf in leaves.items()]
+    return jax.tree.unflatten(jax.tree.structure(template), values)
+
+
+def _stored(params: Any, half: bool) -> dict[str, np.ndarray]:
+    """The arrays by name. Vectors keep their type: they are small, and some counts do not fit float16."""
+    arrays = {name: np.asarray(leaf) for name, leaf in _named(params).items()}
+    return {name: array.astype(np.float16) if half and array.ndim > 1 else array for name, array in arrays.items()}
+
+
+def _named(tree: Any) -> dict[str, Any]:
+    """The leaves of a pytree by their path, as in "params/Dense_0/kernel"."""
+    paths, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in paths}

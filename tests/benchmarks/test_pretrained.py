@@ -1,0 +1,57 @@
+"""`python -m benchmarks.pretrained`: run directories become the networks that come with mimic."""
+
+import json
+import shlex
+
+import numpy as np
+import pytest
+
+from benchmarks import pretrained
+from mimic.commands import train
+from mimic.envs import env_config
+from mimic.pretrained.network import NETWORKS, read_network
+from mimic.runs.files import REPORT, read_json
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.run_config import load_config
+from tests.helpers import pages
+from tests.helpers.untrained_run import untrained_run
+
+
+def test_the_command_names_what_differs_from_the_defaults():
+    trainer = PPOConfig(preset="cpu", num_timesteps=1000, hidden_layers=[8]).resolve()
+    config = TrainConfig(env_config("planar4dof", physics="fused"), trainer, seed=3, run_dir="runs/x")
+    assert shlex.split(pretrained.training_command(config)) == [
+        *("python", "-m", "mimic.train", "env=planar4dof", "trainer=ppo", "trainer.preset=cpu"),
+        *("env.physics=fused", "trainer.num_timesteps=1000", "trainer.hidden_layers=[8]", "seed=3"),
+    ]
+
+
+@pytest.mark.parametrize("folder", sorted(NETWORKS.iterdir()), ids=lambda folder: folder.name)
+def test_the_recorded_commands_are_valid(folder, monkeypatch):
+    pages.check(shlex.split(read_json(folder / REPORT)["source"]["command"]), monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("half", [False, True])
+def test_a_policy_is_measured_as_it_is_stored(tmp_path, half):
+    run_dir = untrained_run(tmp_path / "run")
+    (run_dir / REPORT).write_text(json.dumps({"env": "planar4dof", "seed": 0, "optimality_gap": {"held_out": 7.0}}))
+    row = pretrained.make_network(run_dir, tmp_path / "out", "c0ffee", half)
+    policy = read_network(tmp_path / "out" / "planar4dof-policy", "policy")
+    assert row["gap"] == policy.report["optimality_gap"] != {"held_out": 7.0}
+    assert policy.source["commit"] == "c0ffee" and policy.source["matrices"] == ("float16" if half else "float32")
+    assert policy.config.env == load_config(run_dir).env
+    assert policy(np.zeros(policy.env.observation_size)).shape == (2,)
+
+
+@pytest.mark.slow
+def test_a_mapper_is_measured_as_it_is_stored(tmp_path):
+    settings = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}
+    trainer = PoseMapperConfig(**settings, evaluations=1, validation_poses=32)
+    config = TrainConfig(env_config("planar4dof"), trainer, run_dir=str(tmp_path / "run"), compilation_cache="")
+    assert train.prepare_training(config, 0.0)() == 0
+    trained = json.loads((tmp_path / "run" / REPORT).read_text())
+    row = pretrained.make_network(tmp_path / "run", tmp_path / "out", "c0ffee", False)
+    mapper = read_network(tmp_path / "out" / "planar4dof-pose_mapper", "pose_mapper")
+    assert row["gap"] == mapper.report["quality"] == trained["quality"]
+    assert mapper.report["copying_distance"]["held_out"] > mapper.report["optimal_distance"]["held_out"]
