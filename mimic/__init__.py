@@ -47,7 +47,8 @@ from mimic.metric.kinematics import (  # noqa: E402
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.metric.motion_distance import motion_distance  # noqa: E402
 from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
-from mimic.retargeting.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
+from mimic.retargeting.pose import PoseImitation, imitate_pose  # noqa: E402
+from mimic.retargeting.trajectory import imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:
     from mimic.arms.rendering import ArmScene

@@ -26,7 +26,9 @@ CORE = (
     "retargeting.kinematic_bound",
     "retargeting.optimizers",
     "retargeting.pose",
+    "retargeting.initial_guesses",
     "retargeting.pose_objective",
+    "retargeting.trajectory",
 )
 
 

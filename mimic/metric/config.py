@@ -23,6 +23,7 @@ from mimic.metric.distance import (
     Correspondence,
     DistanceWeights,
     Metric,
+    PairDistances,
     Reduction,
     RotationMeasure,
     Weights,
@@ -71,7 +72,7 @@ class MetricConfig:
         """The weights: constants, or a function of the distances."""
         velocities = {"linear_velocity": self.linear_velocity, "angular_velocity": self.angular_velocity}
         if self.adaptive:
-            return lambda distances: dataclasses.replace(adaptive_weights(distances), **velocities)
+            return partial(_adaptive_weights, **velocities)
         return DistanceWeights(self.translation, self.rotation, **velocities)
 
     def make_correspondence(self, expert: Embodiment, learner: Embodiment) -> Correspondence:
@@ -100,3 +101,8 @@ class MetricConfig:
         shape = expert.num_links, learner.num_links
         matrix = np.ones(shape) if callable(correspondence) else np.asarray(correspondence)
         return matrix / matrix.sum(axis=0)
+
+
+def _adaptive_weights(distances: PairDistances, **velocities: float) -> DistanceWeights:
+    """`adaptive_weights` with constant weights on velocities."""
+    return dataclasses.replace(adaptive_weights(distances), **velocities)

@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.config import MetricConfig
-from mimic.retargeting.pose import PoseImitation, imitate_trajectory
+from mimic.retargeting.pose import PoseImitation
+from mimic.retargeting.trajectory import imitate_trajectory
 
 
 def largest_jump(arm: Embodiment, dt: float) -> Float[np.ndarray, " joints"]:
