@@ -12,12 +12,14 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.compilation import compiled_once
 from mimic.config import check_choice
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.metric.spatial import array_library
+from mimic.retargeting.costs import Costs, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.optimizers import Solution, gradient_descent, newton
 from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
@@ -61,6 +63,8 @@ def imitate_pose(
     kept: int | None = 2,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
+    costs: Costs | None = None,
+    capsules: Capsules | None = None,
 ) -> PoseImitation:
     """Learner pose of minimum embodiment distance to an expert pose, argmin d(s(q), s_hat(q_hat)) (paper, eq. 22).
 
@@ -87,6 +91,8 @@ def imitate_pose(
         the computation but halves the compilation.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
+      costs: see `Costs`; None for the embodiment distance alone. The returned distance is without them.
+      capsules: of the learner, from `fit_capsules`, for the costs of collisions.
 
     Raises:
       ValueError: poses of the wrong shape or not finite, an unknown method, or a count below its minimum.
@@ -99,13 +105,20 @@ def imitate_pose(
         raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {count}")
     if kept is not None and kept < 1:
         raise ValueError(f"kept: expected at least 1, or None for all, got {kept}")
+    costs = Costs() if costs is None else costs
+    costs.check_capsules(capsules)
+    if costs.of_motion:
+        raise ValueError(
+            "costs: expected velocity and acceleration of 0 for single poses; imitate_trajectory takes them"
+        )
     batch = poses.shape[:-1]
     flat_warm = None
     if warm_start is not None:
         flat_warm = checked_poses(learner, jnp.asarray(warm_start), "warm_start").reshape(-1, learner.num_joints)
         flat_warm = jnp.broadcast_to(flat_warm, (int(np.prod(batch)), learner.num_joints))
     metric = Metric(correspondence, weights, rotation, reduction)
-    solve = _pose_solver(expert, learner, metric, _Descents(method, count, kept, bool(starts)))
+    descents = _Descents(method, count, kept, bool(starts))
+    solve = _pose_solver(expert, learner, metric, descents, costs, capsules if costs.of_capsules else None)
     candidates = random_poses(learner, key, max(starts, 1), poses.dtype)
     solutions = solve(poses.reshape(-1, expert.num_joints), flat_warm, candidates)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solutions)
@@ -123,10 +136,15 @@ class _Descents:
 
 @compiled_once
 def _pose_solver(
-    expert: Embodiment, learner: Embodiment, metric: Metric, descents: _Descents
+    expert: Embodiment,
+    learner: Embodiment,
+    metric: Metric,
+    descents: _Descents,
+    costs: Costs,
+    capsules: Capsules | None,
 ) -> Callable[[Array, Array | None, RandomPoses], PoseImitation]:
     """The function of poses [N, n], warm starts [N, n_hat] and random poses that `imitate_pose` compiles."""
-    objective = pose_objective(learner, metric)
+    objective = with_costs(pose_objective(learner, metric), costs, expert, learner, capsules)
 
     def solve(poses: Array, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
         limits, continuous = pose_limits(learner, poses.dtype), continuous_joints(learner)
@@ -134,7 +152,7 @@ def _pose_solver(
         scale = typical_distance(objective, jax.tree.map(lambda x: x[0], states), candidates)
 
         def solve_pose(pose: Array, states: LinkStates, warm: Array | None) -> PoseImitation:
-            target = objective.target(states)
+            target = objective.target(states, pose)
             if warm is None:
                 first = shared_joints(expert, learner, pose)
                 guesses = initial_guesses(objective, target, first, candidates if descents.random else None)

@@ -28,7 +28,7 @@ class PoseObjective:
 
     Attributes:
       distance: (expert's link states, learner's link states) -> embodiment distance, both at rest.
-      target: (expert's link states) -> target.
+      target: (expert's link states, expert's pose) -> target.
       value: (target, learner's link states) -> distance, up to a constant of the target.
       derivatives: (target, joint angles, store) -> derivatives of the distance; the value up to this constant.
         `store` is a `mimic.retargeting.optimizers.Store`, which may be omitted.
@@ -36,7 +36,7 @@ class PoseObjective:
     """
 
     distance: Callable[[LinkStates, LinkStates], Array]
-    target: Callable[[LinkStates], Target]
+    target: Callable[..., Target]
     value: Callable[[Target, LinkStates], Array]
     derivatives: Callable[..., Derivatives]
     rough_derivatives: Callable[..., Derivatives]
@@ -56,7 +56,7 @@ def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
         hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
         return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
 
-    return PoseObjective(metric, lambda states: states, metric, derivatives, derivatives)
+    return PoseObjective(metric, lambda states, _=None: states, metric, derivatives, derivatives)
 
 
 class StaticTarget(NamedTuple):
@@ -85,7 +85,7 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
     pairs = _weighted_pairs(correspondence, weights.translation)
     arm = in_chain_lengths(learner)
 
-    def target(states: LinkStates) -> StaticTarget:
+    def target(states: LinkStates, _: Any = None) -> StaticTarget:
         assert states.direction is not None
         dtype = states.direction.dtype
         # Elementwise, so that nothing is rounded to TF32.

@@ -10,12 +10,14 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.compilation import compiled_once
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import link_states
+from mimic.retargeting.costs import Costs, smoothness_derivatives, sum_of, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
-from mimic.retargeting.optimizers import Derivatives, Solution, newton
+from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, Store, newton
 from mimic.retargeting.pose import (
     FLAT,
     ITERATIONS,
@@ -44,6 +46,8 @@ def imitate_trajectory(
     key: Array | None = None,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
+    costs: Costs | None = None,
+    capsules: Capsules | None = None,
 ) -> PoseImitation:
     """Nearest poses that form a continuous motion: the pose at each time starts from that of the neighbouring time.
 
@@ -63,6 +67,9 @@ def imitate_trajectory(
       key: see `imitate_pose`.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
+      costs: see `Costs`; None for the embodiment distance alone. Those of velocity and acceleration are minimised pose
+        by pose, each against the two poses before it. The returned distance is without costs.
+      capsules: of the learner, from `fit_capsules`, for the costs of collisions.
 
     Raises:
       ValueError: what `imitate_pose` rejects, or a jump that is not above 0.
@@ -74,25 +81,32 @@ def imitate_trajectory(
         raise ValueError(f"largest_jump: expected angles above 0 rad, got {largest_jump}")
     if starts < 0:
         raise ValueError(f"starts: expected at least 0, got {starts}")
+    costs = Costs() if costs is None else costs
+    costs.check_capsules(capsules)
     jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
     metric = Metric(correspondence, weights, rotation, reduction)
-    solve = _trajectory_solver(expert, learner, metric, bool(starts))
+    solve = _trajectory_solver(expert, learner, metric, bool(starts), costs, capsules if costs.of_capsules else None)
     return solve(poses, jump, random_poses(learner, key, max(starts, 1), poses.dtype))
 
 
 @compiled_once
 def _trajectory_solver(
-    expert: Embodiment, learner: Embodiment, metric: Metric, random: bool
+    expert: Embodiment,
+    learner: Embodiment,
+    metric: Metric,
+    random: bool,
+    costs: Costs,
+    capsules: Capsules | None,
 ) -> Callable[[Array, Array, RandomPoses], PoseImitation]:
     """The function of poses [T, n], largest jumps [n_hat] and random poses that `imitate_trajectory` compiles."""
-    objective = pose_objective(learner, metric)
+    objective = with_costs(pose_objective(learner, metric), costs, expert, learner, capsules)
 
     def solve(poses: Array, jump: Array, candidates: RandomPoses) -> PoseImitation:
         anchors = np.unique(np.linspace(0, poses.shape[0] - 1, _ANCHORS).round().astype(int))
         states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
         scale = typical_distance(objective, jax.tree.map(lambda x: x[0], states), candidates)
-        targets = jax.vmap(objective.target)(states)
-        tracker = _Tracker(objective, targets, pose_limits(learner, poses.dtype), jump, times=len(poses))
+        targets = jax.vmap(objective.target)(states, poses)
+        tracker = _Tracker(objective, targets, pose_limits(learner, poses.dtype), jump, len(poses), costs)
 
         def from_anchor(anchor: Array) -> Solution:
             target = jax.tree.map(lambda x: x[anchor], targets)
@@ -113,6 +127,9 @@ def _trajectory_solver(
     return solve
 
 
+_Past = tuple[Array, Array]  # the previous pose, and the one before it
+
+
 @dataclasses.dataclass(frozen=True)
 class _Tracker:
     """Tracks minima over the times of a trajectory.
@@ -123,6 +140,7 @@ class _Tracker:
       limits: of the joints [rad].
       jump: maximum change of each joint between two times [rad].
       times: number of times.
+      costs: those of motions.
     """
 
     objective: PoseObjective
@@ -130,36 +148,44 @@ class _Tracker:
     limits: tuple[Array | np.ndarray, Array | np.ndarray]
     jump: Float[Array, " joints"]
     times: int
+    costs: Costs
 
     def track(self, anchor: Array, guess: Array) -> Solution:
         """The minimum near a guess at the anchor's time, tracked over all times with the rough derivatives."""
         rough = self.objective.rough_derivatives
         begin = newton(self._at(rough, anchor), guess, self.limits, ITERATIONS["newton"]).qpos
 
-        def follow(pose: Array, time: Array) -> tuple[Array, Solution]:
-            solution = self._near(rough, pose, pose, time)
-            return solution.qpos, solution
+        def follow(past: _Past, time: Array) -> tuple[_Past, Solution]:
+            solution = self._near(rough, past, past[0], time)
+            return (solution.qpos, past[0]), solution
 
         # From the anchor to the end, then back over all times, which also covers those before the anchor.
         times = jnp.arange(self.times)
         path = jnp.concatenate([jnp.maximum(times, anchor), times[::-1]])
-        solutions = jax.lax.scan(follow, begin, path)[1]
+        solutions = jax.lax.scan(follow, (begin, begin), path)[1]
         return jax.tree.map(lambda x: x[: self.times - 1 : -1], solutions)
 
     def refine(self, rough: Solution) -> Solution:
         """A track, optimised with the exact derivatives."""
 
-        def follow(pose: Array, guess_and_time: tuple[Array, Array]) -> tuple[Array, Solution]:
+        def follow(past: _Past, guess_and_time: tuple[Array, Array]) -> tuple[_Past, Solution]:
             guess, time = guess_and_time
-            solution = self._near(self.objective.derivatives, pose, guess, time)
-            return solution.qpos, solution
+            solution = self._near(self.objective.derivatives, past, guess, time)
+            return (solution.qpos, past[0]), solution
 
-        return jax.lax.scan(follow, rough.qpos[0], (rough.qpos, jnp.arange(self.times)))[1]
+        begin = rough.qpos[0], rough.qpos[0]
+        return jax.lax.scan(follow, begin, (rough.qpos, jnp.arange(self.times)))[1]
 
     def _at(self, derivatives: Callable[..., Derivatives], time: Array) -> Callable[..., Derivatives]:
         return functools.partial(derivatives, jax.tree.map(lambda x: x[time], self.targets))
 
-    def _near(self, derivatives: Callable[..., Derivatives], previous: Array, guess: Array, time: Array) -> Solution:
+    def _near(self, derivatives: Callable[..., Derivatives], past: _Past, guess: Array, time: Array) -> Solution:
         lower, upper = self.limits
+        previous, earlier = past
         reachable = jnp.maximum(lower, previous - self.jump), jnp.minimum(upper, previous + self.jump)
-        return newton(self._at(derivatives, time), guess, reachable, _TRACKING_ITERATIONS)
+        of_pose = self._at(derivatives, time)
+
+        def of_motion(qpos: Scalars, store: Store) -> Derivatives:
+            return sum_of(of_pose(qpos, store), smoothness_derivatives(self.costs, qpos, previous, earlier))
+
+        return newton(of_motion if self.costs.of_motion else of_pose, guess, reachable, _TRACKING_ITERATIONS)
