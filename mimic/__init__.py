@@ -16,6 +16,7 @@ compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
 compat.import_mujoco()
 
 from mimic.arms.arm import ArmConfig, build_arm  # noqa: E402
+from mimic.arms.capsules import Capsules, fit_capsules  # noqa: E402
 from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
 from mimic.distribution import VERSION  # noqa: E402
 from mimic.envs import env_config, environments, make  # noqa: E402
@@ -49,8 +50,10 @@ from mimic.metric.kinematics import (  # noqa: E402
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.metric.motion_distance import motion_distance  # noqa: E402
 from mimic.registry import register  # noqa: E402
+from mimic.retargeting.costs import Costs  # noqa: E402
 from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
-from mimic.retargeting.pose import PoseImitation, imitate_pose, imitate_trajectory  # noqa: E402
+from mimic.retargeting.pose import PoseImitation, imitate_pose  # noqa: E402
+from mimic.retargeting.trajectory import imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:
     from mimic.arms.rendering import ArmScene
@@ -66,7 +69,9 @@ __all__ = [
     "PAPER_WEIGHTS",
     "ArmConfig",
     "ArmScene",
+    "Capsules",
     "ClosestMotion",
+    "Costs",
     "Demonstrations",
     "DistanceWeights",
     "Embodiment",
@@ -92,6 +97,7 @@ __all__ = [
     "environments",
     "export_run",
     "fit",
+    "fit_capsules",
     "forward_kinematics",
     "hard_correspondence",
     "imitate_pose",

@@ -27,7 +27,9 @@ CORE = (
     "retargeting.kinematic_bound",
     "retargeting.optimizers",
     "retargeting.pose",
+    "retargeting.initial_guesses",
     "retargeting.pose_objective",
+    "retargeting.trajectory",
 )
 
 

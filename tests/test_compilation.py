@@ -1,7 +1,12 @@
 """Compilation in the background, and the options of the compiler."""
 
+import functools
+import gc
+import weakref
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from mimic import compilation
@@ -69,3 +74,39 @@ def test_a_cache_that_cannot_be_written_is_not_used(capsys):
     assert capsys.readouterr().err.startswith(
         "warning: compilation_cache: '/dev/null/cache': cannot write in '/dev/null'"
     )
+
+
+def test_results_are_kept_by_value_and_not_for_ever():
+    made = []
+
+    @compilation.by_value
+    def make(*arguments):
+        made.append(arguments)
+        return object()
+
+    first = make(np.ones(2), {"a": (1.0, "x")}, functools.partial(np.sum, axis=0))
+    assert make(np.ones(2), {"a": (1.0, "x")}, functools.partial(np.sum, axis=0)) is first
+    for other in (np.zeros(2), np.ones(2, np.float32), np.ones((2, 1)), [1.0, 1.0], np.array([1.0, -1.0])):
+        assert make(other, {"a": (1.0, "x")}, functools.partial(np.sum, axis=0)) is not first
+    assert len(made) == 6
+    for number in range(40):
+        make(number)
+    assert make(np.ones(2), {"a": (1.0, "x")}, functools.partial(np.sum, axis=0)) is not first  # dropped
+
+
+def test_kept_functions_release_memory():
+    """Of a hundred arms, the functions of the last 32 stay."""
+    alive = []
+
+    def make(number):
+        def add(x):
+            return x + number
+
+        alive.append(weakref.ref(add))
+        return add
+
+    maker = compilation.compiled_once(make)
+    for number in range(40):
+        assert maker(number)(jnp.ones(2))[0] == number + 1
+    gc.collect()
+    assert sum(reference() is not None for reference in alive) <= 33  # JAX may hold the last one

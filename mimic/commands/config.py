@@ -16,6 +16,7 @@ from mimic.envs.config import PHYSICS, EnvConfig
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.ranges import check_ranges, number, seed_number
+from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "searched")
@@ -244,6 +245,7 @@ class RetargetConfig:
       mapper: run directory of a pose mapper of that environment, used instead of the optimiser.
       limits: see `EnvConfig`.
       out: file of the learner's motions; must not exist.
+      costs: see `Costs`; of the optimiser.
       seed: seed of the random initial poses of the optimiser.
     """
 
@@ -252,10 +254,13 @@ class RetargetConfig:
     mapper: str = ""
     limits: str = "none"
     out: str = ""
+    costs: Costs = dataclasses.field(default_factory=Costs)
     seed: int = seed_number()
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        if self.mapper and self.costs != Costs():
+            raise ValueError("costs: expected none with a mapper, which does not minimise them")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mimic.arms.arm import finite_velocity_limit
+from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import RetargetConfig
 from mimic.commands.progress import similarity_table
@@ -21,6 +22,7 @@ from mimic.envs import env_config
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.config import MetricConfig
+from mimic.retargeting.costs import Costs
 from mimic.retargeting.motions import largest_jump, optimal_motions
 from mimic.retargeting.pose import continuous_joints, wrap_angles
 from mimic.trainers.pose_mapper.model import PoseMapper
@@ -35,6 +37,8 @@ def retarget(
     *,
     mapper: PoseMapper | None = None,
     seed: int = 0,
+    costs: Costs | None = None,
+    capsules: Capsules | None = None,
 ) -> tuple[Demonstrations, dict[str, Any]]:
     """Retargets demonstrations of the expert to the learner, pose by pose, with bounded joint velocities.
 
@@ -47,6 +51,8 @@ def retarget(
       metric: metric to minimise; its weights on velocities are ignored.
       mapper: proposes the poses, see `follow_mapper`. Default None: the optimiser, see `imitate_trajectory`.
       seed: seed of the random initial poses of the optimiser.
+      costs: see `imitate_trajectory`; of the optimiser.
+      capsules: see `imitate_trajectory`.
 
     Returns:
       The learner's motions, and a report: `distance`, the mean over all poses; `largest_jump` [rad], the maximum change
@@ -61,7 +67,7 @@ def retarget(
     jump = largest_jump(learner, demonstrations.dt)
     expert_qpos = jnp.asarray(demonstrations.qpos, jnp.float32)
     if mapper is None:
-        solution = optimal_motions(expert, learner, expert_qpos, metric, jump, seed)
+        solution = optimal_motions(expert, learner, expert_qpos, metric, jump, seed, costs=costs, capsules=capsules)
         learner_qpos, distance, settled = solution.qpos, solution.distance, solution.converged
     else:
         mapper.check_fits(expert, learner)
@@ -157,6 +163,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
     expert, learner = env.build_arms().embodiments
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
     _check(demonstrations, expert)
+    capsules = fit_capsules(env.learner, env.limits) if config.costs.of_capsules else None
     mapper = PoseMapper.load(Path(config.mapper).expanduser()) if config.mapper else None
     if mapper:
         mapper.check_fits(expert, learner)
@@ -164,7 +171,8 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
     def run() -> None:
         console = Console()
         with console.status(f"retargeting {demonstrations.count} motions from {expert.name} to {learner.name}"):
-            motions, report = retarget(demonstrations, expert, learner, env.metric, mapper=mapper, seed=config.seed)
+            options = {"mapper": mapper, "seed": config.seed, "costs": config.costs, "capsules": capsules}
+            motions, report = retarget(demonstrations, expert, learner, env.metric, **options)
         motions.save(out)
         console.print(_table(motions, report))
         console.print(similarity_table(report["similarity"]))

@@ -27,6 +27,7 @@ from mimic.metric.distance import (
     DistanceWeights,
     LinkDistance,
     Metric,
+    PairDistances,
     Reduction,
     RotationMeasure,
     Weights,
@@ -89,7 +90,7 @@ class MetricConfig:
             return LinkDistance(registry.find("link_distance", self.link_distance, "metric.link_distance"))
         velocities = {"linear_velocity": self.linear_velocity, "angular_velocity": self.angular_velocity}
         if self.adaptive:
-            return lambda distances: dataclasses.replace(adaptive_weights(distances), **velocities)
+            return partial(_adaptive_weights, **velocities)
         return DistanceWeights(self.translation, self.rotation, **velocities)
 
     def make_correspondence(self, expert: Embodiment, learner: Embodiment) -> Correspondence:
@@ -136,3 +137,8 @@ class MetricConfig:
         is_static = not callable(self.make_correspondence(expert, learner))
         metric = self if is_static else dataclasses.replace(self, correspondence="arc_length")
         return LinkMatch(expert, learner, metric.link_fractions(expert, learner))
+
+
+def _adaptive_weights(distances: PairDistances, **velocities: float) -> DistanceWeights:
+    """`adaptive_weights` with constant weights on velocities."""
+    return dataclasses.replace(adaptive_weights(distances), **velocities)

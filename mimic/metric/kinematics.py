@@ -141,7 +141,10 @@ def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: b
 
 
 def link_state_table(
-    arm: Embodiment, qpos: Float[np.ndarray, "*batch joints"], qvel: Float[np.ndarray, "*batch joints"]
+    arm: Embodiment,
+    qpos: Float[np.ndarray, "*batch joints"],
+    qvel: Float[np.ndarray, "*batch joints"],
+    dtype: Any = np.float32,
 ) -> LinkStates:
     """Link states of whole trajectories by NumPy, without compilation, for tables that are computed once.
 
@@ -149,16 +152,17 @@ def link_state_table(
       arm: the embodiment.
       qpos: joint angles [rad].
       qvel: joint velocities [rad/s].
+      dtype: of the result.
 
     Returns:
-      Arrays [*batch, links, 3], computed in double precision and rounded to float32.
+      Arrays [*batch, links, 3], computed in double precision.
     """
     shape = np.shape(qpos)[:-1]
     angles, speeds = (np.asarray(x, float).reshape(-1, arm.num_joints).T for x in (qpos, qvel))
 
     def table(column: list[Vector]) -> np.ndarray:
         rows = [np.stack(np.broadcast_arrays(*row, angles[0])[:3], axis=-1) for row in column]
-        return np.stack(rows, axis=1).reshape(*shape, len(rows), 3).astype(np.float32)
+        return np.stack(rows, axis=1).reshape(*shape, len(rows), 3).astype(dtype)
 
     with np.errstate(invalid="ignore", over="ignore"):  # of an unstable rollout
         return LinkStates(*map(table, _link_state_columns(arm, [*angles], [*speeds], normalized=True)))  # pyright: ignore[reportArgumentType]

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.compilation import compiled_once
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.pose import pose_limits, shared_joints
@@ -134,6 +135,14 @@ def closest_motion(
         raise ValueError(f"starts, iterations: expected at least 1, got {starts} and {iterations}")
 
     metric = Metric(correspondence, weights, rotation, reduction)
+    return _motion_solver(expert, learner, metric, starts, iterations, seed)(qpos, qvel)
+
+
+@compiled_once
+def _motion_solver(
+    expert: Embodiment, learner: Embodiment, metric: Metric, starts: int, iterations: int, seed: int
+) -> Callable[[Array, Array], ClosestMotion]:
+    """The function of the expert's motion that `closest_motion` compiles."""
 
     def solve(qpos: Array, qvel: Array) -> ClosestMotion:
         times, rng = len(qpos), np.random.default_rng(seed)
@@ -148,7 +157,7 @@ def closest_motion(
         best_qpos, best_qvel = jnp.split(best.point, 2, axis=-1)
         return ClosestMotion(best_qpos, speed[:, None] * best_qvel, best.value)
 
-    return jax.jit(solve)(qpos, qvel)
+    return solve
 
 
 def _initial_poses(

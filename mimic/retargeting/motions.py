@@ -1,5 +1,7 @@
 """Motions of a learner that resemble those of an expert under a metric, one trajectory at a time."""
 
+from typing import Any
+
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -7,7 +9,8 @@ from jaxtyping import Array, Float
 from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.config import MetricConfig
-from mimic.retargeting.pose import PoseImitation, imitate_trajectory
+from mimic.retargeting.pose import PoseImitation
+from mimic.retargeting.trajectory import imitate_trajectory
 
 
 def largest_jump(arm: Embodiment, dt: float) -> Float[np.ndarray, " joints"]:
@@ -16,9 +19,15 @@ def largest_jump(arm: Embodiment, dt: float) -> Float[np.ndarray, " joints"]:
 
 
 def optimal_motions(
-    expert: Embodiment, learner: Embodiment, qpos: Array, metric: MetricConfig, largest_jump: np.ndarray, seed: int
+    expert: Embodiment,
+    learner: Embodiment,
+    qpos: Array,
+    metric: MetricConfig,
+    largest_jump: np.ndarray,
+    seed: int,
+    **costs: Any,
 ) -> PoseImitation:
-    """`imitate_trajectory` of each of the expert's motions [motions, time, joints]."""
+    """`imitate_trajectory` of each of the expert's motions [motions, time, joints], with its `costs` and `capsules`."""
     arguments = metric.build(expert, learner).arguments
 
     def imitate(qpos: jax.Array) -> PoseImitation:
@@ -29,6 +38,7 @@ def optimal_motions(
             largest_jump=largest_jump,
             key=jax.random.key(seed),
             **arguments,
+            **costs,
         )
 
     # One demonstration after the other: the tracked minima already fill the processor, and memory stays small.

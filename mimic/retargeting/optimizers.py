@@ -3,6 +3,7 @@
 They compute on scalar components (see `mimic.metric.spatial`), so that a batch of descents is elementwise.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mimic import compat
 from mimic.metric.spatial import Scalar, plus, times
 
 _MAX_STEP = 1.0  # rad, of a joint in one Newton step
@@ -51,7 +53,15 @@ class Solution(NamedTuple):
     gradient_norm: Float[Array, ""]
 
 
-Objective = Callable[[Scalars], Derivatives]
+# Derivatives at joint angles. The second argument is a `Store`.
+Objective = Callable[..., Derivatives]
+# Calls a function with one argument; its result may be stored in memory, so that it is computed once.
+Store = Callable[[Callable[[Any], Any], Any], Any]
+
+
+def call(function: Callable[[Any], Any], argument: Any) -> Any:
+    """The `Store` that stores nothing."""
+    return function(argument)
 
 
 def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> Solution:
@@ -59,13 +69,14 @@ def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits,
     joints = start.shape[0]
     bounds = _bounds(limits, joints)
 
-    def iterate(carry: Any, _: None) -> tuple[Any, None]:
+    def iterate(carry: Any, index: Array) -> tuple[Any, None]:
         qpos, here, damping = carry
+        store = functools.partial(compat.stored, index)
         free = _free(qpos, here.gradient, bounds)
         step = _descent_step(here, free, damping)
         scale = 1 / jnp.maximum(_max_abs(step) / _MAX_STEP, 1.0)
         new_qpos = _within([q + s * scale for q, s in zip(qpos, step, strict=True)], bounds)
-        there = _symmetric(objective(new_qpos))
+        there = store(lambda qpos: _symmetric(objective(qpos, store)), new_qpos)
         better = there.value < here.value
         kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (new_qpos, there), (qpos, here))
         return (*kept, damping * jnp.where(better, _LESS, _MORE)), None
@@ -75,7 +86,7 @@ def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits,
     zero = jnp.zeros_like(start[0])
     unevaluated = Derivatives(zero + jnp.inf, (zero,) * joints, tuple((zero,) * (k + 1) for k in range(joints)))
     initial = qpos, unevaluated, zero + _FIRST_DAMPING / _LESS
-    (qpos, here, _), _ = jax.lax.scan(iterate, initial, None, length=iterations + 1)
+    (qpos, here, _), _ = jax.lax.scan(iterate, initial, jnp.arange(iterations + 1))
     return _solution(qpos, here, bounds)
 
 

@@ -15,8 +15,9 @@ from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.metric import spatial
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
+from mimic.metric.spatial import Vector
 from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
-from mimic.retargeting.optimizers import Derivatives, Scalars
+from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 
 Target = Any  # pytree: the data of the expert's pose that the objective needs
 
@@ -27,17 +28,18 @@ class PoseObjective:
 
     Attributes:
       distance: (expert's link states, learner's link states) -> embodiment distance, both at rest.
-      target: (expert's link states) -> target.
+      target: (expert's link states, expert's pose) -> target.
       value: (target, learner's link states) -> distance, up to a constant of the target.
-      derivatives: (target, learner's joint angles) -> derivatives of the distance; the value up to this constant.
+      derivatives: (target, joint angles, store) -> derivatives of the distance; the value up to this constant.
+        `store` is a `mimic.retargeting.optimizers.Store`, which may be omitted.
       rough_derivatives: the same for a smoother function with nearby minima, for the first iterations.
     """
 
     distance: Callable[[LinkStates, LinkStates], Array]
-    target: Callable[[LinkStates], Target]
+    target: Callable[..., Target]
     value: Callable[[Target, LinkStates], Array]
-    derivatives: Callable[[Target, Scalars], Derivatives]
-    rough_derivatives: Callable[[Target, Scalars], Derivatives]
+    derivatives: Callable[..., Derivatives]
+    rough_derivatives: Callable[..., Derivatives]
 
 
 def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
@@ -46,7 +48,7 @@ def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
 
 
 def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
-    def derivatives(target: LinkStates, qpos: Scalars) -> Derivatives:
+    def derivatives(target: LinkStates, qpos: Scalars, store: Store = call) -> Derivatives:
         def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
             value, gradient = jax.value_and_grad(lambda q: metric(target, link_states(learner, q)))(qpos)
             return gradient, (value, gradient)
@@ -54,7 +56,7 @@ def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
         hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
         return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
 
-    return PoseObjective(metric, lambda states: states, metric, derivatives, derivatives)
+    return PoseObjective(metric, lambda states, _=None: states, metric, derivatives, derivatives)
 
 
 class StaticTarget(NamedTuple):
@@ -83,7 +85,7 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
     pairs = _weighted_pairs(correspondence, weights.translation)
     arm = in_chain_lengths(learner)
 
-    def target(states: LinkStates) -> StaticTarget:
+    def target(states: LinkStates, _: Any = None) -> StaticTarget:
         assert states.direction is not None
         dtype = states.direction.dtype
         # Elementwise, so that nothing is rounded to TF32.
@@ -102,12 +104,15 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
         square = jnp.sum(difference * difference, axis=-1)
         return jnp.sum(target.weights * smoothed_length(square, SMOOTHING)) - aligned
 
-    def derivatives(smoothing: float, target: StaticTarget, qpos: Scalars) -> Derivatives:
+    def kinematics(qpos: Scalars) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Vector]]]:
         frames = joint_frames(arm, qpos, None)
-        vectors = zip(arm.link_joint, link_vectors(arm, frames), strict=True)
-        links = [Body(joint, link.direction, link.position) for joint, link in vectors]
-        anchors = [frame.anchor for frame in frames[1:]]
-        return static_derivatives(joint_axes(arm, frames), anchors, links, target.pulls, smoothing)
+        vectors = [(link.direction, link.position) for link in link_vectors(arm, frames)]
+        return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], vectors
+
+    def derivatives(smoothing: float, target: StaticTarget, qpos: Scalars, store: Store = call) -> Derivatives:
+        axes, anchors, vectors = store(kinematics, tuple(qpos))
+        links = [Body(joint, *vector) for joint, vector in zip(arm.link_joint, vectors, strict=True)]
+        return static_derivatives(axes, anchors, links, target.pulls, smoothing)
 
     rough, fine = (functools.partial(derivatives, smoothing) for smoothing in (ROUGH_SMOOTHING, SMOOTHING))
     return PoseObjective(metric, target, value, fine, rough if len(pairs) else fine)

@@ -12,7 +12,8 @@ from mimic.metric.correspondence import arc_length_correspondence, hard_correspo
 from mimic.metric.distance import DistanceWeights, adaptive_weights, embodiment_distance
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.closed_form import SMOOTHING
-from mimic.retargeting.pose import imitate_pose, imitate_trajectory
+from mimic.retargeting.pose import imitate_pose
+from mimic.retargeting.trajectory import imitate_trajectory
 from tests.helpers.metric_cases import planar_optimum
 
 DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.0)

@@ -1,0 +1,64 @@
+"""Latency of one pose on one core: warm-started from the last pose of a motion, and from 13 initial guesses.
+
+    python -m benchmarks.latency [--out FILE] [--poses 2000]
+
+The process is bound to one core of Linux. `jit` is a caller inside `jax.jit`, `call` is `imitate_pose` itself, which
+also looks up what it compiled.
+"""
+
+import functools
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+import mimic
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, collect
+from mimic.metric.config import MetricConfig
+
+COLUMNS = "start way p50_us:.0f p99_us:.0f"
+STARTS = ("warm", "13 initial guesses")
+
+
+def bind_to_one_core() -> None:
+    """Before JAX starts its threads."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def latencies(imitate: Callable[..., Any], motion: np.ndarray, *, warm: bool) -> np.ndarray:
+    """Seconds of each pose of a motion, after the first tenth of them."""
+    last, times = imitate(motion[0]).qpos, []
+    for pose in motion:
+        options = {"warm_start": last} if warm else {}
+        began = time.perf_counter()
+        last = jax.block_until_ready(imitate(pose, **options).qpos)
+        times.append(time.perf_counter() - began)
+    return np.array(times[len(times) // 10 :])
+
+
+def run_way(way: str, start: str, poses: int) -> Row:
+    pair = mimic.panda(), mimic.panda(locked=(3, 6, 7))
+    metric = MetricConfig().build(*pair).arguments
+    imitate = functools.partial(mimic.imitate_pose, *pair, **metric)
+    if way == "jit":
+        imitate = jax.jit(imitate)
+    phases = np.linspace(0, 20, poses)[:, None] + np.arange(7)
+    times = latencies(imitate, np.sin(phases).astype(np.float32), warm=start == "warm")
+    p50, p99 = 1e6 * np.quantile(times, [0.5, 0.99])
+    return {"start": start, "way": way, "p50_us": float(p50), "p99_us": float(p99)}
+
+
+def main() -> None:
+    options = make_parser("latency", __doc__, poses=2000).parse_args()
+    bind_to_one_core()
+    rows = (run_way(way, start, options.poses) for start in STARTS for way in ("jit", "call"))
+    collect(options, rows, "results", COLUMNS)
+
+
+if __name__ == "__main__":
+    main()

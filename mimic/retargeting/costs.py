@@ -1,0 +1,246 @@
+"""Optional costs of retargeting, which are added to the embodiment distance."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mimic.arms.capsules import Capsules
+from mimic.arms.embodiment import Embodiment
+from mimic.metric import spatial
+from mimic.metric.kinematics import LinkStates, forward_kinematics, joint_frames
+from mimic.ranges import check_ranges, number
+from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
+from mimic.retargeting.pose_objective import PoseObjective, Target
+
+_NEAR_LIMIT = 0.1  # fraction of a joint's range at each end where `limits` counts
+_SMOOTHING = 1e-4  # m, of the distance of crossing segments, whose second derivative is infinite without
+_SHORT = 1e-6  # m, axis of a capsule that is a sphere
+_FULL_TURN = 2 * np.pi - 1e-4  # rad; a joint with such a range has no limits, as for `continuous_joints`
+
+
+def _weight() -> float:
+    return number(0.0, at_least=0.0, at_most=1e6)
+
+
+@dataclasses.dataclass(frozen=True)
+class Costs:
+    """Weights of costs that are added to the embodiment distance; 0 removes a cost.
+
+    Attributes:
+      hand_position: squared distance of the frames of the last links, each in its arm's chain lengths.
+      hand_orientation: 1 - cos of the angle between these frames.
+      home: mean over the joints of the squared distance from the home pose, in half ranges.
+      limits: mean over the joints of the squared intrusion into the last tenth of the range at each end; 1 at a limit.
+      velocity, acceleration: mean over the joints of the squared first and second difference of the angles [rad^2] from
+        one time to the next; of `imitate_trajectory` alone.
+      self_collision: sum over pairs of capsules of ((clearance - d) / clearance)^2, where their distance d is less than
+        the clearance; d is negative where they intersect. See `Capsules.pairs`.
+      floor: the same for the distance of each capsule from the floor, except those on the base and the first joint.
+      clearance: of collisions [m].
+      floor_height: height of the floor in the base frame [m].
+    """
+
+    hand_position: float = _weight()
+    hand_orientation: float = _weight()
+    home: float = _weight()
+    limits: float = _weight()
+    velocity: float = _weight()
+    acceleration: float = _weight()
+    self_collision: float = _weight()
+    floor: float = _weight()
+    clearance: float = number(0.02, above=0.0, at_most=1e3)
+    floor_height: float = number(0.0, at_least=-1e3, at_most=1e3)
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "costs.")
+
+    @property
+    def of_pose(self) -> bool:
+        """Whether a cost of single poses has a weight."""
+        return any((self.hand_position, self.hand_orientation, self.home, self.limits, self.of_capsules))
+
+    @property
+    def of_capsules(self) -> bool:
+        """Whether a cost of capsules has a weight."""
+        return bool(self.self_collision or self.floor)
+
+    @property
+    def of_motion(self) -> bool:
+        """Whether a cost of motions has a weight."""
+        return bool(self.velocity or self.acceleration)
+
+    def check_capsules(self, capsules: Capsules | None) -> None:
+        """Raises a `ValueError` where capsules are missing."""
+        if self.of_capsules and capsules is None:
+            raise ValueError("capsules: costs.self_collision and costs.floor need them, as from fit_capsules(config)")
+
+
+def pose_cost(
+    costs: Costs,
+    expert: Embodiment,
+    learner: Embodiment,
+    capsules: Capsules | None,
+    expert_qpos: Float[Array, " joints"],
+    qpos: Float[Array, " learner_joints"],
+) -> Float[Array, ""]:
+    """Weighted sum of the costs of a learner's pose."""
+    total = jnp.zeros((), qpos.dtype)
+    if costs.hand_position or costs.hand_orientation:
+        total += hand_cost(expert, learner, expert_qpos, qpos, costs.hand_position, costs.hand_orientation)
+    if costs.home or costs.limits:
+        total += costs.home * home_cost(learner, qpos) + costs.limits * limit_cost(learner, qpos)
+    if costs.of_capsules and capsules is not None:
+        start, end = capsule_axes(learner, capsules, qpos)
+        if costs.self_collision and capsules.pairs:
+            distance = pair_distances(capsules, start, end)
+            total += costs.self_collision * _intrusion(distance, costs.clearance)
+        if costs.floor:
+            moves = np.flatnonzero(np.array(capsules.joint) > 0)
+            height = jnp.minimum(start[moves, 2], end[moves, 2]) - jnp.asarray(capsules.radius[moves], qpos.dtype)
+            total += costs.floor * _intrusion(height - costs.floor_height, costs.clearance)
+    return total
+
+
+def hand_cost(
+    expert: Embodiment, learner: Embodiment, expert_qpos: Array, qpos: Array, position: float, orientation: float
+) -> Float[Array, ""]:
+    """Weighted costs of the position and the orientation of the last links."""
+    hands = [forward_kinematics(arm, q) for arm, q in ((expert, expert_qpos), (learner, qpos))]
+    points = [
+        frames.position[-1] / spatial.scalar(arm.chain_length)
+        for frames, arm in zip(hands, (expert, learner), strict=True)
+    ]
+    rotations = [frames.rotation[-1] for frames in hands]
+    # |R - S|^2 = 4 (1 - cos) of the angle of R^T S, without cancellation at a match.
+    return position * jnp.sum((points[0] - points[1]) ** 2) + orientation / 4 * jnp.sum(
+        (rotations[0] - rotations[1]) ** 2
+    )
+
+
+def home_cost(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, ""]:
+    """Mean squared distance from the home pose, in half ranges; periodic for joints of a full revolution."""
+    lower, upper = np.asarray(arm.joint_range).T
+    difference = qpos - np.asarray(arm.home)
+    is_periodic = upper - lower >= _FULL_TURN
+    square = jnp.where(is_periodic, 2 * (1 - jnp.cos(difference)), difference**2)
+    return jnp.mean(square / ((upper - lower) / 2) ** 2).astype(qpos.dtype)
+
+
+def limit_cost(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, ""]:
+    """Mean squared intrusion into the last tenth of the range at each end; 0 for joints of a full revolution."""
+    lower, upper = np.asarray(arm.joint_range).T
+    margin = _NEAR_LIMIT * (upper - lower)
+    intrusion = jnp.maximum(0, 1 - jnp.minimum(qpos - lower, upper - qpos) / margin)
+    return jnp.mean(jnp.where(upper - lower >= _FULL_TURN, 0, intrusion**2)).astype(qpos.dtype)
+
+
+def capsule_axes(arm: Embodiment, capsules: Capsules, qpos: Float[Array, " joints"]) -> tuple[Array, Array]:
+    """Ends [capsules, 3] of the capsules' axes in a pose [m]."""
+    frames = joint_frames(arm, qpos, None)
+    anchors = np.concatenate([np.zeros((1, 3)), np.asarray(arm.joint_anchor)])
+
+    def moved(points: np.ndarray) -> Array:
+        rows = []
+        for point, joint in zip(points, capsules.joint, strict=True):
+            frame, offset = frames[joint + 1], spatial.vector(point - anchors[joint + 1])
+            rows.append(spatial.add(frame.anchor, spatial.rotate(frame.rotation, offset)))
+        return spatial.stack(rows, qpos.dtype)
+
+    return moved(np.asarray(capsules.start)), moved(np.asarray(capsules.end))
+
+
+def pair_distances(capsules: Capsules, start: Array, end: Array) -> Float[Array, " pairs"]:
+    """Distance of each of the capsules' pairs [m], negative where they intersect."""
+    i, j = np.array(capsules.pairs).T
+    radii = jnp.asarray(capsules.radius[i] + capsules.radius[j], start.dtype)
+    return jax.vmap(segment_distance)(start[i], end[i], start[j], end[j]) - radii
+
+
+def segment_distance(
+    a: Float[Array, "3"], b: Float[Array, "3"], c: Float[Array, "3"], d: Float[Array, "3"]
+) -> Float[Array, ""]:
+    """Distance of the line segments a-b and c-d (Ericson 2005, section 5.1.9).
+
+    Smoothed where they cross, where it is 0.1 mm and its gradient 0.
+    """
+    u, v, w = b - a, d - c, a - c
+    tiny = _SHORT**2
+    uu, vv, uv, uw, vw = (jnp.sum(x * y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
+    scale = uu * vv
+    determinant = scale - uv * uv
+    is_parallel = determinant <= 1e-6 * scale  # float32 resolves no smaller angle
+    s = jnp.where(is_parallel, 0.5, (uv * vw - vv * uw) / jnp.where(is_parallel, 1, determinant))
+    s = jnp.clip(s, 0, 1)
+    t = jnp.clip((uv * s + vw) / jnp.maximum(vv, tiny), 0, 1)
+    s = jnp.clip((uv * t - uw) / jnp.maximum(uu, tiny), 0, 1)
+    t = jnp.clip((uv * s + vw) / jnp.maximum(vv, tiny), 0, 1)
+    difference = w + s * u - t * v
+    return jnp.sqrt(jnp.sum(difference * difference) + _SMOOTHING**2)
+
+
+def _intrusion(distance: Array, clearance: float) -> Float[Array, ""]:
+    return jnp.sum(jnp.maximum(0, 1 - distance / clearance) ** 2)
+
+
+def with_costs(
+    objective: PoseObjective, costs: Costs, expert: Embodiment, learner: Embodiment, capsules: Capsules | None
+) -> PoseObjective:
+    """The objective plus the costs of single poses, by automatic differentiation; unchanged where none has a weight."""
+    if not costs.of_pose:
+        return objective
+
+    def target(states: LinkStates, expert_qpos: Array) -> Target:
+        return objective.target(states, expert_qpos), expert_qpos
+
+    def value(target: Target, states: LinkStates) -> Array:  # of initial guesses, so without the costs
+        return objective.value(target[0], states)
+
+    def added(derivatives: Callable[..., Derivatives]) -> Callable[..., Derivatives]:
+        def total(target: Target, qpos: Scalars, store: Store = call) -> Derivatives:
+            base = derivatives(target[0], qpos, store)
+            cost = automatic_derivatives(lambda q: pose_cost(costs, expert, learner, capsules, target[1], q), qpos)
+            return sum_of(base, cost)
+
+        return total
+
+    fine = added(objective.derivatives)
+    is_same = objective.rough_derivatives is objective.derivatives
+    rough = fine if is_same else added(objective.rough_derivatives)
+    return dataclasses.replace(objective, target=target, value=value, derivatives=fine, rough_derivatives=rough)
+
+
+def automatic_derivatives(function: Callable[[Array], Array], qpos: Scalars) -> Derivatives:
+    """Derivatives of a function of joint angles, by automatic differentiation."""
+
+    def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
+        value, gradient = jax.value_and_grad(function)(qpos)
+        return gradient, (value, gradient)
+
+    hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
+    return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
+
+
+def smoothness_derivatives(costs: Costs, qpos: Scalars, previous: Array, earlier: Array) -> Derivatives:
+    """Derivatives of the costs of motions, at a pose that follows two others."""
+    joints = len(qpos)
+    value: Any = 0.0
+    gradient = []
+    for q, p, e in zip(qpos, previous, earlier, strict=True):
+        velocity, acceleration = q - p, q - 2 * p + e
+        value = value + (costs.velocity * velocity**2 + costs.acceleration * acceleration**2) / joints
+        gradient.append(2 * (costs.velocity * velocity + costs.acceleration * acceleration) / joints)
+    curvature = 2 * (costs.velocity + costs.acceleration) / joints
+    return Derivatives(value, gradient, [[curvature * (i == j) for j in range(i + 1)] for i in range(joints)])
+
+
+def sum_of(a: Derivatives, b: Derivatives) -> Derivatives:
+    """Derivatives of a sum of two functions."""
+    gradient = tuple(x + y for x, y in zip(a.gradient, b.gradient, strict=True))
+    rows = zip(a.hessian, b.hessian, strict=True)
+    hessian = tuple(tuple(x[j] + y[j] for j in range(i + 1)) for i, (x, y) in enumerate(rows))
+    return Derivatives(a.value + b.value, gradient, hessian)

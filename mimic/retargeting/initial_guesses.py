@@ -1,0 +1,96 @@
+"""Initial guesses of pose imitation: the nearest of random poses."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mimic.arms.embodiment import Embodiment
+from mimic.compilation import by_value, compiled_quickly, has_tracer
+from mimic.metric.kinematics import LinkStates, link_state_table, link_states
+from mimic.retargeting.pose_objective import PoseObjective, Target
+
+_POSES = 256  # random poses whose distances are compared to choose the initial guesses
+
+
+class RandomPoses(NamedTuple):
+    """Random poses of the learner, candidates for initial guesses.
+
+    Attributes:
+      qpos: [sets, poses, joints] [rad].
+      states: link states of these poses, each [sets, poses, links, 3].
+    """
+
+    qpos: Float[Any, "sets poses joints"]
+    states: LinkStates
+
+
+def random_poses(arm: Embodiment, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
+    """Sets of random poses, uniform in the joint ranges; computed once for equal arguments.
+
+    Args:
+      arm: the embodiment.
+      key: `jax.random.key(0)` where None.
+      sets: number of sets.
+      dtype: of the result.
+    """
+    if has_tracer((arm, key)):
+        return _traced_poses(arm, key, sets, dtype)
+    return _constant_poses(arm, key, sets, jnp.dtype(dtype))
+
+
+def _traced_poses(arm: Embodiment, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
+    qpos = _uniform(_shape(arm, sets), key, *_range(arm, dtype))
+    return RandomPoses(qpos, jax.vmap(jax.vmap(lambda q: link_states(arm, q)))(qpos))
+
+
+@by_value
+def _constant_poses(arm: Embodiment, key: Array | None, sets: int, dtype: Any) -> RandomPoses:
+    """By NumPy, because the kinematics would take half a second to compile."""
+    uniform = _compiled_uniform(
+        _shape(arm, sets), None if key is None else jax.ShapeDtypeStruct(key.shape, key.dtype), dtype
+    )
+    with jax.ensure_compile_time_eval():
+        qpos = np.asarray(uniform(key, *_range(arm, dtype)))
+    return RandomPoses(qpos, link_state_table(arm, qpos, np.zeros_like(qpos), dtype))
+
+
+@by_value
+def _compiled_uniform(shape: tuple[int, ...], key: jax.ShapeDtypeStruct | None, dtype: Any) -> Callable[..., Array]:
+    limit = jax.ShapeDtypeStruct(shape[-1:], dtype)
+    return compiled_quickly(functools.partial(_uniform, shape), key, limit, limit)
+
+
+def _uniform(shape: tuple[int, ...], key: Array | None, lower: Any, upper: Any) -> Array:
+    key = jax.random.key(0) if key is None else key
+    return jax.random.uniform(key, shape, lower.dtype, minval=lower, maxval=upper)
+
+
+def _shape(arm: Embodiment, sets: int) -> tuple[int, int, int]:
+    return sets, -(-_POSES // sets), arm.num_joints
+
+
+def _range(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
+    lower, upper = np.asarray(arm.joint_range, dtype).T
+    return lower, upper
+
+
+def typical_distance(objective: PoseObjective, expert_states: LinkStates, candidates: RandomPoses) -> Float[Array, ""]:
+    """Mean distance of random poses to a pose of the expert: the scale of the metric."""
+    distance = jax.vmap(jax.vmap(lambda learner_states: objective.distance(expert_states, learner_states)))
+    return distance(jax.tree.map(jnp.asarray, candidates.states)).mean()
+
+
+def initial_guesses(
+    objective: PoseObjective, target: Target, first: Float[Array, " joints"], candidates: RandomPoses | None
+) -> Float[Array, "guesses joints"]:
+    """A first guess, then the nearest of each set of random poses."""
+    if candidates is None:
+        return first[None]
+    values = jax.vmap(jax.vmap(lambda states: objective.value(target, states)))(candidates.states)
+    nearest = jnp.take_along_axis(candidates.qpos, jnp.argmin(values, axis=1)[:, None, None], axis=1)[:, 0]
+    return jnp.concatenate([first[None], nearest])

@@ -1,0 +1,191 @@
+"""Motion imitation: nearest poses of the learner that form a continuous motion."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from mimic.arms.capsules import Capsules
+from mimic.arms.embodiment import Embodiment
+from mimic.compilation import compiled_once
+from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
+from mimic.metric.kinematics import link_states
+from mimic.retargeting.costs import Costs, smoothness_derivatives, sum_of, with_costs
+from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
+from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, Store, newton
+from mimic.retargeting.pose import (
+    FLAT,
+    ITERATIONS,
+    PoseImitation,
+    checked_poses,
+    continuous_joints,
+    pose_limits,
+    shared_joints,
+    wrap_angles,
+)
+from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
+
+_TRACKING_ITERATIONS = 6  # Newton steps from the pose at the neighbouring time
+_ANCHORS = 3  # times with a search for minima; at the others minima are tracked
+
+
+def imitate_trajectory(
+    expert: Embodiment,
+    learner: Embodiment,
+    qpos: Float[ArrayLike, "time expert_joints"],
+    correspondence: Correspondence,
+    weights: Weights,
+    *,
+    largest_jump: Float[ArrayLike, " learner_joints"] | float = 0.3,
+    starts: int = 12,
+    key: Array | None = None,
+    rotation: RotationMeasure = "cosine",
+    reduction: Reduction = "mean",
+    costs: Costs | None = None,
+    capsules: Capsules | None = None,
+) -> PoseImitation:
+    """Nearest poses that form a continuous motion: the pose at each time starts from that of the neighbouring time.
+
+    Minima are searched at three times: the first, the middle and the last. Each minimum is tracked over the whole
+    motion, and the track of minimum mean distance is returned. Where a minimum vanishes, the joints move to another one
+    in steps of at most `largest_jump`. The first pose lies in [-pi, pi]; later, joints with a range of a full
+    revolution may pass pi.
+
+    Args:
+      expert: n joints.
+      learner: n_hat joints.
+      qpos: [T, n] the expert's motion [rad].
+      correspondence: see `embodiment_distance`.
+      weights: see `embodiment_distance`; velocities are zero.
+      largest_jump: maximum change of a joint between two times [rad], one number or one for each joint.
+      starts: see `imitate_pose`.
+      key: see `imitate_pose`.
+      rotation: see `embodiment_distance`.
+      reduction: see `embodiment_distance`.
+      costs: see `Costs`; None for the embodiment distance alone. Those of velocity and acceleration are minimised pose
+        by pose, each against the two poses before it. The returned distance is without costs.
+      capsules: of the learner, from `fit_capsules`, for the costs of collisions.
+
+    Raises:
+      ValueError: what `imitate_pose` rejects, or a jump that is not above 0.
+    """
+    poses = checked_poses(expert, jnp.asarray(qpos))
+    if poses.ndim != 2:
+        raise ValueError(f"qpos: expected shape [time, {expert.num_joints}], got {poses.shape}")
+    if not np.all(np.asarray(largest_jump) > 0):
+        raise ValueError(f"largest_jump: expected angles above 0 rad, got {largest_jump}")
+    if starts < 0:
+        raise ValueError(f"starts: expected at least 0, got {starts}")
+    costs = Costs() if costs is None else costs
+    costs.check_capsules(capsules)
+    jump = jnp.broadcast_to(jnp.asarray(largest_jump, poses.dtype), (learner.num_joints,))
+    metric = Metric(correspondence, weights, rotation, reduction)
+    solve = _trajectory_solver(expert, learner, metric, bool(starts), costs, capsules if costs.of_capsules else None)
+    return solve(poses, jump, random_poses(learner, key, max(starts, 1), poses.dtype))
+
+
+@compiled_once
+def _trajectory_solver(
+    expert: Embodiment,
+    learner: Embodiment,
+    metric: Metric,
+    random: bool,
+    costs: Costs,
+    capsules: Capsules | None,
+) -> Callable[[Array, Array, RandomPoses], PoseImitation]:
+    """The function of poses [T, n], largest jumps [n_hat] and random poses that `imitate_trajectory` compiles."""
+    objective = with_costs(pose_objective(learner, metric), costs, expert, learner, capsules)
+
+    def solve(poses: Array, jump: Array, candidates: RandomPoses) -> PoseImitation:
+        anchors = np.unique(np.linspace(0, poses.shape[0] - 1, _ANCHORS).round().astype(int))
+        states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
+        scale = typical_distance(objective, jax.tree.map(lambda x: x[0], states), candidates)
+        targets = jax.vmap(objective.target)(states, poses)
+        tracker = _Tracker(objective, targets, pose_limits(learner, poses.dtype), jump, len(poses), costs)
+
+        def from_anchor(anchor: Array) -> Solution:
+            target = jax.tree.map(lambda x: x[anchor], targets)
+            first = shared_joints(expert, learner, poses[anchor])
+            guesses = initial_guesses(objective, target, first, candidates if random else None)
+            return jax.vmap(lambda guess: tracker.track(anchor, guess))(guesses)
+
+        tracks = jax.vmap(from_anchor)(jnp.asarray(anchors))
+        tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
+        best = jnp.argmin(tracks.value.mean(axis=1))
+        solution: Solution = jax.tree.map(lambda x: x[best], tracks)
+        if objective.rough_derivatives is not objective.derivatives:
+            solution = tracker.refine(solution)
+        distance = jax.vmap(lambda state, q: objective.distance(state, link_states(learner, q)))(states, solution.qpos)
+        shift = wrap_angles(solution.qpos[0], continuous_joints(learner)) - solution.qpos[0]
+        return PoseImitation(solution.qpos + shift, distance, solution.gradient_norm <= FLAT * scale)
+
+    return solve
+
+
+_Past = tuple[Array, Array]  # the previous pose, and the one before it
+
+
+@dataclasses.dataclass(frozen=True)
+class _Tracker:
+    """Tracks minima over the times of a trajectory.
+
+    Attributes:
+      objective: of the learner.
+      targets: of all times.
+      limits: of the joints [rad].
+      jump: maximum change of each joint between two times [rad].
+      times: number of times.
+      costs: those of motions.
+    """
+
+    objective: PoseObjective
+    targets: Target
+    limits: tuple[Array | np.ndarray, Array | np.ndarray]
+    jump: Float[Array, " joints"]
+    times: int
+    costs: Costs
+
+    def track(self, anchor: Array, guess: Array) -> Solution:
+        """The minimum near a guess at the anchor's time, tracked over all times with the rough derivatives."""
+        rough = self.objective.rough_derivatives
+        begin = newton(self._at(rough, anchor), guess, self.limits, ITERATIONS["newton"]).qpos
+
+        def follow(past: _Past, time: Array) -> tuple[_Past, Solution]:
+            solution = self._near(rough, past, past[0], time)
+            return (solution.qpos, past[0]), solution
+
+        # From the anchor to the end, then back over all times, which also covers those before the anchor.
+        times = jnp.arange(self.times)
+        path = jnp.concatenate([jnp.maximum(times, anchor), times[::-1]])
+        solutions = jax.lax.scan(follow, (begin, begin), path)[1]
+        return jax.tree.map(lambda x: x[: self.times - 1 : -1], solutions)
+
+    def refine(self, rough: Solution) -> Solution:
+        """A track, optimised with the exact derivatives."""
+
+        def follow(past: _Past, guess_and_time: tuple[Array, Array]) -> tuple[_Past, Solution]:
+            guess, time = guess_and_time
+            solution = self._near(self.objective.derivatives, past, guess, time)
+            return (solution.qpos, past[0]), solution
+
+        begin = rough.qpos[0], rough.qpos[0]
+        return jax.lax.scan(follow, begin, (rough.qpos, jnp.arange(self.times)))[1]
+
+    def _at(self, derivatives: Callable[..., Derivatives], time: Array) -> Callable[..., Derivatives]:
+        return functools.partial(derivatives, jax.tree.map(lambda x: x[time], self.targets))
+
+    def _near(self, derivatives: Callable[..., Derivatives], past: _Past, guess: Array, time: Array) -> Solution:
+        lower, upper = self.limits
+        previous, earlier = past
+        reachable = jnp.maximum(lower, previous - self.jump), jnp.minimum(upper, previous + self.jump)
+        of_pose = self._at(derivatives, time)
+
+        def of_motion(qpos: Scalars, store: Store) -> Derivatives:
+            return sum_of(of_pose(qpos, store), smoothness_derivatives(self.costs, qpos, previous, earlier))
+
+        return newton(of_motion if self.costs.of_motion else of_pose, guess, reachable, _TRACKING_ITERATIONS)

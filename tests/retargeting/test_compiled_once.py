@@ -1,0 +1,128 @@
+"""A second call with equal arms, metric and shapes compiles nothing; calls inside transforms of the user work."""
+
+import contextlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mimic.arms.embodiment import planar_arm
+from mimic.metric.config import MetricConfig
+from mimic.metric.correspondence import hard_correspondence
+from mimic.metric.distance import DistanceWeights
+from mimic.retargeting.kinematic_bound import closest_motion, kinematic_bound
+from mimic.retargeting.pose import imitate_pose
+from mimic.retargeting.trajectory import imitate_trajectory
+
+_COMPILATIONS = []  # names of JAX's events of this process; a listener cannot be removed by a public function
+jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: _COMPILATIONS.append(event))
+
+
+@contextlib.contextmanager
+def count_compilations():
+    """A list that holds the events of tracing and compilation within the context after it."""
+    before, events = len(_COMPILATIONS), []
+    yield events
+    events.extend(event for event in _COMPILATIONS[before:] if event.startswith("/jax/core/compile"))
+
+
+def arms():
+    """New objects at each call, equal by value."""
+    return planar_arm([0.4, 0.35, 0.25]), planar_arm([0.6, 0.4])
+
+
+def qpos(seed, count=4):
+    return np.random.default_rng(seed).uniform(-1, 1, (count, 3)).astype(np.float32)
+
+
+FEW = {"starts": 2, "iterations": 4}
+FUNCTIONS = {
+    "imitate_pose": lambda q, metric: imitate_pose(*arms(), q, **metric, **FEW),
+    "warm": lambda q, metric: imitate_pose(*arms(), q, **metric, warm_start=q[:, :2], **FEW),
+    "imitate_trajectory": lambda q, metric: imitate_trajectory(*arms(), q, **metric, starts=1),
+    "kinematic_bound": lambda q, metric: kinematic_bound(*arms(), q, 0 * q, **metric, starts=1, iterations=2),
+    "closest_motion": lambda q, metric: closest_motion(*arms(), q, 0 * q, **metric, starts=1, iterations=2),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_second_call_compiles_nothing(name):
+    call, metric = FUNCTIONS[name], MetricConfig()
+    first = call(qpos(0), metric.build(*arms()).arguments)
+    call(qpos(0), metric.build(*arms()).arguments)  # JAX's own small functions of the results
+    with count_compilations() as events:
+        second = call(qpos(0), metric.build(*arms()).arguments)
+        other = call(qpos(1), metric.build(*arms()).arguments)
+    assert events == []
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+    assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(second), jax.tree.leaves(other), strict=True))
+
+
+@pytest.mark.parametrize("metric", [MetricConfig(adaptive=True), MetricConfig(correspondence="soft")])
+def test_functions_of_a_metric_config_are_equal_by_value(metric):
+    FUNCTIONS["imitate_pose"](qpos(0), metric.build(*arms()).arguments)
+    with count_compilations() as events:
+        FUNCTIONS["imitate_pose"](qpos(1), metric.build(*arms()).arguments)
+    assert events == []
+
+
+def test_other_values_are_not_mixed_up():
+    """Arms, weights and correspondences of the same shapes give their own results."""
+    expert, learner = arms()
+    other = planar_arm([0.3, 0.7])
+    weights = DistanceWeights(1.0, 1.0)
+    base = imitate_pose(expert, learner, qpos(0), hard_correspondence, weights, **FEW).distance
+    for arguments in (
+        (expert, other, qpos(0), hard_correspondence, weights),
+        (expert, learner, qpos(0), hard_correspondence, DistanceWeights(2.0, 1.0)),
+        (expert, learner, qpos(0), jnp.ones((3, 2)), weights),
+    ):
+        assert np.all(np.abs(imitate_pose(*arguments, **FEW).distance - base) > 1e-4)
+
+
+def test_another_key_compiles_nothing():
+    metric = MetricConfig().build(*arms()).arguments
+
+    def call(seed):
+        return imitate_pose(*arms(), qpos(0), **metric, key=jax.random.key(seed))
+
+    for seed in (0, 1):
+        call(seed)
+    with count_compilations() as events:
+        call(2)
+    assert events == []
+
+
+def test_calls_inside_transforms():
+    """jit, vmap and grad of a caller give what plain calls give; grad equals finite differences."""
+    metric, poses = MetricConfig().build(*arms()).arguments, qpos(2)
+
+    def distance(pose):
+        return imitate_pose(*arms(), pose, **metric, **FEW).distance
+
+    plain = np.array([distance(pose) for pose in poses])
+    for transformed in (jax.vmap(distance), jax.jit(jax.vmap(distance)), jax.vmap(jax.jit(distance))):
+        np.testing.assert_allclose(transformed(poses), plain, atol=1e-6)
+    gradient = np.asarray(jax.grad(distance)(poses[0]))
+    step = 1e-2 * np.eye(3, dtype=np.float32)
+    numeric = [(distance(poses[0] + d) - distance(poses[0] - d)) / 2e-2 for d in step]
+    np.testing.assert_allclose(gradient, numeric, atol=2e-3)  # float32
+    with count_compilations() as events:
+        jax.vmap(distance)(qpos(3))
+    assert events == []
+
+
+def test_traced_arguments_belong_to_the_trace():
+    """Weights that the caller's jit traces work, and nothing of the trace is kept."""
+    metric = MetricConfig().build(*arms())
+
+    @jax.jit
+    def distances(weights, key):
+        options = {**metric.arguments, "weights": DistanceWeights(weights[0], weights[1])}
+        return imitate_pose(*arms(), qpos(0), key=key, **options, **FEW).distance
+
+    expected = imitate_pose(*arms(), qpos(0), **metric.arguments, key=jax.random.key(1), **FEW).distance
+    np.testing.assert_allclose(distances(jnp.array([1.0, 1.0]), jax.random.key(1)), expected, atol=1e-6)
+    with jax.checking_leaks():
+        distances(jnp.array([2.0, 1.0]), jax.random.key(1))

@@ -1,0 +1,170 @@
+"""Costs of retargeting: closed forms, finite differences, C MuJoCo's distances, and what each does to the result."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mimic.arms.arm import ArmConfig
+from mimic.arms.capsules import Capsules, fit_capsules
+from mimic.arms.embodiment import panda, planar_arm
+from mimic.metric.config import MetricConfig
+from mimic.retargeting.costs import (
+    Costs,
+    automatic_derivatives,
+    capsule_axes,
+    hand_cost,
+    home_cost,
+    limit_cost,
+    pair_distances,
+    pose_cost,
+    segment_distance,
+    smoothness_derivatives,
+)
+from mimic.retargeting.pose import imitate_pose
+from mimic.retargeting.trajectory import imitate_trajectory
+
+EXPERT, LEARNER = planar_arm([0.4, 0.35, 0.25]), planar_arm([0.6, 0.4])
+METRIC = MetricConfig().build(EXPERT, LEARNER).arguments
+FEW = {"starts": 3}
+QPOS = np.random.default_rng(0).uniform(-2, 2, (6, 3)).astype(np.float32)
+
+
+def test_segment_distances_equal_those_of_mujoco(x64):
+    """Two capsules in random positions; parallel ones and ends too."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body mocap="true"><geom type="capsule" size="0.01 0.3"/></body>'
+        '<body mocap="true"><geom type="capsule" size="0.02 0.1"/></body></worldbody></mujoco>'
+    )
+    data, rng, compared = mujoco.MjData(model), np.random.default_rng(0), 0
+    distance = jax.jit(segment_distance)
+    for trial in range(300):
+        data.mocap_pos[:] = rng.normal(size=(2, 3)) * 0.4
+        data.mocap_quat[:] = rng.normal(size=(2, 4))
+        if trial % 3 == 0:
+            data.mocap_quat[1] = data.mocap_quat[0]
+        data.mocap_quat /= np.linalg.norm(data.mocap_quat, axis=1, keepdims=True)
+        mujoco.mj_kinematics(model, data)
+        axes = [half * data.geom_xmat[i].reshape(3, 3)[:, 2] for i, half in enumerate((0.3, 0.1))]
+        ends = [data.geom_xpos[i] + sign * axes[i] for i in (0, 1) for sign in (-1, 1)]
+        theirs = mujoco.mj_geomDistance(model, data, 0, 1, 10.0, None)
+        if theirs > 0:  # MuJoCo measures the depth of an intersection along another direction
+            compared += 1
+            assert float(distance(*ends)) - 0.03 == pytest.approx(theirs, abs=1e-6)
+    assert compared > 250
+
+
+def test_closed_forms():
+    """Hand, home and limits of planar arms, whose geometry is plain trigonometry."""
+    expert, learner = planar_arm([1.0]), planar_arm([0.5, 0.5])
+    q, p = np.float32([0.3]), np.float32([0.5, -0.9])
+    tips = [np.array([np.cos(0.3), np.sin(0.3)]) / 2, np.zeros(2)]
+    tips[1] = 0.5 * np.array([np.cos(0.5), np.sin(0.5)]) + 0.25 * np.array([np.cos(-0.4), np.sin(-0.4)])
+    expected = np.sum((tips[0] - tips[1]) ** 2)
+    assert float(hand_cost(expert, learner, q, p, 1.0, 0.0)) == pytest.approx(expected, rel=1e-5)
+    assert float(hand_cost(expert, learner, q, p, 0.0, 1.0)) == pytest.approx(1 - np.cos(0.7), rel=1e-5)
+    bounded = learner.replace(joint_range=np.array([[-1.0, 1.0], [-2.0, 2.0]]), home=np.array([0.1, 0.2]))
+    assert float(home_cost(bounded, p)) == pytest.approx(((0.4 / 1) ** 2 + (1.1 / 2) ** 2) / 2, rel=1e-5)
+    assert float(home_cost(learner, p)) == pytest.approx(np.mean(2 * (1 - np.cos(p)) / np.pi**2), rel=1e-5)
+    assert float(limit_cost(bounded, np.float32([0.9, -2.0]))) == pytest.approx((0.5**2 + 1) / 2, rel=1e-4)
+    assert float(limit_cost(bounded, p)) == 0 and float(limit_cost(learner, np.float32([3.1, 3.1]))) == 0
+
+
+def every_cost(joint=0.7):
+    return Costs(**dict.fromkeys(("hand_position", "hand_orientation", "home", "limits"), joint))
+
+
+def test_derivatives_equal_finite_differences(x64):
+    """All costs of a pose together, of a Panda with some of its capsules near each other and the floor."""
+    arm, expert = panda(limits="hardware"), panda()
+    capsules = fit_capsules(ArmConfig(), "hardware")
+    costs = Costs(1.0, 0.5, 0.3, 0.2, self_collision=0.1, floor=0.1, clearance=0.5, floor_height=0.2)
+    target, rng = jnp.asarray(arm.home), np.random.default_rng(1)
+    cost = jax.jit(lambda q: pose_cost(costs, expert, arm, capsules, target, q))
+    derivatives = jax.jit(lambda q: automatic_derivatives(cost, list(q)))
+    for qpos in arm.home + rng.normal(size=(3, 7)) * 0.3:
+        value, gradient, hessian = derivatives(qpos)
+        assert value == pytest.approx(float(cost(qpos))) and value > 0.1
+        step = 1e-6 * np.eye(7)
+        numeric = [(cost(qpos + d) - cost(qpos - d)) / 2e-6 for d in step]
+        np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-6)
+        rows = [(np.array(derivatives(qpos + d)[1]) - np.array(derivatives(qpos - d)[1])) / 2e-6 for d in step]
+        np.testing.assert_allclose(np.array(hessian), rows, rtol=1e-3, atol=1e-3)
+
+
+def test_smoothness_derivatives_equal_automatic_ones(x64):
+    costs, (p, e, q) = Costs(velocity=0.7, acceleration=0.3), np.random.default_rng(0).normal(size=(3, 4))
+    ours = smoothness_derivatives(costs, list(q), p, e)
+    theirs = automatic_derivatives(
+        lambda q: jnp.mean(0.7 * (q - p) ** 2 + 0.3 * (q - 2 * p + e) ** 2), list(jnp.asarray(q))
+    )
+    assert ours.value == pytest.approx(float(theirs.value))
+    np.testing.assert_allclose(ours.gradient, theirs.gradient)
+    for i, row in enumerate(ours.hessian):
+        np.testing.assert_allclose(row, theirs.hessian[i][: i + 1], atol=1e-12)
+
+
+def test_without_weights_the_result_is_the_same_to_the_bit():
+    plain = imitate_pose(EXPERT, LEARNER, QPOS, **METRIC, **FEW)
+    jax.tree.map(
+        np.testing.assert_array_equal, plain, imitate_pose(EXPERT, LEARNER, QPOS, **METRIC, **FEW, costs=Costs())
+    )
+
+
+def test_each_cost_of_a_pose_falls_where_it_has_a_weight():
+    """And with it the sum of distance and cost: the optimum of the sum is below that of the distance alone."""
+    bounded = LEARNER.replace(joint_range=np.array([[-1.0, 1.0], [-1.0, 1.0]]))
+    plain = imitate_pose(EXPERT, bounded, QPOS, **METRIC, **FEW)
+    for name in ("hand_position", "hand_orientation", "home", "limits"):
+        costs = Costs(**{name: 10.0})
+
+        def cost(q, p, costs=costs):
+            return pose_cost(costs, EXPERT, bounded, None, q, p)
+
+        result = imitate_pose(EXPERT, bounded, QPOS, **METRIC, **FEW, costs=costs)
+        before, after = (np.asarray(jax.vmap(cost)(QPOS, solution.qpos)) for solution in (plain, result))
+        assert after.mean() < 0.9 * before.mean(), name
+        total = np.asarray(result.distance) + after
+        assert np.all(total <= np.asarray(plain.distance) + before + 1e-3), name  # the smoothing of positions
+
+
+def test_arms_do_not_intersect_themselves_or_the_floor():
+    """A planar arm that folds back on itself; the floor is a plane that the default pose crosses."""
+    expert = learner = planar_arm([0.4, 0.3, 0.4])
+    metric = MetricConfig().build(expert, learner).arguments
+    start = np.array([[0.0, 0, 0], [0.4, 0, 0], [0.7, 0, 0]])
+    capsules = Capsules(start, start + np.array([[0.4, 0, 0], [0.3, 0, 0], [0.4, 0, 0]]), np.full(3, 0.03), (0, 1, 2))
+    folded = np.float32([[0.0, 2.0, 1.9], [0.5, 2.2, 1.6]])
+
+    def nearest(qpos):
+        return jax.vmap(lambda q: pair_distances(capsules, *capsule_axes(learner, capsules, q)).min())(qpos)
+
+    plain = imitate_pose(expert, learner, folded, **metric, **FEW)
+    costs = Costs(self_collision=1.0)
+    free = imitate_pose(expert, learner, folded, **metric, **FEW, costs=costs, capsules=capsules)
+    assert np.all(np.asarray(nearest(plain.qpos)) < 0) and np.all(np.asarray(nearest(free.qpos)) > -0.002)
+    high = Costs(floor=1.0, floor_height=-0.02)  # the arm is at height 0: -0.03 at its lower side
+    value = pose_cost(high, expert, learner, capsules, folded[0], jnp.asarray(folded[0]))
+    assert float(value) == pytest.approx(2 * (1 + 0.01 / 0.02) ** 2, rel=1e-4)
+
+
+def test_smoothness_reduces_velocity_and_acceleration():
+    times = np.linspace(0, 1, 30)[:, None]
+    qpos = (np.array([1.0, -1.5, 0.5]) * np.sin(6 * times) + 0.2 * np.sin(60 * times)).astype(np.float32)
+    options = {**METRIC, "starts": 1, "largest_jump": 1.0}
+    plain = imitate_trajectory(EXPERT, LEARNER, qpos, **options)
+    for name, order in (("velocity", 1), ("acceleration", 2)):
+        smooth = imitate_trajectory(EXPERT, LEARNER, qpos, **options, costs=Costs(**{name: 3.0}))
+        sizes = [np.mean(np.diff(motion.qpos, order, axis=0) ** 2) for motion in (plain, smooth)]
+        assert sizes[1] < 0.7 * sizes[0], name
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_bad_costs_are_rejected():
+    with pytest.raises(ValueError, match=r"costs\.home"):
+        Costs(home=-1.0)
+    with pytest.raises(ValueError, match="capsules: costs.self_collision and costs.floor need them"):
+        imitate_pose(EXPERT, LEARNER, QPOS, **METRIC, costs=Costs(floor=1.0))
+    with pytest.raises(ValueError, match="imitate_trajectory takes them"):
+        imitate_pose(EXPERT, LEARNER, QPOS, **METRIC, costs=Costs(velocity=1.0))
