@@ -182,7 +182,8 @@ def _with_armature(config: ArmConfig, arm: Arm, armature: Mapping[str, float]) -
     changes: dict[str, Any] = {}
     for key, proposed in (("armature", armature), ("damping", damping)):
         stated = getattr(config, key)
-        before = stated if isinstance(stated, Mapping) else dict.fromkeys(arm.embodiment.joint_names, stated)
+        names = arm.embodiment.joint_names
+        before: Mapping[str, float] = stated if isinstance(stated, Mapping) else {name: stated for name in names}
         values = {name: round(max(before.get(name, 0.0), proposed.get(name, 0.0)), 6) for name in (*before, *proposed)}
         changes[key] = {name: value for name, value in values.items() if value}
     return dataclasses.replace(config, **changes)
