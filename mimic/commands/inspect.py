@@ -156,7 +156,7 @@ def train_command(config: InspectConfig) -> str:
     words += [word for role in ("expert", "learner") for word in _arm_words(f"env.{role}", getattr(config, role))]
     if config.limits != "none":
         words.append(f"env.limits={config.limits}")
-    return " ".join([*words, "env.physics=fused"])
+    return " ".join(words)
 
 
 def _shown_model(arm: ArmConfig) -> str:

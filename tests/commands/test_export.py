@@ -24,7 +24,7 @@ TOLERANCE = 1e-5  # rad, or a fraction of the maximum torque: float32, sums in a
 
 def policy_run(run_dir, name="panda4dof"):
     """A run whose policy has random weights and random observation statistics."""
-    env = mimic.make(name, demonstrations={"count": 1, "held_out": 1}, physics="fused")
+    env = mimic.make(name, demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
     statistics, *networks = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))

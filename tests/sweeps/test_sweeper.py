@@ -282,7 +282,7 @@ def test_in_one_process_a_signal_ends_the_sweep(sweep):
     assert begun == ["fine", "stopped"]
 
 
-SHORT = [*TINY, "env.physics=fused", "trainer.num_timesteps=2000", "trainer.evaluations=1"]
+SHORT = [*TINY, "trainer.num_timesteps=2000", "trainer.evaluations=1"]
 
 
 @pytest.mark.slow
