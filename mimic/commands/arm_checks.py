@@ -183,7 +183,7 @@ def _with_armature(config: ArmConfig, arm: Arm, armature: Mapping[str, float]) -
     for key, proposed in (("armature", armature), ("damping", damping)):
         stated = getattr(config, key)
         names = arm.embodiment.joint_names
-        before: dict[str, float] = dict(stated) if isinstance(stated, Mapping) else {name: stated for name in names}
+        before: Mapping[str, float] = stated if isinstance(stated, Mapping) else {name: stated for name in names}
         values = {name: round(max(before.get(name, 0.0), proposed.get(name, 0.0)), 6) for name in (*before, *proposed)}
         changes[key] = {name: value for name, value in values.items() if value}
     return dataclasses.replace(config, **changes)

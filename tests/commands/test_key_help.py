@@ -34,7 +34,9 @@ def test_every_key_of_a_trainer_is_documented(config_class):
 
 
 def value(keys, key):
-    return re.search(rf"^ *{key}: (.*?)  +#", keys, re.MULTILINE)[1]
+    match = re.search(rf"^ *{key}: (.*?)  +#", keys, re.MULTILINE)
+    assert match, key
+    return match[1]
 
 
 def test_presets_are_shown_in_place_of_null(monkeypatch, capsys):

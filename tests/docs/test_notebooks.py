@@ -61,8 +61,7 @@ def test_notebooks_use_what_is_public(path):
 def test_notebooks_run(path, tmp_path, monkeypatch):
     nbclient = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
-    import nbformat
-
+    nbformat = pytest.importorskip("nbformat")
     CACHE.mkdir(exist_ok=True)
     for name, value in ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
