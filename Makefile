@@ -4,8 +4,8 @@ PYTHON ?= python3
 VENV ?= .venv
 # Extras of the package to install with it; `EXTRAS=cuda` on a machine with an NVIDIA GPU.
 EXTRAS ?=
-# Passed on to `python -m mimic.train`. The fused physics is the same as the default, MJX, and nine times as fast on CPUs.
-ARGS ?= env.physics=fused
+# Passed on to `python -m mimic.train`.
+ARGS ?=
 # Passed on to pytest, and the number of its workers (0: none, run in one process).
 PYTEST_ARGS ?=
 JOBS ?= auto

@@ -27,7 +27,7 @@ from benchmarks.common.record import Row, print_table, write_results
 from mimic.runs.files import METRICS, REPORT
 
 _SMALL = [
-    *("env=planar4dof", "env.physics=fused", "env.demonstrations.count=3", "env.demonstrations.held_out=1"),
+    *("env=planar4dof", "env.demonstrations.count=3", "env.demonstrations.held_out=1"),
     *("trainer.num_timesteps=20000", "trainer.num_envs=32", "trainer.batch_size=32", "trainer.num_minibatches=4"),
     *("trainer.evaluations=8", "trainer.hidden_layers=[16]"),
 ]

@@ -76,7 +76,7 @@ def summary(runs: Sequence[Row]) -> list[Row]:
 def run(options: argparse.Namespace) -> Iterator[Row]:
     """Rows of the runs as they end; a run on one device is a row of each kind of scaling."""
     of_one = {"num_envs": options.num_envs, "batch_size": options.batch_size, "num_timesteps": options.steps}
-    common = [f"env={options.env}", "env.physics=fused", f"trainer.evaluations={_EVALUATIONS}", *options.arguments]
+    common = [f"env={options.env}", f"trainer.evaluations={_EVALUATIONS}", *options.arguments]
     cases = itertools.product(sorted(options.devices), options.seeds, options.processes, options.kinds)
     for devices, seed, division, kind in cases:
         if devices > 1 or (division, kind) == (options.processes[0], options.kinds[0]):

@@ -26,7 +26,7 @@ from mimic.runs.checkpoints import checkpoint_steps
 from mimic.runs.signals import STOPPED_BY_SIGNAL
 
 ARGUMENTS = (
-    "env=planar4dof", "env.physics=fused", "env.demonstrations.count=4", "env.demonstrations.held_out=2",
+    "env=planar4dof", "env.demonstrations.count=4", "env.demonstrations.held_out=2",
     "trainer.num_envs=64", "trainer.batch_size=32", "trainer.num_minibatches=4", "trainer.num_updates_per_batch=1",
     "trainer.hidden_layers=[16]", "trainer.num_timesteps=1000000000", "trainer.evaluations=200000",
 )  # fmt: skip

@@ -32,10 +32,10 @@ SHORT = {
     "cpu": "trainer.num_timesteps=800000 trainer.evaluations=8",
 }
 CASES = {
-    "one_demonstration": Case(0.02, "env=panda7dof env.physics=fused env.demonstrations.count=1", SHORT),
-    "panda7dof": Case(0.02, "env=panda7dof env.physics=fused"),
-    "panda4dof": Case(0.03, "env=panda4dof env.physics=fused"),
-    "panda3dof": Case(0.03, "env=panda3dof env.physics=fused"),
+    "one_demonstration": Case(0.02, "env=panda7dof env.demonstrations.count=1", SHORT),
+    "panda7dof": Case(0.02, "env=panda7dof"),
+    "panda4dof": Case(0.03, "env=panda4dof"),
+    "panda3dof": Case(0.03, "env=panda3dof"),
 }
 COLUMNS = (
     "case start report[seed] report[optimality_gap][train]:.2% report[optimality_gap][held_out]:.2% to_goal_s:.1f "

@@ -33,7 +33,7 @@ def command(name, *arguments):
 # 0.1 s later, but not the expert's controls. The reward is minus the embodiment distance after the step. `mimic.make`
 # returns an environment of brax:
 
-env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 2, "held_out": 1})
+env = mimic.make("planar4dof", demonstrations={"count": 2, "held_out": 1})
 print(f"{env.observation_size} observations; {env.action_size} actions in [-1, 1], scaled by", env.torque_scale, "N m")
 state = jax.jit(env.reset)(jax.random.key(0))
 state = jax.jit(env.step)(state, np.zeros(env.action_size, np.float32))
@@ -46,7 +46,7 @@ print(f"reward of the first step, without any torque: {float(state.reward):.4f}"
 
 run = out / "run"
 command(
-    "train", "env=planar4dof", "env.physics=fused", "env.demonstrations.count=16", "env.demonstrations.held_out=4",
+    "train", "env=planar4dof", "env.demonstrations.count=16", "env.demonstrations.held_out=4",
     "trainer.preset=cpu", "trainer.num_envs=256", "trainer.num_minibatches=16", "trainer.num_timesteps=180000",
     "trainer.evaluations=3", f"run_dir={run}",
 )  # fmt: skip

@@ -88,7 +88,7 @@ print(f"exit code: {rejected.returncode}")
 
 run = out / "run"
 command(
-    "train", "env=pair", f"env.learner={arm_file}", "env.physics=fused", "env.demonstrations.count=8",
+    "train", "env=pair", f"env.learner={arm_file}", "env.demonstrations.count=8",
     "env.demonstrations.held_out=2", "trainer.preset=cpu", "trainer.num_envs=128", "trainer.batch_size=64",
     "trainer.num_minibatches=16", "trainer.num_timesteps=120000", "trainer.evaluations=2", f"run_dir={run}",
 )  # fmt: skip

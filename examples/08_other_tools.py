@@ -27,7 +27,7 @@ out.mkdir(parents=True, exist_ok=True)
 
 run = out / "run"
 arguments = [
-    "env=planar4dof", "env.physics=fused", "env.demonstrations.count=8", "env.demonstrations.held_out=2",
+    "env=planar4dof", "env.demonstrations.count=8", "env.demonstrations.held_out=2",
     "trainer.preset=cpu", "trainer.num_envs=128", "trainer.batch_size=64", "trainer.num_minibatches=16",
     "trainer.hidden_layers=[32,32]", "trainer.num_timesteps=80000", "trainer.evaluations=1", f"run_dir={run}",
 ]  # fmt: skip
@@ -54,7 +54,7 @@ for part in json.loads(metadata["observation_layout"]):
 # are minus the distances.
 
 demonstrations = {"path": str(run / "demonstrations.npz"), "count": 8, "held_out": 2}
-arms = gymnasium.make_vec("mimic/planar4dof-v0", num_envs=64, physics="fused", demonstrations=demonstrations)
+arms = gymnasium.make_vec("mimic/planar4dof-v0", num_envs=64, demonstrations=demonstrations)
 limit = np.array(json.loads(metadata["torque_scale"]))  # N m, the torque of an action of 1
 
 
@@ -94,7 +94,7 @@ arms.close()
 # The report of the training, computed by JAX, and the exported policy in Gymnasium should agree on the mean distance of
 # the training demonstrations. The arms above follow random demonstrations, so here one arm follows each in turn.
 
-arm = gymnasium.make("mimic/planar4dof-v0", physics="fused", demonstrations=demonstrations)
+arm = gymnasium.make("mimic/planar4dof-v0", demonstrations=demonstrations)
 distances = []
 for index in range(8):
     observation, _ = arm.reset(seed=0, options={"demonstration": index})

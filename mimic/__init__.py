@@ -17,6 +17,7 @@ compat.import_mujoco()
 
 from mimic.arms.arm import ArmConfig, build_arm  # noqa: E402
 from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
+from mimic.distribution import VERSION  # noqa: E402
 from mimic.envs import env_config, environments, make  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
 from mimic.envs.importing import import_demonstrations  # noqa: E402
@@ -58,7 +59,7 @@ if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
     from mimic.trainers.pose_mapper.model import PoseMapper
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 __all__ = [
     "PAPER_WEIGHTS",

@@ -1,17 +1,21 @@
-"""`python -m mimic`: lists the commands, one line each."""
+"""The command `mimic`, also `python -m mimic`: `mimic train env=panda4dof` is `python -m mimic.train env=panda4dof`."""
 
 import ast
+import importlib
 import re
 import sys
 from pathlib import Path
 
 from mimic import __version__
+from mimic.config import BAD_INPUT, suggestion
 
-_ENTRY_POINT = re.compile(r"`python -m (mimic\.\w+)[^`]*`: (.*)\.")  # the docstring of an entry point
+_ENTRY_POINT = re.compile(r"`python -m mimic\.(\w+)[^`]*`: (.*)\.")  # the docstring of an entry point
+_COMPLETION = "completion", "prints the completion of a shell: bash, zsh or fish"
+_HELP = ("-h", "--help")
 
 
 def commands() -> dict[str, str]:
-    """Modules of the commands with what each does, read from the docstrings without importing the modules."""
+    """The commands with what each does, read from the docstrings without importing the modules."""
     summaries = {}
     for file in sorted(Path(__file__).parent.glob("*.py")):
         docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
@@ -20,12 +24,43 @@ def commands() -> dict[str, str]:
     return summaries
 
 
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the command that the first argument names; returns the exit code.
+
+    Args:
+      arguments: of the command line. Default None: those of this process.
+    """
+    name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if name in _HELP or name == "--version":
+        print(_overview() if name in _HELP else f"mimic {__version__}")
+        return 0
+    if name == _COMPLETION[0]:
+        from mimic.shell_completion import complete  # imports Hydra
+
+        return complete(rest, [*commands(), name])
+    if name not in commands():
+        print(f"error: {_unknown(name)}", file=sys.stderr)
+        return BAD_INPUT
+    from mimic import cli
+
+    sys.argv = [f"mimic.{name}", *rest]
+    cli.run(importlib.import_module(f"mimic.{name}").prepare, name)
+    return 0
+
+
+def _unknown(name: str) -> str:
+    if "=" in name:
+        return f"expected a command before {name!r:.80}, as in mimic train env=panda4dof"
+    return f"unknown command {name!r:.80}; valid are {', '.join(commands())}{suggestion(name, commands())}"
+
+
 def _overview() -> str:
     summaries = commands()
-    width = max(map(len, summaries))
-    lines = [f"  {module:{width}}  {summary}" for module, summary in summaries.items()]
-    return "\n".join(["Commands; python -m COMMAND --help shows the keys of each:", "", *lines])
+    width = max(map(len, [*summaries, _COMPLETION[0]]))
+    rows = [f"  {name:{width}}  {summary}" for name, summary in [*summaries.items(), _COMPLETION]]
+    head = "usage: mimic COMMAND [KEY=VALUE ...], or python -m mimic.COMMAND [KEY=VALUE ...]"
+    return "\n".join([head, "", *rows, "", "mimic COMMAND --help shows the keys of each, mimic --version the version."])
 
 
 if __name__ == "__main__":
-    print(f"mimic {__version__}" if "--version" in sys.argv[1:] else _overview())
+    sys.exit(main())

@@ -10,14 +10,17 @@ import traceback
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError
 from pathlib import Path
+from string import Template
 from typing import Any, NoReturn
 
 import hydra
+from hydra._internal.utils import get_args
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import __version__, compat, registry
@@ -33,7 +36,8 @@ from mimic.commands.config import (
     RetargetConfig,
     ViewConfig,
 )
-from mimic.config import explain, schema, typed
+from mimic.commands.key_help import key_lines
+from mimic.config import BAD_INPUT, explain, schema, suggestion, typed
 from mimic.envs import registered_preset
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals
@@ -42,7 +46,6 @@ from mimic.sweeps.launchers import check_launcher, register_launchers
 from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import TrainConfig, trainer_config, trainers
 
-BAD_INPUT = 2
 _LONGEST_MESSAGE = 1000  # characters: Hydra repeats the argument
 ARM_KEYS = {  # keys of each command whose value may be just the name or file of an arm
     "train": ("env.expert", "env.learner"),
@@ -74,18 +77,10 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:
-        sys.argv[1:] = load_plugins(sys.argv[1:])
-    except ValueError as error:
-        _exit_with_error(error)
-    sys.argv[1:] = [_expand_shorthand(argument, config_name) for argument in sys.argv[1:]]
-    compat.share_config_store()
-    try:
-        _register_schemas()
+        sys.argv[1:] = [expand_shorthand(argument, config_name) for argument in load_plugins(sys.argv[1:])]
+        register()
     except ValueError as error:  # of a plugin
         _exit_with_error(error)
-    register_sweeper()
-    register_launchers()
-    bound_config_files()
     is_composed = False  # all errors before that are user errors
 
     @hydra.main(version_base="1.3", config_path="pkg://mimic.conf", config_name=config_name)
@@ -97,7 +92,8 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
     try:
         with watched_signals():
             check_arguments(sys.argv[1:])
-            command()
+            if not _print_help(config_name):
+                command()
     except _CONFIG_ERRORS as error:
         _exit_with_error(error)
     except OSError as error:  # of Hydra or our sweeper
@@ -106,6 +102,30 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         if is_composed:
             raise
         _exit_with_error(error)
+
+
+def _print_help(config_name: str) -> bool:
+    """Prints the help if the command line asks for it; returns whether it did."""
+    options = get_args(sys.argv[1:])
+    if not options.help or options.config_dir or options.config_name or options.config_path:  # Hydra prints the help
+        return False
+    with hydra.initialize_config_module("mimic.conf", version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        config = loader.load_configuration(config_name, options.overrides, RunMode.RUN)
+    template = config.hydra.help.template
+    with open_dict(config):
+        del config["hydra"]
+    print(Template(template).substitute(CONFIG="\n".join(key_lines(config))).rstrip())
+    return True
+
+
+def register() -> None:
+    """Registers with Hydra what the configs in mimic/conf refer to."""
+    compat.share_config_store()
+    _register_schemas()
+    register_sweeper()
+    register_launchers()
+    bound_config_files()
 
 
 def _single_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
@@ -142,7 +162,7 @@ def _sweep_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
     return Outcome(exit_code, f"exit code {exit_code}" if exit_code else "")
 
 
-def _expand_shorthand(argument: str, command: str) -> str:
+def expand_shorthand(argument: str, command: str) -> str:
     """Returns an argument in Hydra's syntax: env.learner=ARM.xml becomes env.learner.model=ARM.xml."""
     key, equals, value = argument.partition("=")
     if command in FIRST_KEY and not equals and not argument.startswith("-"):
@@ -230,5 +250,5 @@ def _one_line(error: BaseException) -> str:
     if choice:
         group, name, options = choice.groups()
         valid = ", ".join(sorted(option for option in set(options.split()) if not option.endswith("schema")))
-        return f"unknown {group} {name!r}; valid are {valid}"
+        return f"unknown {group} {name!r}; valid are {valid}{suggestion(name, valid.split(', '))}"
     return " ".join(message.split())[:_LONGEST_MESSAGE]

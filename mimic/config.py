@@ -3,7 +3,8 @@
 import dataclasses
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from mimic.config_files import check_references
 from mimic.ranges import ranges
 
+BAD_INPUT = 2  # exit code of a command whose input is rejected
 _LONGEST_IN_RUN = 200  # characters of the longest path within a run directory
 
 
@@ -66,14 +68,39 @@ def explain(error: Exception) -> str:
     key = getattr(error, "full_key", None) or getattr(error, "key", None)
     parent = getattr(error, "parent_node", None)
     if " not in " in message and isinstance(parent, DictConfig):
-        return f"unknown key {str(key)!r}; valid are {', '.join(str(name) for name in parent if name != 'hydra')}"
+        names = [str(name) for name in parent if name != "hydra"]
+        return f"unknown key {str(key)!r}; valid are {', '.join(names)}{_suggested_key(str(key), parent)}"
     return f"{key}: {message}" if key and str(key) not in message else message
+
+
+def suggestion(name: str, valid: Iterable[str]) -> str:
+    """The end of an error message about an unknown name: the valid name that is closest, if one is close."""
+    close = {choice.lower(): choice for choice in valid}
+    matches = get_close_matches(name.lower(), close, n=1)
+    return f"; did you mean {close[matches[0]]}?" if matches and name else ""
+
+
+def _suggested_key(key: str, parent: DictConfig) -> str:
+    """The suggestion for an unknown key: a key of the same parent, else one anywhere in the config."""
+    head, _, last = key.rpartition(".")
+    siblings = [f"{head}.{name}" if head else str(name) for name in parent if name != "hydra"]
+    elsewhere = dict(_keys(parent._get_root()))
+    same_name = next((full for full, name in elsewhere.items() if name == last), "")
+    return suggestion(key, siblings) or (f"; did you mean {same_name}?" if same_name else "")
+
+
+def _keys(node: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted keys of a config with the last name of each, without Hydra's own."""
+    for name in node if isinstance(node, DictConfig) and not node._is_none() and not node._is_missing() else ():
+        if prefix or name != "hydra":
+            yield f"{prefix}{name}", str(name)
+            yield from _keys(node._get_node(name), f"{prefix}{name}.")
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
     """Raises a ValueError that lists the choices if the value is none of them."""
     if value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r:.80}")
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r:.80}{suggestion(value, choices)}")
 
 
 def new_file(name: str, path: str) -> Path:

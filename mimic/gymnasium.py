@@ -40,7 +40,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
       env: name of an environment, or an `ImitationEnv`.
       num_envs: number of arms.
       render_mode: "rgb_array", or None.
-      overrides: fields of a named environment's config, see `mimic.env_config`; `physics="fused"` is the fast physics.
+      overrides: fields of a named environment's config, see `mimic.env_config`.
 
     Raises:
       ValueError: an unknown name, field or render mode, or fewer than one arm.

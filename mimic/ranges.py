@@ -22,6 +22,7 @@ class Range:
       minimum, maximum: the limits.
       above, below: whether the minimum or the maximum itself is excluded.
       entries: minimum and maximum number of entries of a list. Default None: a single number.
+      by_name: whether a mapping from names to such numbers is valid too.
     """
 
     minimum: float
@@ -29,6 +30,7 @@ class Range:
     above: bool = False
     below: bool = False
     entries: tuple[int, int] | None = None
+    by_name: bool = False
 
     @property
     def whole(self) -> bool:
@@ -40,7 +42,9 @@ class Range:
 
         Arrays pass, because they have no value while JAX traces a function.
         """
-        if self.entries is not None:
+        if self.by_name and isinstance(value, Mapping):
+            is_valid = all(map(self.contains, value.values()))
+        elif self.entries is not None:
             fewest, most = self.entries
             is_valid = not isinstance(value, str) and fewest <= len(value) <= most and all(map(self.contains, value))
         else:
@@ -63,7 +67,9 @@ class Range:
             lower, upper = "above" if self.above else "of at least", "below" if self.below else "at most"
             limits = f"{lower} {_text(self.minimum)} and {upper} {_text(self.maximum)}"
         kind = "whole number" if self.whole else "number"
-        return f"a {kind} {limits}" if self.entries is None else f"{_count(self.entries)} {kind}s, each {limits}"
+        if self.entries is not None:
+            return f"{_count(self.entries)} {kind}s, each {limits}"
+        return f"a {kind} {limits}" + (", or a mapping from names to such numbers" if self.by_name else "")
 
 
 def number(
@@ -74,6 +80,7 @@ def number(
     at_most: float | None = None,
     below: float | None = None,
     entries: tuple[int, int] | None = None,
+    by_name: bool = False,
 ) -> Any:
     """A dataclass field with a range; None is always valid.
 
@@ -82,10 +89,11 @@ def number(
       at_least, above: the minimum, with or without itself.
       at_most, below: the maximum, with or without itself. Where both are integers, only integers are valid.
       entries: minimum and maximum number of entries, for a list.
+      by_name: whether a mapping from names to numbers is valid too; the field's type is then Any.
     """
     minimum, maximum = (at_least if above is None else above), (at_most if below is None else below)
     assert minimum is not None and maximum is not None
-    metadata = {_RANGE: Range(minimum, maximum, above is not None, below is not None, entries)}
+    metadata = {_RANGE: Range(minimum, maximum, above is not None, below is not None, entries, by_name)}
     if callable(default):
         return dataclasses.field(default_factory=default, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)

@@ -3,12 +3,15 @@
 import runpy
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 import mimic
-from mimic import cli
+from mimic import cli, train
+from mimic.__main__ import main
+from tests.helpers.repository import REPOSITORY
 
 
 @pytest.mark.parametrize(
@@ -56,11 +59,62 @@ def test_the_version_is_that_of_mimic(command, monkeypatch, capsys):
     assert capsys.readouterr().out == f"mimic {mimic.__version__}\n"
 
 
-def test_the_overview_lists_all_commands(monkeypatch, capsys):
-    for arguments, expected in (([], "  mimic.train  "), (["--version"], f"mimic {mimic.__version__}\n")):
-        monkeypatch.setattr(sys, "argv", ["mimic", *arguments])
-        runpy.run_module("mimic", run_name="__main__")
-        assert expected in capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [([], "  train  "), (["--help"], "  train  "), (["--version"], f"mimic {mimic.__version__}\n")],
+)
+def test_the_overview_and_the_version(arguments, expected, capsys):
+    assert main(arguments) == 0 and expected in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore:.*sys.modules:RuntimeWarning")  # runpy: the module is imported already
+def test_the_console_script_runs_a_command(monkeypatch):
+    """`mimic train KEY=VALUE` calls what `python -m mimic.train KEY=VALUE` calls, with the same arguments."""
+    called = []
+    monkeypatch.setattr(cli, "run", lambda *call: called.append((*call, list(sys.argv))))
+    monkeypatch.setattr(sys, "argv", ["/bin/mimic", "train", "env=panda4dof", "seed=1"])
+    assert main() == 0
+    runpy.run_module("mimic.train", run_name="__main__")
+    (prepare, name, argv), (_, same_name, _) = called
+    assert (
+        prepare is train.prepare and name == same_name == "train" and argv == ["mimic.train", "env=panda4dof", "seed=1"]
+    )
+    scripts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
+    assert scripts == {"mimic": f"{main.__module__}:{main.__name__}"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["trian"], "unknown command 'trian'; valid are collect, "),
+        (["trian"], "; did you mean train?"),
+        (["env=panda4dof"], "expected a command before 'env=panda4dof', as in mimic train env=panda4dof"),
+        (["completion", "csh"], "completion: expected one of bash, zsh, fish, got 'csh'"),
+        (["completion"], "got 'nothing'"),
+    ],
+)
+def test_bad_commands(arguments, message, capsys):
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.startswith("error: ") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (["env=panda4dfo"], "panda4dof"),
+        (["trainer=po"], "ppo"),
+        (["env.previw=1"], "env.preview"),
+        (["learning_rate=1"], "trainer.learning_rate"),
+        (["env.limits=hardwere"], "hardware"),
+    ],
+)
+def test_errors_suggest_the_closest_name(arguments, name, rejected):
+    assert rejected("train", *arguments).endswith(f"; did you mean {name}?\n")
+
+
+def test_nothing_is_suggested_where_nothing_is_close(rejected):
+    assert "did you mean" not in rejected("train", "xyz=1")
 
 
 def test_a_bad_arm_file(rejected, tmp_path):
@@ -101,10 +155,11 @@ def test_run_directories_without_a_checkpoint(rejected, tmp_path, command):
 
 
 def test_all_commands_are_listed():
-    commands = {f"mimic.{file.stem}" for file in (Path(mimic.__file__).parent / "conf").glob("*.yaml")}
+    commands = {file.stem for file in (Path(mimic.__file__).parent / "conf").glob("*.yaml")}
     result = subprocess.run([sys.executable, "-m", "mimic"], capture_output=True, text=True, timeout=60, check=False)
     listed = [line.split(maxsplit=1) for line in result.stdout.splitlines()[2:]]
-    assert result.returncode == 0 and {module for module, _ in listed} == commands
+    names = {words[0] for words in listed if len(words) == 2 and words[0] != "mimic"}
+    assert result.returncode == 0 and names == {*commands, "completion"}
 
 
 def test_help_names_the_environments():

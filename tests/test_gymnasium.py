@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode  # noqa: E402
 
 from mimic.gymnasium import Env, VectorEnv  # noqa: E402
 
-SMALL = {"demonstrations": {"count": 3, "held_out": 1}, "physics": "fused"}
+SMALL = {"demonstrations": {"count": 3, "held_out": 1}}
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +137,7 @@ from stable_baselines3 import PPO
 from mimic.gymnasium import Env
 
 torch.set_num_threads(1)  # the network is small: more threads would wait for each other
-env = Env("planar4dof", demonstrations={"count": 1, "held_out": 1}, physics="fused")
+env = Env("planar4dof", demonstrations={"count": 1, "held_out": 1})
 
 
 def mean_return(model):

@@ -1,8 +1,25 @@
-"""The installed package is found from every folder."""
+"""The installed package is found from every folder, and its name is in one place."""
 
 import os
+import re
 import subprocess
 import sys
+import tomllib
+
+import yaml
+
+from mimic import distribution
+from tests.helpers.repository import REPOSITORY
+
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+
+
+def test_all_files_agree_on_the_name_and_the_version():
+    assert PROJECT["name"] == distribution.NAME
+    assert set(re.findall(r"(mimic[\w-]*)\[", str(PROJECT["optional-dependencies"]))) == {distribution.NAME}
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    assert citation["version"] == distribution.VERSION and distribution.NAME in citation["abstract"]
+    assert distribution.NAME in (REPOSITORY / "README.md").read_text()
 
 
 def test_mimic_is_imported_next_to_a_clone(tmp_path):

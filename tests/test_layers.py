@@ -14,7 +14,7 @@ from tests.helpers.repository import REPOSITORY
 
 # From the lowest up: a module may import its own layer and the layers before it.
 LAYERS = (
-    ("compat", "compilation", "config", "config_files", "memory", "npz", "ranges", "registry"),
+    ("compat", "compilation", "config", "config_files", "distribution", "memory", "npz", "ranges", "registry"),
     ("arms",),
     ("metric",),
     ("runs",),

@@ -15,7 +15,9 @@ from mimic.arms.compile_check import VELOCITY_LIMIT
 from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
 from mimic.arms.ignored_elements import ignored_elements
 from mimic.arms.model_files import read_spec
+from mimic.arms.named_arms import BUILT_IN, is_arm_name, named_arm
 from mimic.arms.simulation_model import effective_inertia, simulation_model
+from mimic.config import suggestion
 from mimic.ranges import check_ranges, number
 
 # Planar arms are slender rods; relative to their size, their joints have about the effective inertia of the Panda's.
@@ -29,21 +31,23 @@ _PLANAR_RADIUS, _PLANAR_COLOUR = 0.03, [0.35, 0.55, 0.85, 1.0]  # as drawn [m]
 _SPEED_FACTOR = 2.0
 DEFAULT_VELOCITY_LIMIT = np.pi  # rad/s, assumed for joints without a velocity limit
 
-BUILT_IN = "panda", "planar"
-
 
 @dataclasses.dataclass(frozen=True)
 class ArmConfig:
     """Model of an arm, and changes to it.
 
     Attributes:
-      model: "panda", "planar", or the path of an MJCF or URDF file, which is made absolute.
+      model: "panda", "planar", the path of an MJCF or URDF file, or the name of an arm, see `named_arm`; a path is made
+        absolute, and a name becomes the path.
       locked: joint names or numbers, or a mapping from these to angles [rad].
       link_lengths: lengths of the links of a planar arm [m].
       base: for a file, name of the body that carries the chain.
       tip: for a file, name of the body or site at the end of the chain; default: see `find_chain`.
-      armature: minimum rotor inertia of each joint, at the joint [kg m^2]; many models state none.
-      damping: minimum damping of each joint [N m s/rad].
+      armature: minimum rotor inertia of each joint, at the joint [kg m^2], or a mapping from joints to it; many models
+        state none.
+      damping: minimum damping of each joint [N m s/rad], or a mapping from joints to it.
+      home: start pose: a list with the angle of each joint from base to tip, locked ones included [rad], a mapping from
+        joints to angles, or the name of a keyframe of the model. Default None: by `limits`, see `panda`.
       base_segment: for a file, whether the segment from the base to the first joint is a link; see `load_mjcf`.
     """
 
@@ -54,16 +58,21 @@ class ArmConfig:
     base: str | None = None
     tip: str | None = None
     # Joints of the largest industrial robots have some 1000 kg m^2 and 1000 N m s/rad.
-    armature: float = number(0.0, at_least=0.0, at_most=1e4)
-    damping: float = number(0.0, at_least=0.0, at_most=1e4)
+    armature: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
+    damping: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
+    home: Any = None
     base_segment: bool = True
 
     def __post_init__(self) -> None:
         if not self.model:
             raise ValueError(f"model: expected {', '.join(BUILT_IN)} or the path of an MJCF or URDF file, got nothing")
         check_ranges(self)
+        for name in ("armature", "damping"):
+            if getattr(self, name) is None:
+                raise ValueError(f"{name}: expected a number, or a mapping from joints to numbers, got null")
         if self.is_file:  # absolute, so that a run can be loaded from any folder
-            object.__setattr__(self, "model", os.path.abspath(os.path.expanduser(self.model)))
+            path = named_arm(self.model) if is_arm_name(self.model) else os.path.expanduser(self.model)
+            object.__setattr__(self, "model", os.path.abspath(path))
 
     @property
     def is_file(self) -> bool:
@@ -132,6 +141,7 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
             locked=config.locked or (),
             links=cast(Links, links),
             limits=cast(Limits, limits),
+            home=config.home,
         )
         return with_minimum_armature(
             Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config
@@ -145,6 +155,7 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         tip=config.tip,
         links=cast(Links, links),
         limits=cast(Limits, limits),
+        home=config.home,
         base_segment=config.base_segment,
     )
     notes = () if is_panda else ignored_elements(source, config.base, config.tip)
@@ -154,11 +165,28 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
 
 
 def with_minimum_armature(arm: Arm, config: ArmConfig) -> Arm:
-    """The arm with at least the rotor inertia and the damping of the config in each joint."""
+    """The arm with at least the rotor inertia and the damping of the config in each joint.
+
+    Raises:
+      ValueError: a mapping names a joint that the arm lacks.
+    """
     model = copy.copy(arm.model)
-    model.dof_armature[:] = np.maximum(model.dof_armature, config.armature)
-    model.dof_damping[:] = np.maximum(model.dof_damping, config.damping)
+    model.dof_armature[:] = np.maximum(model.dof_armature, _by_joint(arm, "armature", config.armature))
+    model.dof_damping[:] = np.maximum(model.dof_damping, _by_joint(arm, "damping", config.damping))
     return dataclasses.replace(arm, model=model)
+
+
+def _by_joint(arm: Arm, key: str, value: Any) -> Float[np.ndarray, " joints"]:
+    """A number for each free joint, 0 for those that a mapping does not name; locked joints may be named too."""
+    names = arm.embodiment.joint_names
+    if not isinstance(value, Mapping):
+        return np.full(len(names), value, float)
+    unknown = [name for name in value if name not in names and name not in arm.locked]
+    if unknown:
+        valid = (*names, *arm.locked)
+        close = suggestion(str(unknown[0]), valid)
+        raise ValueError(f"{key}: unknown joint {unknown[0]!r}; valid are {', '.join(valid)}{close}")
+    return np.array([value.get(name, 0.0) for name in names])
 
 
 def finite_velocity_limit(arm: Embodiment) -> Float[np.ndarray, " joints"]:

@@ -92,7 +92,7 @@ def resolve_locked(
     mapping = locked if isinstance(locked, Mapping) else None
     result: dict[str, float] = {}
     for joint in joints:
-        name = _joint_name(joint, joint_names)
+        name = find_joint(joint, joint_names, "locked")
         if name in result:
             raise ValueError(f"locked: joint {name!r} is named twice; name each joint once")
         result[name] = _angle(name, mapping[joint] if mapping is not None else (angles or {}).get(name, 0.0))
@@ -101,7 +101,12 @@ def resolve_locked(
     return result
 
 
-def _joint_name(joint: str | int, joint_names: tuple[str, ...]) -> str:
+def find_joint(joint: str | int, joint_names: tuple[str, ...], key: str) -> str:
+    """The name of a joint, from its name or number.
+
+    Raises:
+      ValueError: an unknown joint. The message starts with `key`.
+    """
     if isinstance(joint, str) and joint in joint_names:
         return joint
     if not isinstance(joint, str | bool):
@@ -111,7 +116,7 @@ def _joint_name(joint: str | int, joint_names: tuple[str, ...]) -> str:
             number = 0
         if 1 <= number <= len(joint_names):
             return joint_names[number - 1]
-    raise ValueError(f"locked: unknown joint {joint!r}; valid are {', '.join(joint_names)} or 1 to {len(joint_names)}")
+    raise ValueError(f"{key}: unknown joint {joint!r}; valid are {', '.join(joint_names)} or 1 to {len(joint_names)}")
 
 
 def _angle(name: str, value: float) -> float:

@@ -18,6 +18,7 @@ from mimic.arms.chain import Chain, Joint, Link, Links, Locked, lock, resolve_lo
 from mimic.arms.compile_check import check_magnitudes
 from mimic.arms.model_files import model_name, read_model
 from mimic.arms.mujoco_chain import read_chain
+from mimic.arms.start_pose import with_home
 from mimic.config import check_choice
 
 Limits = Literal["none", "hardware"]
@@ -194,11 +195,12 @@ def load_arm(
     tip: str | None = None,
     links: Links = "kept",
     limits: Limits = "hardware",
+    home: Any = None,
     base_segment: bool = True,
 ) -> tuple[Embodiment, mujoco.MjModel, dict[str, float]]:
     """An embodiment, its source model, and the angles [rad] of its locked joints by name.
 
-    As `load_mjcf`, but joints are locked at the home pose: see `limits` of `panda`.
+    As `load_mjcf`, but joints are locked at the home pose: see `limits` of `panda`, and `home` of `ArmConfig`.
     """
     check_choice("limits", limits, LIMITS)
     model = _model(path_or_model)
@@ -206,8 +208,10 @@ def load_arm(
     if limits == "none":
         unlimited = (dataclasses.replace(joint, range=(-np.pi, np.pi), home=0.0) for joint in chain.joints)
         chain = Chain(tuple(unlimited), chain.links)
-    home = {joint.name: joint.home for joint in chain.joints}
-    angles = resolve_locked(locked, tuple(home), home)
+    if home is not None:
+        chain = Chain(with_home(chain.joints, home, model), chain.links)
+    angles_at_home = {joint.name: joint.home for joint in chain.joints}
+    angles = resolve_locked(locked, tuple(angles_at_home), angles_at_home)
     return _locked_embodiment(chain, angles, name or _name(path_or_model, model), links), model, angles
 
 

@@ -2,7 +2,8 @@
 
 import copy
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from mimic.retargeting.kinematic_bound import closest_motion
 
 _DEMONSTRATIONS, _EVERY = 2, 5  # two demonstrations, every fifth step: a rough estimate within seconds
 
-# Rotor inertias [kg m^2] tried in turn for an arm that exceeds the velocity bound; the Panda's joints have 0.1.
+# Rotor inertias [kg m^2] tried in turn for a joint that exceeds the velocity bound; the Panda's joints have 0.1.
 # The damping is proportional, with the ratio of the Panda [1/s].
 _ARMATURES, _DAMPING_RATIO = (0.01, 0.03, 0.1, 0.3), 10.0
 _DIVERGED = 10.0  # multiple of the velocity bound at which a simulation stops early
@@ -73,25 +74,26 @@ def reachable_distance(
     )
 
 
-def random_torque_speed(arm: Arm, config: EnvConfig) -> float:
-    """Maximum joint velocity [rad/s] in an episode of random torques, such as those of an untrained policy.
+def random_torque_speeds(arm: Arm, config: EnvConfig) -> Float[np.ndarray, " joints"]:
+    """Maximum velocity of each joint [rad/s] in an episode of random torques, such as those of an untrained policy.
 
-    The simulation stops early once the velocity is far above the bound that ends an episode; inf if it diverges.
+    The simulation stops early once a velocity is far above the bound that ends an episode; inf for joints that diverge.
     """
     model = copy.copy(arm.model)
     model.opt.timestep = config.control_dt / config.substeps
     data = mujoco.MjData(model)
     data.qpos[:] = arm.embodiment.home
-    scale, rng, maximum = torque_scale(arm, config.action_scale, config.control_dt), np.random.default_rng(0), 0.0
+    scale, rng = torque_scale(arm, config.action_scale, config.control_dt), np.random.default_rng(0)
+    maximum = np.zeros(model.nv)
     for _ in range(config.horizon):
         data.qfrc_applied[:] = scale * rng.uniform(-1, 1, model.nv)
         for _ in range(config.substeps):  # not mj_step, which writes a log file on divergence
             mujoco.mj_forward(model, data)
             mujoco.mj_RungeKutta(model, data, 4)
-            speed = float(np.abs(data.qvel).max())
-            if not speed < _DIVERGED * config.speed_bound:  # also true for NaN
-                return speed if np.isfinite(speed) else np.inf
-            maximum = max(maximum, speed)
+            speed = np.nan_to_num(np.abs(data.qvel), nan=np.inf)
+            maximum = np.maximum(maximum, speed)
+            if not speed.max() < _DIVERGED * config.speed_bound:
+                return maximum
     return maximum
 
 
@@ -147,28 +149,43 @@ def warnings(config: ArmConfig, arm: Arm) -> Iterator[str]:
 
 
 def stabilised(config: ArmConfig, arm: Arm, env: EnvConfig) -> tuple[ArmConfig, str]:
-    """Adds rotor inertia and damping to an arm whose joints exceed the velocity bound under random torques.
+    """Adds rotor inertia and damping to the joints that exceed the velocity bound under random torques.
 
     Few models have the rotor inertia of their motors. Without it, random torques spin light wrist links up, and an
-    episode ends before anything is learned.
+    episode ends before anything is learned. Joints that are slow enough stay as they are.
 
     Returns:
       The config of the arm, and the reason for the change; "" where none is needed.
     """
-    speed = original = random_torque_speed(arm, env)
-    limit, changed = _SAFE_FRACTION * env.speed_bound, config
-    for armature in _ARMATURES:
-        if speed < limit:
-            break
-        changed = dataclasses.replace(config, armature=armature, damping=_DAMPING_RATIO * armature)
-        speed = random_torque_speed(with_minimum_armature(arm, changed), env)
+    speeds = random_torque_speeds(arm, env)
+    limit, names = _SAFE_FRACTION * env.speed_bound, arm.embodiment.joint_names
+    original, changed, levels = speeds.max(), config, np.zeros(len(names), int)
+    armature: dict[str, float] = {}
+    while (raised := (speeds >= limit) & (levels < len(_ARMATURES))).any():
+        levels += raised
+        armature = {name: _ARMATURES[level - 1] for name, level in zip(names, levels.tolist(), strict=True) if level}
+        changed = _with_armature(config, arm, armature)
+        speeds = random_torque_speeds(with_minimum_armature(arm, changed), env)
     if original < limit:
         return config, ""
+    values = ", ".join(f"{value:g} in {name}" for name, value in armature.items())
     return changed, (
         f"random torques accelerate a joint to {original:.3g} rad/s or more, but episodes end at "
-        f"{env.speed_bound:g} rad/s; a rotor inertia of {changed.armature:g} kg m^2 and a damping of "
-        f"{changed.damping:g} N m s/rad in each joint, as in the command below, reduce this to {speed:.3g} rad/s"
+        f"{env.speed_bound:g} rad/s; a rotor inertia [kg m^2] of {values}, and {_DAMPING_RATIO:g} times that as "
+        f"damping [N m s/rad], as in the command below, reduce this to {speeds.max():.3g} rad/s"
     )
+
+
+def _with_armature(config: ArmConfig, arm: Arm, armature: Mapping[str, float]) -> ArmConfig:
+    """The config with the rotor inertia of some joints and its damping; what it states already is the minimum."""
+    damping = {name: _DAMPING_RATIO * value for name, value in armature.items()}
+    changes: dict[str, Any] = {}
+    for key, proposed in (("armature", armature), ("damping", damping)):
+        stated = getattr(config, key)
+        before = stated if isinstance(stated, Mapping) else dict.fromkeys(arm.embodiment.joint_names, stated)
+        values = {name: round(max(before.get(name, 0.0), proposed.get(name, 0.0)), 6) for name in (*before, *proposed)}
+        changes[key] = {name: value for name, value in values.items() if value}
+    return dataclasses.replace(config, **changes)
 
 
 def _listed(names: np.ndarray | list[str]) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import LIMITS
+from mimic.arms.named_arms import is_arm_name
 from mimic.config import check_choice
 from mimic.envs import env_config, environments
 from mimic.envs.config import PHYSICS, EnvConfig
@@ -263,7 +264,8 @@ class ViewConfig:
 
     Attributes:
       env: environment that defines the arms and the metric.
-      expert, learner: replace the arms of the environment: "panda", the name of an environment, or an MJCF file.
+      expert, learner: replace the arms of the environment: "panda", the name of an environment or of an arm (see
+        `named_arm`), or an MJCF file.
       mapper: run directory of a pose mapper that moves the learner instead of the optimiser. Its arms are used.
       run: run directory of a policy to play. Its arms and demonstrations are used.
       checkpoint: steps of the checkpoint of the policy or the mapper. Default None: the last checkpoint.
@@ -311,6 +313,8 @@ def _arm(role: str, name: str) -> ArmConfig:
         return ArmConfig()
     if name in environments():
         return getattr(env_config(name), role)
+    if is_arm_name(name):
+        return ArmConfig(model=name)
     if not Path(name).expanduser().is_file():
         valid = ", ".join(environments())
         raise ValueError(f"{role}: expected panda, an MJCF file, or an environment ({valid}), got {name!r}")

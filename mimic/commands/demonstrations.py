@@ -13,6 +13,7 @@ from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_fraction
+from mimic.commands.progress import is_animated
 from mimic.config import new_file
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort
@@ -94,8 +95,8 @@ def _files(config: RecordingConfig) -> tuple[Path, Path]:
 def _record(arm: Arm, env: EnvConfig, console: Console) -> tuple[Demonstrations, int]:
     """Demonstrations, and the number of goals that were redrawn. Shows a progress bar on a terminal."""
     config, redrawn = env.demonstrations, 0
-    columns = TextColumn("[bold]recording"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    columns = BarColumn(), MofNCompleteColumn(), TextColumn("left"), TimeRemainingColumn()
+    with Progress(TextColumn("[bold]recording"), *columns, console=console, disable=not is_animated(console)) as bar:
         task = bar.add_task("record", total=config.count)
 
         def on_recorded(redrawn_goals: int) -> None:

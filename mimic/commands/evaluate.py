@@ -56,6 +56,8 @@ def prepare_report(config: EvaluateConfig, started: float, console: Console) -> 
             with SearchProgress(console, config.search.iterations) as progress:
                 outcome, controller = trainer.run_controller(config.controller, params, config.search, progress.update)
             metrics = {**trainer.metrics(outcome), **trainer.details(outcome, config.controller)}
+            if config.controller == "policy" and not config.physics:
+                metrics |= trainer.cross_check(params)
         report = make_report(trained, trainer, metrics, stopwatch, steps, 0)
         report |= {**controller, "evaluated": _conditions(trained, config)}
         show_report(console, report, trainer)
@@ -95,7 +97,8 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
     )
     trained = dataclasses.replace(trained, env=env)
     unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
-    return trained, make_ppo_trainer(trained, run_dir, unseen)
+    trainer = make_ppo_trainer(trained, run_dir, unseen)
+    return dataclasses.replace(trained, env=trainer.env_config), trainer
 
 
 def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:

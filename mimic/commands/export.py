@@ -16,11 +16,11 @@ from rich.console import Console
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import EXPORT_FORMATS, ExportConfig
 from mimic.config import check_choice, new_file
+from mimic.distribution import VERSION, install_command
 from mimic.envs import env_config
 from mimic.envs.imitation import layout_of, observation_layout, torque_scale
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_atomically
-from mimic.runs.provenance import versions
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo import training
@@ -115,9 +115,7 @@ def _file(config: ExportConfig) -> Path:
     try:
         importlib.import_module(package)
     except ImportError as error:
-        raise ValueError(
-            f"format={config.format} needs the package {package}: pip install 'mimic-mjx[export]'"
-        ) from error
+        raise ValueError(f"format={config.format} needs the package {package}: {install_command('export')}") from error
     return out
 
 
@@ -137,7 +135,7 @@ def _exported_function(config: ExportConfig) -> ExportedFunction:
     if config.learner:
         _check_arms(config.learner, expert, learner)
     common = {
-        "mimic_version": versions()["mimic-mjx"],
+        "mimic_version": VERSION,
         "env": trained.env.name,
         "trainer": trained.trainer.name,
         "checkpoint": steps,

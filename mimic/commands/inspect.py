@@ -18,6 +18,7 @@ from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 from mimic.arms.arm import Arm, ArmConfig, finite_velocity_limit, torque_scale
+from mimic.arms.named_arms import is_arm_name, named_arms  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.commands import arm_checks  # noqa: E402
@@ -155,20 +156,27 @@ def train_command(config: InspectConfig) -> str:
     words += [word for role in ("expert", "learner") for word in _arm_words(f"env.{role}", getattr(config, role))]
     if config.limits != "none":
         words.append(f"env.limits={config.limits}")
-    return " ".join([*words, "env.physics=fused"])
+    return " ".join(words)
+
+
+def _shown_model(arm: ArmConfig) -> str:
+    """The name of an arm that has one, else its file, relative to the current folder if it is inside."""
+    if not arm.is_file:
+        return arm.model
+    names = {os.path.abspath(file): name for name, file in named_arms().items() if is_arm_name(name)}
+    path = os.path.relpath(arm.model)
+    return names.get(arm.model) or (arm.model if path.startswith("..") else path)
 
 
 def _arm_words(key: str, arm: ArmConfig) -> list[str]:
-    path = os.path.relpath(arm.model) if arm.is_file else arm.model
-    words = [f"{key}={arm.model if path.startswith('..') else path}"]
-    words += [
-        f"{key}.{name}={value}" for name in ("base", "tip", "armature", "damping") if (value := getattr(arm, name))
-    ]
+    words = [f"{key}={_shown_model(arm)}"]
+    words += [f"{key}.{name}={value}" for name in ("base", "tip") if (value := getattr(arm, name))]
     words += [f"{key}.base_segment=false"] * (not arm.base_segment)
-    for name in ("locked", "link_lengths"):
+    for name in ("armature", "damping", "locked", "link_lengths", "home"):
         value = getattr(arm, name)
         if value:
-            words.append(f"{key}.{name}={str(value if isinstance(value, dict) else list(value)).replace(' ', '')}")
+            shown = value if isinstance(value, dict | str | float | int) else list(value)
+            words.append(f"{key}.{name}={str(shown).replace(' ', '')}")
     return [shlex.quote(word) if "{" in word else word for word in (word.replace("'", "") for word in words)]
 
 

@@ -1,74 +1,159 @@
 """Progress bars of a training and a search, and the tables of a report."""
 
-from collections.abc import Mapping
+import os
+import time
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich import box
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
 from rich.table import Table
+from rich.text import Text
 
 from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES, SPLIT_NAMES
 from mimic.trainers.trainer import Trainer
 
+_GAP = "  "  # between texts of a line
+_REFRESHES = 2  # of a bar in a second: its clocks show whole seconds
+_WIDE_BAR, _BAR, _NARROW_BAR, _LONGEST_BAR = 20, 10, 5, 40  # columns
+
 
 class TrainingProgress:
-    """A progress bar with metrics, steps/s and remaining time; without a terminal, one line for each evaluation."""
+    """A bar with metrics, steps/s, elapsed and remaining time; without a terminal, one line for each evaluation."""
 
     def __init__(self, console: Console, total_steps: int, done_steps: int = 0):
-        self._console = console
-        self._total = total_steps
-        self._bar = _progress_bar(console, "training")
-        self._task = self._bar.add_task("train", total=total_steps, completed=done_steps, status="compiling")
+        self._display = _Display(console, "training", total_steps, done_steps)
 
     def __enter__(self) -> "TrainingProgress":
-        self._bar.start()
+        self._display.start()
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self._bar.stop()
+        self._display.stop()
 
     def update(self, step: int, status: str, steps_per_second: float | None) -> None:
         """Shows the state after an evaluation at a step."""
+        display, left = self._display, None
         if steps_per_second:
-            left = max(self._total - step, 0) / steps_per_second
-            status += f"  {steps_per_second:,.0f} steps/s  {_duration(left)} left"
-        self._bar.update(self._task, completed=min(step, self._total), status=status)
-        if not self._console.is_terminal:
-            self._console.print(f"step {step:>11,}  {status}", soft_wrap=True, highlight=False)
+            status += f"{_GAP}{steps_per_second:,.0f} steps/s"
+            left = max(display.total - step, 0) / steps_per_second
+        display.update(step, status, left)
+        display.print_line(f"step {step:>11,}")
 
 
 class SearchProgress:
-    """A progress bar over the updates of a search, shown from the first one on; without a terminal, ten lines."""
+    """A bar over the updates of a search, shown from the first one on; without a terminal, ten lines."""
 
     def __init__(self, console: Console, total: int):
-        self._console, self._total = console, total
-        self._bar = _progress_bar(console, "searching")
-        self._task = self._bar.add_task("search", total=total, status="compiling")
+        self._display = _Display(console, "searching", total)
 
     def __enter__(self) -> "SearchProgress":
         return self
 
     def __exit__(self, *_: Any) -> None:
-        if self._bar.live.is_started:
-            self._bar.stop()
+        self._display.stop()
 
     def update(self, done: int, status: str) -> None:
         """Shows the state after `done` updates."""
-        self._bar.start()
-        self._bar.update(self._task, completed=done, status=status)
-        if not self._console.is_terminal and (done % max(self._total // 10, 1) == 0 or done == self._total):
-            self._console.print(f"searching {done:>4} of {self._total}  {status}", soft_wrap=True, highlight=False)
+        display = self._display
+        display.start()
+        display.update(done, status, display.elapsed / done * (display.total - done) if done else None)
+        if done % max(display.total // 10, 1) == 0 or done == display.total:
+            display.print_line(f"searching {done:>4} of {display.total}")
 
 
-def _progress_bar(console: Console, label: str) -> Progress:
-    """A bar with a status text, hidden without a terminal."""
-    columns = BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[status]}"), TimeElapsedColumn()
-    return Progress(TextColumn(f"[bold]{label}"), *columns, console=console, disable=not console.is_terminal)
+def is_animated(console: Console) -> bool:
+    """Whether a bar can be redrawn: on a terminal, but not in the output of a notebook's cell, which keeps every frame.
+
+    Notebooks set FORCE_COLOR, by which rich takes a pipe for a terminal, and run commands in a pseudo-terminal.
+    """
+    is_terminal = console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
+    return is_terminal and "JPY_PARENT_PID" not in os.environ
+
+
+class _Display:
+    """The state of a long computation, as a bar where `is_animated`."""
+
+    def __init__(self, console: Console, label: str, total: int, done: int = 0):
+        self.total = total
+        self._console, self._label, self._done, self._status = console, label, done, "compiling"
+        self._began = self._updated = time.monotonic()
+        self._left: float | None = None
+        self._live: Live | None = None
+
+    def start(self) -> None:
+        if self._live is None and is_animated(self._console):
+            self._live = Live(get_renderable=self._lines, console=self._console, refresh_per_second=_REFRESHES)
+            self._live.start()
+
+    def stop(self) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.monotonic() - self._began
+
+    def update(self, done: int, status: str, left: float | None) -> None:
+        self._done, self._status, self._left, self._updated = min(done, self.total), status, left, time.monotonic()
+        if self._live is not None:
+            self._live.refresh()
+
+    def print_line(self, start: str) -> None:
+        """Prints the state as one line that begins with `start`, where there is no bar."""
+        if self._live is None:
+            line = _GAP.join([start, self._status, *self._times()])
+            self._console.print(line, soft_wrap=True, highlight=False)
+
+    def _times(self) -> list[str]:
+        left = [] if self._left is None else [self._left - (time.monotonic() - self._updated)]
+        return [f"elapsed {_duration(self.elapsed)}", *(f"left {_duration(seconds)}" for seconds in left)]
+
+    def _lines(self) -> Group:
+        head = [f"{self._done:,}/{self.total:,}", *self._times()]
+        fraction = self._done / max(self.total, 1)
+        return Group(*_bar_lines(self._console.width, fraction, self._label, head, self._status.split(_GAP)))
+
+
+def _bar_lines(width: int, fraction: float, label: str, head: list[str], body: list[str]) -> list[Table | Text]:
+    """A bar with texts around it: everything in one line where that fits, else the body below, in lines of a width.
+
+    Args:
+      width: of the terminal.
+      fraction: of the bar that is full.
+      label: before the bar; left out where it does not fit.
+      head: texts next to the bar; below it where even they do not fit.
+      body: all other texts.
+    """
+    layouts = (([label], [*head, *body], [], _WIDE_BAR), ([label], head, body, _BAR), ([], head, body, _NARROW_BAR))
+    for before, after, below, least in layouts:
+        room = width - sum(len(text) + len(_GAP) for text in (*before, *after))
+        if room >= least:
+            bar = ProgressBar(total=1.0, completed=fraction, width=min(room, _LONGEST_BAR))
+            row = Table.grid(padding=(0, len(_GAP), 0, 0))
+            row.add_row(*(Text(text, style="bold") for text in before), bar, *map(Text, after))
+            return [row, *_filled_lines(width, below)]
+    return [*_filled_lines(width, [*head, *body])]
+
+
+def _filled_lines(width: int, texts: Sequence[str]) -> list[Text]:
+    """Texts in as few lines as they need."""
+    lines: list[str] = []
+    for text in texts:
+        if lines and len(lines[-1]) + len(_GAP) + len(text) <= width:
+            lines[-1] += _GAP + text
+        else:
+            lines.append(text)
+    return [Text(line) for line in lines]
 
 
 def _duration(seconds: float) -> str:
-    return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"
+    minutes, rest = divmod(max(int(seconds), 0), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
 def similarity_table(similarity: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:

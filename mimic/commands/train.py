@@ -90,7 +90,7 @@ def prepare_training(
     with stopwatch.stage("build"):
         trainer = make_trainer(config, resumed_dir)
         restored = _start(config, resumed_dir, trainer, any(key.startswith("trainer.") for key in overrides))
-    config = dataclasses.replace(config, trainer=trainer.settings)
+    config = dataclasses.replace(config, env=trainer.env_config, trainer=trainer.settings)
     if group and not is_first:
         return lambda: _follow(trainer, restored, group)
     signals = group.signals if group else signals or Signals()
@@ -170,18 +170,9 @@ def _train(
     console = Console()
     with noted_signals(signals):  # also during the report, where they have no effect
         try:
-            on_trained = (lambda: group.end(0)) if group else None
-            report = run_training(
-                config,
-                trainer,
-                run_dir,
-                console,
-                stopwatch,
-                signals,
-                lock=lock,
-                restored=restored,
-                on_trained=on_trained,
-            )
+            inputs = config, trainer, run_dir, console, stopwatch, signals
+            end = (lambda: group.end(0)) if group else None
+            report = run_training(*inputs, lock=lock, restored=restored, on_trained=end)
         except (Interrupted, Diverged, OSError, RunExists) as error:
             exit_code = _stopped(console, run_dir, error)
             if group:
@@ -230,7 +221,8 @@ def run_training(
         save_plugins(run_dir, config)
         save_config(run_dir, config)  # after the inputs: a folder without it is no run yet
         headline = f"{trainer.headline} on {hardware()['device']} (preset {trainer.settings.preset})"
-        console.print(f"{headline}\nrun directory: {run_dir}", highlight=False, soft_wrap=True)
+        lines = filter(None, (headline, trainer.simulation, f"run directory: {run_dir}"))
+        console.print("\n".join(lines), highlight=False, soft_wrap=True)
         steps, params = _train_and_log(config, trainer, run_dir, signals, restored, stopwatch, console)
         if on_trained:
             on_trained()
@@ -250,7 +242,7 @@ def _evaluate(
     """Evaluates the result of a training; writes plots and tables, and last the report, which completes the run."""
     with stopwatch.stage("evaluate"):
         outcome = trainer.evaluate(params)
-        metrics = {**trainer.metrics(outcome), **trainer.details(outcome)}
+        metrics = {**trainer.metrics(outcome), **trainer.details(outcome), **trainer.cross_check(params)}
     for step in checkpoint_steps(run_dir):  # the last checkpoint is the result
         if step > steps:
             delete_checkpoint(run_dir, step)

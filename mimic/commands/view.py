@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mimic import compat
 from mimic.arms.arm import build_arm
 from mimic.commands.config import ViewConfig
+from mimic.distribution import install_command
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import Signals, noted_signals
 from mimic.trainers.run_config import load_config
@@ -36,7 +37,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     if not is_installed():
         raise ValueError(
             "view: expected the package viser, which is not installed; install it with the extra 'view': "
-            "pip install 'mimic-mjx[view]'"
+            f"{install_command('view')}"
         )
     check_port(config.host, config.port)
     from mimic.compilation import use_compilation_cache

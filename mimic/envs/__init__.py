@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic import compat, registry
-from mimic.config import check_choice, explain, merged, schema, to_dict, typed
+from mimic.config import check_choice, explain, merged, schema, suggestion, to_dict, typed
 from mimic.envs.config import EnvConfig
 
 if TYPE_CHECKING:
@@ -58,8 +58,9 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     Raises:
       ValueError: an unknown name or field, or a value of the wrong type or out of range.
     """
-    if name not in environments():
-        raise ValueError(f"unknown environment {name!r}; valid are {', '.join(environments())}")
+    valid = environments()
+    if name not in valid:
+        raise ValueError(f"unknown environment {name!r}; valid are {', '.join(valid)}{suggestion(name, valid)}")
     preset = _built_in_preset(name) if name in _BUILT_IN else registered_preset(name)
     presets = {"metric": _metric_preset(overrides["metric"])} if isinstance(overrides.get("metric"), str) else {}
     try:

@@ -13,6 +13,7 @@ from mimic.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
 _MAX_WEIGHT = 1e6  # of a reward term
+AUTO = "auto"
 _MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
 
@@ -112,7 +113,8 @@ class EnvConfig:
       horizon: control steps of an episode.
       control_dt: duration of a control step [s]; the torque is constant within it.
       substeps: physics steps in a control step.
-      physics: "mjx", the reference, or "fused": the same equations in one fused kernel, many times faster.
+      physics: "mjx"; "fused": the same equations in one fused kernel, many times faster; or "auto": "fused" where it
+        covers the learner exactly, otherwise "mjx", see `choose_physics` in mimic/envs/physics.py.
       randomization: how the learner's dynamics differ from its model.
       preview: how many control steps ahead the learner also observes the expert; 0 is the paper.
       limit_weight: weight in the reward of joints near or beyond their range and velocity limit; only where `limits`
@@ -133,7 +135,7 @@ class EnvConfig:
     horizon: int = number(50, at_least=1, at_most=10_000)
     control_dt: float = number(0.1, at_least=1e-4, at_most=10.0)  # robots are controlled at 10 kHz at most
     substeps: int = number(10, at_least=1, at_most=1000)  # 0.1 ms for the default control step
-    physics: str = "mjx"
+    physics: str = AUTO
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     preview: int = number(1, at_least=0, at_most=100)  # each step adds an expert to the observation
     limit_weight: float = number(1.0, at_least=0.0, at_most=1e6)
@@ -146,7 +148,7 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)
-        check_choice("physics", self.physics, PHYSICS)
+        check_choice("physics", self.physics, (AUTO, *PHYSICS))
         check_ranges(self)
         for name in self.reward.terms:
             registry.check("reward_term", name, "reward.terms")

@@ -121,6 +121,32 @@ def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
     )
 
 
+def uncovered_elements(model: mujoco.MjModel) -> list[str]:
+    """What a model has that changes its motion and that these dynamics lack; empty where they are exact."""
+    no_gravity = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    elements = {
+        "joints that are not revolute": np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE),
+        "several branches": not _is_serial(model),
+        "gravity": not no_gravity and np.any(model.opt.gravity),
+        "contacts": model.ngeom > 0,
+        "constraints": model.neq > 0,
+        "tendons": model.ntendon > 0,
+        "actuators": model.nu > 0,
+        "springs": np.any(model.jnt_stiffness),
+        "nonlinear damping": np.any(getattr(model, "dof_dampingpoly", 0)),  # only of newer MuJoCo
+        "dry friction": np.any(model.dof_frictionloss),
+        "joint limits": np.any(model.jnt_limited),
+        "a fluid": model.opt.density or model.opt.viscosity,
+        "another integrator": model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4,
+    }
+    return [name for name, is_there in elements.items() if is_there]
+
+
+def _is_serial(model: mujoco.MjModel) -> bool:
+    """Whether each moving body is the child of the one before it, and all bodies move."""
+    return list(model.body_parentid[1:]) == list(range(model.nbody - 1)) and bool(np.all(model.body_jntnum[1:] > 0))
+
+
 def acceleration(
     arm: Sequence[Segment],
     qpos: Sequence[Scalar],

@@ -17,7 +17,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
-from mimic.envs.physics import Load, make_advance
+from mimic.envs.physics import Load, PhysicsChoice, choose_physics, make_advance
 from mimic.envs.recording import record_demonstrations
 from mimic.envs.terms import Transition, observation_layout_of_terms, observation_terms, observed, reward_terms
 from mimic.metric.distance import LinkDistance
@@ -32,7 +32,7 @@ _NOISE, FIRST_STEP = 3, 4
 
 
 class ImitationEnv(Env):
-    """One learner imitating one of the demonstrations; a brax environment over MJX.
+    """One learner imitating one of the demonstrations; a brax environment.
 
     Reward: minus the embodiment distance to the expert after the step; with hardware limits also minus `limit_weight`
     times `limit_excess`. Observation: link states of the learner, of the expert now, and of the expert at each of the
@@ -48,6 +48,8 @@ class ImitationEnv(Env):
       demonstrations: motions to imitate; the config's training demonstrations where None.
 
     Attributes:
+      config: the config; its `physics` is resolved, "mjx" or "fused".
+      physics: the physics and the reason for it.
       expert, learner: the embodiments.
       arm: the learner with its simulation model.
       metric: metric of the reward.
@@ -62,7 +64,6 @@ class ImitationEnv(Env):
 
     def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
         compat.mend_brax()  # here: brax's trainers take any environment, wrapped by any function
-        self.config = config
         arms = config.build_arms()
         self.expert, self.learner = arms.embodiments
         self.metric = config.metric.build(self.expert, self.learner)
@@ -72,8 +73,8 @@ class ImitationEnv(Env):
         self.torque_scale = jnp.asarray(torque_scale(self.arm, config.action_scale, config.control_dt))
         home = np.asarray(self.learner.home)
         self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
-        timestep = config.control_dt / config.substeps
-        self._advance = make_advance(self.arm.model, timestep, config.substeps, config.physics)
+        self.config = config
+        self._set_physics(choose_physics(config.physics, self.arm.model))
         if demonstrations is None:
             demonstrations = training_and_held_out(config, arms.expert)[0]
         self._set_demonstrations(demonstrations)
@@ -84,6 +85,12 @@ class ImitationEnv(Env):
         env._set_demonstrations(demonstrations)
         return env
 
+    def with_physics(self, physics: str) -> "ImitationEnv":
+        """The same environment, simulated by "mjx" or "fused"."""
+        env = copy.copy(self)
+        env._set_physics(choose_physics(physics, self.arm.model))
+        return env
+
     def with_expert_states(self, states: LinkStates) -> "ImitationEnv":
         """The same environment with another array for `expert_states`: an argument of the function that JAX compiles.
 
@@ -92,6 +99,12 @@ class ImitationEnv(Env):
         env = copy.copy(self)
         env.expert_states = states
         return env
+
+    def _set_physics(self, physics: PhysicsChoice) -> None:
+        self.physics = physics
+        config = self.config = dataclasses.replace(self.config, physics=physics.name)
+        timestep = config.control_dt / config.substeps
+        self._advance = make_advance(self.arm.model, timestep, config.substeps, physics.name)
 
     def _set_demonstrations(self, demonstrations: Demonstrations) -> None:
         demonstrations.check_fits(self.expert, self.config.control_dt, self.config.horizon)
@@ -268,7 +281,7 @@ class ImitationEnv(Env):
     @property
     def backend(self) -> str:
         """Name of the physics backend, for brax."""
-        return "mjx"
+        return self.physics.name
 
 
 def _opposite_links() -> tuple[LinkStates, LinkStates]:

@@ -10,7 +10,9 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 
 from mimic.envs import dynamics
+from mimic.envs.config import AUTO
 from mimic.metric import fused_kernel
+from mimic.metric.kinematics import LONG
 
 _LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest by measurement
 
@@ -27,7 +29,33 @@ class Load(NamedTuple):
     damping: Float[Array, ""] | float = 1.0
 
 
+class PhysicsChoice(NamedTuple):
+    """The physics that simulates an arm: "mjx" or "fused", and why."""
+
+    name: str
+    reason: str
+
+
 Advance = Callable[[Array, Array, Array, Load], tuple[Array, Array]]
+
+
+def choose_physics(physics: str, model: mujoco.MjModel) -> PhysicsChoice:
+    """Resolves "auto": "fused" for a model that it covers exactly and compiles quickly, otherwise "mjx".
+
+    Args:
+      physics: see `EnvConfig`.
+      model: the learner's, from `simulation_model`.
+    """
+    if physics != AUTO:
+        return PhysicsChoice(physics, "as configured")
+    uncovered = dynamics.uncovered_elements(model)
+    if uncovered:
+        return PhysicsChoice("mjx", f"auto: the fused dynamics do not cover {', '.join(uncovered)}")
+    if model.njnt > LONG:
+        return PhysicsChoice(
+            "mjx", f"auto: the fused dynamics of more than {LONG} joints compile slowly, got {model.njnt}"
+        )
+    return PhysicsChoice("fused", "auto: it covers the learner exactly")
 
 
 def make_advance(model: mujoco.MjModel, timestep: float, substeps: int, physics: str = "mjx") -> Advance:

@@ -1,5 +1,6 @@
 """Evaluates controllers: every demonstration once, relative to the kinematic bound and to holding the start pose."""
 
+import copy
 import csv
 import functools
 import io
@@ -62,6 +63,12 @@ class Evaluator:
         self._num_train = env.demonstrations.count
         self.env = env.with_demonstrations(concatenate(env.demonstrations, held_out))
         self._references = Background(lambda: _references(self.env))
+
+    def with_physics(self, physics: str) -> "Evaluator":
+        """An evaluator of rollouts in another physics, with the same bound and the same baselines."""
+        evaluator = copy.copy(self)
+        evaluator.env = self.env.with_physics(physics)
+        return evaluator
 
     def prepare(self) -> None:
         """Starts to compute `lower_bound`, `hold_distance` and the baselines in the background."""

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from mimic.distribution import install_command
+
 
 class Logger(Protocol):
     """A service that metrics are sent to."""
@@ -84,7 +86,7 @@ def _package(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise ValueError(
-            f"logger={name} needs the package {name}: pip install 'mimic-mjx[{name}]'; logger=local needs none"
+            f"logger={name} needs the package {name}: {install_command(name)}; logger=local needs none"
         ) from error
 
 

@@ -9,12 +9,14 @@ from typing import Any
 
 import jax
 
-_PACKAGES = ("mimic-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
+from mimic import distribution
+
+_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on."""
-    installed = {"python": platform.python_version()}
+    installed = {"python": platform.python_version(), distribution.NAME: distribution.VERSION}
     for package in _PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             installed[package] = importlib.metadata.version(package)

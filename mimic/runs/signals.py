@@ -168,7 +168,9 @@ def exit_hook(hook: Callable[[int], None]) -> Iterator[None]:
 
 
 def runs_as_command() -> bool:
-    """Whether this process was started by `python -m mimic.NAME`, and is importing the package of that module."""
+    """Whether this process was started by `mimic` or `python -m mimic.NAME`, and is importing the package of it."""
+    if sys.argv[:1] and os.path.basename(sys.argv[0]) == "mimic" and sys.argv[0] in sys.orig_argv[1:2]:
+        return True
     if sys.argv[:1] != ["-m"] or len(sys.orig_argv) <= len(sys.argv):
         return False
     return sys.orig_argv[-len(sys.argv)].removeprefix("-m").partition(".")[0] == "mimic"

@@ -10,9 +10,9 @@ from typing import Any
 
 from mimic import registry
 from mimic.config import flatten, to_dict
+from mimic.distribution import VERSION, recorded_version
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import CONFIG, METRICS, REPORT, read_json
-from mimic.runs.provenance import versions
 from mimic.sweeps.sweeper import LOGS, SWEEP
 from mimic.trainers.run_config import load_config
 
@@ -181,7 +181,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
 
 def _other_version(version: str) -> str:
     """The beginning of a reason, where the run is of another version of mimic than this one."""
-    this = versions()["mimic-mjx"]
+    this = VERSION
     return f"of mimic {version}, and this is {this}: " if version != this else ""
 
 
@@ -205,7 +205,7 @@ def _progress(path: Path, total: int, history: Mapping[str, Mapping[int, float]]
 
 def _version(report: Mapping[str, Any]) -> str:
     versions = report.get("versions")
-    return str(versions.get("mimic-mjx", "unknown")) if isinstance(versions, Mapping) else "unknown"
+    return recorded_version(versions) if isinstance(versions, Mapping) else "unknown"
 
 
 def _history(path: Path) -> dict[str, dict[int, float]]:

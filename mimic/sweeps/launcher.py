@@ -14,6 +14,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
+from mimic.distribution import install_command
 from mimic.runs.signals import Signals, exit_hook, noted_signals
 from mimic.sweeps.run_command import RunCommand
 from mimic.sweeps.sweeper import FAILED, LOGS, Outcome, path_of
@@ -45,7 +46,7 @@ class CommandLauncher(Launcher):
         except ImportError as error:
             raise HydraException(
                 f"hydra/launcher={self.choice} needs the package {self.package}: "
-                f"pip install 'mimic-mjx[{self.extra}]'; hydra/launcher={LOCAL} needs none"
+                f"{install_command(self.extra)}; hydra/launcher={LOCAL} needs none"
             ) from error
         self.connect()
 

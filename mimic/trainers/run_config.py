@@ -96,6 +96,7 @@ def _read_config(run_dir: Path) -> TrainConfig:
 
 def _with_old_defaults(content: DictConfig) -> DictConfig:
     """Completes the config of an older run with the defaults of its time."""
+    content = merged({"env": {"physics": "mjx"}}, content)
     content = _without_base_segments(_with_old_default_metric(content))
     trainer = OmegaConf.select(content, "trainer")
     defaults: dict[str, Any] = {"keep": 1_000_000}

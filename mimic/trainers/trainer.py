@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mimic.envs.config import EnvConfig
 from mimic.evaluation.config import SearchConfig
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.signals import Signals
@@ -22,13 +23,17 @@ class Trainer(abc.ABC):
 
     Attributes:
       settings: the trainer's config, resolved.
+      env_config: the config of the environment, resolved.
       headline: one line for people: the environment, the arms and the training data.
+      simulation: one line for people: the physics and why; empty where nothing is simulated.
       total_steps: training steps of the whole run.
       unit: name of a training step, as its key in the report.
     """
 
     settings: TrainerConfig
+    env_config: EnvConfig
     headline: str
+    simulation: str = ""
     total_steps: int
     unit: str
 
@@ -117,6 +122,11 @@ class Trainer(abc.ABC):
     def details(self, outcome: Any, controller: str = "policy") -> Metrics:
         """Entries of the final report beyond the metrics; `similarity` is shown as a separate table."""
         del outcome, controller
+        return {}
+
+    def cross_check(self, params: Params) -> Metrics:
+        """Entries of the final report by another simulation than that of the training; none by default."""
+        del params
         return {}
 
     @abc.abstractmethod

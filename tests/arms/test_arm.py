@@ -35,3 +35,25 @@ def test_no_action_exceeds_the_torque_limit(locked):
         free = torque_scale(unlimited, action_scale, 0.1)
         np.testing.assert_array_equal(torque_scale(arm, action_scale, 0.1), np.minimum(free, limit))
     assert np.all(torque_scale(arm, 100.0, 0.1) == limit)
+
+
+def test_rotor_inertia_and_damping_by_joint():
+    model = build_arm(ArmConfig(armature={"joint7": 0.5}, damping={"joint1": 7, "joint3": 8}, locked=["joint3"])).model
+    plain = build_arm(ArmConfig(locked=["joint3"])).model
+    np.testing.assert_allclose(model.dof_armature, [*plain.dof_armature[:-1], 0.5])
+    np.testing.assert_allclose(model.dof_damping, [7, *plain.dof_damping[1:]])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"joint8": 1}, "armature: unknown joint 'joint8'; valid are joint1, .*; did you mean joint"),
+        ({"joint1": -1}, "armature: expected a number from 0 to 10000, or a mapping .* got {'joint1': -1}"),
+        ([0.1], r"armature: expected a number from 0 to 10000, or a mapping from names to such numbers, got \[0.1\]"),
+        ("x", "armature: expected a number"),
+        (None, "armature: expected a number, or a mapping from joints to numbers, got null"),
+    ],
+)
+def test_bad_rotor_inertia(values, message):
+    with pytest.raises(ValueError, match=message):
+        build_arm(ArmConfig(armature=values))

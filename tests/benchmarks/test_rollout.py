@@ -47,7 +47,7 @@ def test_a_peer_that_cannot_run_says_why(monkeypatch):
 
 @pytest.mark.parametrize("group, case", [("part", "new episode")])
 def test_peers_run(group, case):
-    env = mimic.make("panda4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("panda4dof", demonstrations={"count": 1, "held_out": 1})
     assert rollout.CASES[group][case](env, 16).median > 0
 
 

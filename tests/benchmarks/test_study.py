@@ -35,7 +35,7 @@ def test_every_run_and_evaluation_has_arguments_that_the_commands_take(preset, c
         command = case.command(tmp_path)
         assert command[1:4] == ["-m", "mimic.train", "-m"] and f"hydra.sweep.dir={tmp_path / case.name}" in command
         config = compose("train", case.arguments)
-        assert config.env.physics == ("mjx" if case.group == "mjx" else "fused")
+        assert config.env.physics == ("mjx" if case.group == "mjx" else "auto")
     evaluated = study.evaluations(cases, tmp_path, UNSEEN)
     assert len(evaluated) == (45 if preset == "paper" else 41)
     for out, command in evaluated.items():

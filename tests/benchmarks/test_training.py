@@ -26,7 +26,7 @@ def test_the_goal_is_reached_when_it_is_held(gaps, reached, tmp_path):
 @pytest.mark.slow  # two runs as processes of their own
 def test_a_case_runs_cold_and_warm(monkeypatch):
     small = (
-        "env=planar4dof", "env.physics=fused", "env.demonstrations.count=2", "env.demonstrations.held_out=1",
+        "env=planar4dof", "env.demonstrations.count=2", "env.demonstrations.held_out=1",
         "trainer.preset=cpu", "trainer.num_timesteps=5000", "trainer.num_envs=16", "trainer.batch_size=16",
         "trainer.num_minibatches=2", "trainer.num_updates_per_batch=1", "trainer.evaluations=1",
     )  # fmt: skip

@@ -9,7 +9,7 @@ import pytest
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-mjx[view]'")
+@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-arms[view]'")
 def test_twenty_clients_move_the_arms(tmp_path):
     command = [sys.executable, "-m", "benchmarks.viewer", "--seconds", "10", "--rate", "2"]
     result = subprocess.run(

@@ -9,6 +9,7 @@ import pytest
 
 from mimic.commands.collect import prepare_collection
 from mimic.commands.config import CollectConfig
+from mimic.runs.files import REPORT
 from mimic.sweeps.seed_groups import mean_interval
 from mimic.sweeps.sweeper import SWEEP
 from tests.helpers.run_directories import write_run
@@ -146,6 +147,15 @@ def test_a_repetition_is_no_further_sample(tmp_path, capsys):
 def test_runs_of_several_versions_are_said_to_be(tmp_path, capsys):
     for seed, version in enumerate(("0.1.0", "0.2.0")):
         write_run(tmp_path / version, [0.5], seed=seed, version=version)
+    assert collect(tmp_path) == 0
+    assert "several versions of mimic: 0.1.0 (1), 0.2.0 (1)" in capsys.readouterr().err
+
+
+def test_runs_under_the_former_name_keep_their_version(tmp_path, capsys):
+    for seed, version in enumerate(("0.1.0", "0.2.0")):
+        path = write_run(tmp_path / version, [0.5], seed=seed) / REPORT
+        report = json.loads(path.read_text())
+        path.write_text(json.dumps({**report, "versions": {"mimic-mjx": version}}))
     assert collect(tmp_path) == 0
     assert "several versions of mimic: 0.1.0 (1), 0.2.0 (1)" in capsys.readouterr().err
 

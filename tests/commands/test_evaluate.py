@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import re
 import shutil
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
+from mimic.envs import physics
 from mimic.envs.imitation import training_and_held_out
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
@@ -43,6 +45,7 @@ def evaluate(run_dir, out, **settings):
 def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path):
     """With other physics than in training. 1e-5: float32, once from rollouts and once from the home pose."""
     report, rows = evaluate(run_dir, tmp_path / "new", controller="hold", physics="mjx")
+    assert report["physics"] == "mjx" and "mjx" not in report
     assert report["trainer"] == "hold"
     assert report["optimality_gap"] == pytest.approx({"train": 1, "held_out": 1}, abs=1e-5)
     assert [float(row["optimality_gap"]) for row in rows] == pytest.approx([1] * 6, abs=1e-5)
@@ -59,10 +62,26 @@ def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path):
     }
 
 
+def test_a_policy_is_evaluated_on_mjx_too(run_dir, tmp_path, monkeypatch, capsys):
+    """Where MJX does not move the arm at all, its distance is that of holding the start pose."""
+
+    def at_rest(*_):
+        return lambda qpos, qvel, torque, load: (qpos, qvel)
+
+    monkeypatch.setattr(physics, "_mjx_advance", at_rest)
+    report, _ = evaluate(run_dir, tmp_path / "new")
+    shown = capsys.readouterr().out
+    assert report["physics"] == "fused" and report["optimality_gap"] != pytest.approx({"train": 1, "held_out": 1})
+    assert report["mjx"]["optimality_gap"] == pytest.approx({"train": 1, "held_out": 1}, abs=1e-5)
+    assert report["mjx"]["mean_distance"] == pytest.approx(report["hold_distance"], rel=1e-5)
+    assert re.search(r"evaluated on MJX +. +100.00% . +100.00%", shown)
+    assert "mjx" not in evaluate(run_dir, tmp_path / "hold", controller="hold")[0]
+
+
 def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_path):
     """1e-5: float32, the same distances from another compiled function."""
     unseen.of_length(HORIZON + 5).save(tmp_path / "unseen.npz")  # more steps than the run's demonstrations have
-    overrides = {"demonstrations": str(tmp_path / "unseen.npz")}
+    overrides = {"demonstrations": str(tmp_path / "unseen.npz"), "physics": "fused"}
     plain, rows = evaluate(run_dir, tmp_path / "plain", **overrides)
     numbers = [(row["split"], int(row["demonstration"])) for row in rows]
     assert numbers == [*(("train", i) for i in range(COUNT)), *(("held_out", i) for i in range(unseen.count))]
@@ -71,7 +90,7 @@ def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_pat
         for key in ("hold_distance", "lower_bound"):
             assert float(row[key]) == pytest.approx(float(other[key]), rel=1e-5)
         assert float(row["mean_distance"]) != pytest.approx(float(other["mean_distance"]), rel=1e-3)
-    assert plain["mean_distance"] != heavy["mean_distance"]
+    assert plain["mean_distance"] != heavy["mean_distance"] and "mjx" not in plain
 
 
 def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):

@@ -24,7 +24,7 @@ TOLERANCE = 1e-5  # rad, or a fraction of the maximum torque: float32, sums in a
 
 def policy_run(run_dir, name="panda4dof"):
     """A run whose policy has random weights and random observation statistics."""
-    env = mimic.make(name, demonstrations={"count": 1, "held_out": 1}, physics="fused")
+    env = mimic.make(name, demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
     statistics, *networks = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
@@ -162,4 +162,4 @@ def test_a_missing_package_is_named(rejected, tmp_path, monkeypatch):
     mapper_run(tmp_path / "run")
     monkeypatch.setitem(sys.modules, "onnx", None)
     message = rejected("export", f"run={tmp_path / 'run'}", "out=new.onnx")
-    assert "format=onnx needs the package onnx: pip install 'mimic-mjx[export]'" in message
+    assert "format=onnx needs the package onnx: pip install 'mimic-arms[export]'" in message

@@ -12,6 +12,7 @@ from PIL import Image
 
 import mimic
 from mimic import cli, inspect
+from mimic.commands import arm_checks
 from mimic.commands.config import InspectConfig
 from mimic.commands.inspect import train_command
 from mimic.envs.config import EnvConfig
@@ -67,7 +68,7 @@ def test_the_suggested_command_trains_the_inspected_arm(arm_file, monkeypatch):
     prepared = []
     monkeypatch.setattr(sys, "argv", ["mimic.train", *words[3:]])
     cli.run(lambda config: prepared.append(config.env) or (lambda: 0), "train")
-    expected = EnvConfig(name="pair", expert=config.expert, learner=learner, limits="hardware", physics="fused")
+    expected = EnvConfig(name="pair", expert=config.expert, learner=learner, limits="hardware")
     assert prepared == [expected]
 
 
@@ -76,7 +77,22 @@ def test_armature_is_suggested_for_an_arm_that_runs_away(inspected, tmp_path):
     file.write_text(original_model.ur_like(armature=0.0))
     said = inspected(file, "bound=false")
     assert "warning: random torques accelerate a joint to" in said
-    assert re.search(r"train it: .* env.learner.armature=\S+ env.learner.damping=\S+ env.physics=fused", said)
+    (armature,) = re.findall(r"train it: .* 'env.learner.armature={(\S+)}' 'env.learner.damping=\S+", said)
+    proposed = {name: float(value) for name, value in (entry.split(":") for entry in armature.split(","))}
+    assert "wrist_3" in proposed and len(set(proposed.values())) > 1  # by joint
+
+
+def test_joints_that_are_slow_enough_stay_as_they_are(tmp_path):
+    """A joint gets rotor inertia only if it exceeds the bound itself, and then no joint does."""
+    file = tmp_path / "light.xml"
+    file.write_text(original_model.ur_like(armature=0.0))
+    env, config = EnvConfig(), mimic.ArmConfig(model=str(file), armature={"pan": 0.05})
+    arm = mimic.build_arm(config)
+    changed, reason = arm_checks.stabilised(config, arm, env)
+    speeds = arm_checks.random_torque_speeds(mimic.build_arm(changed), env)
+    assert reason and speeds.max() < env.speed_bound and changed.armature["pan"] >= 0.05
+    assert set(changed.armature) < set(arm.embodiment.joint_names)
+    assert arm_checks.stabilised(changed, mimic.build_arm(changed), env) == (changed, "")
 
 
 @pytest.mark.slow
@@ -95,7 +111,10 @@ def test_an_equal_arm_reaches_the_poses_of_the_expert(inspected):
         (["arm.xml", "learner.tip=hand"], "the model has no body 'hand'; valid are table, pan_link"),
         (["arm.xml", "learner.base=foot"], "the model has no body 'foot'; valid are table, pan_link"),
         (["arm.xml", "expert=missing.urdf"], "no MJCF or URDF file at '"),
-        (["arm.xml", "learner.armature=-1"], "armature: expected a number from 0 to 10000, got -1"),
+        (
+            ["arm.xml", "learner.armature=-1"],
+            "armature: expected a number from 0 to 10000, or a mapping from names to such numbers, got -1",
+        ),
         (["arm.xml", "limits=soft"], "limits: expected one of none, hardware, got 'soft'"),
         (["arm.xml", "out=missing/out"], "there is no folder 'missing'"),
         (["arm.xml", "tip=hand"], "tip"),
@@ -111,9 +130,9 @@ def test_bad_arms_of_a_pair(rejected, arm_file, role):
 
 
 def test_a_pair_takes_arms_by_file(arm_file):
-    env = mimic.make("pair", learner=str(arm_file), physics="fused", demonstrations={"count": 2, "held_out": 1})
+    env = mimic.make("pair", learner=str(arm_file), demonstrations={"count": 2, "held_out": 1})
     assert env.action_size == 6 and env.learner.name == "ur_like" and env.expert.name == "panda"
-    swapped = mimic.make("pair", expert=str(arm_file), physics="fused", demonstrations={"count": 2, "held_out": 1})
+    swapped = mimic.make("pair", expert=str(arm_file), demonstrations={"count": 2, "held_out": 1})
     assert swapped.action_size == 7 and swapped.demonstrations.arm == "ur_like"
 
 
@@ -134,7 +153,7 @@ def test_a_learner_from_a_file_is_trained_evaluated_and_rendered(arm_file, tmp_p
 
     sizes = ["num_envs=64", "batch_size=32", "num_minibatches=4", "num_updates_per_batch=1", "num_timesteps=5000"]
     small = [f"trainer.{size}" for size in (*sizes, "hidden_layers=[16]", "evaluations=1", "preset=cpu")]
-    pair = ["env=pair", "env.learner=arm.xml", "env.physics=fused", *FEW]
+    pair = ["env=pair", "env.learner=arm.xml", *FEW]
     command("train", *pair, *small, f"run_dir={run_dir}", folder=tmp_path)
     report = json.loads((run_dir / "report.json").read_text())
     assert report["env_steps"] >= 5000 and np.isfinite(report["optimality_gap"]["held_out"])

@@ -71,16 +71,30 @@ def test_a_run_directory_holds_everything(finished):
     assert {"demonstrations.csv", "quality.png", "demonstrations.png", "training.png"} <= names
     assert report["wall_time_s"].keys() == {"import", "build", "compile", "train", "evaluate", "total"}
     assert report["env_steps"] >= 5000
+    assert report["physics"] == load_config(run_dir).env.physics == "fused"
     assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 4
+
+
+def test_the_report_has_the_gap_on_mjx_too(finished):
+    """1e-3: the joint angles of both differ by 1e-4 rad after 5 s, and the distance is of that order."""
+    run_dir, result = finished
+    report = json.loads((run_dir / "report.json").read_text())
+    lines = result.stdout.splitlines()
+    assert lines[1] == (
+        "physics: fused (auto: it covers the learner exactly); the report evaluates the policy on MJX too"
+    )
+    for key in ("optimality_gap", "mean_distance"):
+        assert report["mjx"][key] == pytest.approx(report[key], rel=1e-3)
+    assert "evaluated on MJX" in result.stdout
 
 
 def test_a_run_compiles_few_functions(finished):
     """Each takes a tenth of a second or more on a GPU."""
     _, result = finished
     names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", result.stderr)
-    for function in ("start", "epoch", "rollouts", "closest"):
+    for function in ("start", "epoch", "rollouts", "rollouts_on_mjx", "closest"):
         assert names.count(function) == 1
-    assert len(names) < 20  # 54 with brax's own training loop
+    assert len(names) < 22  # 54 with brax's own training loop
 
 
 def test_evaluate_repeats_the_report(finished, tmp_path):
@@ -94,6 +108,8 @@ def test_evaluate_repeats_the_report(finished, tmp_path):
     again, report = (json.loads((folder / "report.json").read_text()) for folder in (out, run_dir))
     for key in BY_SPLIT - {"worst_demonstrations"}:
         assert again[key] == pytest.approx(report[key], rel=1e-5)  # float32, in another process
+    for key, values in report["mjx"].items():
+        assert again["mjx"][key] == pytest.approx(values, rel=1e-5)
     for split, gaps in report["worst_demonstrations"].items():
         assert again["worst_demonstrations"][split] == pytest.approx(gaps, rel=1e-5)
 
@@ -243,7 +259,7 @@ def test_a_training_that_diverges_stops_and_leaves_a_batch_to_replay(finished, t
     template = make_ppo_trainer(load_config(finished[0]), finished[0]).params_template()
     step, (statistics, policy, value) = load_checkpoint(finished[0], template)
     save_checkpoint(start, step, (statistics, jax.tree.map(lambda x: 1e30 * x, policy), value))
-    result = command("train", *TINY, "env.physics=fused", f"init={start}", f"run_dir={run_dir}")
+    result = command("train", *TINY, f"init={start}", f"run_dir={run_dir}")
     assert result.returncode == 3, result.stderr[-2000:]
     file = run_dir / "divergence.npz"
     (line,) = result.stderr.splitlines()

@@ -45,7 +45,7 @@ def test_a_port_that_is_taken_is_rejected(rejected, monkeypatch):
 def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "viser" else find(name, *more))
-    assert "pip install 'mimic-mjx[view]'" in rejected("view")
+    assert "pip install 'mimic-arms[view]'" in rejected("view")
 
 
 def test_only_the_page_of_the_view_imports_viser():
@@ -77,7 +77,7 @@ def test_ticks_end_with_a_signal():
     assert list(ticks) == []
 
 
-@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-mjx[view]'")
+@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-arms[view]'")
 @pytest.mark.parametrize(("host", "warned"), [("0.0.0.0", True), ("127.0.0.1", False)])
 def test_a_view_that_others_can_reach_says_so(host, warned, capsys):
     config = ViewConfig(env=env_config("planar4dof"), host=host, port=free_port())
@@ -95,7 +95,7 @@ def free_port():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-mjx[view]'")
+@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-arms[view]'")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_end_the_command_cleanly(number):
     command = [sys.executable, "-m", "mimic.view", "env=planar4dof", f"port={free_port()}"]

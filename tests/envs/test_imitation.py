@@ -22,7 +22,7 @@ QUICK = ("planar4dof", "panda3dof")  # the others have all their shapes checked
 
 @pytest.mark.parametrize("name", mimic.environments())
 def test_every_environment_has_its_shapes(name):
-    env = mimic.make(name, demonstrations=FEW, physics="fused")
+    env = mimic.make(name, demonstrations=FEW)
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
     assert state.obs.shape == (env.observation_size,)
     after = jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
@@ -43,9 +43,17 @@ def test_every_environment_resets_and_steps(name, limits):
     assert np.all(np.isfinite(after.obs)) and not after.done
 
 
+def test_the_default_physics_is_resolved_and_can_be_replaced():
+    env = mimic.make("planar4dof", demonstrations=FEW)
+    assert mimic.env_config("planar4dof").physics == "auto" and env.config.physics == env.backend == "fused"
+    on_mjx = env.with_physics("mjx")
+    assert on_mjx.config.physics == on_mjx.backend == "mjx" and env.config.physics == "fused"
+    assert on_mjx.demonstrations is env.demonstrations
+
+
 def test_reward_and_observation_follow_the_demonstration_step_by_step():
     """After i steps both use sample i of the demonstration. 1e-5: float32, of a table made in double precision."""
-    env = mimic.make("planar4dof", preview=2, horizon=6, physics="fused", demonstrations=FEW)
+    env = mimic.make("planar4dof", preview=2, horizon=6, demonstrations=FEW)
     motions, which = env.demonstrations, 3
     expert = [
         mimic.link_states(env.expert, *(np.asarray(x[which, sample], np.float32) for x in (motions.qpos, motions.qvel)))
@@ -85,7 +93,7 @@ class MoreThanLinks(mimic.ImitationEnv):
 
 
 def test_an_overridden_observation_is_observed_everywhere():
-    env = JointsAndStep(mimic.env_config("planar4dof", physics="fused", demonstrations=FEW))
+    env = JointsAndStep(mimic.env_config("planar4dof", demonstrations=FEW))
     assert env.observation_size == 9
     episodes = fresh_episodes(env)
     state = episodes.reset(jax.random.split(jax.random.PRNGKey(0), 3))  # at random steps
@@ -98,7 +106,7 @@ def test_an_overridden_observation_is_observed_everywhere():
 
 
 def test_an_observation_is_extended_and_others_stay():
-    config = mimic.env_config("planar4dof", physics="fused", demonstrations=FEW)
+    config = mimic.env_config("planar4dof", demonstrations=FEW)
     plain, extended = mimic.ImitationEnv(config), MoreThanLinks(config)
     assert extended.observation_size == plain.observation_size + 1
     first, action = plain.reset(jax.random.PRNGKey(0)), jnp.ones(4)
@@ -120,8 +128,7 @@ def test_a_runaway_ends_the_episode_and_never_pays(planar_env):
 
 def test_hardware_limits_are_penalised_near_and_beyond_them():
     free, limited = (
-        mimic.make("panda4dof", physics="fused", demonstrations=FEW, limits=limits, limit_weight=2.0)
-        for limits in ("none", "hardware")
+        mimic.make("panda4dof", demonstrations=FEW, limits=limits, limit_weight=2.0) for limits in ("none", "hardware")
     )
     home, still = jnp.asarray(limited.learner.home, jnp.float32), jnp.zeros(4)
     upper, limit = limited.learner.joint_range[:, 1], limited.learner.velocity_limit

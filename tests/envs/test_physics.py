@@ -11,7 +11,7 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.simulation_model import simulation_model
 from mimic.envs import dynamics
 from mimic.envs.config import PHYSICS
-from mimic.envs.physics import Load, make_advance
+from mimic.envs.physics import Load, PhysicsChoice, choose_physics, make_advance
 from mimic.metric import fused_kernel
 from tests.helpers.lowering import gpu_program
 from tests.helpers.random_arms import SEEDS, random_arm
@@ -109,6 +109,68 @@ def test_random_arms_include_the_hard_cases():
     assert any(source.body_jntnum.max() == 2 for source in sources)
     assert any(source.qpos0.any() for source in sources)
     assert all(source.jnt_pos.any() for source in sources)
+
+
+@pytest.mark.parametrize("model", [*(build_arm(arm).model for arm in ARMS.values()), *(free_arm(i)[1] for i in SEEDS)])
+def test_auto_is_fused_for_every_model_that_simulates_an_arm(model):
+    assert choose_physics("auto", model) == PhysicsChoice("fused", "auto: it covers the learner exactly")
+
+
+def with_option(**values):
+    model = build_arm(ARMS["planar"]).model
+    for name, value in values.items():
+        setattr(model.opt, name, value)
+    return model
+
+
+def with_field(name):
+    model = build_arm(ARMS["planar"]).model
+    getattr(model, name)[:] = 1
+    return model
+
+
+def from_xml(bodies, rest=""):
+    option = '<option integrator="RK4" gravity="0 0 0"/>'
+    inertial = '<inertial pos="0.1 0 0" mass="1" diaginertia="1 1 1"/>'
+    return mujoco.MjModel.from_xml_string(
+        f"<mujoco>{option}<worldbody>{bodies.replace('+', inertial)}</worldbody>{rest}</mujoco>"
+    )
+
+
+_TWO = '<body>+<joint name="a"/>{}<body pos="1 0 0">+<joint name="b" {}/></body></body>'
+UNCOVERED = {
+    "gravity": lambda: with_option(disableflags=0),
+    "springs": lambda: with_field("jnt_stiffness"),
+    "dry friction": lambda: with_field("dof_frictionloss"),
+    "joint limits": lambda: with_field("jnt_limited"),
+    "a fluid": lambda: with_option(viscosity=1.0),
+    "another integrator": lambda: with_option(integrator=mujoco.mjtIntegrator.mjINT_EULER),
+    "joints that are not revolute": lambda: from_xml(_TWO.format("", 'type="slide"')),
+    "several branches": lambda: from_xml(_TWO.format('<body pos="0 1 0">+<joint name="c"/></body>', "")),
+    "contacts": lambda: from_xml(_TWO.format('<geom size="0.1"/>', "")),
+    "constraints": lambda: from_xml(
+        _TWO.format("", ""), '<equality><joint joint1="a" joint2="b"/></equality>'
+    ),
+    "actuators": lambda: from_xml(_TWO.format("", ""), '<actuator><motor joint="a"/></actuator>'),
+    "tendons": lambda: from_xml(
+        _TWO.format("", ""), '<tendon><fixed stiffness="1"><joint joint="a" coef="1"/></fixed></tendon>'
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("element", UNCOVERED)
+def test_auto_is_mjx_where_the_fused_dynamics_lack_something(element):
+    model = UNCOVERED[element]()
+    choice = choose_physics("auto", model)
+    assert choice == PhysicsChoice("mjx", f"auto: the fused dynamics do not cover {element}")
+    assert choose_physics("fused", model).name == "fused"  # what is configured is used
+
+
+def test_auto_is_mjx_for_many_joints():
+    """The fused dynamics of 24 joints compile in 45 s of a core; MJX compiles as long, and runs faster."""
+    for joints, expected in ((16, "fused"), (17, "mjx")):
+        model = build_arm(ArmConfig(model="planar", link_lengths=[0.1] * joints)).model
+        assert choose_physics("auto", model).name == expected
 
 
 def locked_panda(locked):

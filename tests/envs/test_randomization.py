@@ -22,7 +22,7 @@ ACTION = jnp.array([0.6, -0.4])
 def make(**randomization):
     arms = {"expert": {"link_lengths": [0.4, 0.3, 0.3]}, "learner": {"link_lengths": [0.6, 0.4]}}
     few = {"count": 2, "held_out": 1}
-    return mimic.make("planar4dof", **arms, demonstrations=few, horizon=3, physics="fused", randomization=randomization)
+    return mimic.make("planar4dof", **arms, demonstrations=few, horizon=3, randomization=randomization)
 
 
 @pytest.fixture(scope="module")

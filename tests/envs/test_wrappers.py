@@ -13,7 +13,7 @@ from mimic.envs.wrappers import wrap_for_training
 
 def test_observations_of_new_episodes_match_their_states():
     """In a batch where some episodes end: the wrapper composes the observations itself."""
-    env = mimic.make("planar4dof", demonstrations={"count": 3}, physics="fused")
+    env = mimic.make("planar4dof", demonstrations={"count": 3})
     wrapped = wrap_for_training(env, env.config.horizon + 1)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
     step, observe = jax.jit(wrapped.step), jax.jit(jax.vmap(env.observe))

@@ -35,7 +35,6 @@ def evaluator():
         learner=LINKS,
         demonstrations={"count": COUNT, "held_out": HELD_OUT},
         horizon=HORIZON,
-        physics="fused",
     )
     training, held_out = training_and_held_out(config)
     return Evaluator(mimic.ImitationEnv(config, training), held_out)
@@ -81,7 +80,6 @@ def test_angles_are_weighted_by_the_fraction_of_each_expert_link():
         learner={"link_lengths": [1.0]},
         demonstrations={"count": 1, "held_out": 1},
         horizon=1,
-        physics="fused",
         metric={"correspondence": "overlap"},
     )
     motions = training_and_held_out(config)[0]
@@ -247,7 +245,7 @@ def test_actions_out_of_range_get_the_maximum_torque(evaluator):
 
 def test_the_bound_of_an_equal_arm_needs_no_search(monkeypatch):
     monkeypatch.setattr(evaluation, "closest_motion", None)  # would fail
-    config = mimic.env_config("panda7dof", demonstrations={"count": 2, "held_out": 1}, physics="fused")
+    config = mimic.env_config("panda7dof", demonstrations={"count": 2, "held_out": 1})
     training, held_out = training_and_held_out(config)
     evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
     assert evaluator.lower_bound.shape == evaluator.hold_distance.shape == (3, 50)
@@ -273,7 +271,7 @@ def test_bound_and_hold_distance_belong_to_the_samples_after_each_step():
     """Closed forms for the directions of planar arms. 1e-4: the tolerance of the search."""
     metric = {"correspondence": "overlap", "translation": 0.0, "linear_velocity": 0.0, "angular_velocity": 0.0}
     few = {"count": 1, "held_out": 1}
-    config = mimic.env_config("planar4dof", demonstrations=few, horizon=12, metric=metric, physics="fused")
+    config = mimic.env_config("planar4dof", demonstrations=few, horizon=12, metric=metric)
     training, held_out = training_and_held_out(config)
     evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
     env = evaluator.env

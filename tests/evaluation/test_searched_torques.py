@@ -30,7 +30,6 @@ def evaluator_of(learner, **settings):
         learner={"link_lengths": learner},
         demonstrations={"count": 2, "held_out": 1},
         horizon=HORIZON,
-        physics="fused",
         **settings,
     )
     training, held_out = training_and_held_out(config)

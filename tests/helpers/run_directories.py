@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mimic import distribution
 from mimic.envs import env_config
 from mimic.runs.files import METRICS, REPORT
 from mimic.runs.provenance import versions
@@ -35,7 +36,7 @@ def write_run(
         writer.writeheader()
         writer.writerows({key: "nan" if x is None else x for key, x in row.items()} for row in rows)
     if report:
-        package_versions = {**versions(), **({"mimic-mjx": version} if version else {})}
+        package_versions = {**versions(), **({distribution.NAME: version} if version else {})}
         content = {"seed": seed, metric: _by_split("", gaps[-1]), unit: 1000 * len(gaps), "versions": package_versions}
         (run_dir / REPORT).write_text(json.dumps(content))
     return run_dir

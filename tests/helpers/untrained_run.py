@@ -28,7 +28,6 @@ def environment(learner: Sequence[float] = (0.5, 0.5), model: str = "planar") ->
         learner={"link_lengths": list(learner), "model": model},
         demonstrations={"count": COUNT, "held_out": HELD_OUT},
         horizon=HORIZON,
-        physics="fused",
     )
 
 

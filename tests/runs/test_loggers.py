@@ -94,8 +94,8 @@ def test_a_resumed_run_continues_its_mlflow_run(tmp_path, services):
 @pytest.mark.parametrize(
     ("argument", "missing", "message"),
     [
-        ("logger=wandb", "wandb", "logger=wandb needs the package wandb: pip install 'mimic-mjx[wandb]'"),
-        ("logger=[local,mlflow]", "mlflow", "logger=mlflow needs the package mlflow: pip install 'mimic-mjx[mlflow]'"),
+        ("logger=wandb", "wandb", "logger=wandb needs the package wandb: pip install 'mimic-arms[wandb]'"),
+        ("logger=[local,mlflow]", "mlflow", "logger=mlflow needs the package mlflow: pip install 'mimic-arms[mlflow]'"),
         ("logger=comet", None, "logger: expected one of local, wandb, mlflow, got 'comet'"),
     ],
 )

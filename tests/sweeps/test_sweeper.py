@@ -111,7 +111,7 @@ def test_missing_slurm_and_packages_are_reported(rejected, monkeypatch):
     assert "expected a machine with Slurm's sbatch" in rejected("train", "-m", "hydra/launcher=submitit_slurm")
     monkeypatch.setitem(sys.modules, "ray", None)
     os.rmdir(os.getcwd())
-    assert "needs the package ray: pip install 'mimic-mjx[ray]'" in rejected("train", "-m", "hydra/launcher=ray")
+    assert "needs the package ray: pip install 'mimic-arms[ray]'" in rejected("train", "-m", "hydra/launcher=ray")
 
 
 def test_a_folder_takes_one_sweep(rejected, tmp_path):
@@ -282,7 +282,7 @@ def test_in_one_process_a_signal_ends_the_sweep(sweep):
     assert begun == ["fine", "stopped"]
 
 
-SHORT = [*TINY, "env.physics=fused", "trainer.num_timesteps=2000", "trainer.evaluations=1"]
+SHORT = [*TINY, "trainer.num_timesteps=2000", "trainer.evaluations=1"]
 
 
 @pytest.mark.slow

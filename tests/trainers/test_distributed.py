@@ -28,7 +28,6 @@ from mimic.trainers.run_config import run_schema
 from tests.helpers.repository import REPOSITORY
 from tests.helpers.tiny import TINY
 
-FUSED = [*TINY, "env.physics=fused"]
 LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with many checkpoints
 
 
@@ -45,7 +44,7 @@ def start(tmp_path, *arguments, slurm=False):
             found = ["distributed.coordinator=auto"]
             environment |= {"SLURM_JOB_ID": str(port), "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2"}
             environment |= {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index)}
-        command = [sys.executable, "-m", "mimic.train", *FUSED, *found, *arguments]
+        command = [sys.executable, "-m", "mimic.train", *TINY, *found, *arguments]
         output = subprocess.PIPE
         process = subprocess.Popen(
             command, stdout=output, stderr=subprocess.STDOUT, text=True, env=environment, cwd=tmp_path
@@ -105,7 +104,7 @@ def test_the_first_process_records_a_divergence(tmp_path):
 
 def alone(tmp_path, *arguments):
     """One command that starts the other process itself."""
-    command = [sys.executable, "-m", "mimic.train", *FUSED, "distributed.coordinator=local", *arguments]
+    command = [sys.executable, "-m", "mimic.train", *TINY, "distributed.coordinator=local", *arguments]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, cwd=tmp_path

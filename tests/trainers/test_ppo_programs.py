@@ -28,7 +28,7 @@ _SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
 @pytest.fixture(scope="module")
 def one_batch():
     """States before and after a batch; losses without gradient record observations, projected on `along`, and time."""
-    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})
+    env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
     config = PPOConfig(
         num_envs=ARMS, unroll_length=1, batch_size=UNROLLS * ARMS // 2, num_minibatches=2, num_updates_per_batch=PASSES,
         hidden_layers=[8],
@@ -203,7 +203,7 @@ def test_entropy_cost_and_discount_change_with_the_progress():
 
 
 def test_a_batch_learns_by_the_settings_of_its_progress():
-    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     small = {"num_envs": 4, "batch_size": 4, "num_minibatches": 1, "num_updates_per_batch": 1, "hidden_layers": [8]}
 
     def after(batches, **settings):
@@ -226,7 +226,7 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
 
 def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
     """Compiled anew, its numbers may differ in the last bits: on a GPU, XLA chooses matrix products by their speed."""
-    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
     lowered = []
@@ -239,7 +239,7 @@ def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
 
 
 def test_schedules_of_a_restored_state_begin_at_its_updates():
-    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
     functions = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
@@ -257,7 +257,7 @@ def test_schedules_of_a_restored_state_begin_at_its_updates():
 
 def test_both_functions_are_compiled_with_the_options_of_a_run(monkeypatch):
     monkeypatch.setattr(programs, "compiler_options", lambda: {"no_option_of_xla": True})
-    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
     networks = training.make_networks(config, env.observation_size, env.action_size)
     start, _, epoch = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)

@@ -55,6 +55,18 @@ def test_an_old_run_of_an_arm_from_a_file_keeps_its_links(tmp_path, role):
     assert getattr(load_config(run_dir).env, built_in) == ArmConfig()
 
 
+@pytest.mark.parametrize(("saved", "expected"), [(None, "mjx"), ("mjx", "mjx"), ("fused", "fused")])
+def test_an_old_run_keeps_its_physics(tmp_path, saved, expected):
+    """Runs older than the field were trained on MJX."""
+    run_dir = write_run(tmp_path / "run", [0.1], env="panda4dof")
+    content = OmegaConf.load(run_dir / CONFIG)
+    del content.env.physics
+    if saved:
+        content.env.physics = saved
+    OmegaConf.save(content, run_dir / CONFIG)
+    assert load_config(run_dir).env.physics == expected
+
+
 def test_an_old_run_keeps_its_critic_and_its_schedule(tmp_path):
     """Runs older than both fields: their checkpoints have a critic that does not observe the time."""
     run_dir = write_run(tmp_path / "run", [0.1], env="panda4dof")

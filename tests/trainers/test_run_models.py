@@ -187,7 +187,7 @@ def test_commands_use_the_arm_of_a_moved_run(tmp_path):
     file = tmp_path / "arm.xml"
     file.write_text(TWO_JOINTS)
     arguments = [f"env.learner.model={file}", *TINY, f"run_dir={tmp_path / 'first'}", "compilation_cache="]
-    command("train", *arguments, "env.physics=fused")
+    command("train", *arguments)
     report = json.loads((tmp_path / "first" / "report.json").read_text())
     file.write_text(TWO_JOINTS.replace('mass="0.5"', 'mass="5"'))
     run_dir = (tmp_path / "first").rename(tmp_path / "run")

@@ -146,7 +146,7 @@ def settled(page):
 def test_a_policy_plays_and_can_be_scrubbed(page, serve, tmp_path):
     page, complaints = page
     tiny = {"num_envs": 64, "batch_size": 32, "num_minibatches": 4, "num_updates_per_batch": 1, "hidden_layers": [16]}
-    env = env_config("planar4dof", demonstrations={"count": 1, "held_out": 2}, physics="fused")
+    env = env_config("planar4dof", demonstrations={"count": 1, "held_out": 2})
     settings = PPOConfig(**tiny, num_timesteps=2000, evaluations=1)
     config = TrainConfig(env, settings, run_dir=str(tmp_path / "run"), compilation_cache="")
     assert train.prepare_training(config, 0.0)() == 0

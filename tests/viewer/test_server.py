@@ -9,7 +9,7 @@ import time
 import pytest
 
 if importlib.util.find_spec("viser") is None:
-    pytest.skip("needs viser: pip install 'mimic-mjx[view]'", allow_module_level=True)
+    pytest.skip("needs viser: pip install 'mimic-arms[view]'", allow_module_level=True)
 
 import msgspec
 import viser

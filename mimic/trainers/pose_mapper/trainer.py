@@ -74,6 +74,7 @@ class PoseMapperTrainer(Trainer):
         self.settings: PoseMapperSettings = config.trainer.resolve()
         self._name, self._seed = config.env.name, config.seed % 2**31  # the range of a 32-bit integer
         self.total_steps = self.settings.total_steps
+        self.env_config = config.env
         self._model = model = make_model(config.env, self.settings)
         kind = "fresh poses in each epoch" if self.settings.fresh else "training poses"
         self.headline = (

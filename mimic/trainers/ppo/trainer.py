@@ -2,14 +2,14 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import jax
 
-from mimic.compilation import Background, compiling
+from mimic.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, make_env, training_and_held_out
@@ -56,11 +56,15 @@ class PPOTrainer(Trainer):
         self.evaluator = Evaluator(env, held_out)
         self._env = _with_crossovers(env, self.settings.crossovers, config.env.demonstrations.seed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
+        self.env_config = dataclasses.replace(config.env, physics=env.physics.name)
         self.headline = (
-            f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms in parallel, "
-            f"{config.env.physics} physics"
+            f"{config.env.name}: {env.demonstrations.count} demonstrations, {self.settings.num_envs} arms in parallel"
         )
+        self.simulation = f"physics: {env.physics.name} ({env.physics.reason})"
+        if self._is_cross_checked:
+            self.simulation += "; the report evaluates the policy on MJX too"
         self._rollouts = Background(self._compile)
+        self._rollouts_on_mjx = Background(self._compile_on_mjx)
 
     def save_inputs(self, run_dir: Path) -> None:
         """Writes the demonstrations."""
@@ -83,8 +87,22 @@ class PPOTrainer(Trainer):
         def rollouts(params: Params) -> Rollouts:
             return self.evaluator.rollout(self.controller(params))
 
+        return compiling(rollouts, self._params_shapes())()
+
+    def _compile_on_mjx(self) -> tuple[Evaluator, Callable[[Params], Rollouts]]:
+        """The evaluator on MJX and its rollouts, on the CPU, where MJX compiles several times faster."""
+
+        def rollouts_on_mjx(params: Params) -> Rollouts:
+            return evaluator.rollout(self.controller(params))
+
+        with on_host():
+            evaluator = self.evaluator.with_physics("mjx")
+            compiled = jax.jit(rollouts_on_mjx).lower(self._params_shapes()).compile()
+        return evaluator, compiled
+
+    def _params_shapes(self) -> Params:
         template = jax.eval_shape(self.params_template)
-        return compiling(rollouts, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template))()
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
 
     def _prepare(self) -> None:
         """Starts to compile the evaluation, and to compute the bound and the baselines."""
@@ -95,12 +113,19 @@ class PPOTrainer(Trainer):
         self, run_dir: Path, on_evaluation: OnEvaluation, signals: Signals, restored: Checkpoint | None
     ) -> tuple[int, Params]:
         """See `ppo.train`."""
+
+        def evaluated(step: int, params: Params, metrics: Mapping[str, float]) -> bool:
+            stop = on_evaluation(step, params, metrics)
+            if self._is_cross_checked:
+                self._rollouts_on_mjx.start()  # not earlier: it would delay the functions of the training
+            return stop
+
         return ppo.train(
             self._env,
             self.settings,
             run_dir,
             seed=self._seed,
-            on_evaluation=on_evaluation,
+            on_evaluation=evaluated,
             signals=signals,
             restored=restored,
             on_compiling=self._prepare,
@@ -118,6 +143,19 @@ class PPOTrainer(Trainer):
         """Runs the deterministic policy once on each demonstration."""
         # Parameters come from the host: each sharding over devices would need a compiled function of its own.
         return self._rollouts()(jax.device_get(params))
+
+    @property
+    def _is_cross_checked(self) -> bool:
+        return self.env_config.physics != "mjx"
+
+    def cross_check(self, params: Params) -> Metrics:
+        """Gap and distance of the policy on MJX, an engine that is not ours; nothing where the training was on it."""
+        if not self._is_cross_checked:
+            return {}
+        evaluator, rollouts = self._rollouts_on_mjx()
+        with on_host():
+            summary = evaluator.summary(rollouts(jax.device_get(params)))
+        return {"mjx": {key: summary[key] for key in ("optimality_gap", "mean_distance")}}
 
     def run_controller(
         self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate
@@ -150,8 +188,9 @@ class PPOTrainer(Trainer):
         return metrics["optimality_gap"]["train"] <= self.settings.target_gap
 
     def details(self, outcome: Rollouts, controller: str = "policy") -> Metrics:
-        """Similarity of the motions compared with the baselines, and the demonstrations with the largest gaps."""
+        """Physics, similarity of the motions compared with the baselines, demonstrations with the largest gaps."""
         return {
+            "physics": self.env_config.physics,
             "similarity": self.evaluator.similarity_summary(outcome, controller),
             "worst_demonstrations": self.evaluator.worst(outcome),
         }
@@ -176,6 +215,9 @@ class PPOTrainer(Trainer):
             (label, _text(form, metrics[key]["train"]), _text(form, metrics[key]["held_out"]))
             for label, key, form in by_split
         ]
+        if "mjx" in metrics:
+            on_mjx = metrics["mjx"]["optimality_gap"]
+            rows.insert(1, ("  evaluated on MJX", *(_text("{:.2%}", on_mjx[split]) for split in SPLITS)))
         if not all(math.isfinite(gap) for gap in metrics["optimality_gap"].values()):
             rows.insert(1, ("  none: the best motion saves less than", f"{MIN_SPAN:.0%} of holding", "the start pose"))
         train, held_out = (

@@ -1,0 +1,67 @@
+"""`--help` shows a value and an explanation for every key, and the values of presets."""
+
+import dataclasses
+import re
+import sys
+
+import pytest
+
+from mimic import cli
+from mimic.__main__ import commands
+from mimic.commands.key_help import explanations, key_lines
+from mimic.config import schema
+from mimic.trainers.config import MAPPER_PRESETS, PRESETS, TRAINERS
+
+
+def shown(monkeypatch, capsys, name, *arguments):
+    """The keys of a command's help."""
+    monkeypatch.setattr(sys, "argv", [f"mimic.{name}", *arguments, "--help"])
+    cli.run(lambda config: pytest.fail("the command ran"), name)
+    text, keys = capsys.readouterr().out.split("All keys, with their current values:\n\n")
+    assert "usage: " in text
+    return keys
+
+
+@pytest.mark.parametrize("name", commands())
+def test_every_key_has_an_explanation(name, monkeypatch, capsys):
+    for line in shown(monkeypatch, capsys, name).splitlines():
+        assert line.endswith(":") or re.search(r": .*  # \w|: +# \w|  # \S", line), line
+
+
+@pytest.mark.parametrize("config_class", TRAINERS.values())
+def test_every_key_of_a_trainer_is_documented(config_class):
+    assert {field.name for field in dataclasses.fields(config_class)} == set(explanations(config_class))
+
+
+def value(keys, key):
+    return re.search(rf"^ *{key}: (.*?)  +#", keys, re.MULTILINE)[1]
+
+
+def test_presets_are_shown_in_place_of_null(monkeypatch, capsys):
+    keys = shown(monkeypatch, capsys, "train")
+    assert value(keys, "num_envs") == f"{PRESETS['cpu']['num_envs']} (cpu), {PRESETS['gpu']['num_envs']} (gpu)"
+    assert value(keys, "unroll_length") == "10" and value(keys, "final_discounting") == "null"
+    keys = shown(monkeypatch, capsys, "train", "trainer.preset=gpu", "trainer.crossovers=7")
+    assert value(keys, "num_envs") == str(PRESETS["gpu"]["num_envs"]) and value(keys, "crossovers") == "7"
+    keys = shown(monkeypatch, capsys, "train", "trainer=pose_mapper", "trainer.preset=paper")
+    assert value(keys, "samples") == str(MAPPER_PRESETS["paper"]["samples"])
+    keys = shown(monkeypatch, capsys, "train", "env=panda3dof")
+    assert "[2, 3, 6, 7]" in keys
+
+
+def test_lines_fit_and_explanations_end_at_a_word():
+    @dataclasses.dataclass(frozen=True)
+    class Config:
+        """A config.
+
+        Attributes:
+          first, second: long words that no line of a terminal would have enough space for, since there are too many of
+            them. A second sentence.
+        """
+
+        first: str = "value"
+        second: str = "x" * 100
+
+    first, second = key_lines(schema(Config))
+    assert first.startswith("first: value  ") and first.endswith(" for, since ...")
+    assert len(first) <= 120 and "A second" not in second

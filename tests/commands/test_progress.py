@@ -1,0 +1,127 @@
+"""Progress bars at different widths of a terminal, and lines in pipes and notebooks."""
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+
+from mimic.commands import progress
+from mimic.commands.progress import SearchProgress, TrainingProgress
+
+STATUS = "distance 0.1139  gap 234.6%, held out 255.2%"
+
+
+class Terminal(io.StringIO):
+    """A file that says that it is a terminal."""
+
+    def isatty(self):
+        return True
+
+
+def terminal(width):
+    return Console(file=Terminal(), width=width, force_terminal=True, color_system=None)
+
+
+def written(console):
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def final_lines(console):
+    """What a terminal shows at the end."""
+    frames = re.split(r"\r?\x1b\[2K(?:\x1b\[1A\x1b\[2K)*|\r", written(console))
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", [frame for frame in frames if frame.strip()][-1])
+    return [line.rstrip() for line in text.splitlines() if line.strip()]
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The time [s], which a test changes."""
+    now = [1000.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.delenv("JPY_PARENT_PID", raising=False)  # the tests may run in a notebook
+    return now
+
+
+@pytest.mark.parametrize(("width", "lines"), [(40, 4), (60, 2), (80, 2), (110, 2), (200, 1)])
+@pytest.mark.parametrize("total", [3_000_000, 150_000_000])
+def test_a_bar_shows_everything_at_every_width(clock, width, lines, total):
+    console = terminal(width)
+    with TrainingProgress(console, total) as bar:
+        clock[0] += 3700
+        bar.update(total // 3, STATUS, 17_400.0)
+    shown = final_lines(console)
+    assert len(shown) == lines and all(len(line) <= width for line in shown)
+    left = progress._duration((total - total // 3) / 17_400)
+    text = " ".join(" ".join(shown).split())
+    for part in (f"{total // 3:,}/{total:,}", "elapsed 1:01:40", f"left {left}", "17,400 steps/s", *STATUS.split("  ")):
+        assert part in text
+    assert ("━" in text) == (width > 40) and ("training" in text) == (width > 60)
+
+
+def test_the_remaining_time_counts_down_between_evaluations(clock):
+    console = terminal(80)
+    with TrainingProgress(console, 1000) as bar:
+        clock[0] += 10
+        bar.update(500, STATUS, 10.0)
+        clock[0] += 20
+    assert "elapsed 0:30  left 0:30" in final_lines(console)[0]
+
+
+def test_a_bar_says_that_it_compiles(clock):
+    console = terminal(80)
+    with TrainingProgress(console, 1000):
+        clock[0] += 5
+    shown = final_lines(console)
+    assert len(shown) == 1 and shown[0].endswith("0/1,000  elapsed 0:05  compiling")
+
+
+def as_pipe(monkeypatch):
+    """By FORCE_COLOR, which notebooks set, rich takes every file for a terminal."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    return Console(file=io.StringIO(), width=80)
+
+
+def in_notebook(monkeypatch):
+    """`!command` in a notebook runs in a pseudo-terminal."""
+    monkeypatch.setenv("JPY_PARENT_PID", "1")
+    return Console(file=Terminal(), width=80)
+
+
+def on_dumb_terminal(monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    return Console(file=Terminal(), width=80, force_terminal=True)
+
+
+@pytest.mark.parametrize("make_console", [as_pipe, in_notebook, on_dumb_terminal])
+def test_without_a_terminal_there_is_line_for_each_evaluation(monkeypatch, clock, make_console):
+    console = make_console(monkeypatch)
+    assert console.is_terminal
+    with TrainingProgress(console, 1000) as shown:
+        for step in (0, 500, 1000):
+            clock[0] += 60
+            shown.update(step, STATUS, 10.0)
+    assert written(console).splitlines() == [
+        f"step           0  {STATUS}  10 steps/s  elapsed 1:00  left 1:40",
+        f"step         500  {STATUS}  10 steps/s  elapsed 2:00  left 0:50",
+        f"step       1,000  {STATUS}  10 steps/s  elapsed 3:00  left 0:00",
+    ]
+
+
+def test_a_search_writes_ten_lines_into_a_pipe(monkeypatch, clock):
+    console = as_pipe(monkeypatch)
+    with SearchProgress(console, 200) as shown:
+        for done in range(201):
+            clock[0] += 1
+            shown.update(done, "objective 0.5")
+    lines = written(console).splitlines()
+    assert len(lines) == 11
+    assert lines[5] == "searching  100 of 200  objective 0.5  elapsed 1:41  left 1:41"
+
+
+def test_a_search_without_updates_shows_nothing(clock):
+    console = terminal(80)
+    with SearchProgress(console, 200):
+        pass
+    assert written(console) == ""
