@@ -170,18 +170,9 @@ def _train(
     console = Console()
     with noted_signals(signals):  # also during the report, where they have no effect
         try:
-            on_trained = (lambda: group.end(0)) if group else None
-            report = run_training(
-                config,
-                trainer,
-                run_dir,
-                console,
-                stopwatch,
-                signals,
-                lock=lock,
-                restored=restored,
-                on_trained=on_trained,
-            )
+            inputs = config, trainer, run_dir, console, stopwatch, signals
+            end = (lambda: group.end(0)) if group else None
+            report = run_training(*inputs, lock=lock, restored=restored, on_trained=end)
         except (Interrupted, Diverged, OSError, RunExists) as error:
             exit_code = _stopped(console, run_dir, error)
             if group:

@@ -12,8 +12,8 @@ from mimic.metric.config import MetricConfig
 from mimic.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
-AUTO = "auto"
 _MAX_WEIGHT = 1e6  # of a reward term
+AUTO = "auto"
 _MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
 
