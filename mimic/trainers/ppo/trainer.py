@@ -216,9 +216,8 @@ class PPOTrainer(Trainer):
             for label, key, form in by_split
         ]
         if "mjx" in metrics:
-            on_mjx = metrics["mjx"]["optimality_gap"]
-            train, held_out = (_text("{:.2%}", on_mjx[split]) for split in SPLITS)
-            rows.insert(1, ("  evaluated on MJX", train, held_out))
+            on_mjx = {split: _text("{:.2%}", gap) for split, gap in metrics["mjx"]["optimality_gap"].items()}
+            rows.insert(1, ("  evaluated on MJX", on_mjx["train"], on_mjx["held_out"]))
         if not all(math.isfinite(gap) for gap in metrics["optimality_gap"].values()):
             rows.insert(1, ("  none: the best motion saves less than", f"{MIN_SPAN:.0%} of holding", "the start pose"))
         train, held_out = (
