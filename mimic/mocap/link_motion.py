@@ -72,7 +72,14 @@ class LinkMotion:
         return dataclasses.replace(self, start=self.start[start:stop], end=self.end[start:stop])
 
 
-def arm_motion(motion: PointMotion, side: str = "right", *, cutoff: float = CUTOFF, name: str = "") -> LinkMotion:
+def arm_motion(
+    motion: PointMotion,
+    side: str = "right",
+    *,
+    arms: dict[str, ArmPoints] | None = None,
+    cutoff: float = CUTOFF,
+    name: str = "",
+) -> LinkMotion:
     """Upper arm, forearm and, if it was captured, hand of a body, as seen from the shoulder.
 
     The base frame has its origin in the shoulder, z up, and x to where the body faces: perpendicular to the line through
@@ -81,13 +88,14 @@ def arm_motion(motion: PointMotion, side: str = "right", *, cutoff: float = CUTO
     Args:
       motion: all points must be known at all times; see `bridge_gaps`.
       side: "left" or "right".
+      arms: names of the points of both arms; found where None.
       cutoff: of the facing direction [Hz].
       name: of the body.
 
     Raises:
       ValueError: the body has no such arm, or a point is missing at some time.
     """
-    arms = find_arms(motion)
+    arms = find_arms(motion) if arms is None else arms
     if side not in arms:
         raise ValueError(f"arm: expected one of {', '.join(arms) or 'none that was found'}, got {side!r}")
     arm = arms[side]
@@ -120,9 +128,10 @@ def facing_frames(
 def motion_states(motion: LinkMotion, *, cutoff: float = CUTOFF, normalized: bool = True) -> LinkStates:
     """Link states over time, as `link_states` gives those of an arm.
 
-    Positions are those of the links' middles. Velocities are central differences of positions behind a Butterworth filter
-    of second order, applied forwards and backwards, so that nothing is delayed. The angular velocity is direction x its
-    derivative: two points of a link do not show its rotation about itself.
+    Links are rigid: they have their median length and start at the end of their parent. Directions are those of the
+    points behind a Butterworth filter of second order, applied forwards and backwards, so that nothing is delayed; their
+    derivatives are central differences. The angular velocity is direction x derivative: two points of a link do not show
+    its rotation about itself.
 
     Args:
       motion: the links.
@@ -130,20 +139,47 @@ def motion_states(motion: LinkMotion, *, cutoff: float = CUTOFF, normalized: boo
       normalized: divide positions and linear velocities by the chain length.
 
     Returns:
-      Arrays [time, links, 3].
+      Arrays [time, links, 3]; positions are those of the links' middles.
 
     Raises:
       ValueError: fewer than 2 samples, or a cutoff of 0 or less.
     """
     if len(motion.start) < 2:
         raise ValueError(f"motion: expected at least 2 samples, got {len(motion.start)}")
-    start, end = (low_pass(points, motion.rate, cutoff) for points in (motion.start, motion.end))
-    span = end - start
+    span = low_pass(motion.end - motion.start, motion.rate, cutoff)
     direction = span / np.linalg.norm(span, axis=2, keepdims=True)
-    position = 0.5 * (start + end)
-    linear, turning = (_derivative(values, motion.rate) for values in (position, direction))
+    angular = np.cross(direction, _derivative(direction, motion.rate))
+    lengths = motion.link_lengths[:, None]
+    middle, middle_velocity = _along_tree(motion, direction * lengths), _along_tree(
+        motion, np.cross(angular, direction) * lengths
+    )
     unit = 1 / motion.chain_length if normalized else 1.0
-    return LinkStates(position * unit, direction, linear * unit, np.cross(direction, turning))
+    return LinkStates(unit * (middle + _base(motion)), direction, unit * middle_velocity, angular)
+
+
+def rigid_error(motion: LinkMotion, *, cutoff: float = CUTOFF) -> float:
+    """Root mean square distance [m] of the captured middles of the links from those of `motion_states`."""
+    rigid = motion_states(motion, cutoff=cutoff, normalized=False).position
+    return float(np.sqrt(np.mean(np.sum((0.5 * (motion.start + motion.end) - rigid) ** 2, axis=-1))))
+
+
+def _along_tree(motion: LinkMotion, spans: np.ndarray) -> np.ndarray:
+    """Middles of links with these spans [time, links, 3], each of which starts at the end of its parent."""
+    ends: list[np.ndarray] = []
+    middles = []
+    for link, parent in enumerate(motion.parents):
+        start = ends[parent] if parent >= 0 else np.zeros_like(spans[:, 0])
+        middles.append(start + 0.5 * spans[:, link])
+        ends.append(start + spans[:, link])
+    return np.stack(middles, axis=1)
+
+
+def _base(motion: LinkMotion) -> np.ndarray:
+    """Mean start of the tree that each link belongs to, [links, 3]."""
+    roots: list[int] = []
+    for link, parent in enumerate(motion.parents):
+        roots.append(roots[parent] if parent >= 0 else link)
+    return motion.start[:, roots].mean(axis=0)
 
 
 def low_pass(values: Float[np.ndarray, "time *axes"], rate: float, cutoff: float) -> Float[np.ndarray, "time *axes"]:
