@@ -3,13 +3,16 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
+from mimic.arms.arm import build_arm
+from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import CaptureConfig, RecordingConfig
-from mimic.config import check_choice
 from mimic.envs.config import EnvConfig
+from mimic.metric.kinematics import link_state_table
 from mimic.mocap.arms import SIDES, find_arms
 from mimic.mocap.ball_chain import ball_chain_xml, zero_frames
 from mimic.mocap.clips import Windows, relative_speeds, slow_down_for, turned, windows
@@ -21,6 +24,7 @@ from mimic.mocap.reading import read_motion
 MOTION_CAPTURE = (".bvh", ".c3d", ".trc")  # CSV and npz files may be those of joint angles
 _CHANGING = 0.02  # of a length: a segment that changes more is named
 _NAMED = 5  # segments
+_STILL = 1e-5  # of a chain: single precision rounds by 1e-7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +44,14 @@ class Capture:
     bridged: int
 
 
-def read_arm(source: Path, side: str, config: CaptureConfig) -> Capture:
+def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0) -> Capture:
     """Reads the motion of one arm of a body.
+
+    Args:
+      source: the file.
+      side: "left" or "right".
+      config: how it is read.
+      fixed: fraction of the robot's chain that no joint moves, for the length of the trunk.
 
     Raises:
       ValueError: what `read_motion` and `arm_motion` reject.
@@ -57,21 +67,30 @@ def read_arm(source: Path, side: str, config: CaptureConfig) -> Capture:
     # Split where a point jumps: a first frame in another pose, or markers that were exchanged.
     pieces = [piece.cut(*span) for piece in pieces for span in _between(jumps(piece), len(piece.positions))]
     pieces = [piece for piece in pieces if len(piece.positions) > 1]
-    angles = np.radians([config.yaw, config.pitch, config.roll])
-    parts = [
-        turned(arm_motion(piece, side, arms=arms, cutoff=config.cutoff, name=f"{side}_arm"), *angles)
-        for piece in pieces
-    ]
-    if not parts:
+    if not pieces:
         raise ValueError(f"source: {str(source)!r} has no time at which all points of the {side} arm are known")
+    longest = max(pieces, key=lambda piece: len(piece.positions))
+    chain = arm_motion(longest, side, arms=arms).chain_length
+    settings: dict[str, Any] = {
+        "arms": arms, "cutoff": config.cutoff, "name": f"{side}_arm",
+        "trunk": chain * fixed / (1 - fixed) if config.trunk is None else config.trunk,
+    }  # fmt: skip
+    angles = np.radians([config.yaw, config.pitch, config.roll])
+    parts = [turned(arm_motion(piece, side, **settings), *angles) for piece in pieces]
     starts = [_start(used, piece) for piece in pieces]
     lengths = np.median([part.link_lengths for part in parts], axis=0)  # one body
     return Capture(body, [_with_lengths(part, lengths) for part in parts], starts, bridged)
 
 
-def prepare_capture(
-    config: RecordingConfig, env: EnvConfig, out: Path, plot: Path
-) -> Callable[[], None]:
+def fixed_fraction(arm: Embodiment) -> float:
+    """Fraction of an arm's chain that stands still, at its base: before joints, or on the axis of the first one."""
+    poses = np.random.default_rng(0).uniform(-1, 1, (8, arm.num_joints))
+    states = link_state_table(arm, poses, np.zeros_like(poses))
+    moves = np.ptp(states.position, axis=0).max(axis=1) + np.ptp(np.asarray(states.direction), axis=0).max(axis=1)
+    return float(np.asarray(arm.link_lengths)[moves < _STILL].sum() / arm.chain_length)
+
+
+def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Path) -> Callable[[], None]:
     """Reads and cuts a captured motion; the returned function writes the demonstrations, the arm and a plot.
 
     Raises:
@@ -81,7 +100,8 @@ def prepare_capture(
     model = out.with_suffix(".xml")
     if model.exists():
         raise ValueError(f"out: {str(model)!r} exists, where the model of the arm would be written")
-    capture = read_arm(source, config.arm or "right", capture_config)
+    learner = build_arm(env.learner, env.limits, env.metric.links).embodiment
+    capture = read_arm(source, config.arm or "right", capture_config, fixed_fraction(learner))
     parts = capture.parts
     zero = zero_frames(parts[int(np.argmax([len(part.start) for part in parts]))])
     slow_down = capture_config.slow_down or slow_down_for(parts, capture_config.speed, cutoff=capture_config.cutoff)

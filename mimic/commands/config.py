@@ -179,6 +179,8 @@ class CaptureConfig:
       up: axis of the file that points up, see `read_motion`. Default "": found out.
       yaw, pitch, roll: turn the person about z, then y, then x of the robot's base [deg]. By default up is up, and
         forward is the x-axis of the robot's base.
+      trunk: length of an upright link below the shoulder [m], where the base frame then is; 0 for none. Default None:
+        as large a part of the chain as the learner's links that stand still, such as the column of a Panda.
       cutoff: of the low-pass filter [Hz].
       speed: maximum speed of a link relative to the one before [rad/s]; faster motions are slowed down.
       slow_down: factor on times. Default None: as large as `speed` requires.
@@ -191,6 +193,7 @@ class CaptureConfig:
     yaw: float = number(0.0, at_least=-360.0, at_most=360.0)
     pitch: float = number(0.0, at_least=-360.0, at_most=360.0)
     roll: float = number(0.0, at_least=-360.0, at_most=360.0)
+    trunk: float | None = number(None, at_least=0.0, at_most=10.0)
     cutoff: float = number(6.0, at_least=0.1, at_most=1e4)
     speed: float = number(2.0, at_least=0.01, at_most=100.0)
     slow_down: float | None = number(None, at_least=0.1, at_most=100.0)

@@ -12,10 +12,22 @@ SIDES = ("left", "right")
 _SHORT = 0.25  # of the forearm's length; a shorter segment beyond the wrist is not the hand
 
 # Words of a name without its side: of skeletons (BVH, SMPL-X, pose estimators) and marker sets (Plug-in Gait).
-_SHOULDER = {"shoulder", "sho", "arm", "upperarm", "uparm", "shldr", "humerus", "acromion", "gh"}
+_UPPER_ARM = {"arm", "upperarm", "uparm", "humerus"}
+_SHOULDER = {"shoulder", "sho", "shldr", "acromion", "gh", *_UPPER_ARM}
 _ELBOW = {"elbow", "forearm", "lowerarm", "lowarm", "radius", "elb", "elbl", "elbm"}
 _WRIST = {"wrist", "hand", "wra", "wrb", "wri", "wrl", "wrm"}
-_HAND = {"middle1", "middlefinger1", "handmiddle1", "middle", "fingerbase", "index", "index1", "handindex1", "fin", "hand"}
+_HAND = {
+    "middle1",
+    "middlefinger1",
+    "handmiddle1",
+    "middle",
+    "fingerbase",
+    "index",
+    "index1",
+    "handindex1",
+    "fin",
+    "hand",
+}
 _SIDE_WORDS = {"l": "left", "left": "left", "r": "right", "right": "right"}
 
 
@@ -50,8 +62,10 @@ def _among_markers(motion: PointMotion, side: str, own: Mapping[str, str]) -> Ar
     def named(among: set[str]) -> tuple[str, ...]:
         return tuple(name for name, word in own.items() if word in among)
 
-    shoulder, elbow, wrist = named(_SHOULDER), named(_ELBOW), named(_WRIST - {"hand"})
-    hand = next((points for word in sorted(_HAND) if (points := named({word}))), ())
+    # A collar is called shoulder where the shoulder is called arm, and a wrist hand where it has no other name.
+    shoulder = named(_UPPER_ARM) or named(_SHOULDER)
+    elbow, wrist = named(_ELBOW), named(_WRIST - {"hand"}) or named({"hand"})
+    hand = next((points for word in sorted(_HAND) if (points := named({word})) and points != wrist), ())
     return ArmPoints(side, shoulder, elbow, wrist, hand) if shoulder and elbow and wrist else None
 
 
@@ -67,7 +81,9 @@ def _in_skeleton(motion: PointMotion, side: str, own: Mapping[str, str]) -> ArmP
             continue
         forearm = _distance(motion, index, wrist)
         hand = _descendant(motion, wrist, _SHORT * forearm, prefer=_HAND)
-        return ArmPoints(side, (names[shoulder],), (elbow,), (names[wrist],), (names[hand],) if hand is not None else ())
+        return ArmPoints(
+            side, (names[shoulder],), (elbow,), (names[wrist],), (names[hand],) if hand is not None else ()
+        )
     return None
 
 

@@ -27,9 +27,7 @@ def ball_chain_xml(motion: LinkMotion, zero: Float[np.ndarray, "links 3 3"]) -> 
     for name, length, frame in zip(motion.names, lengths, zero, strict=True):
         quaternion = _text(_quaternion(previous.T @ frame))
         tip = f"0 0 0 {length:.9g} 0 0"
-        joints = "".join(
-            f'<joint name="{name}_{axis}" axis="{_text(np.eye(3)["xyz".index(axis)])}"/>' for axis in AXES
-        )
+        joints = "".join(f'<joint name="{name}_{axis}" axis="{_text(np.eye(3)["xyz".index(axis)])}"/>' for axis in AXES)
         mass = 1000 * np.pi * radius**2 * length  # of water
         inertia = mass * np.array([radius**2 / 2, length**2 / 12, length**2 / 12])
         bodies += (
@@ -50,7 +48,7 @@ def zero_frames(motion: LinkMotion) -> Float[np.ndarray, "links 3 3"]:
 
     A joint's angles are singular 90 deg from there.
     """
-    frames = _no_roll_frames(motion_states(motion, cutoff=np.inf).direction)
+    frames = _no_roll_frames(np.asarray(motion_states(motion, cutoff=np.inf).direction))
     zero, previous = [], np.eye(3)
     for link in range(motion.num_links):
         before = frames[:, link - 1] if link else np.tile(np.eye(3), (len(frames), 1, 1))
@@ -153,7 +151,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """wxyz."""
+    """Wxyz."""
     from scipy.spatial.transform import Rotation
 
     return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)

@@ -133,7 +133,9 @@ def _hierarchy(text: str) -> tuple[Joint, ...]:
             case "CHANNELS" if open_joints and name is None:
                 joints[open_joints[-1]] = joints[open_joints[-1]]._replace(channels=_channels(rest))
             case _:
-                raise ValueError(f"expected ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace, got {line.strip()!r:.60}")
+                raise ValueError(
+                    f"expected ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace, got {line.strip()!r:.60}"
+                )
     if open_joints or name is not None:
         raise ValueError("a closing brace is missing before MOTION")
     if not joints:
@@ -164,7 +166,9 @@ def _motion(text: str, channels: int) -> tuple[np.ndarray, float, tuple[str, ...
     try:
         stated, frame_time = int(float(header[1])), float(header[2])
     except (ValueError, OverflowError) as error:
-        raise ValueError(f"MOTION: expected numbers of frames and seconds, got {header[1]!r:.30}, {header[2]!r:.30}") from error
+        raise ValueError(
+            f"MOTION: expected numbers of frames and seconds, got {header[1]!r:.30}, {header[2]!r:.30}"
+        ) from error
     if not 1e-5 <= frame_time <= 10:
         raise ValueError(f"Frame Time: expected seconds from 1e-5 to 10, got {frame_time:g}")
     if not channels:

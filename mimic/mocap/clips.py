@@ -35,14 +35,12 @@ class Windows(NamedTuple):
 def relative_speeds(motion: LinkMotion, *, cutoff: float = CUTOFF) -> Float[np.ndarray, "time links"]:
     """Angular speed of each link relative to its parent [rad/s]."""
     angular = np.asarray(motion_states(motion, cutoff=cutoff).angular_velocity)
-    parents = np.stack(
-        [angular[:, parent] if parent >= 0 else 0 * angular[:, 0] for parent in motion.parents], axis=1
-    )
+    parents = np.stack([angular[:, parent] if parent >= 0 else 0 * angular[:, 0] for parent in motion.parents], axis=1)
     return np.linalg.norm(angular - parents, axis=2)
 
 
 def slow_down_for(parts: Sequence[LinkMotion], speed: float, *, cutoff: float = CUTOFF) -> float:
-    """Factor on times, 1 at least, with which 99.5 % of the samples stay within a relative speed [rad/s] of the links."""
+    """Factor on times, at least 1, with which 99.5 % of the samples stay within a relative speed of links [rad/s]."""
     speeds = np.concatenate([relative_speeds(part, cutoff=cutoff).max(axis=1) for part in parts])
     return max(1.0, float(np.quantile(speeds, _SPEED_QUANTILE)) / speed)
 

@@ -2,18 +2,20 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy import signal
 
+from mimic.metric.kinematics import LinkStates
 from mimic.mocap.arms import ArmPoints, find_arms
 from mimic.mocap.conventions import mean_point
 from mimic.mocap.points import PointMotion
-from mimic.metric.kinematics import LinkStates
 
 CUTOFF = 6.0  # Hz; usual for human motion (Winter, Biomechanics and Motor Control of Human Movement, section 3.4)
 ARM_LINKS = ("upper_arm", "forearm", "hand")
+TRUNK = "trunk"
 _SHORTEST = 1e-3  # m
 
 
@@ -77,18 +79,21 @@ def arm_motion(
     side: str = "right",
     *,
     arms: dict[str, ArmPoints] | None = None,
+    trunk: float = 0.0,
     cutoff: float = CUTOFF,
     name: str = "",
 ) -> LinkMotion:
     """Upper arm, forearm and, if it was captured, hand of a body, as seen from the shoulder.
 
-    The base frame has its origin in the shoulder, z up, and x to where the body faces: perpendicular to the line through
-    both shoulders, low-pass filtered. Without the other shoulder, x is that of the capture.
+    The base frame has its origin in the shoulder, z up, and x to where the body faces: perpendicular to the line
+    through both shoulders, low-pass filtered. Without the other shoulder, x is that of the capture.
 
     Args:
       motion: all points must be known at all times; see `bridge_gaps`.
       side: "left" or "right".
       arms: names of the points of both arms; found where None.
+      trunk: length of a link that stands upright below the shoulder [m], as the base column of most robots; the base
+        frame is then at its lower end. 0 for none.
       cutoff: of the facing direction [Hz].
       name: of the body.
 
@@ -105,6 +110,9 @@ def arm_motion(
         raise ValueError("motion: expected all points of the arm at all times; bridge or split at gaps first")
     seen = (points - points[:, :1]) @ facing_frames(motion, arms, cutoff)
     names = ARM_LINKS[: len(groups) - 1]
+    if trunk:
+        seen = np.concatenate([np.zeros_like(seen[:, :1]), seen + [0, 0, trunk]], axis=1)
+        names = (TRUNK, *names)
     parents = tuple(range(-1, len(names) - 1))
     return LinkMotion(names, parents, seen[:, :-1], seen[:, 1:], motion.rate, name or f"{side}_arm")
 
@@ -129,9 +137,9 @@ def motion_states(motion: LinkMotion, *, cutoff: float = CUTOFF, normalized: boo
     """Link states over time, as `link_states` gives those of an arm.
 
     Links are rigid: they have their median length and start at the end of their parent. Directions are those of the
-    points behind a Butterworth filter of second order, applied forwards and backwards, so that nothing is delayed; their
-    derivatives are central differences. The angular velocity is direction x derivative: two points of a link do not show
-    its rotation about itself.
+    points behind a Butterworth filter of second order, applied forwards and backwards, so that nothing is delayed;
+    their derivatives are central differences. The angular velocity is direction x derivative: two points of a link do
+    not show its rotation about itself.
 
     Args:
       motion: the links.
@@ -150,11 +158,13 @@ def motion_states(motion: LinkMotion, *, cutoff: float = CUTOFF, normalized: boo
     direction = span / np.linalg.norm(span, axis=2, keepdims=True)
     angular = np.cross(direction, _derivative(direction, motion.rate))
     lengths = motion.link_lengths[:, None]
-    middle, middle_velocity = _along_tree(motion, direction * lengths), _along_tree(
-        motion, np.cross(angular, direction) * lengths
+    middle, middle_velocity = (
+        _along_tree(motion, direction * lengths),
+        _along_tree(motion, np.cross(angular, direction) * lengths),
     )
     unit = 1 / motion.chain_length if normalized else 1.0
-    return LinkStates(unit * (middle + _base(motion)), direction, unit * middle_velocity, angular)
+    states: Any = unit * (middle + _base(motion)), direction, unit * middle_velocity, angular  # NumPy's arrays
+    return LinkStates(*states)
 
 
 def rigid_error(motion: LinkMotion, *, cutoff: float = CUTOFF) -> float:

@@ -54,7 +54,9 @@ def draw_skeleton(motion: PointMotion, path: Path, title: str) -> None:
     plt.close(figure)
 
 
-def draw_windows(motions: Sequence[LinkMotion], spans: Sequence[tuple[float, float, bool]], path: Path, title: str) -> None:
+def draw_windows(
+    motions: Sequence[LinkMotion], spans: Sequence[tuple[float, float, bool]], path: Path, title: str
+) -> None:
     """Directions of the links over time, with the windows that were cut; spans are start, stop [s] and held out."""
     links = motions[0].names
     figure, axes = plt.subplots(len(links) + 1, 1, figsize=(9, 1.7 * len(links) + 1.6), sharex=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -72,7 +73,7 @@ def bridge_gaps(motion: PointMotion, longest: float = GAP) -> tuple[list[PointMo
         track = positions[:, index]
         missing = ~np.isfinite(track).all(axis=1)
         for start, length in _intervals(missing):
-            if 0 < start and start + length < count and length / motion.rate <= longest:
+            if start > 0 and start + length < count and length / motion.rate <= longest:
                 fraction = np.arange(1, length + 1)[:, None] / (length + 1)
                 track[start : start + length] = (1 - fraction) * track[start - 1] + fraction * track[start + length]
                 bridged += 1
@@ -98,7 +99,7 @@ def segment_lengths(motion: PointMotion) -> Iterator[tuple[str, str, Float[np.nd
             yield motion.names[parent], motion.names[child], length
 
 
-def _intervals(flags: np.ndarray) -> list[tuple[int, int]]:
+def _intervals(flags: Any) -> list[tuple[int, int]]:
     """First index and length of each run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(start), int(stop - start)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]

@@ -15,7 +15,15 @@ from mimic.mocap.tables import Table, read_csv, read_npz, read_trc
 
 KINDS = (".bvh", ".c3d", ".trc", ".csv", ".npz")
 _UNEVEN = 1e-3  # of an interval: larger differences between times are resampled
-_SYNONYMS = {"meters": "m", "meter": "m", "metres": "m", "millimeters": "mm", "centimeters": "cm", "in": "inch", "ft": "foot"}
+_SYNONYMS = {
+    "meters": "m",
+    "meter": "m",
+    "metres": "m",
+    "millimeters": "mm",
+    "centimeters": "cm",
+    "in": "inch",
+    "ft": "foot",
+}
 _UP = {".bvh": "y", ".trc": "y", ".c3d": "z", ".csv": "z", ".npz": "z"}  # where neither file nor body says
 
 

@@ -111,7 +111,12 @@ def read_npz(path: Path) -> Table:
 
 
 def _parents(parents: np.ndarray, points: int) -> tuple[int, ...]:
-    if parents.shape != (points,) or parents.dtype.kind not in "iu" or np.any(parents >= np.arange(points)) or np.any(parents < -1):
+    if (
+        parents.shape != (points,)
+        or parents.dtype.kind not in "iu"
+        or np.any(parents >= np.arange(points))
+        or np.any(parents < -1)
+    ):
         raise ValueError(f"parents: expected the index of an earlier point, or -1, for each of {points} points")
     return tuple(map(int, parents))
 
