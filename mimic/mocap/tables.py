@@ -51,7 +51,7 @@ def read_trc(path: Path) -> Table:
     columns = 2 + 3 * len(names)
     values = _numbers([(row + [""] * columns)[:columns] for row in rows], "TRC")
     positions = values[:, 2:].reshape(len(rows), len(names), 3)
-    return checked(Table(names, positions, values[:, 1], unit=header.get("Units", "").strip() or None))
+    return _checked(Table(names, positions, values[:, 1], unit=header.get("Units", "").strip() or None))
 
 
 def read_csv(path: Path) -> Table:
@@ -77,7 +77,7 @@ def read_csv(path: Path) -> Table:
     if any(len(row) != len(header) for row in rows):
         raise ValueError(f"expected {len(header)} cells in each row")
     values = _numbers(rows, "CSV", [time[0], *(axes[a] for axes in points.values() for a in "xyz")])
-    return checked(Table(tuple(points), values[:, 1:].reshape(len(rows), len(points), 3), values[:, 0]))
+    return _checked(Table(tuple(points), values[:, 1:].reshape(len(rows), len(points), 3), values[:, 0]))
 
 
 def read_npz(path: Path) -> Table:
@@ -107,7 +107,9 @@ def read_npz(path: Path) -> Table:
         raise ValueError(f"time: expected {len(positions)} numbers, got shape {time.shape}")
     parents = _parents(content["parents"], len(names)) if "parents" in content else None
     texts = {key: str(content[key]) for key in ("unit", "up") if key in content}
-    return checked(Table(tuple(map(str, names)), positions.astype(float), time.astype(float), parents=parents, **texts))
+    return _checked(
+        Table(tuple(map(str, names)), positions.astype(float), time.astype(float), parents=parents, **texts)
+    )
 
 
 def _parents(parents: np.ndarray, points: int) -> tuple[int, ...]:
@@ -121,7 +123,7 @@ def _parents(parents: np.ndarray, points: int) -> tuple[int, ...]:
     return tuple(map(int, parents))
 
 
-def checked(table: Table) -> Table:
+def _checked(table: Table) -> Table:
     """The table, if its names, values and times can be those of a motion."""
     if not table.names or len(table.names) > _MAX_POINTS:
         raise ValueError(f"expected 1 to {_MAX_POINTS} points, got {len(table.names)}")
