@@ -53,7 +53,9 @@ ARM_KEYS = {  # keys of each command whose value may be just the name or file of
     "inspect": ("expert", "learner"),
 }
 FIRST_KEY = {"inspect": "learner.model", "collect": "folder"}  # key of each command's positional argument
-FIRST_KEY_OF_NPZ = {"inspect": "divergence"}  # the same where the argument is an npz file
+FIRST_KEY_OF_SUFFIX = {  # the same where the argument is a file of another kind
+    "inspect": {".npz": "divergence", ".bvh": "clip", ".c3d": "clip", ".trc": "clip", ".csv": "clip"},
+}
 _CONFIG_ERRORS = (
     FrozenInstanceError,
     HydraException,
@@ -166,8 +168,8 @@ def expand_shorthand(argument: str, command: str) -> str:
     """Returns an argument in Hydra's syntax: env.learner=ARM.xml becomes env.learner.model=ARM.xml."""
     key, equals, value = argument.partition("=")
     if command in FIRST_KEY and not equals and not argument.startswith("-"):
-        keys = {**FIRST_KEY, **(FIRST_KEY_OF_NPZ if argument.endswith(".npz") else {})}
-        return f"{keys[command]}={argument}"
+        of_suffix = FIRST_KEY_OF_SUFFIX.get(command, {})
+        return f"{of_suffix.get(Path(argument).suffix.lower(), FIRST_KEY[command])}={argument}"
     is_arm = key in ARM_KEYS.get(command, ()) and not value.startswith("{")
     return f"{key}.model={value}" if equals and is_arm else argument
 

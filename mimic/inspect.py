@@ -11,6 +11,15 @@ def prepare(config: InspectConfig) -> cli.Work:
         from mimic.commands import inspect_divergence
 
         return inspect_divergence.prepare_replay(config)
+    if config.clip:
+        from pathlib import Path
+
+        from mimic.commands.capture import prepare_capture_inspection
+        from mimic.config import new_folder
+
+        return prepare_capture_inspection(
+            Path(config.clip).expanduser(), config.capture, new_folder("out", config.out) if config.out else None
+        )
     from mimic.commands import inspect  # slow to import, and not needed for --help
 
     return inspect.prepare_inspection(config)

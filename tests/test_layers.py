@@ -20,6 +20,7 @@ LAYERS = (
     ("runs",),
     ("retargeting",),
     ("envs",),
+    ("mocap",),
     ("evaluation",),
     ("trainers",),
     ("pretrained",),

@@ -173,6 +173,40 @@ class CollectConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class CaptureConfig:
+    """How a motion capture file is read and cut into demonstrations.
+
+    Attributes:
+      unit: of the file, see `read_motion`. Default "": found out.
+      up: axis of the file that points up, see `read_motion`. Default "": found out.
+      yaw, pitch, roll: turn the person about z, then y, then x of the robot's base [deg]. By default up is up, and
+        forward is the x-axis of the robot's base.
+      trunk: length of an upright link below the shoulder [m], where the base frame then is; 0 for none. Default None:
+        as large a part of the chain as the learner's links that stand still, such as the column of a Panda.
+      cutoff: of the low-pass filter [Hz].
+      speed: maximum speed of a link relative to the one before [rad/s]; faster motions are slowed down.
+      slow_down: factor on times. Default None: as large as `speed` requires.
+      overlap: fraction of a window that it has in common with the next.
+      held_out: fraction of the windows that is held out, the last in time.
+    """
+
+    unit: str = ""
+    up: str = ""
+    yaw: float = number(0.0, at_least=-360.0, at_most=360.0)
+    pitch: float = number(0.0, at_least=-360.0, at_most=360.0)
+    roll: float = number(0.0, at_least=-360.0, at_most=360.0)
+    trunk: float | None = number(None, at_least=0.0, at_most=10.0)
+    cutoff: float = number(6.0, at_least=0.1, at_most=1e4)
+    speed: float = number(2.0, at_least=0.01, at_most=100.0)
+    slow_down: float | None = number(None, at_least=0.1, at_most=100.0)
+    overlap: float = number(0.5, at_least=0.0, at_most=0.95)
+    held_out: float = number(0.2, at_least=0.01, at_most=0.9)
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "capture.")
+
+
+@dataclasses.dataclass(frozen=True)
 class RecordingConfig:
     """Config of a recording of demonstrations.
 
@@ -182,6 +216,8 @@ class RecordingConfig:
       limits: see `EnvConfig`. Default None: those of the environment.
       source: file of motions to import instead of recording, see `import_demonstrations`.
       joints: names of the expert's joints in `source`, base to tip. Default []: the expert's own names.
+      arm: "left" or "right" arm of the person in a motion capture file `source`. Default "": right.
+      capture: how such a file is read and cut.
       out: .npz file of the demonstrations; must not exist.
       plot: .png, .pdf or .svg file of the plot; must not exist. Default "": `out` with the suffix .png.
     """
@@ -193,6 +229,8 @@ class RecordingConfig:
     limits: str | None = None
     source: str = ""
     joints: list[str] = dataclasses.field(default_factory=list)
+    arm: str = ""
+    capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
     out: str = ""
     plot: str = ""
 
@@ -222,6 +260,8 @@ class InspectConfig:
       out: new folder for a picture of both arms with their correspondence, a picture of expert poses with the
         learner's nearest poses (only with `bound`), and a JSON file of all results.
       divergence: file that a training that diverged has written, to replay instead of an inspection.
+      clip: motion capture file to inspect instead of an arm.
+      capture: how it is read.
     """
 
     learner: ArmConfig = dataclasses.field(default_factory=ArmConfig)
@@ -230,6 +270,8 @@ class InspectConfig:
     bound: bool = True
     out: str = ""
     divergence: str = ""
+    clip: str = ""
+    capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
 
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_fraction
 from mimic.commands.progress import is_animated
@@ -33,6 +34,9 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
     """
     out, plot = _files(config)
     env, console = config.resolve(), Console()
+    if config.source and (config.arm or Path(config.source).suffix.lower() in MOTION_CAPTURE):
+        _check_unused(config, "kind", "count", "seed", "limits", "joints")
+        return prepare_capture(config, env, out, plot)
     arm = build_arm(env.expert, env.limits)
     if config.source:
         return _prepare_import(config, env, arm, out, plot)
@@ -57,8 +61,7 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
 
 def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path, plot: Path) -> Callable[[], None]:
     """Imports motions; the returned function writes and plots them."""
-    if unused := [key for key in ("kind", "count", "seed") if getattr(config, key) is not None]:
-        raise ValueError(f"{unused[0]}: expected none with source=FILE, whose motions are not recorded")
+    _check_unused(config, "kind", "count", "seed")
     source = Path(config.source).expanduser()
     imported, differentiated = import_demonstrations(
         source, arm.embodiment, dt=env.control_dt, horizon=env.horizon, joints=config.joints
@@ -79,6 +82,11 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
+
+
+def _check_unused(config: RecordingConfig, *keys: str) -> None:
+    if unused := [key for key in keys if getattr(config, key) not in (None, [])]:
+        raise ValueError(f"{unused[0]}: expected none with source=FILE, whose motions are not recorded")
 
 
 def _files(config: RecordingConfig) -> tuple[Path, Path]:

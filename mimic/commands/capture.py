@@ -1,0 +1,211 @@
+"""Demonstrations from motion capture, and the inspection of a captured motion."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from mimic.arms.arm import build_arm
+from mimic.arms.embodiment import Embodiment
+from mimic.commands.config import CaptureConfig, RecordingConfig
+from mimic.envs.config import EnvConfig
+from mimic.metric.kinematics import link_state_table
+from mimic.mocap.arms import SIDES, find_arms
+from mimic.mocap.ball_chain import ball_chain_xml, zero_frames
+from mimic.mocap.clips import Windows, relative_speeds, slow_down_for, turned, windows
+from mimic.mocap.link_motion import LinkMotion, arm_motion, rigid_error
+from mimic.mocap.picture import draw_skeleton, draw_windows
+from mimic.mocap.points import PointMotion, bridge_gaps, gaps, jumps, segment_lengths
+from mimic.mocap.reading import read_motion
+
+MOTION_CAPTURE = (".bvh", ".c3d", ".trc")  # CSV and npz files may be those of joint angles
+_CHANGING = 0.02  # of a length: a segment that changes more is named
+_NAMED = 5  # segments
+_STILL = 1e-5  # of a chain: single precision rounds by 1e-7
+
+
+@dataclasses.dataclass(frozen=True)
+class Capture:
+    """An arm's motion from a file.
+
+    Attributes:
+      body: all points, as they were read.
+      parts: the arm's motion between gaps.
+      starts: time of each part in the file [s].
+      bridged: number of bridged gaps.
+    """
+
+    body: PointMotion
+    parts: list[LinkMotion]
+    starts: list[float]
+    bridged: int
+
+
+def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0) -> Capture:
+    """Reads the motion of one arm of a body.
+
+    Args:
+      source: the file.
+      side: "left" or "right".
+      config: how it is read.
+      fixed: fraction of the robot's chain that no joint moves, for the length of the trunk.
+
+    Raises:
+      ValueError: what `read_motion` and `arm_motion` reject.
+    """
+    body = read_motion(source, unit=config.unit, up=config.up)
+    arms = find_arms(body)
+    if side not in arms:
+        found = " and ".join(arms) or "none"
+        raise ValueError(f"arm: expected {' or '.join(SIDES)}, of which {str(source)!r} has {found}, got {side!r}")
+    names = [name for arm in arms.values() for group in arm[1:] for name in group]
+    used = body.select(list(dict.fromkeys(names)))
+    pieces, bridged = bridge_gaps(used)
+    # Split where a point jumps: a first frame in another pose, or markers that were exchanged.
+    pieces = [piece.cut(*span) for piece in pieces for span in _between(jumps(piece), len(piece.positions))]
+    pieces = [piece for piece in pieces if len(piece.positions) > 1]
+    if not pieces:
+        raise ValueError(f"source: {str(source)!r} has no time at which all points of the {side} arm are known")
+    longest = max(pieces, key=lambda piece: len(piece.positions))
+    chain = arm_motion(longest, side, arms=arms).chain_length
+    settings: dict[str, Any] = {
+        "arms": arms, "cutoff": config.cutoff, "name": f"{side}_arm",
+        "trunk": chain * fixed / (1 - fixed) if config.trunk is None else config.trunk,
+    }  # fmt: skip
+    angles = np.radians([config.yaw, config.pitch, config.roll])
+    parts = [turned(arm_motion(piece, side, **settings), *angles) for piece in pieces]
+    starts = [_start(used, piece) for piece in pieces]
+    lengths = np.median([part.link_lengths for part in parts], axis=0)  # one body
+    return Capture(body, [_with_lengths(part, lengths) for part in parts], starts, bridged)
+
+
+def fixed_fraction(arm: Embodiment) -> float:
+    """Fraction of an arm's chain that stands still, at its base: before joints, or on the axis of the first one."""
+    poses = np.random.default_rng(0).uniform(-1, 1, (8, arm.num_joints))
+    states = link_state_table(arm, poses, np.zeros_like(poses))
+    moves = np.ptp(states.position, axis=0).max(axis=1) + np.ptp(np.asarray(states.direction), axis=0).max(axis=1)
+    return float(np.asarray(arm.link_lengths)[moves < _STILL].sum() / arm.chain_length)
+
+
+def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Path) -> Callable[[], None]:
+    """Reads and cuts a captured motion; the returned function writes the demonstrations, the arm and a plot.
+
+    Raises:
+      ValueError: what `read_arm` and `windows` reject.
+    """
+    source, capture_config = Path(config.source).expanduser(), config.capture
+    model = out.with_suffix(".xml")
+    if model.exists():
+        raise ValueError(f"out: {str(model)!r} exists, where the model of the arm would be written")
+    learner = build_arm(env.learner, env.limits, env.metric.links).embodiment
+    capture = read_arm(source, config.arm or "right", capture_config, fixed_fraction(learner))
+    parts = capture.parts
+    zero = zero_frames(parts[int(np.argmax([len(part.start) for part in parts]))])
+    slow_down = capture_config.slow_down or slow_down_for(parts, capture_config.speed, cutoff=capture_config.cutoff)
+    cut = windows(
+        parts, zero, starts=capture.starts, dt=env.control_dt, horizon=env.horizon, slow_down=slow_down,
+        overlap=capture_config.overlap, held_out=capture_config.held_out, cutoff=capture_config.cutoff,
+    )  # fmt: skip
+    xml = ball_chain_xml(parts[0], zero)
+
+    def run() -> None:
+        console = Console()
+        model.write_text(xml)
+        cut.demonstrations.save(out)
+        length = env.horizon * env.control_dt / slow_down
+        spans = [(start, start + length, i >= cut.training) for i, start in enumerate(cut.start)]
+        draw_windows(parts, spans, plot, f"{source.name}, {parts[0].name}: {len(spans)} windows of {length:.2f} s")
+        for line in [*body_lines(capture.body), *_capture_lines(capture, cut, env)]:
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
+        console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
+        console.print(f"results: {out}, {model}", soft_wrap=True, highlight=False)
+        command = (
+            f"python -m mimic.train env={env.name} env.expert={model} env.demonstrations.path={out} "
+            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out}"
+        )
+        console.print(f"train on it: {command}", soft_wrap=True, highlight=False, markup=False)
+
+    return run
+
+
+def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | None) -> Callable[[], None]:
+    """Reads a captured motion; the returned function prints what it has and draws its skeleton.
+
+    Raises:
+      ValueError: what `read_motion` rejects.
+    """
+    body = read_motion(source, unit=config.unit, up=config.up)
+
+    def run() -> None:
+        console = Console()
+        for line in body_lines(body):
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
+        if out:
+            out.mkdir()
+            draw_skeleton(body, out / "skeleton.png", source.name)
+            console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        for side in find_arms(body):
+            command = f"python -m mimic.demonstrations source={source} arm={side} out={source.stem}_{side}.npz"
+            console.print(f"demonstrations: {command}", soft_wrap=True, highlight=False, markup=False)
+
+    return run
+
+
+def body_lines(body: PointMotion) -> list[str]:
+    """What a captured motion has: size, conventions, arms, gaps, jumps and lengths that change."""
+    lines = [f"{len(body.names)} points, {body.duration:.2f} s at {body.rate:.5g} Hz", *body.notes]
+    for side, arm in find_arms(body).items():
+        names = " - ".join("+".join(group) for group in arm[1:] if group)
+        lines.append(f"{side} arm: {names}")
+    missing = gaps(body)
+    if missing:
+        longest = max(length for _, length in missing) / body.rate
+        lines.append(f"gaps: {len(missing)}, the longest of {longest:.2f} s")
+    if len(jumps(body)):
+        lines.append(f"jumps: {len(jumps(body))}, the first at {jumps(body)[0] / body.rate:.2f} s")
+    changing = []
+    for parent, child, length in segment_lengths(body):
+        median = np.nanmedian(length)
+        if median > 0 and np.nanmax(np.abs(length - median)) > _CHANGING * median:
+            changing.append(f"{parent} - {child} ({np.nanmin(length):.3f} to {np.nanmax(length):.3f} m)")
+    if changing:
+        rest = f" and {len(changing) - _NAMED} more" if len(changing) > _NAMED else ""
+        lines.append(f"lengths that change: {', '.join(changing[:_NAMED])}{rest}")
+    return lines
+
+
+def _capture_lines(capture: Capture, cut: Windows, env: EnvConfig) -> list[str]:
+    part = max(capture.parts, key=lambda part: len(part.start))
+    lengths = ", ".join(f"{name} {length:.3f} m" for name, length in zip(part.names, part.link_lengths, strict=True))
+    fastest = max(relative_speeds(part).max() for part in capture.parts) / cut.slow_down
+    lines = [
+        f"links: {lengths}; as rigid links they differ from the points by {1000 * rigid_error(part):.1f} mm",
+        f"time: {cut.slow_down:.2f} times as long as captured; the fastest link then turns at {fastest:.2f} rad/s",
+        f"windows of {env.horizon} steps of {env.control_dt:g} s: {cut.training} for training, the last "
+        f"{cut.held_out} in time held out",
+    ]
+    if capture.bridged or len(capture.parts) > 1:
+        lines.insert(0, f"gaps bridged: {capture.bridged}; parts without longer gaps or jumps: {len(capture.parts)}")
+    return lines
+
+
+def _between(cuts: np.ndarray, length: int) -> list[tuple[int, int]]:
+    edges = [0, *map(int, cuts), length]
+    return list(zip(edges[:-1], edges[1:], strict=True))
+
+
+def _start(whole: PointMotion, piece: PointMotion) -> float:
+    """Time of a piece in the motion that it was cut from [s]."""
+    first = piece.positions[0]
+    same = np.flatnonzero((whole.positions == first).all(axis=(1, 2)))
+    return float(same[0] / whole.rate) if len(same) else 0.0
+
+
+def _with_lengths(part: LinkMotion, lengths: np.ndarray) -> LinkMotion:
+    """The part with links of these lengths."""
+    span = part.end - part.start
+    span *= (lengths / np.median(np.linalg.norm(span, axis=2), axis=0))[:, None]
+    return dataclasses.replace(part, end=part.start + span)

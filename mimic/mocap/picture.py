@@ -1,0 +1,84 @@
+"""Pictures of captured motions."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+
+from mimic.mocap.arms import find_arms  # noqa: E402
+from mimic.mocap.conventions import mean_point  # noqa: E402
+from mimic.mocap.link_motion import LinkMotion  # noqa: E402
+from mimic.mocap.points import PointMotion  # noqa: E402
+
+_COLOURS = {"left": "tab:blue", "right": "tab:orange"}
+_POSES = 5
+
+
+def draw_skeleton(motion: PointMotion, path: Path, title: str) -> None:
+    """Five poses of a body side by side, seen from the front and from the left, with its arms in colour."""
+    whole = np.isfinite(motion.positions).all(axis=(1, 2))
+    samples = np.flatnonzero(whole)[np.linspace(0, whole.sum() - 1, _POSES).round().astype(int)]
+    figure, axes = plt.subplots(2, _POSES, figsize=(1.9 * _POSES, 7), sharey=True)
+    arms = find_arms(motion)
+    centred = motion.positions[samples] - motion.positions[samples].mean(axis=1, keepdims=True) * [1, 1, 0]
+    reach = 1.1 * float(np.abs(centred[..., :2]).max())
+    for column, sample in enumerate(samples):
+        pose = centred[column]
+        for row, (horizontal, label) in enumerate(((1, "y [m]"), (0, "x [m]"))):
+            axis = axes[row, column]
+            axis.plot(pose[:, horizontal], pose[:, 2], ".", color="0.6", markersize=3)
+            for child, parent in enumerate(motion.parents):
+                if parent >= 0:
+                    axis.plot(pose[[parent, child], horizontal], pose[[parent, child], 2], color="0.6", linewidth=1)
+            for side, arm in arms.items():
+                groups = [group for group in (arm.shoulder, arm.elbow, arm.wrist, arm.hand) if group]
+                line = np.stack([mean_point(motion, group)[sample] for group in groups])
+                line -= motion.positions[sample].mean(axis=0) * [1, 1, 0]
+                axis.plot(line[:, horizontal], line[:, 2], "o-", color=_COLOURS[side], markersize=3, label=side)
+            axis.set_aspect("equal")
+            axis.set_xlim(-reach, reach)
+            axis.set_xlabel(label)
+            if row == 0:
+                axis.set_title(f"{sample / motion.rate:.1f} s", fontsize=9)
+    axes[0, 0].set_ylabel("z [m]")
+    axes[1, 0].set_ylabel("z [m]")
+    if arms:
+        axes[0, 0].legend(fontsize=8, loc="upper left")
+    figure.suptitle(title)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def draw_windows(
+    motions: Sequence[LinkMotion], spans: Sequence[tuple[float, float, bool]], path: Path, title: str
+) -> None:
+    """Directions of the links over time, with the windows that were cut; spans are start, stop [s] and held out."""
+    links = motions[0].names
+    figure, axes = plt.subplots(len(links) + 1, 1, figsize=(9, 1.7 * len(links) + 1.6), sharex=True)
+    begin = 0.0
+    for motion in motions:
+        time = begin + np.arange(len(motion.start)) / motion.rate
+        span = motion.end - motion.start
+        direction = span / np.linalg.norm(span, axis=2, keepdims=True)
+        for link, axis in enumerate(axes[:-1]):
+            for component, colour in zip(range(3), ("tab:red", "tab:green", "tab:blue"), strict=True):
+                axis.plot(time, direction[:, link, component], color=colour, linewidth=0.8)
+        begin = time[-1] + 1 / motion.rate
+    for link, axis in zip(links, axes[:-1], strict=True):
+        axis.set_ylabel(f"{link}\ndirection")
+        axis.set_ylim(-1.05, 1.05)
+    axes[0].legend(("x forward", "y left", "z up"), fontsize=8, loc="upper right", ncols=3)
+    for index, (start, stop, is_held_out) in enumerate(spans):
+        colour = "tab:orange" if is_held_out else "tab:blue"
+        axes[-1].plot([start, stop], [index, index], color=colour, linewidth=2)
+    axes[-1].set_ylabel("window")
+    axes[-1].set_xlabel("time in the capture [s]; blue: training, orange: held out")
+    figure.suptitle(title)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,105 @@
+"""Captured points of a body over time: joints of a skeleton, or markers."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+GAP = 0.2  # s; shorter gaps are bridged, longer ones split a motion
+
+
+@dataclasses.dataclass(frozen=True)
+class PointMotion:
+    """Positions of named points at equal intervals, z up.
+
+    Attributes:
+      names: of the points.
+      parents: index of each point's parent, -1 where there is none; markers have none.
+      positions: [time, points, 3] [m]; NaN where a point was not seen.
+      rate: samples per second.
+      notes: what the reader assumed or corrected, one line each.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    positions: Float[np.ndarray, "time points 3"]
+    rate: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last [s]."""
+        return (len(self.positions) - 1) / self.rate
+
+    def point(self, name: str) -> Float[np.ndarray, "time 3"]:
+        """Positions of one point [m].
+
+        Raises:
+          ValueError: there is no such point.
+        """
+        if name not in self.names:
+            raise ValueError(f"point: expected one of {', '.join(self.names)}, got {name!r}")
+        return self.positions[:, self.names.index(name)]
+
+    def select(self, names: Sequence[str]) -> "PointMotion":
+        """The motion of some points, without their parents."""
+        positions = np.stack([self.point(name) for name in names], axis=1)
+        return dataclasses.replace(self, names=tuple(names), parents=(-1,) * len(names), positions=positions)
+
+    def cut(self, start: int, stop: int) -> "PointMotion":
+        """The samples from `start` up to `stop`."""
+        return dataclasses.replace(self, positions=self.positions[start:stop])
+
+
+def gaps(motion: PointMotion) -> list[tuple[int, int]]:
+    """First sample and number of samples of each interval in which a point was not seen."""
+    return _intervals(~np.isfinite(motion.positions).all(axis=(1, 2)))
+
+
+def bridge_gaps(motion: PointMotion, longest: float = GAP) -> tuple[list[PointMotion], int]:
+    """The parts of a motion in which all points are known, and the number of bridged gaps.
+
+    Gaps between two known samples are bridged linearly up to a length; longer ones split the motion.
+
+    Args:
+      motion: the motion.
+      longest: maximum length of a bridged gap [s].
+    """
+    positions = motion.positions.copy()
+    count, bridged = len(positions), 0
+    for index in range(len(motion.names)):
+        track = positions[:, index]
+        missing = ~np.isfinite(track).all(axis=1)
+        for start, length in _intervals(missing):
+            if start > 0 and start + length < count and length / motion.rate <= longest:
+                fraction = np.arange(1, length + 1)[:, None] / (length + 1)
+                track[start : start + length] = (1 - fraction) * track[start - 1] + fraction * track[start + length]
+                bridged += 1
+            else:
+                track[start : start + length] = np.nan
+    whole = dataclasses.replace(motion, positions=positions)
+    known = np.isfinite(positions).all(axis=(1, 2))
+    return [whole.cut(start, start + length) for start, length in _intervals(known)], bridged
+
+
+def jumps(motion: PointMotion, fastest: float = 20.0) -> Int[np.ndarray, " jumps"]:
+    """Samples before which a point moves faster than a speed [m/s], by default faster than a hand can."""
+    steps = np.linalg.norm(np.diff(motion.positions, axis=0), axis=2) * motion.rate
+    with np.errstate(invalid="ignore"):
+        return np.flatnonzero((steps > fastest).any(axis=1)) + 1
+
+
+def segment_lengths(motion: PointMotion) -> Iterator[tuple[str, str, Float[np.ndarray, " time"]]]:
+    """Parent, child and distance over time [m] of each pair of connected points."""
+    for child, parent in enumerate(motion.parents):
+        if parent >= 0:
+            length = np.linalg.norm(motion.positions[:, child] - motion.positions[:, parent], axis=1)
+            yield motion.names[parent], motion.names[child], length
+
+
+def _intervals(flags: Any) -> list[tuple[int, int]]:
+    """First index and length of each run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(start), int(stop - start)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
