@@ -10,7 +10,7 @@ from mimic import cli
 from mimic.__main__ import commands
 from mimic.commands.key_help import explanations, key_lines
 from mimic.config import schema
-from mimic.trainers.config import MAPPER_PRESETS, PRESETS, TRAINERS
+from mimic.trainers.config import BUILT_IN_TRAINERS, MAPPER_PRESETS, PRESETS
 
 
 def shown(monkeypatch, capsys, name, *arguments):
@@ -28,7 +28,7 @@ def test_every_key_has_an_explanation(name, monkeypatch, capsys):
         assert line.endswith(":") or re.search(r": .*  # \w|: +# \w|  # \S", line), line
 
 
-@pytest.mark.parametrize("config_class", TRAINERS.values())
+@pytest.mark.parametrize("config_class", BUILT_IN_TRAINERS.values())
 def test_every_key_of_a_trainer_is_documented(config_class):
     assert {field.name for field in dataclasses.fields(config_class)} == set(explanations(config_class))
 

@@ -1,6 +1,7 @@
 """A second call with equal arms, metric and shapes compiles nothing; calls inside transforms of the user work."""
 
 import contextlib
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +37,7 @@ def qpos(seed, count=4):
     return np.random.default_rng(seed).uniform(-1, 1, (count, 3)).astype(np.float32)
 
 
-FEW = {"starts": 2, "iterations": 4}
+FEW: dict[str, Any] = {"starts": 2, "iterations": 4}
 FUNCTIONS = {
     "imitate_pose": lambda q, metric: imitate_pose(*arms(), q, **metric, **FEW),
     "warm": lambda q, metric: imitate_pose(*arms(), q, **metric, warm_start=q[:, :2], **FEW),

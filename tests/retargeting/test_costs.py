@@ -1,5 +1,8 @@
 """Costs of retargeting: closed forms, finite differences, C MuJoCo's distances, and what each does to the result."""
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -27,7 +30,7 @@ from mimic.retargeting.trajectory import imitate_trajectory
 
 EXPERT, LEARNER = planar_arm([0.4, 0.35, 0.25]), planar_arm([0.6, 0.4])
 METRIC = MetricConfig().build(EXPERT, LEARNER).arguments
-FEW = {"starts": 3}
+FEW: dict[str, Any] = {"starts": 3}
 QPOS = np.random.default_rng(0).uniform(-2, 2, (6, 3)).astype(np.float32)
 
 
@@ -58,17 +61,17 @@ def test_segment_distances_equal_those_of_mujoco(x64):
 def test_closed_forms():
     """Hand, home and limits of planar arms, whose geometry is plain trigonometry."""
     expert, learner = planar_arm([1.0]), planar_arm([0.5, 0.5])
-    q, p = np.float32([0.3]), np.float32([0.5, -0.9])
+    q, p = jnp.array([0.3]), jnp.array([0.5, -0.9])
     tips = [np.array([np.cos(0.3), np.sin(0.3)]) / 2, np.zeros(2)]
     tips[1] = 0.5 * np.array([np.cos(0.5), np.sin(0.5)]) + 0.25 * np.array([np.cos(-0.4), np.sin(-0.4)])
     expected = np.sum((tips[0] - tips[1]) ** 2)
     assert float(hand_cost(expert, learner, q, p, 1.0, 0.0)) == pytest.approx(expected, rel=1e-5)
     assert float(hand_cost(expert, learner, q, p, 0.0, 1.0)) == pytest.approx(1 - np.cos(0.7), rel=1e-5)
-    bounded = learner.replace(joint_range=np.array([[-1.0, 1.0], [-2.0, 2.0]]), home=np.array([0.1, 0.2]))
+    bounded = dataclasses.replace(learner, joint_range=np.array([[-1.0, 1.0], [-2.0, 2.0]]), home=np.array([0.1, 0.2]))
     assert float(home_cost(bounded, p)) == pytest.approx(((0.4 / 1) ** 2 + (1.1 / 2) ** 2) / 2, rel=1e-5)
     assert float(home_cost(learner, p)) == pytest.approx(np.mean(2 * (1 - np.cos(p)) / np.pi**2), rel=1e-5)
-    assert float(limit_cost(bounded, np.float32([0.9, -2.0]))) == pytest.approx((0.5**2 + 1) / 2, rel=1e-4)
-    assert float(limit_cost(bounded, p)) == 0 and float(limit_cost(learner, np.float32([3.1, 3.1]))) == 0
+    assert float(limit_cost(bounded, jnp.array([0.9, -2.0]))) == pytest.approx((0.5**2 + 1) / 2, rel=1e-4)
+    assert float(limit_cost(bounded, p)) == 0 and float(limit_cost(learner, jnp.array([3.1, 3.1]))) == 0
 
 
 def every_cost(joint=0.7):
@@ -114,7 +117,7 @@ def test_without_weights_the_result_is_the_same_to_the_bit():
 
 def test_each_cost_of_a_pose_falls_where_it_has_a_weight():
     """And with it the sum of distance and cost: the optimum of the sum is below that of the distance alone."""
-    bounded = LEARNER.replace(joint_range=np.array([[-1.0, 1.0], [-1.0, 1.0]]))
+    bounded = dataclasses.replace(LEARNER, joint_range=np.array([[-1.0, 1.0], [-1.0, 1.0]]))
     plain = imitate_pose(EXPERT, bounded, QPOS, **METRIC, **FEW)
     for name in ("hand_position", "hand_orientation", "home", "limits"):
         costs = Costs(**{name: 10.0})
@@ -135,7 +138,7 @@ def test_arms_do_not_intersect_themselves_or_the_floor():
     metric = MetricConfig().build(expert, learner).arguments
     start = np.array([[0.0, 0, 0], [0.4, 0, 0], [0.7, 0, 0]])
     capsules = Capsules(start, start + np.array([[0.4, 0, 0], [0.3, 0, 0], [0.4, 0, 0]]), np.full(3, 0.03), (0, 1, 2))
-    folded = np.float32([[0.0, 2.0, 1.9], [0.5, 2.2, 1.6]])
+    folded = jnp.array([[0.0, 2.0, 1.9], [0.5, 2.2, 1.6]])
 
     def nearest(qpos):
         return jax.vmap(lambda q: pair_distances(capsules, *capsule_axes(learner, capsules, q)).min())(qpos)

@@ -1,5 +1,7 @@
 """The closed form of static metrics against automatic differentiation, and the effect of its smoothing."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,7 @@ from tests.helpers.random_arms import random_arm
 
 DIRECTIONS = DistanceWeights(translation=0.0, rotation=1.7)
 BOTH = DistanceWeights(translation=0.6, rotation=1.7)
-DEFAULT = MetricConfig().make_weights()
+DEFAULT: Any = MetricConfig().make_weights()
 
 
 def learners():
