@@ -2,13 +2,13 @@
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import least_squares
 
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import joint_transforms, link_ends
 
-_ITERATIONS, _CLOSE = 60, 1e-4  # chain lengths
-_DAMPING = 0.03  # chain lengths; bounds the step near singular poses
-_STEP = 0.2  # rad, maximum change of a joint in an iteration
+_EVALUATIONS = 40  # of the hand's position; some 0.2 ms each
+_STAY = 1e-3  # chain lengths per radian: chooses among poses with the same hand
 
 
 def hand_position(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "3"]:
@@ -19,24 +19,21 @@ def hand_position(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[
 def pose_of_hand(
     arm: Embodiment, qpos: Float[np.ndarray, " joints"], target: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, " joints"]:
-    """A pose near `qpos` [rad], within the joint ranges, whose hand is at or near a position in the base frame [m].
+    """A pose near `qpos` [rad], within the joint ranges, whose hand is nearest to a position in the base frame [m].
 
-    Damped least squares on the position (Wampler, 1986); a joint that a step would move beyond its range stops there.
+    By SciPy's least squares within bounds (trust region reflective), which also ends where the position is out of reach.
     """
     length, (lower, upper) = float(arm.chain_length), np.asarray(arm.joint_range, float).T
-    pose = np.clip(np.asarray(qpos, float), lower, upper)
-    best, smallest = pose, np.inf
-    for _ in range(_ITERATIONS):
-        error = (target - hand_position(arm, pose)) / length
-        if np.linalg.norm(error) < smallest:
-            best, smallest = pose, float(np.linalg.norm(error))
-        if smallest < _CLOSE:
-            break
-        jacobian = _jacobian(arm, pose) / length
-        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + _DAMPING**2 * np.eye(3), error)
-        step *= min(1.0, _STEP / max(float(np.abs(step).max()), 1e-12))
-        pose = np.clip(pose + step, lower, upper)
-    return best
+    start = np.clip(np.asarray(qpos, float), lower + 1e-9, upper - 1e-9)
+    stay = _STAY * np.eye(arm.num_joints)
+
+    def residuals(pose: np.ndarray) -> np.ndarray:
+        return np.concatenate([(hand_position(arm, pose) - target) / length, _STAY * (pose - start)])
+
+    def jacobian(pose: np.ndarray) -> np.ndarray:
+        return np.concatenate([_jacobian(arm, pose) / length, stay])
+
+    return least_squares(residuals, start, jacobian, bounds=(lower, upper), max_nfev=_EVALUATIONS).x
 
 
 def _jacobian(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "3 joints"]:
