@@ -30,8 +30,8 @@ class Capsules:
     """Capsules fixed to the links of an arm, in the base frame and its zero pose.
 
     Attributes:
-      start, end: [capsules, 3] ends of their axes [m].
-      radius: [capsules] [m].
+      start, end: [capsules, 3] ends of their axes, in m.
+      radius: [capsules], in m.
       joint: index of the last free joint that moves each capsule; -1 for the base.
     """
 

@@ -1,7 +1,6 @@
 """The config of an environment. The presets in mimic/conf/env, `make` and the command line set its fields."""
 
 import dataclasses
-import math
 
 from mimic import registry
 from mimic.arms.arm import ArmConfig, ArmPair, build_arm
@@ -12,7 +11,6 @@ from mimic.metric.config import MetricConfig
 from mimic.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
-_MAX_WEIGHT = 1e6  # of a reward term
 AUTO = "auto"
 _MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
@@ -75,12 +73,10 @@ class RewardConfig:
         weight's magnitude for all remaining steps; so terms should be in [-1, 1].
     """
 
-    terms: dict[str, float] = dataclasses.field(default_factory=dict)
+    terms: dict[str, float] = number(dict, at_least=-1e6, at_most=1e6, by_name=True)
 
     def __post_init__(self) -> None:
-        for name, weight in self.terms.items():
-            if not (math.isfinite(weight) and abs(weight) <= _MAX_WEIGHT):
-                raise ValueError(f"reward.terms.{name}: expected a number up to {_MAX_WEIGHT:g}, got {weight}")
+        check_ranges(self, "reward.")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,7 @@ def pose_of_hand(
 ) -> Float[np.ndarray, " joints"]:
     """A pose near `qpos` [rad], within the joint ranges, whose hand is nearest to a position in the base frame [m].
 
-    By SciPy's least squares within bounds (trust region reflective), which also ends where the position is out of reach.
+    By SciPy's least squares within bounds (trust region reflective), also where the position is out of reach.
     """
     length, (lower, upper) = float(arm.chain_length), np.asarray(arm.joint_range, float).T
     start = np.clip(np.asarray(qpos, float), lower + 1e-9, upper - 1e-9)

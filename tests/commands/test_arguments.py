@@ -61,7 +61,7 @@ def test_odd_command_lines(rejected, monkeypatch, arguments, message):
     [
         ("trainer.entropy_cost=nan", "trainer.entropy_cost: expected a number from 0 to 1000, got nan"),
         ("trainer.entropy_cost=1e38", "trainer.entropy_cost: expected a number from 0 to 1000, got 1e+38"),
-        ("env.learner.damping=1e30", "env.learner.damping: expected a number from 0 to 10000, got 1e+30"),
+        ("env.learner.damping=1e30", "env.learner.damping: expected a number from 0 to 10000, or a mapping"),
         ("env.metric.translation=1e30", "env.metric.translation: expected a number from 0 to 1e+06, got 1e+30"),
         ("env.substeps=1000000000", "env.substeps: expected a whole number from 1 to 1,000, got 1000000000"),
         ("env.demonstrations.count=1000000000", "env.demonstrations.count: expected a whole number from 1 to 100,000"),

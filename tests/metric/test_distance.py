@@ -223,7 +223,9 @@ def test_unknown_measures_and_reductions_are_rejected():
         lambda: link_distances(*pair, adaptive_weights, rotation="Angle"),  # pyright: ignore[reportArgumentType]
         lambda: rotation_distance(jnp.ones(3), jnp.ones(3), "Angle"),  # pyright: ignore[reportArgumentType]
     ):
-        with pytest.raises(ValueError, match="^rotation: expected one of cosine, angle, got 'Angle'$"):
+        with pytest.raises(
+            ValueError, match=r"^rotation: expected one of cosine, angle, got 'Angle'; did you mean angle\?$"
+        ):
             call()
 
 
