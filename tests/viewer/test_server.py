@@ -16,6 +16,7 @@ import viser
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
+from mimic.viewer.messages import HAND
 from mimic.viewer.server import make_server
 
 PROTOCOL = f"viser-v{viser.__version__}"
@@ -38,6 +39,15 @@ def served():
     slider.on_update(lambda event: values.append(event.target.value) if event.client else None)
     yield server.get_port(), gatekeeper, slider, values
     server.stop()
+
+
+@pytest.fixture(scope="module")
+def dragged(served):
+    """Positions of the handle at the hand that arrived."""
+    positions = []
+    hand = served[1].server.scene.add_transform_controls(HAND)
+    hand.on_update(lambda event: positions.append(tuple(map(float, event.target.position))))
+    return positions
 
 
 def page(port, **headers):
@@ -132,6 +142,24 @@ def test_a_message_that_is_too_long_ends_its_connection_alone(served, capfd):
 
     asyncio.run(send())
     assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("owner", [{}, {"owner": ""}])
+def test_a_drag_of_the_hand_arrives(served, dragged, owner):
+    port, gatekeeper, _, _ = served
+    drag = {"type": "TransformControlsUpdateMessage", "name": HAND, "wxyz": [1.0, 0.0, 0.0, 0.0], **owner}
+    dropped = gatekeeper.dropped
+
+    async def send():
+        async with page(port) as client:
+            await client.send(encode(CAMERA))
+            for height in (0.5, 0.6):
+                await client.send(encode({**drag, "position": [0.25, 0.0, height]}))
+            await until(lambda: dragged and dragged[-1] == (0.25, 0.0, 0.6))
+
+    dragged.clear()
+    asyncio.run(send())
+    assert gatekeeper.dropped == dropped
 
 
 def test_twenty_clients_move_the_slider(served):
