@@ -38,7 +38,7 @@ install: $(STAMP) ## install alone
 train: $(STAMP) ## install if needed, then train: make train ARGS="env=panda4dof"
 	@$(BIN)/python -m mimic.train $(ARGS)
 
-test: static ## install if needed, then ruff, pyright, the quick tests and all examples
+test: static ## install if needed, then ruff, pyright, the quick tests and quick examples
 	$(PYTEST) $(PYTEST_ARGS)
 
 test-all: static ## the same with the slow tests

@@ -154,7 +154,7 @@ def test_demonstrations(said, tmp_path):
     assert is_picture(tmp_path / "waves_and_bound.png") and is_picture(tmp_path / "waves.png")
 
 
-@example("06_train_and_evaluate", patience)
+@example("06_train_and_evaluate", patience, pytest.mark.slow)
 def test_train_and_evaluate(said, tmp_path):
     gap = json.loads((tmp_path / "run" / "report.json").read_text())["optimality_gap"]
     assert gap["train"] < 0.3  # it learns: the start is at 1.8
@@ -165,7 +165,7 @@ def test_train_and_evaluate(said, tmp_path):
     assert (tmp_path / "policy.mp4").stat().st_size > 10_000
 
 
-@example("07_own_arm", patience)
+@example("07_own_arm", patience, pytest.mark.slow)
 def test_own_arm(said, tmp_path):
     assert mimic.load_mjcf(tmp_path / "arm.xml").joint_names == ("turn", "shoulder", "elbow", "bend", "roll")
     inspection = json.loads((tmp_path / "inspected" / "inspection.json").read_text())

@@ -10,7 +10,7 @@ from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from tests.helpers.pages import PAGES, REPOSITORY, Block, check, commands, module, read_blocks, run_page
 
 DOCS = REPOSITORY / "docs"
-QUICK = ("install.md", "metric.md", "own_arm.md")  # run by `make test`; all by `make test-all`
+QUICK = ("install.md", "metric.md")  # run by `make test`; all by `make test-all`
 
 
 def named(page):
