@@ -1,6 +1,8 @@
 """Similarity of robots to the arms of captured people: mimic's motions, and baselines, by measures nobody optimises.
 
-    python -m benchmarks.motion_capture CLIP.bvh ... --out FILE [--rate 50] [--arms FOLDER]
+    python -m benchmarks.motion_capture CLIP.bvh ... --out FILE [--rate 50] [--arms FOLDER] [--trunks 0 0.25]
+
+With `--trunks`, only the effect of the trunk's length [m] is measured instead: nearest poses of the Panda to 64 poses.
 
 Each arm of each clip is retargeted to the Panda, with and without locked joints, and to arms of an unpacked wheel of
 robosuite in FOLDER. Methods: `imitate_trajectory` with the default metric; inverse kinematics of the scaled hand by
@@ -28,6 +30,8 @@ from mimic.mocap.arms import SIDES
 from mimic.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
 from mimic.mocap.link_motion import LinkMotion
 from mimic.retargeting.pose_baselines import BASELINES
+
+_POSES = 64  # of a clip, for the effect of the trunk
 
 
 def learners(folder: Path | None) -> dict[str, ArmConfig]:
@@ -59,6 +63,19 @@ def retarget(clip: Path, side: str, name: str, config: ArmConfig, rate: float) -
     return [{**case, "method": method, **_measures(line, learner, motion, rate)} for method, motion in motions.items()]
 
 
+def nearest_with_trunk(clip: Path, side: str, trunk: float) -> Row:
+    """Similarity of the Panda's nearest poses to some of a clip's, with a trunk of a length [m]."""
+    part = max(read_arm(clip, side, CaptureConfig(trunk=trunk)).parts, key=lambda part: len(part.start))
+    with tempfile.TemporaryDirectory() as folder:
+        expert, qpos = _as_arm(part, Path(folder) / "person.xml", part.rate)
+    qpos, learner = qpos[:: len(qpos) // _POSES][:_POSES], mimic.panda()
+    metric = EnvConfig("trunk").metric.build(expert, learner)
+    nearest = mimic.imitate_pose(expert, learner, jnp.asarray(qpos, jnp.float32), **metric.arguments)
+    values = similarity(centre_line_table(expert, qpos), centre_line_table(learner, np.asarray(nearest.qpos, float)))
+    means = {name: float(np.mean(value)) for name, value in values.items()}
+    return {"clip": clip.name, "arm": side, "trunk_m": trunk, "distance": float(nearest.distance.mean()), **means}
+
+
 def _as_arm(part: LinkMotion, path: Path, rate: float) -> tuple[mimic.Embodiment, np.ndarray]:
     """The person's arm and its poses at a rate [1/s]."""
     zero = zero_frames(part)
@@ -78,10 +95,16 @@ def _measures(line: object, learner: mimic.Embodiment, qpos: np.ndarray, rate: f
 def main() -> None:
     parser = make_parser("motion_capture", __doc__, rate=50.0)
     parser.add_argument("clips", nargs="+", type=Path)
+    parser.add_argument("--trunks", nargs="+", type=float, metavar="M")
     parser.add_argument("--learners", nargs="+", metavar="NAME", help="some of the robots")
     parser.add_argument("--arms", type=Path, help="folder with an unpacked wheel of robosuite")
     options = parser.parse_args()
     rows: list[Row] = []
+    if options.trunks:
+        rows = [nearest_with_trunk(clip, "right", trunk) for clip in options.clips for trunk in options.trunks]
+        write_results(options, results=rows)
+        print_table(rows, "clip trunk_m:.2f distance:.4f centre_line_distance:.4f tangent_angle_deg:.1f")
+        return
     robots = learners(options.arms)
     unknown = [name for name in options.learners or () if name not in robots]
     if unknown:

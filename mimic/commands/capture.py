@@ -61,7 +61,9 @@ def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0)
     if side not in arms:
         found = " and ".join(arms) or "none"
         raise ValueError(f"arm: expected {' or '.join(SIDES)}, of which {str(source)!r} has {found}, got {side!r}")
-    names = [name for arm in arms.values() for group in arm[1:] for name in group]
+    # Of the other arm, the shoulder shows where the body faces.
+    groups = [*arms[side][1:], *(arm.shoulder for arm in arms.values())]
+    names = [name for group in groups for name in group]
     used = body.select(list(dict.fromkeys(names)))
     pieces, bridged = bridge_gaps(used)
     # Split where a point jumps: a first frame in another pose, or markers that were exchanged.
@@ -77,7 +79,7 @@ def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0)
     }  # fmt: skip
     angles = np.radians([config.yaw, config.pitch, config.roll])
     parts = [turned(arm_motion(piece, side, **settings), *angles) for piece in pieces]
-    starts = [_start(used, piece) for piece in pieces]
+    starts = [piece.begin for piece in pieces]
     lengths = np.median([part.link_lengths for part in parts], axis=0)  # one body
     return Capture(body, [_with_lengths(part, lengths) for part in parts], starts, bridged)
 
@@ -195,13 +197,6 @@ def _capture_lines(capture: Capture, cut: Windows, env: EnvConfig) -> list[str]:
 def _between(cuts: np.ndarray, length: int) -> list[tuple[int, int]]:
     edges = [0, *map(int, cuts), length]
     return list(zip(edges[:-1], edges[1:], strict=True))
-
-
-def _start(whole: PointMotion, piece: PointMotion) -> float:
-    """Time of a piece in the motion that it was cut from [s]."""
-    first = piece.positions[0]
-    same = np.flatnonzero((whole.positions == first).all(axis=(1, 2)))
-    return float(same[0] / whole.rate) if len(same) else 0.0
 
 
 def _with_lengths(part: LinkMotion, lengths: np.ndarray) -> LinkMotion:

@@ -13,7 +13,7 @@ from mimic.mocap.arms import ArmPoints, find_arms
 from mimic.mocap.conventions import mean_point
 from mimic.mocap.points import PointMotion
 
-CUTOFF = 6.0  # Hz; usual for human motion (Winter, Biomechanics and Motor Control of Human Movement, section 3.4)
+CUTOFF = 6.0  # Hz; usual for human motion (Winter, Biomechanics and Motor Control of Human Movement)
 ARM_LINKS = ("upper_arm", "forearm", "hand")
 TRUNK = "trunk"
 _SHORTEST = 1e-3  # m

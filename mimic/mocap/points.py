@@ -20,6 +20,7 @@ class PointMotion:
       positions: [time, points, 3] [m]; NaN where a point was not seen.
       rate: samples per second.
       notes: what the reader assumed or corrected, one line each.
+      begin: time of the first sample in the file [s].
     """
 
     names: tuple[str, ...]
@@ -27,6 +28,7 @@ class PointMotion:
     positions: Float[np.ndarray, "time points 3"]
     rate: float
     notes: tuple[str, ...] = ()
+    begin: float = 0.0
 
     @property
     def duration(self) -> float:
@@ -50,7 +52,8 @@ class PointMotion:
 
     def cut(self, start: int, stop: int) -> "PointMotion":
         """The samples from `start` up to `stop`."""
-        return dataclasses.replace(self, positions=self.positions[start:stop])
+        begin = self.begin + start / self.rate
+        return dataclasses.replace(self, positions=self.positions[start:stop], begin=begin)
 
 
 def gaps(motion: PointMotion) -> list[tuple[int, int]]:

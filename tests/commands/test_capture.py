@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.commands.capture import read_arm
+from mimic.commands.config import CaptureConfig
 from mimic.mocap.clips import slow_down_for
 from mimic.mocap.link_motion import arm_motion
 from tests.mocap.bodies import bvh_text, person
@@ -45,6 +47,18 @@ def test_demonstrations_fit_the_arm_that_is_written_with_them(written):
     slow_down = slow_down_for([arm_motion(person(900), "left")], 2.0)
     assert f"time: {slow_down:.2f} times as long" in printed
     assert (folder / "left.png").stat().st_size > 10_000
+
+
+def test_a_gap_in_the_other_arm_splits_nothing(tmp_path):
+    body = person(300)
+    positions = body.positions.copy()
+    positions[100:200, body.names.index("LeftHand")] = np.nan
+    np.savez(tmp_path / "clip.npz", names=np.array(body.names), positions=positions, rate=body.rate)
+    capture = read_arm(tmp_path / "clip.npz", "right", CaptureConfig())
+    assert [len(part.start) for part in capture.parts] == [300] and capture.starts == [0.0]
+    capture = read_arm(tmp_path / "clip.npz", "left", CaptureConfig())
+    assert [len(part.start) for part in capture.parts] == [100, 100]
+    assert capture.starts == pytest.approx([0.0, 200 / body.rate])
 
 
 @pytest.mark.slow

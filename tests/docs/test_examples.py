@@ -12,18 +12,10 @@ import pytest
 from PIL import Image
 
 import mimic
-from tests.helpers.repository import REPOSITORY
+from tests.helpers.repository import CACHE, CACHED, REPOSITORY
 
 EXAMPLES = REPOSITORY / "examples"
 NAMES = sorted(path.stem for path in EXAMPLES.glob("[0-9]*.py"))
-CACHE = REPOSITORY / ".jax_cache"
-ENVIRONMENT = {
-    **os.environ,
-    "HOME": str(CACHE),  # the default place of the compilation cache
-    "JAX_PLATFORMS": "cpu",
-    "JAX_COMPILATION_CACHE_DIR": str(CACHE),
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
-}
 patience = pytest.mark.timeout(900)
 
 
@@ -34,7 +26,7 @@ def said(request, tmp_path):
     CACHE.mkdir(exist_ok=True)
     result = subprocess.run(
         [sys.executable, str(EXAMPLES / f"{name}.py"), str(tmp_path)],
-        capture_output=True, text=True, check=False, cwd=tmp_path, env=ENVIRONMENT,
+        capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, **CACHED},
     )  # fmt: skip
     assert result.returncode == 0, result.stdout[-1000:] + result.stderr[-2000:]
     return result.stdout

@@ -7,18 +7,10 @@ import os
 import pytest
 
 import mimic
-from tests.helpers.repository import REPOSITORY
+from tests.helpers.repository import CACHE, CACHED, REPOSITORY
 
 NOTEBOOKS = sorted((REPOSITORY / "examples" / "notebooks").glob("*.ipynb"))
 SLOW = ("2_train_and_evaluate",)
-CACHE = REPOSITORY / ".jax_cache"
-ENVIRONMENT = {
-    "HOME": str(CACHE),  # the default place of the compilation cache
-    "JAX_PLATFORMS": "cpu",
-    "JAX_COMPILATION_CACHE_DIR": str(CACHE),
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
-    "PYTHONPATH": str(REPOSITORY),
-}
 
 
 def named(path):
@@ -63,7 +55,7 @@ def test_notebooks_run(path, tmp_path, monkeypatch):
     pytest.importorskip("ipykernel")
     nbformat = pytest.importorskip("nbformat")
     CACHE.mkdir(exist_ok=True)
-    for name, value in ENVIRONMENT.items():
+    for name, value in {**CACHED, "PYTHONPATH": str(REPOSITORY)}.items():
         monkeypatch.setenv(name, value)
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)

@@ -1,5 +1,12 @@
-"""The root folder of the repository."""
+"""The root folder of the repository, and the compilation cache of the processes that tests start."""
 
 import pathlib
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[2]
+CACHE = REPOSITORY / ".jax_cache"
+CACHED = {  # environment variables of processes that compile: one compilation cache for all tests
+    "HOME": str(CACHE),  # the default place of mimic's own
+    "JAX_PLATFORMS": "cpu",
+    "JAX_COMPILATION_CACHE_DIR": str(CACHE),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
+}

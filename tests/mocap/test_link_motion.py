@@ -150,6 +150,8 @@ def test_short_gaps_are_bridged_and_long_ones_split(body):
     assert gaps(motion) == [(100, 10), (300, 30)]
     parts, bridged = bridge_gaps(motion)
     assert bridged == 1 and [len(part.positions) for part in parts] == [300, 270]
+    assert [part.begin for part in parts] == pytest.approx([0.0, 330 / RATE])
+    assert parts[1].cut(60, 80).begin == pytest.approx(390 / RATE)
     np.testing.assert_allclose(parts[0].positions[100:110, 11], body.positions[100:110, 11], atol=0.02)
 
 
