@@ -8,10 +8,14 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.compilation import on_host
+from mimic.retargeting.costs import Costs
 from mimic.retargeting.pose import imitate_pose
 
 START_POSES = ("home", "nearest")
-_CHUNK = 32  # poses at a time: one function is compiled for any number of demonstrations
+# Weight of the distance from the home pose. Where many poses are equally near, as for redundant joints, it makes similar
+# starts of similar ones; it adds 0.1 % to the mean distance of a Panda to a captured arm.
+_HOME = 0.01
+_CHUNK = 256  # poses at a time: one function is compiled for any number of demonstrations
 
 
 def home_poses(learner: Embodiment, count: int) -> Float[np.ndarray, "demonstrations joints"]:
@@ -37,7 +41,7 @@ def nearest_poses(
     padded = np.asarray(qpos, np.float32)[np.minimum(np.arange(-(-count // _CHUNK) * _CHUNK), count - 1)]
     with on_host():  # compiles several times faster, and runs once
         chunks = [
-            np.asarray(imitate_pose(expert, learner, jnp.asarray(chunk), **metric).qpos)
+            np.asarray(imitate_pose(expert, learner, jnp.asarray(chunk), costs=Costs(home=_HOME), **metric).qpos)
             for chunk in padded.reshape(-1, _CHUNK, expert.num_joints)
         ]
     return np.concatenate(chunks)[:count]
