@@ -12,8 +12,8 @@ from mimic.retargeting.costs import Costs
 from mimic.retargeting.pose import imitate_pose
 
 START_POSES = ("home", "nearest")
-# Weight of the distance from the home pose. Where many poses are equally near, as for redundant joints, it makes similar
-# starts of similar ones; it adds 0.1 % to the mean distance of a Panda to a captured arm.
+# Weight of the distance from the home pose, so that redundant joints start alike where many poses are equally near. It
+# adds 0.1 % to the mean distance of a Panda from a captured arm.
 _HOME = 0.01
 _CHUNK = 256  # poses at a time: one function is compiled for any number of demonstrations
 
