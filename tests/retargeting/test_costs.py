@@ -65,7 +65,9 @@ def capsule_model(height, thicker):
     model = spec.compile()
     cylinders = model.geom_type == int(mujoco.mjtGeom.mjGEOM_CYLINDER)
     radius, half = model.geom_size[cylinders, 0], model.geom_size[cylinders, 1]
-    model.geom_size[cylinders, 1] = np.maximum(half - radius, 0)  # of the axis, at whose ends a capsule has half spheres
+    model.geom_size[cylinders, 1] = np.maximum(
+        half - radius, 0
+    )  # of the axis, at whose ends a capsule has half spheres
     model.geom_type[cylinders] = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
     model.geom_size[model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE), 0] += thicker
     return model
