@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mimic import compat
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import Capsule, Colour, link_ends
@@ -237,10 +238,10 @@ def _renderer(model: mujoco.MjModel, width: int, height: int, fast: bool) -> muj
             model.vis.quality.offsamples = 0
         _choose_window_system()
         renderer = mujoco.Renderer(model, height, width)
-    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+    except (*compat.NO_GRAPHICS, ImportError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(
-            "rendering: no OpenGL library works; expected EGL (Debian, Ubuntu: libegl1), or MUJOCO_GL=osmesa with "
-            f"libosmesa6: {' '.join(str(error).split())}"
+            "rendering: no OpenGL library works; expected EGL (Debian, Ubuntu: libegl1 and libgl1), or "
+            f"MUJOCO_GL=osmesa with libosmesa6: {' '.join(str(error).split())}"
         ) from error
     if is_plain:
         renderer.scene.flags[int(mujoco.mjtRndFlag.mjRND_SHADOW)] = 0

@@ -14,10 +14,11 @@ from mimic.arms.link_match import Capsule
 from mimic.arms.rendering import ArmScene
 
 
-def test_a_missing_graphics_library_is_reported_when_something_is_drawn(tmp_path):
-    """PyOpenGL fails in this way where there is no libEGL."""
+@pytest.mark.parametrize("error", ["AttributeError('no eglQueryString')", "ctypes.ArgumentError('no glGetError')"])
+def test_a_missing_graphics_library_is_reported_when_something_is_drawn(error, tmp_path):
+    """PyOpenGL fails in these ways where there is no libEGL, and no libGL."""
     (tmp_path / "OpenGL").mkdir()
-    (tmp_path / "OpenGL" / "__init__.py").write_text("raise AttributeError('no eglQueryString')")
+    (tmp_path / "OpenGL" / "__init__.py").write_text(f"import ctypes\nraise {error}")
     code = "import mimic, mujoco.mjx; from mimic import ArmScene; ArmScene([mimic.ArmConfig()])"
     found = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}", "MUJOCO_GL": "egl"}
     ended = subprocess.run([sys.executable, "-c", code], env=found, capture_output=True, text=True, check=False)
