@@ -93,7 +93,8 @@ def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[s
         '<div style="display:flex;gap:22px;padding:4px 12px">'
         + cell("mimic-distance", "embodiment distance", distance, LEARNER)
         + cell("mimic-bound", "kinematic bound", bound, BOUND)
-        + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px">'
+        + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px;'
+        f'white-space:pre-line">'
         f"{html.escape(note)}</div>{_measures(similarity or {})}"
     )
 

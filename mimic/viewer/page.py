@@ -57,6 +57,10 @@ class Page:
         self._chart = server.gui.add_html("")
         self._maps = server.gui.add_html("", order=_LAST)  # below the controls, which then fit 800 pixels
 
+    def show_note(self, note: str) -> None:
+        """Shows a line in the place of the numbers, before the first frame."""
+        self._numbers.content = html.numbers(float("nan"), float("nan"), note)
+
     def show(self, frame: Frame, chart: str, note: str) -> None:
         """Shows a frame; all elements change together."""
         with self.server.atomic():
@@ -79,7 +83,13 @@ class _DrawnArm:
             f"{path}/label", label, position=(0.3 * shape.reach, 0.0, 0.0), anchor="top-center", font_screen_scale=1.1
         )
         bodies = sorted({part.body for part in shape.parts})
-        self._frames = {body: scene.add_frame(f"{path}/body{body}", show_axes=False) for body in bodies}
+        positions, quaternions = shape.bodies({})
+        self._frames = {
+            body: scene.add_frame(
+                f"{path}/body{body}", show_axes=False, position=positions[body], wxyz=quaternions[body]
+            )
+            for body in bodies
+        }
         self._marks: dict[str, Any] = {}
         for index, part in enumerate(shape.parts):
             mesh = _mesh(scene, f"{path}/body{part.body}/part{index}", part)
