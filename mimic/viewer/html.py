@@ -11,7 +11,8 @@ from mimic.evaluation.labels import similarity_texts
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
 _BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 120, 34, 18, 8  # pixels of a chart and its margins
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 96, 34, 18, 8  # pixels of a chart and its margins
+LAST = 1e12  # order of an element below all others, whose orders are times in seconds
 _MIN_TOP = 0.01  # of a chart's scale, so that the scale is readable at distance 0
 
 
@@ -77,6 +78,11 @@ def heat_maps(
         + '</div><div style="font-size:10px;color:#777;padding:2px 12px">rows: links of the expert, columns: of the '
         "learner</div>"
     )
+
+
+def title(text: str) -> str:
+    """Returns the title of a page."""
+    return f'<div style="font-weight:bold;font-size:13px;padding:2px 12px 0">{html.escape(text)}</div>'
 
 
 def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[str, float] | None = None) -> str:
