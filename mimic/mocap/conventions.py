@@ -33,6 +33,8 @@ def arm_length(motion: PointMotion, arm: ArmPoints) -> float:
 
 def mean_point(motion: PointMotion, names: tuple[str, ...]) -> np.ndarray:
     """Mean position of some points [time, 3]."""
+    if len(names) == 1:
+        return motion.point(names[0])
     return np.mean([motion.point(name) for name in names], axis=0)
 
 

@@ -57,15 +57,23 @@ class Page:
         self._chart = server.gui.add_html("")
         self._maps = server.gui.add_html("", order=_LAST)  # below the controls, which then fit 800 pixels
 
+    def move(self, frame: Frame) -> None:
+        """Moves the arms to those of a frame; numbers, chart and maps stay."""
+        with self.server.atomic():
+            self._move(frame)
+
     def show(self, frame: Frame, chart: str, note: str) -> None:
         """Shows a frame; all elements change together."""
         with self.server.atomic():
-            self._arms[0].move_to(frame.expert, ())
-            self._arms[1].move_to(frame.learner, frame.locked)
-            self._ghost.move_to(frame)
+            self._move(frame)
             self._numbers.content = html.numbers(frame.distance, frame.bound, note, frame.similarity)
             self._maps.content = html.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
             self._chart.content = chart
+
+    def _move(self, frame: Frame) -> None:
+        self._arms[0].move_to(frame.expert, ())
+        self._arms[1].move_to(frame.learner, frame.locked)
+        self._ghost.move_to(frame)
 
 
 class _DrawnArm:
