@@ -16,7 +16,7 @@ from jaxtyping import Float
 from mimic.mocap.arms import ArmPoints, find_arms
 from mimic.mocap.ball_chain import ball_chain_pose
 from mimic.mocap.clips import turn_matrix, turned
-from mimic.mocap.conventions import UNITS, arm_length, guessed_unit, z_up
+from mimic.mocap.conventions import UNITS, arm_length, guessed_units, z_up
 from mimic.mocap.link_motion import LinkMotion, arm_motion, link_ends_from_shoulder
 from mimic.mocap.points import PointMotion
 
@@ -156,10 +156,10 @@ def find_live_arms(sample: Sample, unit: str, *, up: str = "z") -> dict[str, Arm
     complete = {side: arm for side, arm in arms.items() if np.isfinite(arm_length(body, arm))} if arms else {}
     if not arms:
         raise ValueError(f"points: expected shoulder, elbow and wrist of an arm by their names, got {_few(names)}")
-    found = guessed_unit(body, complete) if complete else "m"
-    if not unit and found != "m":
+    fitting = guessed_units(body, complete) if complete else ["m"]
+    if not unit and fitting != ["m"]:
         lengths = ", ".join(f"{arm_length(body, arm):.4g}" for arm in complete.values())
-        known = f"in {found}" if found else f"in none of {', '.join(UNITS)}"
+        known = f"in {' and '.join(fitting)}" if fitting else f"in none of {', '.join(UNITS)}"
         raise ValueError(
             f"points: expected metres, got arms {lengths} long, as an adult's {known}; capture.unit= sets the unit"
         )
