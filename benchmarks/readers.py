@@ -4,8 +4,8 @@
     python -m benchmarks.readers [--clips FILE.bvh ...] [--out FILE]
 
 BVH is compared with pybvh, C3D with c3d, TRC with trc-data-reader. C3D files are written by ezc3d and by c3d, in
-floating point and in integers; the others are those of the tests' generated person. `--clips` adds BVH files; a header with a
-wrong number of frames, which pybvh rejects, is corrected before.
+floating point and in integers; the others are those of the tests' generated person. `--clips` adds BVH files; a header
+with a wrong number of frames, which pybvh rejects, is corrected before.
 """
 
 import argparse
