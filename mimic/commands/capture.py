@@ -75,13 +75,18 @@ def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0)
     chain = arm_motion(longest, side, arms=arms).chain_length
     settings: dict[str, Any] = {
         "arms": arms, "cutoff": config.cutoff, "name": f"{side}_arm",
-        "trunk": chain * fixed / (1 - fixed) if config.trunk is None else config.trunk,
+        "trunk": trunk_length(chain, config, fixed),
     }  # fmt: skip
     angles = np.radians([config.yaw, config.pitch, config.roll])
     parts = [turned(arm_motion(piece, side, **settings), *angles) for piece in pieces]
     starts = [piece.begin for piece in pieces]
     lengths = np.median([part.link_lengths for part in parts], axis=0)  # one body
     return Capture(body, [_with_lengths(part, lengths) for part in parts], starts, bridged)
+
+
+def trunk_length(chain: float, config: CaptureConfig, fixed: float) -> float:
+    """Length of the trunk [m] below an arm with a length [m], for a robot with a fixed fraction of its chain."""
+    return chain * fixed / (1 - fixed) if config.trunk is None else config.trunk
 
 
 def fixed_fraction(arm: Embodiment) -> float:

@@ -20,6 +20,7 @@ from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "searched")
+ARM_SIDES = ("left", "right")
 EXPORT_FORMATS = ("onnx", "jax")
 
 
@@ -315,6 +316,10 @@ class ViewConfig:
         `named_arm`), or an MJCF file.
       mapper: run directory of a pose mapper that moves the learner instead of the optimiser. Its arms are used.
       run: run directory of a policy to play. Its arms and demonstrations are used.
+      source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
+        that takes points as lines of JSON.
+      arm: "left" or "right" arm of the person in `source`. Default "": right.
+      capture: how `source` is read.
       checkpoint: steps of the checkpoint of the policy or the mapper. Default None: the last checkpoint.
       follow: whether to play each new checkpoint of `run`, which another process trains.
       split: "held_out" or "train": demonstrations of the run to show first.
@@ -328,6 +333,9 @@ class ViewConfig:
     learner: str = ""
     mapper: str = ""
     run: str = ""
+    source: str = ""
+    arm: str = ""
+    capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
     checkpoint: int | None = _steps()
     follow: bool = False
     split: str = "held_out"
@@ -347,6 +355,12 @@ class ViewConfig:
             )
         if (self.run or self.mapper) and (self.expert or self.learner):
             raise ValueError("expert, learner: expected neither with run= or mapper=, whose arms are used")
+        if self.source and (self.run or self.mapper or self.expert):
+            raise ValueError("expert, run, mapper: expected none with source=, whose person is the expert")
+        if not self.source and (self.arm or self.capture != CaptureConfig()):
+            raise ValueError("arm, capture: expected only with source=")
+        if self.arm:
+            check_choice("arm", self.arm, ARM_SIDES)
 
     def resolve_env(self) -> EnvConfig:
         """Returns the environment with the arms named in `expert` and `learner`.

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import importlib.util
 import io
+import math
 import socket
 import sys
 import time
@@ -17,6 +18,15 @@ from rich.console import Console
 from mimic import compat
 from mimic.arms.arm import build_arm
 from mimic.commands.config import ViewConfig
+from mimic.commands.view_capture import (
+    CapturedExpert,
+    clip_expert,
+    is_address,
+    listen,
+    live_expert,
+    read_clip,
+    wait_for_arm,
+)
 from mimic.distribution import install_command
 from mimic.envs.config import EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
@@ -27,6 +37,7 @@ from mimic.viewer.live_session import Frame, LiveSession
 from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
+    from mimic.viewer.controls import ExpertControls
     from mimic.viewer.newest_checkpoint import NewestCheckpoint
     from mimic.viewer.page import Page
     from mimic.viewer.playback import Playback
@@ -34,6 +45,8 @@ if TYPE_CHECKING:
     from mimic.viewer.recorder import Recorder
 
 _MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
+CAPTURE_RATE = 100.0  # frames per second of a captured person, at most
+_NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a browser more than the arms
 _AT_BOUND = 1e-3  # fraction of the distance within which it counts as the bound
 
 
@@ -54,6 +67,8 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     use_compilation_cache(config.compilation_cache)
     if config.follow:
         return _prepare_training_view(config)
+    # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     if config.run:
         return _prepare_playback(config)
     mapper, env = None, config.resolve_env()
@@ -62,10 +77,48 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
 
         mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
         env = load_config(Path(config.mapper).expanduser()).env
+    if config.source:
+        return _prepare_captured(config, env)
     live = LiveSession(env, mapper)
-    return lambda: serve(
-        config, env, lambda page, times: _show_live(page, times, live, env, mapper is None), None, live.finish
-    )
+
+    def show(page: "Page", times: Iterator[float]) -> None:
+        from mimic.viewer.manual_controls import ManualControls
+
+        _show_live(page, times, live, env, ManualControls(live, env, page.expert), mapper is None)
+
+    return lambda: serve(config, env, show, None, live.finish)
+
+
+def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
+    """Checks the captured person of `source`; the returned function shows it."""
+
+    def show(expert: CapturedExpert) -> int:
+        live = LiveSession(expert.env)
+
+        def play(page: "Page", times: Iterator[float]) -> None:
+            _show_live(page, times, live, expert.env, expert.controls(live), True, _NUMBERS_RATE)
+
+        return serve(config, expert.env, play, None, live.finish, rate=CAPTURE_RATE)
+
+    if is_address(config.source):
+        listener = listen(config)
+
+        def run_live() -> int:
+            with contextlib.closing(listener):
+                measured = wait_for_arm(listener, config, env)
+                if measured is None:
+                    return 0
+                with live_expert(env, *measured, listener) as expert:
+                    return show(expert)
+
+        return run_live
+    content = read_clip(config, env)
+
+    def run_clip() -> int:
+        with clip_expert(env, *content) as expert:
+            return show(expert)
+
+    return run_clip
 
 
 def _prepare_playback(config: ViewConfig) -> Callable[[], int]:
@@ -140,8 +193,12 @@ def serve(
     show: "Callable[[Page, Iterator[float]], None]",
     before: Callable[[], None] | None = None,
     after: Callable[[], None] | None = None,
+    rate: float = RATE,
 ) -> int:
-    """Serves a page until a signal. Calls `before` before the server starts and `after` when it has ended."""
+    """Serves a page until a signal, with a rate of frames [1/s].
+
+    Calls `before` before the server starts and `after` when it has ended.
+    """
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
     from mimic.viewer.recorder import Recorder
@@ -169,7 +226,7 @@ def serve(
             is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
             page = Page(server, shapes, names, _title(config, env), is_flat, match)
             print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
-            show(page, _recorded(Recorder(server), ticks(signals)))
+            show(page, _recorded(Recorder(server), ticks(signals, rate)))
         finally:
             with contextlib.redirect_stdout(io.StringIO()):
                 server.stop()
@@ -193,12 +250,24 @@ def _title(config: ViewConfig, env: EnvConfig) -> str:
     return f"{env.name or 'mimic'}: the learner is moved by the {controller}"
 
 
-def _show_live(page: "Page", times: Iterator[float], live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
+def _show_live(
+    page: "Page",
+    times: Iterator[float],
+    live: LiveSession,
+    env: EnvConfig,
+    expert: "ExpertControls",
+    can_lock: bool,
+    numbers_rate: float = math.inf,
+) -> None:
+    """Moves the arms at each tick, and shows numbers, chart and maps at a rate [1/s]."""
     from mimic.viewer.controls import LiveControls
 
-    controls = LiveControls(page.server, live, env, can_lock, page.expert)
-    history, frame, was_compiling = History(), None, True
+    controls = LiveControls(page.server, live, env, can_lock, expert)
+    history, frame, was_compiling, since_numbers = History(), None, True, 0.0
+    is_behind = False  # whether the numbers are older than the arms
     for dt in times:
+        expert.advance(dt)
+        since_numbers += dt
         try:
             new_frame = live.advance(dt)
         except ValueError as error:
@@ -207,13 +276,17 @@ def _show_live(page: "Page", times: Iterator[float], live: LiveSession, env: Env
             new_frame = None
             controls.undo_locks()
         compiling = live.is_compiling
-        if new_frame is None and (compiling == was_compiling or frame is None):
-            continue
-        frame, was_compiling = new_frame or frame, compiling
-        assert frame is not None
-        history.add(frame)
-        page.show(frame, history.chart(), _note(frame, compiling, can_lock))
-        controls.update()
+        changed = new_frame is not None or (compiling != was_compiling and frame is not None)
+        is_behind |= changed
+        if changed:
+            frame, was_compiling = new_frame or frame, compiling
+        if frame is not None and is_behind and since_numbers * numbers_rate >= 1:
+            history.add(frame)
+            page.show(frame, history.chart(), _note(frame, compiling, can_lock))
+            is_behind, since_numbers = False, 0.0
+        elif frame is not None and changed:
+            page.move(frame)
+        expert.update()
 
 
 def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:
@@ -263,11 +336,11 @@ def _recorded(recorder: "Recorder", times: Iterator[float]) -> Iterator[float]:
         yield dt
 
 
-def ticks(signals: Signals) -> Iterator[float]:
-    """Yields the time since the last tick [s], at most `RATE` times per second, until a signal."""
+def ticks(signals: Signals, rate: float = RATE) -> Iterator[float]:
+    """Yields the time since the last tick [s], at a rate [1/s] at most, until a signal."""
     last = time.perf_counter()
     while not signals.caught:
-        time.sleep(max(0.0, last + 1 / RATE - time.perf_counter()))
+        time.sleep(max(0.0, last + 1 / rate - time.perf_counter()))
         now = time.perf_counter()
         yield min(now - last, _MAX_STEP)
         last = now

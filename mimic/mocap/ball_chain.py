@@ -4,6 +4,8 @@ The joints are a way to write the motion down, not those of the body: they let a
 expert's, such as demonstrations, files and views. Link states do not depend on them.
 """
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -90,6 +92,33 @@ def ball_chain_motion(
         parent, parent_zero = frames[:, link], zero[link]
         parent_velocity = np.asarray(states.angular_velocity)[:, link]
     return np.concatenate(qpos, axis=1), np.concatenate(qvel, axis=1)
+
+
+def ball_chain_pose(
+    directions: Float[np.ndarray, "links 3"], zero: Float[np.ndarray, "links 3 3"]
+) -> Float[np.ndarray, " joints"]:
+    """Angles of the joints of `ball_chain_xml` [rad] in which the links point in these directions.
+
+    Each link is turned from its zero pose without a rotation about itself, so that the angles depend on nothing else.
+
+    Args:
+      directions: of the links, of length 1.
+      zero: frames of the links in the zero pose.
+    """
+    parent, parent_zero, angles = np.eye(3), np.eye(3), []
+    for direction, own_zero in zip(directions, zero, strict=True):
+        base = parent @ parent_zero.T @ own_zero
+        x, y, z = base.T @ direction
+        yaw, pitch = math.atan2(y, x), math.asin(min(max(-z, -1.0), 1.0))
+        angles.append((yaw, pitch, 0.0))
+        parent, parent_zero = base @ _yaw_pitch(yaw, pitch), own_zero
+    return np.array(angles).reshape(-1)
+
+
+def _yaw_pitch(yaw: float, pitch: float) -> np.ndarray:
+    """Rotation about z, then the new y."""
+    cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+    return np.array([[cy * cp, -sy, cy * sp], [sy * cp, cy, sy * sp], [-sp, 0.0, cp]])
 
 
 def _check_serial(motion: LinkMotion) -> None:

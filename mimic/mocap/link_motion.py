@@ -101,6 +101,21 @@ def arm_motion(
       ValueError: the body has no such arm, or a point is missing at some time.
     """
     arms = find_arms(motion) if arms is None else arms
+    seen = link_ends_from_shoulder(motion, side, arms=arms, trunk=trunk, cutoff=cutoff)
+    names = ((TRUNK,) if trunk else ()) + ARM_LINKS
+    names = names[: seen.shape[1] - 1]
+    parents = tuple(range(-1, len(names) - 1))
+    return LinkMotion(names, parents, seen[:, :-1], seen[:, 1:], motion.rate, name or f"{side}_arm")
+
+
+def link_ends_from_shoulder(
+    motion: PointMotion, side: str, *, arms: dict[str, ArmPoints], trunk: float, cutoff: float
+) -> Float[np.ndarray, "time ends 3"]:
+    """Ends of an arm's links in its base frame, in the order of the chain [m]. Arguments are those of `arm_motion`.
+
+    Raises:
+      ValueError: the body has no such arm, or a point is missing at some time.
+    """
     if side not in arms:
         raise ValueError(f"arm: expected one of {', '.join(arms) or 'none that was found'}, got {side!r}")
     arm = arms[side]
@@ -109,12 +124,9 @@ def arm_motion(
     if not np.all(np.isfinite(points)):
         raise ValueError("motion: expected all points of the arm at all times; bridge or split at gaps first")
     seen = (points - points[:, :1]) @ facing_frames(motion, arms, cutoff)
-    names = ARM_LINKS[: len(groups) - 1]
     if trunk:
         seen = np.concatenate([np.zeros_like(seen[:, :1]), seen + [0, 0, trunk]], axis=1)
-        names = (TRUNK, *names)
-    parents = tuple(range(-1, len(names) - 1))
-    return LinkMotion(names, parents, seen[:, :-1], seen[:, 1:], motion.rate, name or f"{side}_arm")
+    return seen
 
 
 def facing_frames(

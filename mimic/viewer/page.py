@@ -67,16 +67,24 @@ class Page:
         """Shows a line in the place of the numbers, before the first frame."""
         self._numbers.content = self._title + html.numbers(float("nan"), float("nan"), note)
 
+    def move(self, frame: Frame) -> None:
+        """Moves the arms to those of a frame; numbers, chart and maps stay."""
+        with self.server.atomic():
+            self._move(frame)
+
     def show(self, frame: Frame, chart: str, note: str) -> None:
         """Shows a frame; all elements change together."""
         with self.server.atomic():
-            self._arms[0].move_to(frame.expert, ())
-            self._arms[1].move_to(frame.learner, frame.locked)
-            self._ghost.move_to(frame)
+            self._move(frame)
             numbers = html.numbers(frame.distance, frame.bound, note, frame.similarity)
             self._numbers.content = self._title + numbers
             self._maps.content = html.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
             self._chart.content = chart
+
+    def _move(self, frame: Frame) -> None:
+        self._arms[0].move_to(frame.expert, ())
+        self._arms[1].move_to(frame.learner, frame.locked)
+        self._ghost.move_to(frame)
 
 
 class _DrawnArm:

@@ -58,7 +58,11 @@ def test_a_gap_in_the_other_arm_splits_nothing(tmp_path):
     assert [len(part.start) for part in capture.parts] == [300] and capture.starts == [0.0]
     capture = read_arm(tmp_path / "clip.npz", "left", CaptureConfig())
     assert [len(part.start) for part in capture.parts] == [100, 100]
-    assert capture.starts == pytest.approx([0.0, 200 / body.rate])
+    assert capture.starts == pytest.approx([0.0, 200 / body.rate]) and capture.bridged == 0
+    positions[100:194] = body.positions[100:194]  # 0.1 s remain
+    np.savez(tmp_path / "short.npz", names=np.array(body.names), positions=positions, rate=body.rate)
+    capture = read_arm(tmp_path / "short.npz", "left", CaptureConfig())
+    assert [len(part.start) for part in capture.parts] == [300] and capture.bridged == 1
 
 
 @pytest.mark.slow

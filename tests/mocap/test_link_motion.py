@@ -155,6 +155,14 @@ def test_short_gaps_are_bridged_and_long_ones_split(body):
     np.testing.assert_allclose(parts[0].positions[100:110, 11], body.positions[100:110, 11], atol=0.02)
 
 
+@pytest.mark.parametrize(("samples", "parts"), [(1, 1), (12, 1), (13, 2)])
+def test_gaps_of_up_to_0_2_s_are_bridged(body, samples, parts):
+    positions = body.positions.copy()
+    positions[200 : 200 + samples, 12] = np.nan  # 60 Hz: 12 samples take 0.2 s
+    pieces, bridged = bridge_gaps(dataclasses.replace(body, positions=positions))
+    assert (len(pieces), bridged) == (parts, int(parts == 1))
+
+
 def test_jumps_are_found(body):
     positions = body.positions.copy()
     positions[200:, 6] += 0.5
