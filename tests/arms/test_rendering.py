@@ -87,6 +87,15 @@ def test_fitted_arms_fill_the_image(config):
     assert np.ptp(np.flatnonzero(moved.any(axis=0))) > 100
 
 
+def test_the_floor_is_below_an_arm_that_reaches_below_its_base():
+    down, up = (np.array([0.0, angle, 0, 0, 0, 0]) for angle in (2.8, 0.0))
+    with ArmScene([ArmConfig(locked=[6])], width=160, height=120) as scene:
+        scene.fit([down[None]])
+        assert red_share(scene.image([down])) > 0.002  # the locked joint, near the hand
+        scene.fit([up[None]])
+        assert red_share(scene.image([up])) > 0 and scene._data.mocap_pos[0, 2] == 0
+
+
 def test_an_overlay_is_drawn_at_the_last_arm():
     config = ArmConfig(model="planar", link_lengths=[0.5, 0.5])
     capsule = Capsule(np.zeros(3), np.array([0, 0, 0.2]), 0.1, (1.0, 0.0, 0.0, 1.0))
