@@ -4,7 +4,7 @@
 
 `imitate_trajectory` moves a Panda with joints 3, 6 and 7 locked like one with seven joints, both in their hardware
 limits. Motions are demonstrations, which keep off the floor, and splines through random poses, which do not. Each
-row adds one cost in one weight; the first row has none. Each row compiles, for half a minute on two cores.
+row adds one cost in one weight; the first row has none, the last all. Each compiles, for half a minute on two cores.
 """
 
 from collections.abc import Iterator
