@@ -18,6 +18,7 @@ from mimic.runs.files import REPORT
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SHORT = "ARGS=env=planar4dof trainer.num_timesteps=500000 run_dir=short"
+OWN_VARIABLES = "PYTHONPATH", "VIRTUAL_ENV", "XLA_FLAGS"  # mimic sets the last for this process's version of JAX
 COLUMNS = "stage wall_s:.0f cpu_s:.0f load_at_start:.1f optimality_gap[held_out]:.1%"
 
 
@@ -43,7 +44,7 @@ def run_stage(stage: Stage, folder: Path, home: Path) -> Row:
     """Wall and CPU time of a stage in a folder [s], load of the machine at its start, and the gaps of its training."""
     # pip's settings may be in the real home.
     changes = {"PIP_NO_CACHE_DIR": "1"} if stage.name == INSTALL.name else {"HOME": str(home)}
-    variables = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")} | changes
+    variables = {key: value for key, value in os.environ.items() if key not in OWN_VARIABLES} | changes
     load = round(os.getloadavg()[0], 1)
     # A python3 on the path may be too old.
     command = [*stage.command, f"PYTHON={sys.executable}"] if stage.command[0] == "make" else stage.command

@@ -87,6 +87,7 @@ def test_the_console_script_runs_a_command(monkeypatch):
     ("arguments", "message"),
     [
         (["trian"], "unknown command 'trian'; valid are collect, "),
+        (["complete"], "render, retarget, train, view, completion; did you mean completion?"),
         (["trian"], "; did you mean train?"),
         (["env=panda4dof"], "expected a command before 'env=panda4dof', as in mimic train env=panda4dof"),
         (["completion", "csh"], "completion: expected one of bash, zsh, fish, got 'csh'"),
