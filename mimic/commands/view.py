@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import importlib.util
 import io
-import math
 import socket
 import sys
 import time
@@ -32,12 +31,11 @@ from mimic.envs.config import EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.signals import Signals, noted_signals
 from mimic.trainers.run_config import load_config, policy_config, policy_run
-from mimic.viewer.history import RATE, History
-from mimic.viewer.live_session import Frame, LiveSession
+from mimic.viewer.history import RATE
+from mimic.viewer.live_session import LiveSession
 from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
-    from mimic.viewer.controls import ExpertControls
     from mimic.viewer.newest_checkpoint import NewestCheckpoint
     from mimic.viewer.page import Page
     from mimic.viewer.playback import Playback
@@ -47,7 +45,6 @@ if TYPE_CHECKING:
 _MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
 CAPTURE_RATE = 100.0  # frames per second of a captured person, at most
 _NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a browser more than the arms
-_AT_BOUND = 1e-3  # fraction of the distance within which it counts as the bound
 
 
 def prepare_view(config: ViewConfig) -> Callable[[], int]:
@@ -67,8 +64,6 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     use_compilation_cache(config.compilation_cache)
     if config.follow:
         return _prepare_training_view(config)
-    # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
     if config.run:
         return _prepare_playback(config)
     mapper, env = None, config.resolve_env()
@@ -77,16 +72,19 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
 
         mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
         env = load_config(Path(config.mapper).expanduser()).env
+    # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     if config.source:
         return _prepare_captured(config, env)
     live = LiveSession(env, mapper)
 
-    def show(page: "Page", times: Iterator[float]) -> None:
+    def follow(page: "Page", times: Iterator[float]) -> None:
+        from mimic.viewer.live_page import show_live
         from mimic.viewer.manual_controls import ManualControls
 
-        _show_live(page, times, live, env, ManualControls(live, env, page.expert), mapper is None)
+        show_live(page, times, live, env, ManualControls(live, env, page.expert), mapper is None)
 
-    return lambda: serve(config, env, show, None, live.finish)
+    return lambda: serve(config, env, follow, None, live.finish)
 
 
 def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
@@ -95,10 +93,12 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
     def show(expert: CapturedExpert) -> int:
         live = LiveSession(expert.env)
 
-        def play(page: "Page", times: Iterator[float]) -> None:
-            _show_live(page, times, live, expert.env, expert.controls(live), True, _NUMBERS_RATE)
+        def follow(page: "Page", times: Iterator[float]) -> None:
+            from mimic.viewer.live_page import show_live
 
-        return serve(config, expert.env, play, None, live.finish, rate=CAPTURE_RATE)
+            show_live(page, times, live, expert.env, expert.controls(live), True, _NUMBERS_RATE)
+
+        return serve(config, expert.env, follow, None, live.finish, rate=CAPTURE_RATE)
 
     if is_address(config.source):
         listener = listen(config)
@@ -250,45 +250,6 @@ def _title(config: ViewConfig, env: EnvConfig) -> str:
     return f"{env.name or 'mimic'}: the learner is moved by the {controller}"
 
 
-def _show_live(
-    page: "Page",
-    times: Iterator[float],
-    live: LiveSession,
-    env: EnvConfig,
-    expert: "ExpertControls",
-    can_lock: bool,
-    numbers_rate: float = math.inf,
-) -> None:
-    """Moves the arms at each tick, and shows numbers, chart and maps at a rate [1/s]."""
-    from mimic.viewer.controls import LiveControls
-
-    controls = LiveControls(page.server, live, env, can_lock, expert)
-    history, frame, was_compiling, since_numbers = History(), None, True, 0.0
-    is_behind = False  # whether the numbers are older than the arms
-    for dt in times:
-        expert.advance(dt)
-        since_numbers += dt
-        try:
-            new_frame = live.advance(dt)
-        except ValueError as error:
-            for client in page.server.get_clients().values():
-                client.add_notification("not possible", str(error), color="red", auto_close_seconds=6.0)
-            new_frame = None
-            controls.undo_locks()
-        compiling = live.is_compiling
-        changed = new_frame is not None or (compiling != was_compiling and frame is not None)
-        is_behind |= changed
-        if changed:
-            frame, was_compiling = new_frame or frame, compiling
-        if frame is not None and is_behind and since_numbers * numbers_rate >= 1:
-            history.add(frame)
-            page.show(frame, history.chart(), _note(frame, compiling, can_lock))
-            is_behind, since_numbers = False, 0.0
-        elif frame is not None and changed:
-            page.move(frame)
-        expert.update()
-
-
 def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:
     from mimic.viewer.player import Player
 
@@ -344,12 +305,3 @@ def ticks(signals: Signals, rate: float = RATE) -> Iterator[float]:
         now = time.perf_counter()
         yield min(now - last, _MAX_STEP)
         last = now
-
-
-def _note(frame: Frame, compiling: bool, by_optimiser: bool) -> str:
-    if compiling:
-        return "compiling …"
-    excess = frame.distance - frame.bound
-    if excess <= _AT_BOUND * max(frame.distance, _AT_BOUND):
-        return "at the kinematic bound"
-    return f"{excess:.4f} above the bound: " + ("moving, or in a local minimum" if by_optimiser else "pose mapper")

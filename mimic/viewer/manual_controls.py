@@ -34,6 +34,7 @@ class ManualControls:
         self._session, self._env, self._expert = session, env, expert
         self._random = np.random.default_rng()
         self._demonstrations: Demonstrations | None = None
+        self._handle_pose: np.ndarray | None = None  # of the expert, for which the handle was placed
         self._was_moving = False  # whether the expert moved by itself at the last update
 
     def add_widgets(self, server: viser.ViserServer) -> None:
@@ -50,11 +51,14 @@ class ManualControls:
 
         Otherwise the sliders are not set: a slider that the user drags is ahead of the session and would jump back.
         """
-        moving = self._session.moves_by_itself or time.perf_counter() - self._dragged < _DRAG_PAUSE
-        if time.perf_counter() - self._dragged > _DRAG_PAUSE:  # otherwise the user holds it
-            self._hand.position = hand_position(self._session.expert, self._session.pose)
+        dragged, pose = time.perf_counter() - self._dragged < _DRAG_PAUSE, self._session.pose
+        moving = self._session.moves_by_itself or dragged
+        if dragged:  # the user holds the handle
+            self._handle_pose = None
+        elif not np.array_equal(pose, self._handle_pose):
+            self._hand.position, self._handle_pose = hand_position(self._session.expert, pose), pose
         if moving or self._was_moving:
-            for slider, angle in zip(self._sliders, self._session.pose, strict=True):
+            for slider, angle in zip(self._sliders, pose, strict=True):
                 slider.value = round(float(np.clip(angle, slider.min, slider.max)), 2)
         self._was_moving = moving
 

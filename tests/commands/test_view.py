@@ -35,9 +35,6 @@ from tests.mocap.bodies import bvh_text, person
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),
         (["run=a", "expert=panda"], "expected neither with run= or mapper="),
-        (["follow=true"], "follow: expected with run= and without checkpoint="),
-        (["run=a", "follow=true", "checkpoint=5"], "got run='a' and checkpoint=5"),
-        (["run=missing", "follow=true"], "not a run directory"),
         (["source=missing.bvh"], "source: no file at 'missing.bvh'"),
         (["source=a.bvh", "expert=panda"], "expert, run, mapper: expected none with source="),
         (["arm=left"], "arm, capture: expected only with source="),
@@ -49,6 +46,9 @@ from tests.mocap.bodies import bvh_text, person
         (["source=tcp://localhost:9000/x"], "source: expected a file or tcp://localhost:PORT"),
         (["source=tcp://localhost:9000", "capture.slow_down=2"], "capture.slow_down: expected none with this source"),
         (["source=tcp://0.0.0.0:9000"], "to take points from other machines, set host=0.0.0.0 too"),
+        (["follow=true"], "follow: expected with run= and without checkpoint="),
+        (["run=a", "follow=true", "checkpoint=5"], "got run='a' and checkpoint=5"),
+        (["run=missing", "follow=true"], "not a run directory"),
         (["split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
@@ -73,9 +73,8 @@ def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
 
 
 def test_only_the_page_of_the_view_imports_viser():
-    names = ("html", "live_session", "playback", "meshes", "follower", "history", "newest_checkpoint", "captured")
-    modules = ", ".join(f"mimic.viewer.{name}" for name in names)
-    code = f"import sys; sys.modules['viser'] = None; import {modules}"
+    names = "html", "live_session", "playback", "meshes", "follower", "history", "newest_checkpoint", "captured"
+    code = f"import sys; sys.modules['viser'] = None; import {', '.join(f'mimic.viewer.{name}' for name in names)}"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
