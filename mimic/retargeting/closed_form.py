@@ -1,9 +1,13 @@
 """First and second derivatives of the static distance with respect to the learner's joint angles, in closed form.
 
-The expert pulls each link of the learner: its direction e towards a unit vector t with strength c, and its position p
-towards points p_i with weights w_i. Up to a constant of the expert, the distance is the sum over the links of
+The expert pulls each link of the learner: its direction e towards unit vectors t_i with strengths c_i, and its position
+p towards points p_i with weights w_i. Up to a constant of the expert, the distance is the sum over the links of
 
-    c (1 - e . t) + sum_i w_i h(|p - p_i|)        with a smoothed length, h(d) = sqrt(d^2 + s^2) - s.
+    sum_i c_i f(e . t_i) + sum_i w_i h(|p - p_i|)        with a smoothed length, h(d) = sqrt(d^2 + s^2) - s.
+
+f is 1 - e . t for the cosine, or a smoothed angle, f(x) = arccos(k x) - arccos(k), k = 1 / (1 + a^2 / 2): near a match
+it is h of the angle with s = a, and also smooth where both are opposite. It has a derivative of c_i f' e x t_i with
+respect to a rotation, and c_i f'' (e x t_i)(e x t_i)^T in the second one.
 
 A length has a kink at 0, where Newton's method would divide by it; a sum of lengths often has its minimum there, at
 links that match exactly. The smoothed length is 0 with derivative 0 at a match, and its error is at most s.
@@ -18,6 +22,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from mimic.metric import spatial
 from mimic.metric.spatial import Rotation, Scalar, Vector
@@ -27,6 +32,7 @@ from mimic.retargeting.optimizers import Derivatives
 # Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone leaves
 # more than 1e-4 of distance on 55 % of them, both on 3 %; with 1e-4 alone 89 % converge.
 ROUGH_SMOOTHING, SMOOTHING = 1e-2, 1e-3
+ROUGH_ANGLE_SMOOTHING, ANGLE_SMOOTHING = 0.1, 0.01  # a [rad]
 
 Symmetric = tuple[Scalar, ...]  # xx, xy, xz, yy, yz, zz of a symmetric 3x3 matrix
 _NONE: Symmetric = (0.0,) * 6
@@ -37,14 +43,14 @@ class Pull(NamedTuple):
     """Pull of the expert on one link.
 
     Attributes:
-      unit: t, target of its direction.
-      strength: c, at least 0.
+      units: t_i, targets of its direction; one for the cosine, since the sum of cosines is that of one target.
+      strengths: c_i.
       points: p_i, targets of its position [chain lengths].
       weights: w_i.
     """
 
-    unit: Vector
-    strength: Scalar
+    units: Sequence[Vector]
+    strengths: Sequence[Scalar]
     points: Sequence[Vector]
     weights: Sequence[Scalar]
 
@@ -63,7 +69,7 @@ class _Load(NamedTuple):
     Attributes:
       value: of the distance.
       force: its gradient with respect to a translation.
-      moment: sum of p g^T - c e t^T. Its antisymmetric part is the gradient with respect to a rotation.
+      moment: sum of p g^T + c f' e t^T. Its antisymmetric part is the gradient with respect to a rotation.
       linear, coupling, angular: second derivative K, B, C of the position terms with respect to a twist (a, m):
         force K m + B a, torque C a + B^T m.
     """
@@ -87,12 +93,13 @@ def static_derivatives(
     links: Sequence[Body],
     pulls: Sequence[Pull],
     smoothing: float,
+    angle_smoothing: float | None = None,
 ) -> Derivatives:
     """Derivatives of the static distance, whose value is up to a constant of the pulls.
 
     With M taken about a point on axis l, and the twist's torque and force of the stiffness,
 
-        d/dq_l       = a_l . (M_zy - M_yz, M_xz - M_zx, M_yx - M_xy), the sum of (p - c) x g and -c e x t,
+        d/dq_l       = a_l . (M_zy - M_yz, M_xz - M_zx, M_yx - M_xy), the sum of (p - c) x g and c f' e x t,
         d^2/dq_k dq_l = a_k . (torque_l + M a_l - tr(M) a_l) + m_k . force_l         for k <= l.
 
     Args:
@@ -101,13 +108,15 @@ def static_derivatives(
       links: links of the learner.
       pulls: pull on each link.
       smoothing: s [chain lengths].
+      angle_smoothing: a [rad] where the measure of directions is their angle; None where it is the cosine.
     """
     moments = [spatial.cross(anchor, axis) for anchor, axis in zip(anchors, axes, strict=True)]
     load, gradient, rows = _Load(), [], []
     for joint in reversed(range(len(axes))):
         for link, pull in zip(links, pulls, strict=True):
             if link.joint == joint:
-                load = _add_position(_add_direction(load, link.direction, pull), link.position, pull, smoothing)
+                load = _add_directions(load, link.direction, pull, angle_smoothing)
+                load = _add_position(load, link.position, pull, smoothing)
         axis, moment = axes[joint], moments[joint]
         local = spatial.add_outer(load.moment, spatial.scale(-1.0, anchors[joint]), load.force)
         gradient.append(spatial.dot(axis, _twice_antisymmetric(local)))
@@ -121,11 +130,39 @@ def static_derivatives(
     return Derivatives(load.value, tuple(gradient[::-1]), rows[::-1])
 
 
-def _add_direction(load: _Load, direction: Vector, pull: Pull) -> _Load:
-    difference = spatial.subtract(direction, pull.unit)  # |e - t|^2 / 2 = 1 - e . t, exactly 0 at a match
-    value = 0.5 * pull.strength * spatial.dot(difference, difference)
-    moment = spatial.add_outer(load.moment, spatial.scale(-pull.strength, direction), pull.unit)
-    return load._replace(value=spatial.plus(load.value, value), moment=moment)
+def _add_directions(load: _Load, direction: Vector, pull: Pull, angle_smoothing: float | None) -> _Load:
+    for unit, strength in zip(pull.units, pull.strengths, strict=True):
+        if angle_smoothing is None:
+            difference = spatial.subtract(direction, unit)  # |e - t|^2 / 2 = 1 - e . t, exactly 0 at a match
+            value, slope = 0.5 * strength * spatial.dot(difference, difference), -strength
+        else:
+            cross = spatial.cross(direction, unit)
+            value, slope, curvature = (
+                strength * x for x in _angle_derivatives(direction, unit, cross, angle_smoothing)
+            )
+            load = load._replace(angular=tuple(map(spatial.plus, load.angular, _outer(curvature, cross))))
+        moment = spatial.add_outer(load.moment, spatial.scale(slope, direction), unit)
+        load = load._replace(value=spatial.plus(load.value, value), moment=moment)
+    return load
+
+
+def smoothed_angle(cosine: Scalar, sine_square: Scalar, smoothing: float) -> Scalar:
+    """Smoothed angle f [rad] of two unit vectors, from e . t and |e x t|^2."""
+    factor = 1 / (1 + 0.5 * smoothing**2)
+    return jnp.arctan2(_scaled_sine(sine_square, factor), factor * cosine) - np.arccos(factor)
+
+
+def _angle_derivatives(a: Vector, b: Vector, cross: Vector, smoothing: float) -> tuple[Scalar, Scalar, Scalar]:
+    """Smoothed angle of two unit vectors, and its first and second derivative with respect to their cosine."""
+    factor = 1 / (1 + 0.5 * smoothing**2)
+    cosine, square = spatial.dot(a, b), spatial.dot(cross, cross)
+    slope = -factor / _scaled_sine(square, factor)
+    return smoothed_angle(cosine, square, smoothing), slope, cosine * slope**3
+
+
+def _scaled_sine(sine_square: Scalar, factor: float) -> Scalar:
+    """sqrt(1 - k^2 cos^2), without cancellation at 0."""
+    return jnp.sqrt((1 - factor**2) + factor**2 * sine_square)
 
 
 def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: float) -> _Load:
@@ -159,6 +196,13 @@ def _projection(factor: Scalar, unit: Vector) -> Symmetric:
     x, y, z = unit
     u, v, w = (spatial.times(-factor, component) for component in unit)
     return factor + u * x, u * y, u * z, factor + v * y, v * z, factor + w * z
+
+
+def _outer(factor: Scalar, vector: Vector) -> Symmetric:
+    """The matrix factor v v^T."""
+    x, y, z = vector
+    u, v, w = (spatial.times(factor, component) for component in vector)
+    return u * x, u * y, u * z, v * y, v * z, w * z
 
 
 def _sum(a: Rotation, b: Rotation) -> Rotation:

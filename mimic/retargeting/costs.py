@@ -32,8 +32,8 @@ class Costs:
     """Weights of costs that are added to the embodiment distance; 0 removes a cost.
 
     Attributes:
-      hand_position: squared distance of the frames of the last links, each in its arm's chain lengths.
-      hand_orientation: 1 - cos of the angle between these frames.
+      hand_position: squared distance of the tips of the centre lines, each in its arm's chain lengths.
+      hand_orientation: 1 - cos of the angle between the frames of the last links.
       home: mean over the joints of the squared distance from the home pose, in half ranges.
       limits: mean over the joints of the squared intrusion into the last tenth of the range at each end; 1 at a limit.
       velocity, acceleration: mean over the joints of the squared first and second difference of the angles [rad^2] from
@@ -109,17 +109,24 @@ def pose_cost(
 def hand_cost(
     expert: Embodiment, learner: Embodiment, expert_qpos: Array, qpos: Array, position: float, orientation: float
 ) -> Float[Array, ""]:
-    """Weighted costs of the position and the orientation of the last links."""
-    hands = [forward_kinematics(arm, q) for arm, q in ((expert, expert_qpos), (learner, qpos))]
-    points = [
-        frames.position[-1] / spatial.scalar(arm.chain_length)
-        for frames, arm in zip(hands, (expert, learner), strict=True)
-    ]
-    rotations = [frames.rotation[-1] for frames in hands]
+    """Weighted costs of the position of the tips and the orientation of the last links."""
+    arms = (expert, expert_qpos), (learner, qpos)
+    points = [tip_position(arm, q) / spatial.scalar(arm.chain_length) for arm, q in arms]
+    total = position * jnp.sum((points[0] - points[1]) ** 2)
+    if not orientation:
+        return total
+    rotations = [forward_kinematics(arm, q).rotation[-1] for arm, q in arms]
     # |R - S|^2 = 4 (1 - cos) of the angle of R^T S, without cancellation at a match.
-    return position * jnp.sum((points[0] - points[1]) ** 2) + orientation / 4 * jnp.sum(
-        (rotations[0] - rotations[1]) ** 2
-    )
+    return total + orientation / 4 * jnp.sum((rotations[0] - rotations[1]) ** 2)
+
+
+def tip_position(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, "3"]:
+    """End of the last segment [m]."""
+    joint = arm.link_joint[arm.segment_link[-1]]
+    frame = joint_frames(arm, qpos, None)[joint + 1]
+    anchor = arm.joint_anchor[joint] if joint >= 0 else np.zeros(3)
+    offset = spatial.vector(arm.segment_end[-1] - anchor)
+    return spatial.stack([spatial.add(frame.anchor, spatial.rotate(frame.rotation, offset))], qpos.dtype)[0]
 
 
 def home_cost(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, ""]:

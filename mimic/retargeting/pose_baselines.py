@@ -108,7 +108,7 @@ class _HandSolver:
         import mink  # takes half a second, and few need it
 
         self._mink = mink
-        self._model = _kinematic_model(learner)
+        self._model = kinematic_model(learner, {_HAND: len(learner.segment_end) - 1})
         self._configuration = mink.Configuration(self._model, np.array(learner.home, float))
         # The hand's x-axis is its direction: rotation about it has no cost.
         self._task = mink.FrameTask(
@@ -139,7 +139,7 @@ class _HandSolver:
         configuration.update(start)
         for _ in range(steps):
             frame = self._frame()
-            rotated = _smallest_rotation(frame[:, 0], direction) @ frame
+            rotated = smallest_rotation(frame[:, 0], direction) @ frame
             self._task.set_target(mink.SE3.from_rotation_and_translation(mink.SO3.from_matrix(rotated), position))
             change = mink.solve_ik(
                 configuration, [self._task], 1.0, solver="daqp", damping=_DAMPING, limits=self._limits
@@ -155,8 +155,13 @@ class _HandSolver:
         return self._configuration.data.site(_HAND).xmat.reshape(3, 3).copy()
 
 
-def _kinematic_model(arm: Embodiment) -> mujoco.MjModel:
-    """MuJoCo model of an embodiment's joints and hand, in chain lengths; its masses are arbitrary."""
+def kinematic_model(arm: Embodiment, sites: dict[str, int]) -> mujoco.MjModel:
+    """MuJoCo model of an embodiment's joints, in chain lengths; its masses are arbitrary.
+
+    Args:
+      arm: the embodiment.
+      sites: segment at whose end each site is, with its x-axis along the segment, by name.
+    """
     spec = mujoco.MjSpec()
     spec.compiler.autolimits = False
     spec.compiler.degree = False
@@ -172,16 +177,17 @@ def _kinematic_model(arm: Embodiment) -> mujoco.MjModel:
         joint_range = [low, high] if limited else [0.0, 0.0]
         body.add_joint(name=name, axis=axis, range=joint_range, limited=limited)
         bodies.append((body, anchor))
-    start, end = unit * np.asarray(arm.segment_start[-1]), unit * np.asarray(arm.segment_end[-1])
-    rotation = _smallest_rotation(np.array([1.0, 0.0, 0.0]), (end - start) / np.linalg.norm(end - start))
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    body, origin = bodies[arm.link_joint[arm.segment_link[-1]] + 1]
-    body.add_site(name=_HAND, pos=end - origin, quat=quaternion)
+    for name, segment in sites.items():
+        start, end = unit * np.asarray(arm.segment_start[segment]), unit * np.asarray(arm.segment_end[segment])
+        rotation = smallest_rotation(np.array([1.0, 0.0, 0.0]), (end - start) / np.linalg.norm(end - start))
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+        body, origin = bodies[arm.link_joint[arm.segment_link[segment]] + 1]
+        body.add_site(name=name, pos=end - origin, quat=quaternion)
     return spec.compile()
 
 
-def _smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The smallest rotation that maps a unit vector onto another, [3, 3]; about any axis where they are opposite."""
     middle = a + b
     square = middle @ middle

@@ -16,9 +16,20 @@ from mimic.metric import spatial
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
 from mimic.metric.spatial import Vector
-from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
+from mimic.retargeting.closed_form import (
+    ANGLE_SMOOTHING,
+    ROUGH_ANGLE_SMOOTHING,
+    ROUGH_SMOOTHING,
+    SMOOTHING,
+    Body,
+    Pull,
+    smoothed_angle,
+    smoothed_length,
+    static_derivatives,
+)
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 
+Smoothing = tuple[float, float | None]  # of lengths [chain lengths], and of angles [rad]; None for cosines
 Target = Any  # pytree: the data of the expert's pose that the objective needs
 
 
@@ -43,8 +54,8 @@ class PoseObjective:
 
 
 def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
-    """The objective: in closed form for a static metric, see `_static`; else by automatic differentiation."""
-    return _static(learner, metric) if metric.is_static else _differentiated(learner, metric)
+    """The objective: in closed form for a weighted sum, see `_static`; else by automatic differentiation."""
+    return _static(learner, metric) if metric.is_weighted_sum else _differentiated(learner, metric)
 
 
 def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
@@ -60,62 +71,80 @@ def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
 
 
 class StaticTarget(NamedTuple):
-    """Target of a static metric: pulls on the learner's directions and positions (`mimic.retargeting.closed_form`).
+    """Target of a weighted sum: pulls on the learner's directions and positions (`mimic.retargeting.closed_form`).
 
     Attributes:
-      unit, strength: [links, 3], [links] of the pulls on directions.
+      units, strengths: [directions, 3], [directions] of the pulls on directions.
       points, weights: [pairs, 3], [pairs] of the pulls on positions.
       pulls: both for each link, as scalar components.
     """
 
-    unit: Array
-    strength: Array
+    units: Array
+    strengths: Array
     points: Array
     weights: Array
     pulls: tuple[Pull, ...]
 
 
 def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
-    """Constant W and weights, cosines and the mean: sums of W_ij (pi/2) (1 - e_i . e^_j) and W_ij |p_i - p^_j|.
+    """Constant W and weights, and the mean: sums of W_ij (pi/2) (1 - e_i . e^_j) or angles, and W_ij |p_i - p^_j|.
 
-    For the directions the expert reduces to one pull for each link of the learner, t_j = sum_i W_ij e_i.
+    For the cosines the expert reduces to one pull on each link of the learner, t_j = sum_i W_ij e_i.
     """
     correspondence, weights = metric.correspondence, cast(DistanceWeights, metric.weights)
     directions, positions = (_pair_weights(correspondence, w) for w in (weights.rotation, weights.translation))
     pairs = _weighted_pairs(correspondence, weights.translation)
+    angles = _weighted_pairs(correspondence, weights.rotation) if metric.rotation == "angle" else None
+    directed = np.arange(learner.num_links) if angles is None else angles[:, 1]  # link of each pull on a direction
     arm = in_chain_lengths(learner)
+
+    def pulls_on_directions(direction: Array) -> tuple[Array, Array]:
+        if angles is not None:
+            return direction[angles[:, 0]], jnp.asarray(directions[angles[:, 0], angles[:, 1]], direction.dtype)
+        # Elementwise, so that nothing is rounded to TF32.
+        pull = np.pi / 2 * jnp.sum(directions[:, :, None] * direction[:, None, :], axis=0)
+        strength = spatial.safe_sqrt(jnp.sum(pull * pull, axis=-1))
+        unit = pull / jnp.maximum(strength, jnp.finfo(pull.dtype).tiny)[:, None]
+        return unit.astype(direction.dtype), strength.astype(direction.dtype)
 
     def target(states: LinkStates, _: Any = None) -> StaticTarget:
         assert states.direction is not None
-        dtype = states.direction.dtype
-        # Elementwise, so that nothing is rounded to TF32.
-        pull = np.pi / 2 * jnp.sum(directions[:, :, None] * states.direction[:, None, :], axis=0)
-        strength = spatial.safe_sqrt(jnp.sum(pull * pull, axis=-1))
-        unit = pull / jnp.maximum(strength, jnp.finfo(pull.dtype).tiny)[:, None]
-        weight = jnp.asarray(positions[pairs[:, 0], pairs[:, 1]], dtype)
-        unit, strength, points = unit.astype(dtype), strength.astype(dtype), states.position[pairs[:, 0]]
-        pulls = tuple(_pull(unit[j], strength[j], points, weight, pairs[:, 1] == j) for j in range(learner.num_links))
-        return StaticTarget(unit, strength, points, weight, pulls)
+        units, strengths = pulls_on_directions(states.direction)
+        points = states.position[pairs[:, 0]]
+        weight = jnp.asarray(positions[pairs[:, 0], pairs[:, 1]], points.dtype)
+        of_links = [(directed == link, pairs[:, 1] == link) for link in range(learner.num_links)]
+        pulls = [
+            Pull(*_on_link(units, strengths, is_on), *_on_link(points, weight, is_at)) for is_on, is_at in of_links
+        ]
+        return StaticTarget(units, strengths, points, weight, tuple(pulls))
 
     def value(target: StaticTarget, states: LinkStates) -> Array:
         assert states.direction is not None
-        aligned = jnp.vdot(target.strength[:, None] * target.unit, states.direction)
+        direction = states.direction[directed]
+        if angles is None:
+            turned = -jnp.vdot(target.strengths[:, None] * target.units, direction)
+        else:
+            sine = jnp.cross(direction, target.units)
+            cosine = jnp.sum(direction * target.units, axis=-1)
+            turned = jnp.sum(target.strengths * smoothed_angle(cosine, jnp.sum(sine * sine, axis=-1), ANGLE_SMOOTHING))
         difference = states.position[pairs[:, 1]] - target.points
         square = jnp.sum(difference * difference, axis=-1)
-        return jnp.sum(target.weights * smoothed_length(square, SMOOTHING)) - aligned
+        return jnp.sum(target.weights * smoothed_length(square, SMOOTHING)) + turned
 
     def kinematics(qpos: Scalars) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Vector]]]:
         frames = joint_frames(arm, qpos, None)
         vectors = [(link.direction, link.position) for link in link_vectors(arm, frames)]
         return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], vectors
 
-    def derivatives(smoothing: float, target: StaticTarget, qpos: Scalars, store: Store = call) -> Derivatives:
+    def derivatives(smoothing: Smoothing, target: StaticTarget, qpos: Scalars, store: Store = call) -> Derivatives:
         axes, anchors, vectors = store(kinematics, tuple(qpos))
         links = [Body(joint, *vector) for joint, vector in zip(arm.link_joint, vectors, strict=True)]
-        return static_derivatives(axes, anchors, links, target.pulls, smoothing)
+        return static_derivatives(axes, anchors, links, target.pulls, *smoothing)
 
-    rough, fine = (functools.partial(derivatives, smoothing) for smoothing in (ROUGH_SMOOTHING, SMOOTHING))
-    return PoseObjective(metric, target, value, fine, rough if len(pairs) else fine)
+    is_angle = angles is not None
+    rough = functools.partial(derivatives, (ROUGH_SMOOTHING, ROUGH_ANGLE_SMOOTHING if is_angle else None))
+    fine = functools.partial(derivatives, (SMOOTHING, ANGLE_SMOOTHING if is_angle else None))
+    return PoseObjective(metric, target, value, fine, rough if len(pairs) or is_angle else fine)
 
 
 def _pair_weights(correspondence: Any, weight: Any) -> Any:
@@ -136,8 +165,9 @@ def _weighted_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 
     return np.argwhere(has_weight)
 
 
-def _pull(unit: Array, strength: Array, points: Array, weights: Array, is_on_link: Bool[np.ndarray, " pairs"]) -> Pull:
-    """Pull on one link as scalars, extracted from the arrays once and not in each step of a descent."""
+def _on_link(
+    vectors: Array, factors: Array, is_on_link: Bool[np.ndarray, " pulls"]
+) -> tuple[list[Vector], list[spatial.Scalar]]:
+    """Pulls on one link as scalars, extracted from the arrays once and not in each step of a descent."""
     indices = np.flatnonzero(is_on_link)
-    points_of_link = [spatial.vector(points[i]) for i in indices]
-    return Pull(spatial.vector(unit), strength, points_of_link, [weights[i] for i in indices])
+    return [spatial.vector(vectors[i]) for i in indices], [factors[i] for i in indices]

@@ -111,8 +111,8 @@ def test_closed_forms():
     """Hand, home and limits of planar arms, whose geometry is plain trigonometry."""
     expert, learner = planar_arm([1.0]), planar_arm([0.5, 0.5])
     q, p = jnp.array([0.3]), jnp.array([0.5, -0.9])
-    tips = [np.array([np.cos(0.3), np.sin(0.3)]) / 2, np.zeros(2)]
-    tips[1] = 0.5 * np.array([np.cos(0.5), np.sin(0.5)]) + 0.25 * np.array([np.cos(-0.4), np.sin(-0.4)])
+    tips = [np.array([np.cos(0.3), np.sin(0.3)]), np.zeros(2)]
+    tips[1] = 0.5 * np.array([np.cos(0.5), np.sin(0.5)]) + 0.5 * np.array([np.cos(-0.4), np.sin(-0.4)])
     expected = np.sum((tips[0] - tips[1]) ** 2)
     assert float(hand_cost(expert, learner, q, p, 1.0, 0.0)) == pytest.approx(expected, rel=1e-5)
     assert float(hand_cost(expert, learner, q, p, 0.0, 1.0)) == pytest.approx(1 - np.cos(0.7), rel=1e-5)

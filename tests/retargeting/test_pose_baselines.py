@@ -194,3 +194,13 @@ def rotated(axis, angle, vector):
     """Rodrigues' formula, [n, 3]."""
     along = np.sum(axis * vector, axis=1, keepdims=True) * axis
     return along + np.cos(angle) * (vector - along) + np.sin(angle) * np.cross(axis, vector)
+
+
+def test_aligning_takes_known_landmarks():
+    """The upper arm of the expert is then between other vertices, so that the learner's points elsewhere."""
+    qpos = motion(PANDA, 4, spread=1.0)
+    other = Landmarks(1, 2, 5, 7)
+    poses = align_segments(PANDA, PANDA, qpos, expert_marks=other)
+    assert part_angles(PANDA, PANDA, other, qpos, poses)[0].max() < ROUNDING
+    default = align_segments(PANDA, PANDA, qpos)
+    assert poses is not None and default is not None and not np.allclose(poses, default, atol=1e-3)
