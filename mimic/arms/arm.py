@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import mujoco
@@ -43,7 +43,8 @@ class ArmConfig:
       locked: joint names or numbers, or a mapping from these to angles [rad].
       link_lengths: lengths of the links of a planar arm [m].
       base: for a file, name of the body that carries the chain.
-      tip: for a file, name of the body or site at the end of the chain; default: see `find_chain`.
+      tip: for a file, name of the body or site at the end of the chain; default: see `find_chain`. A list of names
+        gives a tree with a chain to each of them, and ["*"] one to each end of the model.
       armature: minimum rotor inertia of each joint, at the joint [kg m^2], or a mapping from joints to it; many models
         state none.
       damping: minimum damping of each joint [N m s/rad], or a mapping from joints to it.
@@ -57,7 +58,7 @@ class ArmConfig:
     # From a micromanipulator's links to a crane's; the kinematics of 100 links take minutes to compile.
     link_lengths: list[float] = number(list, at_least=1e-3, at_most=100.0, entries=(0, 100))
     base: str | None = None
-    tip: str | None = None
+    tip: Any = None
     # Joints of the largest industrial robots have some 1000 kg m^2 and 1000 N m s/rad.
     armature: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
     damping: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
@@ -68,6 +69,9 @@ class ArmConfig:
         if not self.model:
             raise ValueError(f"model: expected {', '.join(BUILT_IN)} or the path of an MJCF or URDF file, got nothing")
         check_ranges(self)
+        is_list = isinstance(self.tip, Sequence) and not isinstance(self.tip, str)
+        if self.tip is not None and not all(isinstance(name, str) for name in (self.tip if is_list else [self.tip])):
+            raise ValueError(f"tip: expected the name of a body or site, or a list of names, got {self.tip!r:.80}")
         for name in ("armature", "damping"):
             if getattr(self, name) is None:
                 raise ValueError(f"{name}: expected a number, or a mapping from joints to numbers, got null")

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.arms.capsules import Capsules
+from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment
 from mimic.metric import spatial
 from mimic.metric.kinematics import LinkStates, forward_kinematics, joint_frames
@@ -32,8 +33,9 @@ class Costs:
     """Weights of costs that are added to the embodiment distance; 0 removes a cost.
 
     Attributes:
-      hand_position: squared distance of the frames of the last links, each in its arm's chain lengths.
-      hand_orientation: 1 - cos of the angle between these frames.
+      hand_position: squared distance of the frames of the last links, each in its arm's chain lengths; of trees, the
+        sum over the pairs of corresponding chains.
+      hand_orientation: 1 - cos of the angle between these frames, likewise.
       home: mean over the joints of the squared distance from the home pose, in half ranges.
       limits: mean over the joints of the squared intrusion into the last tenth of the range at each end; 1 at a limit.
       velocity, acceleration: mean over the joints of the squared first and second difference of the angles [rad^2] from
@@ -100,7 +102,7 @@ def pose_cost(
             distance = pair_distances(capsules, start, end)
             total += costs.self_collision * _intrusion(distance, costs.clearance)
         if costs.floor:
-            moves = np.flatnonzero(np.array(capsules.joint) > 0)
+            moves = np.flatnonzero(~np.array(capsules.near_base))
             height = jnp.minimum(start[moves, 2], end[moves, 2]) - jnp.asarray(capsules.radius[moves], qpos.dtype)
             total += costs.floor * _intrusion(height - costs.floor_height, costs.clearance)
     return total
@@ -110,12 +112,15 @@ def hand_cost(
     expert: Embodiment, learner: Embodiment, expert_qpos: Array, qpos: Array, position: float, orientation: float
 ) -> Float[Array, ""]:
     """Weighted costs of the position and the orientation of the last links."""
-    hands = [forward_kinematics(arm, q) for arm, q in ((expert, expert_qpos), (learner, qpos))]
+    arms = expert, learner
+    frames = [forward_kinematics(arm, q) for arm, q in zip(arms, (expert_qpos, qpos), strict=True)]
+    pairs = np.array(matched_chains(expert.chain_names, learner.chain_names))
+    last = [np.array([chain[-1] for chain in arm.chains])[i] for arm, i in zip(arms, pairs.T, strict=True)]
     points = [
-        frames.position[-1] / spatial.scalar(arm.chain_length)
-        for frames, arm in zip(hands, (expert, learner), strict=True)
+        of_arm.position[links] / spatial.scalar(arm.chain_length)
+        for of_arm, links, arm in zip(frames, last, arms, strict=True)
     ]
-    rotations = [frames.rotation[-1] for frames in hands]
+    rotations = [of_arm.rotation[links] for of_arm, links in zip(frames, last, strict=True)]
     # |R - S|^2 = 4 (1 - cos) of the angle of R^T S, without cancellation at a match.
     return position * jnp.sum((points[0] - points[1]) ** 2) + orientation / 4 * jnp.sum(
         (rotations[0] - rotations[1]) ** 2

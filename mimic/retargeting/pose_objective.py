@@ -112,7 +112,7 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
     def derivatives(smoothing: float, target: StaticTarget, qpos: Scalars, store: Store = call) -> Derivatives:
         axes, anchors, vectors = store(kinematics, tuple(qpos))
         links = [Body(joint, *vector) for joint, vector in zip(arm.link_joint, vectors, strict=True)]
-        return static_derivatives(axes, anchors, links, target.pulls, smoothing)
+        return static_derivatives(axes, anchors, links, target.pulls, smoothing, arm.joint_parent)
 
     rough, fine = (functools.partial(derivatives, smoothing) for smoothing in (ROUGH_SMOOTHING, SMOOTHING))
     return PoseObjective(metric, target, value, fine, rough if len(pairs) else fine)
