@@ -14,6 +14,7 @@ from mimic.arms.chain import Links
 from mimic.arms.compile_check import VELOCITY_LIMIT
 from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
 from mimic.arms.ignored_elements import ignored_elements
+from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.model_files import read_spec
 from mimic.arms.named_arms import BUILT_IN, is_arm_name, named_arm
 from mimic.arms.simulation_model import effective_inertia, simulation_model
@@ -38,8 +39,8 @@ class ArmConfig:
     """Model of an arm, and changes to it.
 
     Attributes:
-      model: "panda", "planar", the path of an MJCF or URDF file, or the name of an arm, see `named_arm`; a path is made
-        absolute, and a name becomes the path.
+      model: "panda", "planar", "panda_pair" (two Pandas side by side, 0.6 m apart, as one embodiment), the path of an
+        MJCF or URDF file, or the name of an arm, see `named_arm`; a path is made absolute, and a name becomes the path.
       locked: joint names or numbers, or a mapping from these to angles [rad].
       link_lengths: lengths of the links of a planar arm [m].
       base: for a file, name of the body that carries the chain.
@@ -78,6 +79,8 @@ class ArmConfig:
         if self.is_file:  # absolute, so that a run can be loaded from any folder
             path = named_arm(self.model) if is_arm_name(self.model) else os.path.expanduser(self.model)
             object.__setattr__(self, "model", os.path.abspath(path))
+        if self.model == "panda_pair" and self.tip is None:
+            object.__setattr__(self, "tip", [ALL_ENDS])
 
     @property
     def is_file(self) -> bool:
@@ -122,8 +125,7 @@ def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
     """
     if config.model == "planar":
         return _planar_spec(planar_arm(config.link_lengths))
-    path = panda_path() if config.model == "panda" else config.model
-    return read_spec(path)
+    return read_spec(config.model if config.is_file else panda_path(config.model))
 
 
 def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> Arm:
@@ -151,10 +153,9 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         return with_minimum_armature(
             Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config
         )
-    is_panda = config.model == "panda"
     embodiment, source, angles = load_arm(
-        panda_path() if is_panda else config.model,
-        name="panda" if is_panda else None,
+        config.model if config.is_file else panda_path(config.model),
+        name=None if config.is_file else config.model,
         locked=config.locked or (),
         base=config.base,
         tip=config.tip,
@@ -163,7 +164,7 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         home=config.home,
         base_segment=config.base_segment,
     )
-    notes = () if is_panda else ignored_elements(source, config.base, config.tip)
+    notes = () if not config.is_file else ignored_elements(source, config.base, config.tip)
     return with_minimum_armature(
         Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, notes), config
     )

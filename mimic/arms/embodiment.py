@@ -144,9 +144,9 @@ def planar_arm(link_lengths: Sequence[float] | Float[ArrayLike, " n"], *, frame_
     return from_chain(Chain(joints, links), name=f"planar{lengths.size}", frame_at=frame_at)
 
 
-def panda_path() -> str:
-    """Path of the Panda's MJCF file."""
-    return str(importlib.resources.files("mimic") / "xml" / "panda.xml")
+def panda_path(name: str = "panda") -> str:
+    """Path of the MJCF file of the Panda, or of the two of "panda_pair"."""
+    return str(importlib.resources.files("mimic") / "xml" / f"{name}.xml")
 
 
 def panda(*, locked: Locked = (), links: Links = "kept", limits: Limits = "none") -> Embodiment:
