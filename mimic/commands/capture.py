@@ -131,7 +131,7 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
         console.print(f"results: {out}, {model}", soft_wrap=True, highlight=False)
         command = (
             f"python -m mimic.train env={env.name} env.expert={model} env.demonstrations.path={out} "
-            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out}"
+            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out} env.start=nearest"
         )
         console.print(f"train on it: {command}", soft_wrap=True, highlight=False, markup=False)
 

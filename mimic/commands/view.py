@@ -9,21 +9,28 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import jax
+from rich.console import Console
 
 from mimic import compat
 from mimic.arms.arm import build_arm
 from mimic.commands.config import ViewConfig
 from mimic.distribution import install_command
 from mimic.envs.config import EnvConfig
+from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.signals import Signals, noted_signals
-from mimic.trainers.run_config import load_config
+from mimic.trainers.run_config import load_config, policy_config, policy_run
 from mimic.viewer.history import RATE, History
 from mimic.viewer.live_session import Frame, LiveSession
 from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
+    from mimic.viewer.newest_checkpoint import NewestCheckpoint
     from mimic.viewer.page import Page
+    from mimic.viewer.playback import Playback
+    from mimic.viewer.player import Player
     from mimic.viewer.recorder import Recorder
 
 _MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
@@ -45,16 +52,10 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     from mimic.compilation import use_compilation_cache
 
     use_compilation_cache(config.compilation_cache)
+    if config.follow:
+        return _prepare_training_view(config)
     if config.run:
-        compat.import_mjx()
-        from mimic.trainers.run_config import policy_run
-        from mimic.viewer.playback import Playback
-
-        run_dir, trained = policy_run(config.run, config.checkpoint)
-        playback = Playback(trained, run_dir, config.checkpoint)
-        return lambda: serve(
-            config, trained.env, lambda page, times: _play(page, times, playback, config.split), playback.run
-        )
+        return _prepare_playback(config)
     mapper, env = None, config.resolve_env()
     if config.mapper:
         from mimic.trainers.pose_mapper.model import PoseMapper
@@ -63,8 +64,50 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         env = load_config(Path(config.mapper).expanduser()).env
     live = LiveSession(env, mapper)
     return lambda: serve(
-        config, env, lambda page, times: _follow(page, times, live, env, mapper is None), None, live.finish
+        config, env, lambda page, times: _show_live(page, times, live, env, mapper is None), None, live.finish
     )
+
+
+def _prepare_playback(config: ViewConfig) -> Callable[[], int]:
+    """Prepares the playback of a checkpoint."""
+    compat.import_mjx()
+    from mimic.trainers.make import make_ppo_trainer
+    from mimic.viewer.playback import Playback
+
+    run_dir, trained = policy_run(config.run, config.checkpoint)
+    trainer = make_ppo_trainer(trained, run_dir)
+    _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
+    playback = Playback(trained.env, trainer.evaluator)
+
+    def evaluate() -> None:
+        with Console().status("running the policy on all demonstrations and computing the kinematic bound"):
+            playback.replace(trainer.evaluate(params))
+            _ = trainer.evaluator.lower_bound
+
+    return lambda: serve(
+        config, trained.env, lambda page, times: _play(page, times, playback, config.split), before=evaluate
+    )
+
+
+def _prepare_training_view(config: ViewConfig) -> Callable[[], int]:
+    """Prepares the playback of the newest checkpoint of a run that another process trains."""
+    jax.config.update("jax_platforms", "cpu")  # the training may take the whole memory of the GPU
+    compat.import_mjx()
+    from mimic.trainers.make import make_ppo_trainer
+    from mimic.viewer.newest_checkpoint import NewestCheckpoint
+    from mimic.viewer.playback import Playback
+
+    run_dir, trained = policy_config(config.run)
+    trainer = make_ppo_trainer(trained, run_dir)
+    newest, playback = NewestCheckpoint(trainer, run_dir), Playback(trained.env, trainer.evaluator)
+
+    def show(page: "Page", times: Iterator[float]) -> None:
+        newest.start()
+        if not newest.exists:
+            print(f"view: {run_dir} has no checkpoint yet; waiting for the first one", flush=True)
+        _play_newest(page, times, playback, newest, config.split)
+
+    return lambda: serve(config, trained.env, show, after=newest.finish)
 
 
 def is_installed() -> bool:
@@ -145,11 +188,12 @@ def address(host: str, port: int) -> str:
 
 
 def _title(config: ViewConfig, env: EnvConfig) -> str:
-    controller = f"policy of {Path(config.run).name}" if config.run else "pose mapper" if config.mapper else "optimiser"
+    policy = f"{'newest policy' if config.follow else 'policy'} of {Path(config.run).name}"
+    controller = policy if config.run else "pose mapper" if config.mapper else "optimiser"
     return f"{env.name or 'mimic'}: the learner is moved by the {controller}"
 
 
-def _follow(page: "Page", times: Iterator[float], live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
+def _show_live(page: "Page", times: Iterator[float], live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
     from mimic.viewer.controls import LiveControls
 
     controls = LiveControls(page.server, live, env, can_lock, page.expert)
@@ -172,15 +216,44 @@ def _follow(page: "Page", times: Iterator[float], live: LiveSession, env: EnvCon
         controls.update()
 
 
-def _play(page: "Page", times: Iterator[float], playback: Any, split: str) -> None:
+def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:
     from mimic.viewer.player import Player
 
     player = Player(page.server, playback, split)
     for dt in times:
         if player.advance(dt):
-            episode = player.split, player.demonstration
-            frame = playback.frame(*episode, player.time)
-            page.show(frame, playback.chart(*episode, player.time), playback.note(*episode))
+            _show_playback(page, playback, player)
+
+
+def _show_playback(page: "Page", playback: "Playback", player: "Player", text: str = "") -> None:
+    """Shows the current frame of a playback, below a text."""
+    episode = player.split, player.demonstration
+    frame, note = playback.frame(*episode, player.time), playback.note(*episode)
+    page.show(frame, playback.chart(*episode, player.time), f"{text}\n{note}" if text else note)
+
+
+def _play_newest(
+    page: "Page", times: Iterator[float], playback: "Playback", newest: "NewestCheckpoint", split: str
+) -> None:
+    """Plays each new checkpoint from when it is evaluated; the time in the episode goes on."""
+    from mimic.viewer.player import Player
+
+    page.show_note("waiting for the first checkpoint" if not newest.exists else "evaluating the newest checkpoint …")
+    player, text = None, ""
+    for dt in times:
+        try:
+            evaluation = newest.advance()
+        except ValueError as error:
+            evaluation = None
+            print(f"view: {error}; waiting for the next one", file=sys.stderr, flush=True)
+        if evaluation is not None:
+            playback.replace(evaluation.rollouts)
+            text = evaluation.text
+            print(f"view: {text}", flush=True)
+            player = player or Player(page.server, playback, split)
+            player.refresh()
+        if player is not None and player.advance(dt):
+            _show_playback(page, playback, player, text)
 
 
 def _recorded(recorder: "Recorder", times: Iterator[float]) -> Iterator[float]:

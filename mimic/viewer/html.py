@@ -11,7 +11,8 @@ from mimic.evaluation.labels import similarity_texts
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
 _BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 120, 34, 18, 8  # pixels of a chart and its margins
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 96, 34, 18, 8  # pixels of a chart and its margins
+LAST = 1e12  # order of an element below all others, whose orders are times in seconds
 _MIN_TOP = 0.01  # of a chart's scale, so that the scale is readable at distance 0
 
 
@@ -79,6 +80,11 @@ def heat_maps(
     )
 
 
+def title(text: str) -> str:
+    """Returns the title of a page."""
+    return f'<div style="font-weight:bold;font-size:13px;padding:2px 12px 0">{html.escape(text)}</div>'
+
+
 def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[str, float] | None = None) -> str:
     """Returns distance and bound in large type, a note, and the measures of `mimic.metric.similarity`."""
 
@@ -93,7 +99,8 @@ def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[s
         '<div style="display:flex;gap:22px;padding:4px 12px">'
         + cell("mimic-distance", "embodiment distance", distance, LEARNER)
         + cell("mimic-bound", "kinematic bound", bound, BOUND)
-        + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px">'
+        + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px;'
+        f'white-space:pre-line">'
         f"{html.escape(note)}</div>{_measures(similarity or {})}"
     )
 

@@ -25,6 +25,9 @@ from mimic.runs.signals import Signals
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),
         (["run=a", "expert=panda"], "expected neither with run= or mapper="),
+        (["follow=true"], "follow: expected with run= and without checkpoint="),
+        (["run=a", "follow=true", "checkpoint=5"], "got run='a' and checkpoint=5"),
+        (["run=missing", "follow=true"], "not a run directory"),
         (["split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
@@ -49,10 +52,8 @@ def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
 
 
 def test_only_the_page_of_the_view_imports_viser():
-    modules = ", ".join(
-        f"mimic.viewer.{name}" for name in ("html", "live_session", "playback", "meshes", "follower", "history")
-    )
-    code = f"import sys; sys.modules['viser'] = None; import {modules}"
+    names = "html", "live_session", "playback", "meshes", "follower", "history", "newest_checkpoint"
+    code = f"import sys; sys.modules['viser'] = None; import {', '.join(f'mimic.viewer.{name}' for name in names)}"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
