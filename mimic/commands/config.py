@@ -217,7 +217,7 @@ class RecordingConfig:
       limits: see `EnvConfig`. Default None: those of the environment.
       source: file of motions to import instead of recording, see `import_demonstrations`.
       joints: names of the expert's joints in `source`, base to tip. Default []: the expert's own names.
-      arm: "left" or "right" arm of the person in a motion capture file `source`. Default "": right.
+      arm: "left" or "right" arm of the person in a motion capture file `source`, or "both". Default "": right.
       capture: how such a file is read and cut.
       out: .npz file of the demonstrations; must not exist.
       plot: .png, .pdf or .svg file of the plot; must not exist. Default "": `out` with the suffix .png.

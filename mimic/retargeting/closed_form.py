@@ -14,8 +14,8 @@ links that match exactly. The smoothed length is 0 with derivative 0 at a match,
 
 The computation is on scalar components (see `mimic.metric.spatial`). Rotating joint k moves all distal links: with its
 axis a and a point c on it, a link's position by J = a x (p - c) = m + a x p, m = c x a. Sums over the distal links are
-accumulated from tip to base, as for a composite rigid body: the force g = grad h, the moments M of force and pull, and
-the stiffness of position.
+accumulated from the tips to the base, as for a composite rigid body: the force g = grad h, the moments M of force and
+pull, and the stiffness of position.
 """
 
 from collections.abc import Sequence
@@ -93,6 +93,7 @@ def static_derivatives(
     links: Sequence[Body],
     pulls: Sequence[Pull],
     smoothing: float,
+    parents: Sequence[int],
     angle_smoothing: float | None = None,
 ) -> Derivatives:
     """Derivatives of the static distance, whose value is up to a constant of the pulls.
@@ -100,7 +101,7 @@ def static_derivatives(
     With M taken about a point on axis l, and the twist's torque and force of the stiffness,
 
         d/dq_l       = a_l . (M_zy - M_yz, M_xz - M_zx, M_yx - M_xy), the sum of (p - c) x g and c f' e x t,
-        d^2/dq_k dq_l = a_k . (torque_l + M a_l - tr(M) a_l) + m_k . force_l         for k <= l.
+        d^2/dq_k dq_l = a_k . (torque_l + M a_l - tr(M) a_l) + m_k . force_l         for l and its ancestors k, else 0.
 
     Args:
       axes: unit axis of each joint, base to tip.
@@ -108,11 +109,14 @@ def static_derivatives(
       links: links of the learner.
       pulls: pull on each link.
       smoothing: s [chain lengths].
+      parents: index of each joint's parent, -1 for a joint at the base.
       angle_smoothing: a [rad] where the measure of directions is their angle; None where it is the cosine.
     """
     moments = [spatial.cross(anchor, axis) for anchor, axis in zip(anchors, axes, strict=True)]
-    load, gradient, rows = _Load(), [], []
+    gradient, rows = [], []
+    of_children: dict[int, _Load] = {}
     for joint in reversed(range(len(axes))):
+        load = of_children.get(joint, _Load())
         for link, pull in zip(links, pulls, strict=True):
             if link.joint == joint:
                 load = _add_directions(load, link.direction, pull, angle_smoothing)
@@ -125,9 +129,31 @@ def static_derivatives(
         torque = spatial.rotate(spatial.transpose(load.coupling), moment)
         torque = spatial.add(torque, spatial.rotate(_rows(load.angular), axis))
         torque = spatial.add(torque, spatial.subtract(spatial.rotate(local, axis), spatial.scale(trace, axis)))
-        row = [(spatial.dot(axes[k], torque), spatial.dot(moments[k], force)) for k in range(joint + 1)]
-        rows.append([spatial.plus(*parts) for parts in row])
-    return Derivatives(load.value, tuple(gradient[::-1]), rows[::-1])
+        row: list[Scalar] = [0.0] * (joint + 1)
+        for k in _with_ancestors(joint, parents):
+            row[k] = spatial.plus(spatial.dot(axes[k], torque), spatial.dot(moments[k], force))
+        rows.append(row)
+        parent = parents[joint]
+        of_children[parent] = _total(of_children[parent], load) if parent in of_children else load
+    return Derivatives(of_children[-1].value, tuple(gradient[::-1]), rows[::-1])
+
+
+def _with_ancestors(joint: int, parents: Sequence[int]) -> list[int]:
+    line = [joint]
+    while parents[line[-1]] >= 0:
+        line.append(parents[line[-1]])
+    return line[::-1]
+
+
+def _total(a: _Load, b: _Load) -> _Load:
+    return _Load(
+        value=spatial.plus(a.value, b.value),
+        force=spatial.add(a.force, b.force),
+        moment=_sum(a.moment, b.moment),
+        linear=tuple(map(spatial.plus, a.linear, b.linear)),
+        coupling=_sum(a.coupling, b.coupling),
+        angular=tuple(map(spatial.plus, a.angular, b.angular)),
+    )
 
 
 def _add_directions(load: _Load, direction: Vector, pull: Pull, angle_smoothing: float | None) -> _Load:

@@ -50,7 +50,7 @@ def hold_home(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses:
     return np.broadcast_to(np.asarray(learner.home, qpos.dtype), (*shape, learner.num_joints)).copy()
 
 
-def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int = IK_EVERY) -> Poses:
+def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int = IK_EVERY) -> Poses | None:
     """Inverse kinematics of the hand with mink: matches the position of the tip, and less strictly its direction.
 
     The objective is |p - p*|^2 + (0.1 angle(e, e*))^2, with the tip p in chain lengths and the direction e of the last
@@ -64,9 +64,14 @@ def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int 
       qpos: the expert's poses [rad].
       every: interval between solved samples; 1 solves all.
 
+    Returns:
+      The learner's poses [rad]; None for trees, which have several hands.
+
     Raises:
       ValueError: `qpos` is not [..., time, n] or not finite, or `every` is below 1.
     """
+    if len(expert.chains) > 1 or len(learner.chains) > 1:
+        return None
     qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
     if every < 1:
         raise ValueError(f"every: expected at least 1, got {every}")
@@ -168,10 +173,11 @@ def kinematic_model(arm: Embodiment, sites: dict[str, int]) -> mujoco.MjModel:
     unit = 1 / float(segment_arm(arm).chain_length)
     bodies = [(spec.worldbody, np.zeros(3))]
     lower, upper = pose_limits(arm, float)
-    for name, axis, anchor, low, high in zip(
-        arm.joint_names, arm.joint_axis, unit * np.asarray(arm.joint_anchor), lower, upper, strict=True
+    anchors = unit * np.asarray(arm.joint_anchor)
+    for name, before, axis, anchor, low, high in zip(
+        arm.joint_names, arm.joint_parent, arm.joint_axis, anchors, lower, upper, strict=True
     ):
-        parent, origin = bodies[-1]
+        parent, origin = bodies[before + 1]
         body = parent.add_body(pos=anchor - origin, mass=1.0, inertia=np.ones(3), explicitinertial=True)
         limited = bool(np.isfinite(low))
         joint_range = [low, high] if limited else [0.0, 0.0]

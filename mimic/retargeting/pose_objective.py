@@ -139,7 +139,10 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
     def derivatives(smoothing: Smoothing, target: StaticTarget, qpos: Scalars, store: Store = call) -> Derivatives:
         axes, anchors, vectors = store(kinematics, tuple(qpos))
         links = [Body(joint, *vector) for joint, vector in zip(arm.link_joint, vectors, strict=True)]
-        return static_derivatives(axes, anchors, links, target.pulls, *smoothing)
+        position_smoothing, angle_smoothing = smoothing
+        return static_derivatives(
+            axes, anchors, links, target.pulls, position_smoothing, arm.joint_parent, angle_smoothing
+        )
 
     is_angle = angles is not None
     rough = functools.partial(derivatives, (ROUGH_SMOOTHING, ROUGH_ANGLE_SMOOTHING if is_angle else None))

@@ -80,12 +80,15 @@ def align_segments(
         `landmarks` where None.
 
     Returns:
-      The learner's poses [rad]; None where an arm has no elbow: fewer than three segments that a joint rotates.
+      The learner's poses [rad]; None where an arm has no elbow: fewer than three segments that a joint rotates. None
+      for trees.
 
     Raises:
       ValueError: `qpos` is not [..., time, n], or not finite.
     """
     qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
+    if not all(arm.is_serial and len(arm.chains) == 1 for arm in (expert, learner)):
+        return None
     expert_marks = landmarks(expert) if expert_marks is None else expert_marks
     learner_marks = expert_marks if _same_segments(expert, learner) else landmarks(learner)
     if expert_marks is None or learner_marks is None:

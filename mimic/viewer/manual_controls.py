@@ -55,7 +55,7 @@ class ManualControls:
         moving = self._session.moves_by_itself or dragged
         if dragged:  # the user holds the handle
             self._handle_pose = None
-        elif not np.array_equal(pose, self._handle_pose):
+        elif self._handle_pose is None or not np.array_equal(pose, self._handle_pose):
             self._hand.position, self._handle_pose = hand_position(self._session.expert, pose), pose
         if moving or self._was_moving:
             for slider, angle in zip(self._sliders, pose, strict=True):

@@ -83,7 +83,7 @@ def test_penetrations_of_a_panda_equal_those_of_mujoco(x64):
     geoms = [geom for geom in range(model.ngeom) if geom != floor]
     pairs = [(geoms[i], geoms[j]) for i, j in capsules.pairs]
     pairs += [(floor, geom) for geom, joint in zip(geoms, capsules.joint, strict=True) if joint > 0]
-    lower, upper = np.asarray(arm.joint_range).T
+    lower, upper = np.asarray(arm.joint_range, float).T
     qpos = np.random.default_rng(0).uniform(lower, upper, (150, 7))
     theirs = np.empty((len(qpos), len(pairs)))
     for row, q in zip(theirs, qpos, strict=True):
