@@ -53,7 +53,7 @@ def test_link_states_are_those_of_mujoco(x64, name):
         error = largest_error(model, arm, tips, locked, jax.jit(lambda q, v: link_states(arm, q, v, normalized=False)))
         print(f"{name}: {arm.num_joints} joints, {arm.num_links} links, {len(arm.chains)} chains: off by {error:.1e}")
         assert error < 1e-9
-    by_numpy = largest_error(model, arm, tips, locked, lambda *x: _in_metres(arm, link_state_table(arm, *x, float)))
+    by_numpy = largest_error(model, arm, tips, locked, lambda q, v: _in_metres(arm, link_state_table(arm, q, v, float)))
     assert by_numpy < 1e-9
 
 
