@@ -1,12 +1,13 @@
 """Similarity of robots to the arms of captured people: mimic's motions, and baselines, by measures nobody optimises.
 
-    python -m benchmarks.motion_capture CLIP.bvh ... --out FILE [--rate 10] [--arms FOLDER] [--trunks 0 0.25]
+    python -m benchmarks.motion_capture CLIP.bvh ... --out FILE [--rate 20] [--arms FOLDER] [--trunks 0 0.25]
 
 With `--trunks`, only the effect of the trunk's length [m] is measured instead: nearest poses of the Panda to 64 poses.
 
 Each arm of each clip is retargeted to the Panda, with and without locked joints, and to arms of an unpacked wheel of
-robosuite in FOLDER. Methods: `imitate_trajectory` with angles and positions, without and with the cost of the hand, and
-with the default metric; a pose mapper that was trained on the poses of the same arm of the clip; inverse kinematics of
+robosuite in FOLDER. Methods: `imitate_trajectory` with angles and positions of links that are cut alike, without and
+with the cost of the hand, and with the default metric; a pose mapper that was trained on the poses of the same arm of
+the clip, with the metric of the first; inverse kinematics of
 the scaled hand by mink, and of frames of the links as GMR does it; the closed form that aligns shoulder, elbow and
 wrist; holding the home pose. Besides the measures of similarity: the largest speed of a joint between two samples
 [rad/s], and the root mean square of the joints' jerk [rad/s^3], at the captured speed.
@@ -27,6 +28,7 @@ from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.peers.frame_matching import match_frames
 from benchmarks.similarity import other_arms
 from mimic.arms.arm import ArmConfig
+from mimic.arms.common_cuts import cut_alike
 from mimic.commands.capture import fixed_fraction, read_arm
 from mimic.commands.config import CaptureConfig
 from mimic.envs.config import EnvConfig
@@ -44,11 +46,10 @@ from mimic.trainers.pose_mapper.training import train
 
 _POSES = 64  # of a clip, for the effect of the trunk
 _SPEED = 15.0  # rad/s, of a joint: retargeting passes from one minimum to another within it
-# Angles, because they and positions are linear near a match, and cosines are not. The weight of positions was chosen
-# among 1, 1.5, 2 and 4 on the right arm of a clip and two robots (docs/motion_capture.md).
+# Angles, because they and positions are linear near a match, and cosines are not. See docs/motion_capture.md for the
+# weight of positions.
 METRIC = MetricConfig(rotation_measure="angle", translation=2.0)
-# A hand off by 0.01 chain lengths then pulls with 2, as much as all positions of the arm together.
-HAND = mimic.Costs(hand_position=100.0)
+HAND = mimic.Costs(hand_position=300.0)
 _MAPPER = PoseMapperConfig(fresh=False, samples=256, batch_size=64, epochs=400, evaluations=1, validation_poses=64)
 
 
@@ -97,6 +98,11 @@ def imitated(case: Case, metric: MetricConfig = METRIC, costs: mimic.Costs | Non
     return np.asarray(moved.qpos)
 
 
+def with_cut_links(case: Case) -> Case:
+    expert, learner = cut_alike(case.expert, case.learner)
+    return dataclasses.replace(case, expert=expert, learner=learner)
+
+
 def mapped(case: Case) -> np.ndarray:
     """Poses of a mapper that was trained on the same poses."""
     settings = _MAPPER.resolve()
@@ -116,10 +122,10 @@ def mapped(case: Case) -> np.ndarray:
 
 
 METHODS: dict[str, Callable[[Case], np.ndarray | None]] = {
-    "mimic": imitated,
-    "mimic_hand": lambda case: imitated(case, costs=HAND),
+    "mimic": lambda case: imitated(with_cut_links(case)),
+    "mimic_hand": lambda case: imitated(with_cut_links(case), costs=HAND),
     "mimic_default_metric": lambda case: imitated(case, MetricConfig()),
-    "pose_mapper": mapped,
+    "pose_mapper": lambda case: mapped(with_cut_links(case)),
     "hand_ik": lambda case: hand_ik(case.expert, case.learner, case.qpos, every=1),
     "frame_matching": lambda case: match_frames(case.expert, case.learner, case.qpos, case.marks),
     "align_segments": lambda case: align_segments(case.expert, case.learner, case.qpos, expert_marks=case.marks),
@@ -167,7 +173,7 @@ def _measures(line: object, learner: mimic.Embodiment, qpos: np.ndarray, rate: f
 
 
 def main() -> None:
-    parser = make_parser("motion_capture", __doc__, rate=10.0)
+    parser = make_parser("motion_capture", __doc__, rate=20.0)
     parser.add_argument("clips", nargs="+", type=Path)
     parser.add_argument("--trunks", nargs="+", type=float, metavar="M")
     parser.add_argument("--learners", nargs="+", metavar="NAME", help="some of the robots")
