@@ -29,7 +29,7 @@ from mimic.retargeting.costs import capsule_axes, pair_distances
 _PAIR = ArmConfig("panda_pair")
 _LIMITS = "none"  # as in env=bimanual
 _SPEED = 15.0  # rad/s, of a joint
-_STARTS = 2  # random initial guesses: each takes a minute of one core with the cost
+_STARTS = 8  # random initial guesses: each takes a minute of one core with the cost
 _CLOSE = 0.02  # m
 _RANDOM_POSES, _CHANGE = 1000, 1e-3  # m, of a distance that joints change
 # The cost is 0 from its clearance on; below, the distance pulls against it, so that it keeps less than its clearance.
@@ -113,7 +113,7 @@ def main() -> None:
         if name not in motions:
             motions[name] = imitated(expert, learner, capsules, qpos, options.rate, costs)
             if options.poses:
-                np.savez(options.poses, **motions)
+                np.savez(options.poses, **motions)  # type: ignore[arg-type]
     rows: list[Row] = [
         {"cost": name, **measure(expert, learner, capsules, (qpos, motions[name]), options.rate)} for name in COSTS
     ]
