@@ -119,7 +119,14 @@ def computed_once(scalars: list[Any]) -> list[Any]:
     """
     import jax
 
-    return scalars if jax.default_backend() == "cpu" else jax.lax.optimization_barrier(scalars)
+    return scalars if is_cpu() else jax.lax.optimization_barrier(scalars)
+
+
+def is_cpu() -> bool:
+    """Whether JAX's default backend is the CPU."""
+    import jax
+
+    return jax.default_backend() == "cpu"
 
 
 def stored(index: Any, function: Callable[[Any], Any], argument: Any) -> Any:
@@ -136,7 +143,7 @@ def stored(index: Any, function: Callable[[Any], Any], argument: Any) -> Any:
     """
     import jax
 
-    if jax.default_backend() != "cpu":
+    if not is_cpu():
         return function(argument)
     result: Any = None  # that of the trace: its Python numbers, and the shapes of its arrays
 

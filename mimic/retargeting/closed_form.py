@@ -76,7 +76,7 @@ class _Load(NamedTuple):
     angular: Symmetric = _NONE
 
 
-def smoothed_length(square: Scalar, smoothing: float) -> Scalar:
+def smoothed_length(square: Scalar, smoothing: Scalar) -> Scalar:
     """Smoothed length h [chain lengths] from the square of the length, without cancellation at 0."""
     return square / (jnp.sqrt(square + smoothing**2) + smoothing)
 
@@ -86,7 +86,7 @@ def static_derivatives(
     anchors: Sequence[Vector],
     links: Sequence[Body],
     pulls: Sequence[Pull],
-    smoothing: float,
+    smoothing: Scalar,
 ) -> Derivatives:
     """Derivatives of the static distance, whose value is up to a constant of the pulls.
 
@@ -128,7 +128,7 @@ def _add_direction(load: _Load, direction: Vector, pull: Pull) -> _Load:
     return load._replace(value=spatial.plus(load.value, value), moment=moment)
 
 
-def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: float) -> _Load:
+def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: Scalar) -> _Load:
     if not pull.points or all(isinstance(x, float) for x in position):  # such a position cannot move
         return load
     value, force, stiffness = load.value, spatial.ZERO, _NONE

@@ -15,8 +15,8 @@ from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.metric import spatial
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
-from mimic.metric.spatial import Vector
-from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING, Body, Pull, smoothed_length, static_derivatives
+from mimic.metric.spatial import Scalar, Vector
+from mimic.retargeting.closed_form import SMOOTHING, Body, Pull, smoothed_length, static_derivatives
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 
 Target = Any  # pytree: the data of the expert's pose that the objective needs
@@ -30,16 +30,36 @@ class PoseObjective:
       distance: (expert's link states, learner's link states) -> embodiment distance, both at rest.
       target: (expert's link states, expert's pose) -> target.
       value: (target, learner's link states) -> distance, up to a constant of the target.
-      derivatives: (target, joint angles, store) -> derivatives of the distance; the value up to this constant.
-        `store` is a `mimic.retargeting.optimizers.Store`, which may be omitted.
-      rough_derivatives: the same for a smoother function with nearby minima, for the first iterations.
+      derivatives: (target, joint angles, store, smoothing) -> derivatives of the distance; the value up to this
+        constant. `store`, a `mimic.retargeting.optimizers.Store`, and `smoothing` [chain lengths] may be omitted.
+      is_smoothed: whether the smoothing has an effect.
+      is_elementwise: whether `derivatives` also takes arrays of poses for each joint, which broadcast with arrays of
+        targets; see `of_batch`.
     """
 
     distance: Callable[[LinkStates, LinkStates], Array]
     target: Callable[..., Target]
     value: Callable[[Target, LinkStates], Array]
     derivatives: Callable[..., Derivatives]
-    rough_derivatives: Callable[..., Derivatives]
+    is_smoothed: bool = False
+    is_elementwise: bool = False
+
+    def of_batch(self, targets: Target) -> Callable[..., Derivatives]:
+        """`derivatives` for joint angles [lanes, poses] each.
+
+        Args:
+          targets: one for each pose, along the last axis of each array.
+        """
+        if self.is_elementwise:
+            return functools.partial(self.derivatives, targets)
+
+        def derivatives(qpos: Scalars, store: Store = call, smoothing: Scalar = SMOOTHING) -> Derivatives:
+            def at(target: Target, qpos: Scalars) -> Derivatives:
+                return self.derivatives(target, qpos, store, smoothing)
+
+            return jax.vmap(jax.vmap(at, (None, 0)), (-1, -1), -1)(targets, tuple(qpos))
+
+        return derivatives
 
 
 def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
@@ -48,7 +68,7 @@ def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
 
 
 def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
-    def derivatives(target: LinkStates, qpos: Scalars, store: Store = call) -> Derivatives:
+    def derivatives(target: LinkStates, qpos: Scalars, store: Store = call, smoothing: Any = None) -> Derivatives:
         def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
             value, gradient = jax.value_and_grad(lambda q: metric(target, link_states(learner, q)))(qpos)
             return gradient, (value, gradient)
@@ -56,7 +76,7 @@ def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
         hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
         return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
 
-    return PoseObjective(metric, lambda states, _=None: states, metric, derivatives, derivatives)
+    return PoseObjective(metric, lambda states, _=None: states, metric, derivatives)
 
 
 class StaticTarget(NamedTuple):
@@ -109,13 +129,14 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
         vectors = [(link.direction, link.position) for link in link_vectors(arm, frames)]
         return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], vectors
 
-    def derivatives(smoothing: float, target: StaticTarget, qpos: Scalars, store: Store = call) -> Derivatives:
+    def derivatives(
+        target: StaticTarget, qpos: Scalars, store: Store = call, smoothing: Scalar = SMOOTHING
+    ) -> Derivatives:
         axes, anchors, vectors = store(kinematics, tuple(qpos))
         links = [Body(joint, *vector) for joint, vector in zip(arm.link_joint, vectors, strict=True)]
         return static_derivatives(axes, anchors, links, target.pulls, smoothing)
 
-    rough, fine = (functools.partial(derivatives, smoothing) for smoothing in (ROUGH_SMOOTHING, SMOOTHING))
-    return PoseObjective(metric, target, value, fine, rough if len(pairs) else fine)
+    return PoseObjective(metric, target, value, derivatives, is_smoothed=bool(len(pairs)), is_elementwise=True)
 
 
 def _pair_weights(correspondence: Any, weight: Any) -> Any:

@@ -15,6 +15,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.compilation import compiled_once
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import link_states
+from mimic.retargeting.closed_form import ROUGH_SMOOTHING
 from mimic.retargeting.costs import Costs, smoothness_derivatives, sum_of, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, Store, newton
@@ -118,7 +119,7 @@ def _trajectory_solver(
         tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
         best = jnp.argmin(tracks.value.mean(axis=1))
         solution: Solution = jax.tree.map(lambda x: x[best], tracks)
-        if objective.rough_derivatives is not objective.derivatives:
+        if objective.is_smoothed:
             solution = tracker.refine(solution)
         distance = jax.vmap(lambda state, q: objective.distance(state, link_states(learner, q)))(states, solution.qpos)
         shift = wrap_angles(solution.qpos[0], continuous_joints(learner)) - solution.qpos[0]
@@ -152,7 +153,7 @@ class _Tracker:
 
     def track(self, anchor: Array, guess: Array) -> Solution:
         """The minimum near a guess at the anchor's time, tracked over all times with the rough derivatives."""
-        rough = self.objective.rough_derivatives
+        rough = functools.partial(self.objective.derivatives, smoothing=ROUGH_SMOOTHING)
         begin = newton(self._at(rough, anchor), guess, self.limits, ITERATIONS["newton"]).qpos
 
         def follow(past: _Past, time: Array) -> tuple[_Past, Solution]:
