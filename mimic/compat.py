@@ -151,16 +151,29 @@ def stored(index: Any, function: Callable[[Any], Any], argument: Any) -> Any:
         nonlocal result
         value = function(argument)
         result = jax.tree.map(lambda x: x if _is_number(x) else jax.ShapeDtypeStruct(x.shape, x.dtype), value)
-        return [leaf for leaf in jax.tree.leaves(value) if not _is_number(leaf)]
+        return _in_pairs([leaf for leaf in jax.tree.leaves(value) if not _is_number(leaf)])
 
-    def never(_: Any) -> list[Any]:
-        if result is None:
-            jax.eval_shape(arrays_of, argument)
-        return [jax.numpy.zeros(x.shape, x.dtype) for x in jax.tree.leaves(result) if not _is_number(x)]
+    def never(argument: Any) -> list[Any]:
+        shapes = jax.eval_shape(arrays_of, argument)
+        return [jax.numpy.zeros(x.shape, x.dtype) for x in shapes]
 
-    arrays = iter(jax.lax.cond(index >= 0, arrays_of, never, argument))
+    arrays = iter(_from_pairs(jax.lax.cond(index >= 0, arrays_of, never, argument)))
     return jax.tree.map(lambda x: x if _is_number(x) else next(arrays), result)
 
+
+def _in_pairs(arrays: list[Any]) -> list[Any]:
+    import jax
+
+    return [jax.lax.complex(*pair) for pair in zip(arrays[::2], arrays[1::2], strict=False)] + arrays[len(arrays)//2*2:]
+
+def _from_pairs(arrays: list[Any]) -> list[Any]:
+    import jax
+    import jax.numpy as jnp
+    out=[]
+    for x in arrays:
+        if jnp.iscomplexobj(x): out += [jax.lax.real(x), jax.lax.imag(x)]
+        else: out.append(x)
+    return out
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, float | int)

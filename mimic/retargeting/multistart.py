@@ -117,14 +117,18 @@ def _descend_in_one_loop(
         guess = jax.lax.dynamic_index_in_dim(rounds, step.round, keepdims=False)
         return newton_start(jnp.where(step.is_last, best.qpos, guess), limits), best
 
-    def iterate(carry: tuple[NewtonState, Solution], step: _Step) -> tuple[tuple[NewtonState, Solution], None]:
+    def iterate(
+        carry: tuple[NewtonState, Solution], index_and_step: tuple[Array, _Step]
+    ) -> tuple[tuple[NewtonState, Solution], None]:
+        index, step = index_and_step
         state, best = jax.lax.cond(step.begins, begin, lambda carry, _: carry, carry, step)
         of_step = functools.partial(objective, smoothing=step.smoothing)
-        return (newton_step(of_step, state, limits, step.round), best), None
+        return (newton_step(of_step, state, limits, index), best), None
 
     unknown = newton_start(rounds[0], limits)
     steps = jax.tree.map(jnp.asarray, _schedule(len(rounds), descents, rounds.dtype))
-    (state, _), _ = jax.lax.scan(iterate, (unknown, solution_at(unknown, limits)), steps)
+    indices = jnp.arange(len(steps.begins))
+    (state, _), _ = jax.lax.scan(iterate, (unknown, solution_at(unknown, limits)), (indices, steps))
     return solution_at(state, limits)
 
 
