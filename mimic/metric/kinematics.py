@@ -140,6 +140,49 @@ def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: b
     return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, links)))
 
 
+def resting_link_states(arm: Embodiment, qpos: Float[Array, "joints poses"]) -> LinkStates:
+    """Normalized link states at rest of a batch of poses along the last axis, as few operations on arrays.
+
+    It compiles in a quarter of the time of `link_states`, and runs slower: for what is computed once in a function.
+
+    Args:
+      arm: the embodiment.
+      qpos: joint angles [rad].
+
+    Returns:
+      Arrays [links, 3, poses].
+    """
+    rotations = _joint_rotations(arm, qpos)
+    frame_index = np.asarray(arm.link_joint) + 1
+    anchors = np.concatenate([np.zeros((1, 3)), np.asarray(arm.joint_anchor, float)])
+    offsets = np.asarray(arm.link_position, float) - anchors[frame_index]
+    is_proximal = np.arange(1, len(anchors))[None] <= frame_index[:, None]
+
+    def rotated(index: np.ndarray, vectors: np.ndarray) -> Array:  # elementwise: TF32 never touches it
+        return jnp.sum(rotations[index] * jnp.asarray(vectors, qpos.dtype)[:, None, :, None], axis=2)
+
+    steps = rotated(np.arange(arm.num_joints), np.diff(anchors, axis=0))
+    position = jnp.sum(jnp.asarray(is_proximal, qpos.dtype)[:, :, None, None] * steps, axis=1)
+    position = (position + rotated(frame_index, offsets)) / np.asarray(arm.chain_length, qpos.dtype)
+    direction = rotated(frame_index, np.asarray(arm.link_rotation, float)[:, :, 0])
+    return LinkStates(position, direction, jnp.zeros_like(position), jnp.zeros_like(position))
+
+
+def _joint_rotations(arm: Embodiment, qpos: Float[Array, "joints poses"]) -> Float[Array, "frames 3 3 poses"]:
+    """Rotations of the base and of each joint's child body (Rodrigues)."""
+    x, y, z = np.asarray(arm.joint_axis, float).T
+    zero = np.zeros_like(x)
+    skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    first, second = (jnp.asarray(matrix[..., None], qpos.dtype) for matrix in (skew, skew @ skew))
+    identity = jnp.eye(3, dtype=qpos.dtype)[:, :, None]
+    angle = qpos[:, None, None]
+    turns = identity + jnp.sin(angle) * first + (1 - jnp.cos(angle)) * second
+    rotations = [jnp.broadcast_to(identity, turns.shape[1:])]
+    for turn in turns:
+        rotations.append(jnp.sum(rotations[-1][:, :, None] * turn[None], axis=1))
+    return jnp.stack(rotations)
+
+
 def link_state_table(
     arm: Embodiment,
     qpos: Float[np.ndarray, "*batch joints"],

@@ -16,7 +16,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.compilation import compiled_once
 from mimic.config import check_choice
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
-from mimic.metric.kinematics import link_states
+from mimic.metric.kinematics import resting_link_states
 from mimic.metric.spatial import array_library
 from mimic.retargeting.costs import Costs, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
@@ -137,8 +137,8 @@ def _pose_solver(
     objective = with_costs(pose_objective(learner, metric), costs, expert, learner, capsules)
 
     def solve(poses: Array, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
-        states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
-        targets = jax.vmap(objective.target, out_axes=-1)(states, poses)
+        states = resting_link_states(expert, poses.T)
+        targets = jax.vmap(objective.target, (-1, 0), -1)(states, poses)
         if warm is None:
             first = shared_joints(expert, learner, poses)
             guess = functools.partial(initial_guesses, objective, candidates=candidates if random else None)
@@ -146,10 +146,8 @@ def _pose_solver(
         else:
             guesses = warm.T[None]
         solution = best_descent(objective.of_batch(targets), guesses, pose_limits(learner, poses.dtype), descents)
-        distance = jax.vmap(lambda state, q: objective.distance(state, link_states(learner, q)))(
-            states, solution.qpos.T
-        )
-        scale = typical_distance(objective, jax.tree.map(lambda x: x[0], states), candidates)
+        distance = jax.vmap(objective.distance, -1)(states, resting_link_states(learner, solution.qpos))
+        scale = typical_distance(objective, jax.tree.map(lambda x: x[..., 0], targets), candidates)
         qpos = wrap_angles(solution.qpos.T, continuous_joints(learner))
         return PoseImitation(qpos, distance, solution.gradient_norm <= FLAT * scale)
 

@@ -29,9 +29,9 @@ class PoseObjective:
     Attributes:
       distance: (expert's link states, learner's link states) -> embodiment distance, both at rest.
       target: (expert's link states, expert's pose) -> target.
-      value: (target, learner's link states) -> distance, up to a constant of the target.
-      derivatives: (target, joint angles, store, smoothing) -> derivatives of the distance; the value up to this
-        constant. `store`, a `mimic.retargeting.optimizers.Store`, and `smoothing` [chain lengths] may be omitted.
+      value: (target, learner's link states) -> distance with smoothed lengths.
+      derivatives: (target, joint angles, store, smoothing) -> derivatives of the distance; the value up to a constant
+        of the target. `store`, a `mimic.retargeting.optimizers.Store`, and `smoothing` [chain lengths] may be omitted.
       is_smoothed: whether the smoothing has an effect.
       is_elementwise: whether `derivatives` also takes arrays of poses for each joint, which broadcast with arrays of
         targets; see `of_batch`.
@@ -85,14 +85,12 @@ class StaticTarget(NamedTuple):
     Attributes:
       unit, strength: [links, 3], [links] of the pulls on directions.
       points, weights: [pairs, 3], [pairs] of the pulls on positions.
-      pulls: both for each link, as scalar components.
     """
 
     unit: Array
     strength: Array
     points: Array
     weights: Array
-    pulls: tuple[Pull, ...]
 
 
 def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
@@ -113,16 +111,14 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
         strength = spatial.safe_sqrt(jnp.sum(pull * pull, axis=-1))
         unit = pull / jnp.maximum(strength, jnp.finfo(pull.dtype).tiny)[:, None]
         weight = jnp.asarray(positions[pairs[:, 0], pairs[:, 1]], dtype)
-        unit, strength, points = unit.astype(dtype), strength.astype(dtype), states.position[pairs[:, 0]]
-        pulls = tuple(_pull(unit[j], strength[j], points, weight, pairs[:, 1] == j) for j in range(learner.num_links))
-        return StaticTarget(unit, strength, points, weight, pulls)
+        return StaticTarget(unit.astype(dtype), strength.astype(dtype), states.position[pairs[:, 0]], weight)
 
     def value(target: StaticTarget, states: LinkStates) -> Array:
         assert states.direction is not None
         aligned = jnp.vdot(target.strength[:, None] * target.unit, states.direction)
         difference = states.position[pairs[:, 1]] - target.points
         square = jnp.sum(difference * difference, axis=-1)
-        return jnp.sum(target.weights * smoothed_length(square, SMOOTHING)) - aligned
+        return jnp.sum(target.weights * smoothed_length(square, SMOOTHING)) + np.pi / 2 * directions.sum() - aligned
 
     def kinematics(qpos: Scalars) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Vector]]]:
         frames = joint_frames(arm, qpos, None)
@@ -134,7 +130,8 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
     ) -> Derivatives:
         axes, anchors, vectors = store(kinematics, tuple(qpos))
         links = [Body(joint, *vector) for joint, vector in zip(arm.link_joint, vectors, strict=True)]
-        return static_derivatives(axes, anchors, links, target.pulls, smoothing)
+        pulls = [_pull(target, j, pairs[:, 1] == j) for j in range(learner.num_links)]
+        return static_derivatives(axes, anchors, links, pulls, smoothing)
 
     return PoseObjective(metric, target, value, derivatives, is_smoothed=bool(len(pairs)), is_elementwise=True)
 
@@ -157,8 +154,8 @@ def _weighted_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 
     return np.argwhere(has_weight)
 
 
-def _pull(unit: Array, strength: Array, points: Array, weights: Array, is_on_link: Bool[np.ndarray, " pairs"]) -> Pull:
-    """Pull on one link as scalars, extracted from the arrays once and not in each step of a descent."""
+def _pull(target: StaticTarget, link: int, is_on_link: Bool[np.ndarray, " pairs"]) -> Pull:
+    """Pull on one link as scalars."""
     indices = np.flatnonzero(is_on_link)
-    points_of_link = [spatial.vector(points[i]) for i in indices]
-    return Pull(spatial.vector(unit), strength, points_of_link, [weights[i] for i in indices])
+    points = [spatial.vector(target.points[i]) for i in indices]
+    return Pull(spatial.vector(target.unit[link]), target.strength[link], points, [target.weights[i] for i in indices])

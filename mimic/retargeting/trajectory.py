@@ -105,8 +105,8 @@ def _trajectory_solver(
     def solve(poses: Array, jump: Array, candidates: RandomPoses) -> PoseImitation:
         anchors = np.unique(np.linspace(0, poses.shape[0] - 1, _ANCHORS).round().astype(int))
         states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
-        scale = typical_distance(objective, jax.tree.map(lambda x: x[0], states), candidates)
         targets = jax.vmap(objective.target)(states, poses)
+        scale = typical_distance(objective, jax.tree.map(lambda x: x[0], targets), candidates)
         tracker = _Tracker(objective, targets, pose_limits(learner, poses.dtype), jump, len(poses), costs)
 
         def from_anchor(anchor: Array) -> Solution:
