@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic import compat
-from mimic.metric.spatial import Scalar, plus, times
+from mimic.metric.spatial import Scalar, minus, plus, times
 
 _MAX_STEP = 1.0  # rad, of a joint in one Newton step
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: initial value, factors after a success and a failure
@@ -148,14 +148,14 @@ def _descent_step(here: Derivatives, free: Scalars, damping: Scalar) -> Scalars:
         below = [matrix[i][k] for i in range(joints) if i > k]
         for i in range(k + 1, joints):
             matrix[i][k] = matrix[i][k] / pivot  # from now on an entry of L
-            step[i] = step[i] - matrix[i][k] * step[k]
+            step[i] = minus(step[i], times(matrix[i][k], step[k]))
             for j in range(k + 1, i + 1):
-                matrix[i][j] = matrix[i][j] - matrix[i][k] * below[j - k - 1]
+                matrix[i][j] = minus(matrix[i][j], times(matrix[i][k], below[j - k - 1]))
         pivots.append(jnp.abs(pivot))
     step = [s / pivot for s, pivot in zip(step, pivots, strict=True)]
     for k in reversed(range(joints)):
         for i in range(k + 1, joints):
-            step[k] = step[k] - matrix[i][k] * step[i]
+            step[k] = minus(step[k], times(matrix[i][k], step[i]))
     return step
 
 
