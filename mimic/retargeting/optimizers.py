@@ -115,8 +115,8 @@ def newton_step(objective: Objective, state: NewtonState, limits: Limits, index:
     new_qpos = _within([q + s * scale for q, s in zip(qpos, step, strict=True)], bounds)
     there = store(lambda qpos: _symmetric(objective(qpos, store)), new_qpos)
     better = there.value < here.value
-    kept = jax.tree.map(functools.partial(jnp.where, better), (new_qpos, there), (qpos, here))
-    return NewtonState(*kept, damping * jnp.where(better, _LESS, _MORE))
+    best_qpos, best = jax.tree.map(functools.partial(jnp.where, better), (new_qpos, there), (qpos, here))
+    return NewtonState(best_qpos, best, damping * jnp.where(better, _LESS, _MORE))
 
 
 def gradient_descent(

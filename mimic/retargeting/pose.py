@@ -27,6 +27,7 @@ METHODS = ("newton", "gradient_descent")
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 ITERATIONS = {"newton": 16, "gradient_descent": 1000}
+_NO_COSTS = Costs()
 FLAT = 1e-3  # gradient [1/rad] of a converged pose, as a fraction of the mean distance of random poses
 
 
@@ -94,7 +95,7 @@ def imitate_pose(
     Raises:
       ValueError: poses of the wrong shape or not finite, an unknown method, or a count below its minimum.
     """
-    poses = checked_poses(expert, jnp.asarray(qpos))
+    poses = checked_poses(expert, _concrete(qpos))
     check_choice("method", method, METHODS)
     # Longer than 40 lines: argument checks, and functions that share the arguments.
     count = ITERATIONS[method] if iterations is None else iterations
@@ -102,25 +103,25 @@ def imitate_pose(
         raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {count}")
     if kept is not None and kept < 1:
         raise ValueError(f"kept: expected at least 1, or None for all, got {kept}")
-    costs = Costs() if costs is None else costs
+    costs = _NO_COSTS if costs is None else costs
     costs.check_capsules(capsules)
     if costs.of_motion:
         raise ValueError(
             "costs: expected velocity and acceleration of 0 for single poses; imitate_trajectory takes them"
         )
-    batch = poses.shape[:-1]
-    flat_warm = None
-    if warm_start is not None:
-        flat_warm = checked_poses(learner, jnp.asarray(warm_start), "warm_start").reshape(-1, learner.num_joints)
-        flat_warm = jnp.broadcast_to(flat_warm, (int(np.prod(batch)), learner.num_joints))
+    warm = None if warm_start is None else checked_poses(learner, _concrete(warm_start), "warm_start")
     metric = Metric(correspondence, weights, rotation, reduction)
     descents = Descents(method, count, kept)
     solve = _pose_solver(
         expert, learner, metric, descents, bool(starts), costs, capsules if costs.of_capsules else None
     )
-    candidates = random_poses(learner, key, max(starts, 1), poses.dtype)
-    solutions = solve(poses.reshape(-1, expert.num_joints), flat_warm, candidates)
-    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solutions)
+    dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
+    return solve(poses, warm, random_poses(learner, key, max(starts, 1), dtype))
+
+
+def _concrete(values: ArrayLike) -> Any:
+    """The values as an array, without a copy to a device: functions of `jax.numpy` outside of `jax.jit` are slow."""
+    return values if isinstance(values, jax.Array) else np.asarray(values)  # a tracer is a `jax.Array`
 
 
 @compiled_once
@@ -133,10 +134,11 @@ def _pose_solver(
     costs: Costs,
     capsules: Capsules | None,
 ) -> Callable[[Array, Array | None, RandomPoses], PoseImitation]:
-    """The function of poses [N, n], warm starts [N, n_hat] and random poses that `imitate_pose` compiles."""
+    """The function of poses [..., n], warm starts [..., n_hat] and random poses that `imitate_pose` compiles."""
     objective = with_costs(pose_objective(learner, metric), costs, expert, learner, capsules)
 
-    def solve(poses: Array, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
+    def solve(batch: Array, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
+        poses = jnp.asarray(batch).reshape(-1, expert.num_joints)
         states = resting_link_states(expert, poses.T)
         targets = jax.vmap(objective.target, (-1, 0), -1)(states, poses)
         if warm is None:
@@ -144,12 +146,14 @@ def _pose_solver(
             guess = functools.partial(initial_guesses, objective, candidates=candidates if random else None)
             guesses = jax.vmap(guess, (-1, 0), -1)(targets, first)
         else:
-            guesses = warm.T[None]
+            warm = jnp.asarray(warm).reshape(-1, learner.num_joints)
+            guesses = jnp.broadcast_to(warm, (len(poses), learner.num_joints)).T[None]
         solution = best_descent(objective.of_batch(targets), guesses, pose_limits(learner, poses.dtype), descents)
         distance = jax.vmap(objective.distance, -1)(states, resting_link_states(learner, solution.qpos))
         scale = typical_distance(objective, jax.tree.map(lambda x: x[..., 0], targets), candidates)
         qpos = wrap_angles(solution.qpos.T, continuous_joints(learner))
-        return PoseImitation(qpos, distance, solution.gradient_norm <= FLAT * scale)
+        solutions = PoseImitation(qpos, distance, solution.gradient_norm <= FLAT * scale)
+        return jax.tree.map(lambda x: x.reshape(*batch.shape[:-1], *x.shape[1:]), solutions)
 
     return solve
 
