@@ -67,7 +67,7 @@ def best_descent(
     if kept is None:
         ends = descend(exact, guesses.swapaxes(0, 1), limits, descents.iterations)
     elif descents.method == "newton" and compat.is_cpu():
-        ends = _descend_in_one_loop(objective, _rounds(guesses, kept), limits, descents)
+        ends = _descend_in_one_loop(objective, guesses, limits, descents._replace(kept=kept))
     else:
         rough = functools.partial(objective, smoothing=ROUGH_SMOOTHING)
         ends = descend(rough, guesses.swapaxes(0, 1), limits, descents.rough_iterations)
@@ -106,13 +106,16 @@ def _schedule(rounds: int, descents: Descents, dtype: Any) -> _Step:
 
 
 def _descend_in_one_loop(
-    objective: SmoothedObjective, rounds: Float[Array, "rounds joints kept poses"], limits: Limits, descents: Descents
+    objective: SmoothedObjective, guesses: Float[Array, "guesses joints poses"], limits: Limits, descents: Descents
 ) -> Solution:
-    kept = rounds.shape[2]
+    kept = descents.kept or len(guesses)
+    rounds = _rounds(guesses, kept)
+    repeated = np.arange(kept)[:, None] >= kept - -len(guesses) % kept  # lanes of the last round
 
     def begin(carry: tuple[NewtonState, Solution], step: _Step) -> tuple[NewtonState, Solution]:
         state, best = carry
         ends = solution_at(state, limits)
+        ends = ends._replace(value=jnp.where(step.is_last & repeated, jnp.inf, ends.value))
         best = _best_lanes(jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), best, ends), kept)
         guess = jax.lax.dynamic_index_in_dim(rounds, step.round, keepdims=False)
         return newton_start(jnp.where(step.is_last, best.qpos, guess), limits), best

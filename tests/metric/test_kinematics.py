@@ -17,6 +17,7 @@ from mimic.metric.kinematics import (
     forward_kinematics,
     link_state_table,
     link_states,
+    resting_link_states,
 )
 from tests.helpers import random_arms
 
@@ -257,6 +258,17 @@ def test_wrong_shapes_are_rejected(unchecked, shape):
                 function()
             assert "\n" not in str(error.value)
             assert ("jax.vmap" in str(error.value)) == (len(shape) > 1)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("arm", [panda(), panda(locked=(3, 6, 7)), load_mjcf(random_arms.random_arm(0))])
+def test_link_states_of_a_batch_at_rest_equal_link_states(arm):
+    """1e-12: double precision."""
+    qpos = np.random.default_rng(0).uniform(-3, 3, (3, arm.num_joints))
+    batch = resting_link_states(arm, jnp.asarray(qpos.T))
+    for pose, angles in enumerate(qpos):
+        one = link_states(arm, angles)
+        jax.tree.map(lambda a, b, p=pose: np.testing.assert_allclose(a[..., p], b, atol=1e-12), batch, one)
 
 
 def test_the_table_of_link_states_equals_link_states():
