@@ -1,6 +1,6 @@
 """Damaged and hostile inputs: how many are rejected in one line, accepted, or do harm.
 
-    python -m benchmarks.fuzz [--kind npz models] [--count N] [--out FILE]
+    python -m benchmarks.fuzz [--kind npz models captures] [--count N] [--out FILE]
 
 Seeds are fixed, so that case number n is the same in each run; `--only` repeats some cases of one kind and prints their
 messages. Each input has 20 s. The exit code is 1 if an input led to a traceback, a hang, a crash, more than 2 GB of

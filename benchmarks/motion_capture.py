@@ -1,37 +1,55 @@
 """Similarity of robots to the arms of captured people: mimic's motions, and baselines, by measures nobody optimises.
 
-    python -m benchmarks.motion_capture CLIP.bvh ... --out FILE [--rate 50] [--arms FOLDER] [--trunks 0 0.25]
+    python -m benchmarks.motion_capture CLIP.bvh ... --out FILE [--rate 10] [--arms FOLDER] [--trunks 0 0.25]
 
 With `--trunks`, only the effect of the trunk's length [m] is measured instead: nearest poses of the Panda to 64 poses.
 
 Each arm of each clip is retargeted to the Panda, with and without locked joints, and to arms of an unpacked wheel of
-robosuite in FOLDER. Methods: `imitate_trajectory` with the default metric; inverse kinematics of the scaled hand by
-mink; the closed form that aligns segments; holding the home pose. Beside the measures of similarity: the largest
-change of a joint between two samples [rad], and the root mean square of the joints' jerk [rad/s^3], at the captured
-speed.
+robosuite in FOLDER. Methods: `imitate_trajectory` with angles and positions, without and with the cost of the hand, and
+with the default metric; a pose mapper that was trained on the poses of the same arm of the clip; inverse kinematics of
+the scaled hand by mink, and of frames of the links as GMR does it; the closed form that aligns shoulder, elbow and
+wrist; holding the home pose. Besides the measures of similarity: the largest speed of a joint between two samples
+[rad/s], and the root mean square of the joints' jerk [rad/s^3], at the captured speed.
 """
 
+import dataclasses
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
+from benchmarks.peers.frame_matching import match_frames
 from benchmarks.similarity import other_arms
 from mimic.arms.arm import ArmConfig
 from mimic.commands.capture import fixed_fraction, read_arm
 from mimic.commands.config import CaptureConfig
 from mimic.envs.config import EnvConfig
+from mimic.metric.config import MetricConfig
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.mocap.arms import SIDES
 from mimic.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
-from mimic.mocap.link_motion import LinkMotion
-from mimic.retargeting.pose_baselines import BASELINES
+from mimic.mocap.link_motion import TRUNK, LinkMotion
+from mimic.retargeting.pose_baselines import hand_ik, hold_home
+from mimic.retargeting.segment_alignment import Landmarks, align_segments
+from mimic.runs.signals import Signals
+from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.pose_mapper.model import MapperModel
+from mimic.trainers.pose_mapper.training import train
 
 _POSES = 64  # of a clip, for the effect of the trunk
+_SPEED = 15.0  # rad/s, of a joint: retargeting passes from one minimum to another within it
+# Angles, because they and positions are linear near a match, and cosines are not. The weight of positions was chosen
+# among 1, 1.5, 2 and 4 on the right arm of a clip and two robots (docs/motion_capture.md).
+METRIC = MetricConfig(rotation_measure="angle", translation=2.0)
+# A hand off by 0.01 chain lengths then pulls with 2, as much as all positions of the arm together.
+HAND = mimic.Costs(hand_position=100.0)
+_MAPPER = PoseMapperConfig(fresh=False, samples=256, batch_size=64, epochs=400, evaluations=1, validation_poses=64)
 
 
 def learners(folder: Path | None) -> dict[str, ArmConfig]:
@@ -44,23 +62,79 @@ def learners(folder: Path | None) -> dict[str, ArmConfig]:
     return arms
 
 
-def retarget(clip: Path, side: str, name: str, config: ArmConfig, rate: float) -> list[Row]:
-    """Measures of each method for one arm of a clip and one robot."""
-    learner_config = EnvConfig(name, learner=config)
-    capture = read_arm(clip, side, CaptureConfig(), fixed_fraction(learner_config.build_arms().learner.embodiment))
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A captured motion and a robot.
+
+    Attributes:
+      expert, learner: the person's arm, and the robot.
+      qpos: [time, joints] the person's poses [rad].
+      marks: shoulder, elbow, wrist and hand of the person.
+      rate: samples per second.
+    """
+
+    expert: mimic.Embodiment
+    learner: mimic.Embodiment
+    qpos: np.ndarray
+    marks: Landmarks
+    rate: float
+
+
+def read_case(clip: Path, side: str, name: str, config: ArmConfig, rate: float) -> Case:
+    learner = EnvConfig(name, learner=config).build_arms().learner.embodiment
+    capture = read_arm(clip, side, CaptureConfig(), fixed_fraction(learner))
     part = max(capture.parts, key=lambda part: len(part.start))
     with tempfile.TemporaryDirectory() as folder:
         expert, qpos = _as_arm(part, Path(folder) / "person.xml", rate)
-    learner = learner_config.build_arms().learner.embodiment
-    metric = learner_config.metric.build(expert, learner)
-    moved = mimic.imitate_trajectory(expert, learner, jnp.asarray(qpos, jnp.float32), **metric.arguments)
-    motions = {"mimic": np.asarray(moved.qpos, float)}
-    for baseline, function in BASELINES.items():
-        posed = function(expert, learner, qpos[None])
-        if posed is not None:
-            motions[baseline] = np.asarray(posed[0], float)
-    line, case = centre_line_table(expert, qpos), {"clip": clip.name, "arm": side, "learner": name}
-    return [{**case, "method": method, **_measures(line, learner, motion, rate)} for method, motion in motions.items()]
+    shoulder = int(TRUNK in part.names)
+    return Case(expert, learner, qpos, Landmarks(shoulder, shoulder + 1, shoulder + 2, len(part.names)), rate)
+
+
+def imitated(case: Case, metric: MetricConfig = METRIC, costs: mimic.Costs | None = None) -> np.ndarray:
+    arguments = metric.build(case.expert, case.learner).arguments
+    qpos, jump = jnp.asarray(case.qpos, jnp.float32), _SPEED / case.rate
+    moved = mimic.imitate_trajectory(case.expert, case.learner, qpos, **arguments, largest_jump=jump, costs=costs)
+    return np.asarray(moved.qpos)
+
+
+def mapped(case: Case) -> np.ndarray:
+    """Poses of a mapper that was trained on the same poses."""
+    settings = _MAPPER.resolve()
+    model = MapperModel(case.expert, case.learner, METRIC, settings)
+    shuffled = np.random.default_rng(0).permutation(len(case.qpos))
+    poses = jnp.asarray(case.qpos[np.resize(shuffled, settings.samples)], jnp.float32)
+    with tempfile.TemporaryDirectory() as folder:
+        _, params = train(
+            model,
+            lambda: (poses, poses[: settings.validation_poses]),
+            Path(folder),
+            seed=0,
+            on_evaluation=lambda *_: False,
+            signals=Signals(),
+        )
+    return np.asarray(jax.vmap(lambda qpos: model(params, qpos))(jnp.asarray(case.qpos, jnp.float32)))
+
+
+METHODS: dict[str, Callable[[Case], np.ndarray | None]] = {
+    "mimic": imitated,
+    "mimic_hand": lambda case: imitated(case, costs=HAND),
+    "mimic_default_metric": lambda case: imitated(case, MetricConfig()),
+    "pose_mapper": mapped,
+    "hand_ik": lambda case: hand_ik(case.expert, case.learner, case.qpos, every=1),
+    "frame_matching": lambda case: match_frames(case.expert, case.learner, case.qpos, case.marks),
+    "align_segments": lambda case: align_segments(case.expert, case.learner, case.qpos, expert_marks=case.marks),
+    "hold_home": lambda case: hold_home(case.expert, case.learner, case.qpos),
+}
+
+
+def measure(case: Case, methods: list[str]) -> list[Row]:
+    """Measures of each method that applies."""
+    line, rows = centre_line_table(case.expert, case.qpos), []
+    for method in methods:
+        motion = METHODS[method](case)
+        if motion is not None:
+            rows.append({"method": method, **_measures(line, case.learner, np.asarray(motion, float), case.rate)})
+    return rows
 
 
 def nearest_with_trunk(clip: Path, side: str, trunk: float) -> Row:
@@ -88,15 +162,16 @@ def _measures(line: object, learner: mimic.Embodiment, qpos: np.ndarray, rate: f
     values = similarity(line, centre_line_table(learner, qpos))  # type: ignore[arg-type]
     means = {name: float(np.mean(value)) for name, value in values.items()}
     jerk = np.diff(qpos, n=3, axis=0) * rate**3
-    jump = float(np.abs(np.diff(qpos, axis=0)).max())
-    return {**means, "largest_jump": jump, "jerk_rms": float(np.sqrt((jerk**2).mean()))}
+    speed = rate * float(np.abs(np.diff(qpos, axis=0)).max())
+    return {**means, "largest_speed": speed, "jerk_rms": float(np.sqrt((jerk**2).mean()))}
 
 
 def main() -> None:
-    parser = make_parser("motion_capture", __doc__, rate=50.0)
+    parser = make_parser("motion_capture", __doc__, rate=10.0)
     parser.add_argument("clips", nargs="+", type=Path)
     parser.add_argument("--trunks", nargs="+", type=float, metavar="M")
     parser.add_argument("--learners", nargs="+", metavar="NAME", help="some of the robots")
+    parser.add_argument("--methods", nargs="+", metavar="NAME", choices=METHODS, default=list(METHODS))
     parser.add_argument("--arms", type=Path, help="folder with an unpacked wheel of robosuite")
     options = parser.parse_args()
     rows: list[Row] = []
@@ -112,13 +187,15 @@ def main() -> None:
     for clip in options.clips:
         for name in options.learners or robots:
             for side in SIDES:
-                rows += retarget(clip, side, name, robots[name], options.rate)
+                case = read_case(clip, side, name, robots[name], options.rate)
+                names = {"clip": clip.name, "arm": side, "learner": name}
+                rows += [{**names, **row} for row in measure(case, options.methods)]
                 print(f"{clip.name}, {side} arm to {name}", flush=True)
-            write_results(options, results=rows)
+                write_results(options, rate=options.rate, results=rows)
     print_table(
         rows,
         "clip arm learner method centre_line_distance:.4f tangent_angle_deg:.1f hand_position_error:.4f "
-        "hand_angle_deg:.1f largest_jump:.2f jerk_rms:.1f",
+        "hand_angle_deg:.1f largest_speed:.1f jerk_rms:.1f",
     )
 
 

@@ -18,7 +18,8 @@ from mimic.runs.files import REPORT
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 SHORT = "ARGS=env=planar4dof trainer.num_timesteps=500000 run_dir=short"
-COLUMNS = "stage wall_s:.0f load_at_start:.1f optimality_gap[held_out]:.1%"
+OWN_VARIABLES = "PYTHONPATH", "VIRTUAL_ENV", "XLA_FLAGS"  # mimic sets the last for this process's version of JAX
+COLUMNS = "stage wall_s:.0f cpu_s:.0f load_at_start:.1f optimality_gap[held_out]:.1%"
 
 
 class Stage(NamedTuple):
@@ -39,20 +40,28 @@ STAGES = (
 )
 
 
-def run_stage(stage: Stage, clone: Path, home: Path) -> Row:
-    """Wall time of a stage [s], load of the machine at its start, and the gaps of its training."""
+def run_stage(stage: Stage, folder: Path, home: Path) -> Row:
+    """Wall and CPU time of a stage in a folder [s], load of the machine at its start, and the gaps of its training."""
     # pip's settings may be in the real home.
-    changes = {"PIP_NO_CACHE_DIR": "1"} if stage is INSTALL else {"HOME": str(home)}
-    variables = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "VIRTUAL_ENV")} | changes
+    changes = {"PIP_NO_CACHE_DIR": "1"} if stage.name == INSTALL.name else {"HOME": str(home)}
+    variables = {key: value for key, value in os.environ.items() if key not in OWN_VARIABLES} | changes
     load = round(os.getloadavg()[0], 1)
     # A python3 on the path may be too old.
     command = [*stage.command, f"PYTHON={sys.executable}"] if stage.command[0] == "make" else stage.command
     row: Row = {"stage": stage.name, "command": " ".join(stage.command), "load_at_start": load}
-    row["wall_s"] = run_process(command, cwd=clone, env=variables)
+    cpu_before = _cpu_time()
+    row["wall_s"] = run_process(command, cwd=folder, env=variables)
+    row["cpu_s"] = round(_cpu_time() - cpu_before, 1)
     if stage.run_dir:
-        report = json.loads((clone / stage.run_dir / REPORT).read_text())
+        report = json.loads((folder / stage.run_dir / REPORT).read_text())
         row |= {key: report[key] for key in ("env_steps", "optimality_gap")}
     return row
+
+
+def _cpu_time() -> float:
+    """Of all ended processes that this one started [s]: unlike wall time, it hardly depends on what else runs."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def main() -> None:

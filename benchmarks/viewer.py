@@ -49,6 +49,11 @@ def decode(frame: bytes) -> Iterator[dict[str, Any]]:
         yield message if isinstance(message, dict) else message[-1]
 
 
+def encoded_camera() -> bytes:
+    """The first message of a page."""
+    return msgspec.msgpack.encode(_CAMERA)
+
+
 class Client:
     """A connection to a view.
 
@@ -68,7 +73,7 @@ class Client:
 
     async def listen(self) -> None:
         """Reads what the server sends, for as long as the connection is open."""
-        await self._connection.send(msgspec.msgpack.encode(_CAMERA))
+        await self._connection.send(encoded_camera())
         async for frame in self._connection:
             assert isinstance(frame, bytes)
             updates = [message for message in decode(frame) if self._note_message(message)]

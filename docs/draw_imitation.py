@@ -3,8 +3,8 @@
     python docs/draw_imitation.py [--out FILE]
 
 The learners' motions are those of `imitate_trajectory` under the default metric. Each link of a learner has the colour
-of the expert's links that it corresponds to; red discs are locked joints. Takes some minutes on two CPU cores and
-needs EGL or OSMesa (see docs/install.md).
+of the expert's links that it corresponds to; the translucent arm is the expert, and red discs are locked joints. Takes
+some minutes on two CPU cores and needs EGL or OSMesa (see docs/install.md).
 """
 
 import argparse
@@ -24,7 +24,7 @@ OUT = Path(__file__).resolve().parent / "images" / "imitation.gif"
 LOCKED = (), (), (3, 6, 7), (2, 3, 6, 7)  # of the expert and the learners
 SEED, DEMONSTRATION = 7, 25  # a long motion, above the floor, that all learners can follow in part
 FRAME, LAST_FRAME = 60, 900  # ms; a GIF counts in 10 ms
-WIDTH, HEIGHT = 240, 290  # pixels of an arm's panel
+WIDTH, HEIGHT = 200, 290  # pixels of an arm's panel
 COLOURS = 128  # of the GIF
 CAPTION = 52  # pixels below the panels
 INK = "#333333"
@@ -42,7 +42,7 @@ def main() -> None:
     poses = [motion, *(qpos for qpos, _ in solutions)]
     metric = mimic.env_config("panda4dof").metric
     panels = [
-        _draw(metric.match_links(expert, arm), LOCKED[index], index == 0, qpos)
+        _draw(metric.match_links(expert, arm), LOCKED[index], motion, None if index == 0 else qpos)
         for index, (arm, qpos) in enumerate(zip([expert, *learners], poses, strict=True))
     ]
     frames = [
@@ -76,14 +76,20 @@ def _retarget(
 
 
 def _draw(
-    match: LinkMatch, locked: tuple[int, ...], is_expert: bool, poses: Float[np.ndarray, "frames joints"]
+    match: LinkMatch,
+    locked: tuple[int, ...],
+    motion: Float[np.ndarray, "frames joints"],
+    learner_motion: Float[np.ndarray, "frames learner_joints"] | None,
 ) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """An arm in its poses, its links in the colours of the expert's links that they correspond to."""
-    colours = match.expert_colours if is_expert else match.learner_colours
+    """The expert in its poses, or a learner in its own over the expert's ghost; corresponding links have one colour."""
+    colours = match.expert_colours if learner_motion is None else match.learner_colours
     arm = mimic.ArmConfig(locked=locked)
     with mimic.ArmScene([arm], width=WIDTH, height=HEIGHT, colours=[colours]) as scene:
-        scene.fit([poses])
-        return [scene.image([pose]) for pose in poses]
+        scene.fit([motion if learner_motion is None else learner_motion])
+        if learner_motion is None:
+            return [scene.image([pose]) for pose in motion]
+        poses = zip(motion, learner_motion, strict=True)
+        return [scene.image([pose], match.ghost(expert_pose, pose)) for expert_pose, pose in poses]
 
 
 def _annotate(

@@ -51,7 +51,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _unknown(name: str) -> str:
     if "=" in name:
         return f"expected a command before {name!r:.80}, as in mimic train env=panda4dof"
-    return f"unknown command {name!r:.80}; valid are {', '.join(commands())}{suggestion(name, commands())}"
+    valid = [*commands(), _COMPLETION[0]]
+    return f"unknown command {name!r:.80}; valid are {', '.join(valid)}{suggestion(name, valid)}"
 
 
 def _overview() -> str:

@@ -1,6 +1,7 @@
 """Workarounds for other packages and their versions; all of them are here."""
 
 import contextlib
+import ctypes
 import importlib
 import importlib.metadata
 import importlib.util
@@ -14,6 +15,8 @@ from typing import Any
 
 _log = logging.getLogger(__name__)
 _BRAX_AXIS_NAME = "i"  # brax.training.agents.ppo.train
+# What PyOpenGL and ctypes raise where a graphics library is missing.
+NO_GRAPHICS = (AttributeError, OSError, ctypes.ArgumentError)
 _SLOW_CPU_FLAG = "--xla_cpu_use_fusion_emitters=false"
 
 
@@ -46,7 +49,7 @@ def import_mujoco() -> None:
     user_setting = os.environ.get("MUJOCO_GL", "")
     try:
         importlib.import_module("mujoco")
-    except (AttributeError, OSError):  # from PyOpenGL and ctypes, if the library is missing
+    except NO_GRAPHICS:
         os.environ["MUJOCO_GL"] = "disabled"
         try:
             package = importlib.import_module("mujoco")

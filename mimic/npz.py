@@ -101,7 +101,7 @@ def _entries(archive: zipfile.ZipFile, size: int) -> dict[str, zipfile.ZipInfo]:
 
 def _read_all(archive: zipfile.ZipFile, entries: dict[str, zipfile.ZipInfo], max_bytes: int) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {}
-    total = 0
+    total = text = 0
     for name, entry in entries.items():
         with archive.open(entry) as stream:
             header, header_size = _read_header(stream, name)
@@ -112,7 +112,8 @@ def _read_all(archive: zipfile.ZipFile, entries: dict[str, zipfile.ZipInfo], max
                 raise ValueError(
                     f"its arrays need {total / 2**30:.3g} GiB; expected at most {max_bytes / 2**30:.3g} GiB"
                 )
-            if header.dtype.kind == "U" and total > MAX_TEXT:
+            text += header.nbytes if header.dtype.kind == "U" else 0
+            if text > MAX_TEXT:
                 raise ValueError(f"{name} has {header.nbytes} bytes of text; expected at most {MAX_TEXT}")
             arrays[name] = _read_values(stream, header, name)
     return arrays

@@ -26,19 +26,20 @@ _mimic() {
     COMPREPLY=($(mimic completion query "$line" 2>/dev/null))
     local before="${word%"${word##*[=:]}"}"  # bash replaces what follows the last = or :
     COMPREPLY=("${COMPREPLY[@]#"$before"}")
+    (( ${#COMPREPLY[@]} )) && compopt -o nospace  # files get a space from bash
 }
-complete -o nospace -o default -F _mimic mimic
+complete -o default -F _mimic mimic
 """
 _ZSH = r"""#compdef mimic
 # eval "$(mimic completion zsh)", after compinit
 _mimic() {
-    local -a candidates
+    local -a candidates whole partial
     candidates=("${(@f)$(mimic completion query "${(j: :)words[1,CURRENT-1]} $PREFIX" 2>/dev/null)}")
-    local -a whole=("${(@)${(M)candidates:#* }% }") partial=("${(@)candidates:#* }")
+    whole=("${(@)${(@M)candidates:#* }% }") partial=("${(@)candidates:#* }")
     whole=(${whole:#}) partial=(${partial:#})
     (( $#whole )) && compadd -Q -- $whole
     (( $#partial )) && compadd -Q -S '' -- $partial
-    (( $#whole + $#partial )) || _files
+    (( $#whole + $#partial )) || { compset -P '*='; _files }
 }
 compdef _mimic mimic
 """
@@ -55,7 +56,7 @@ def complete(arguments: Sequence[str], commands: Sequence[str]) -> int:
     """Runs `mimic completion SHELL`, or `mimic completion query LINE`; returns the exit code."""
     match arguments:
         case ["query", line]:
-            print("\n".join(candidates(line, commands)))
+            print("".join(f"{word}\n" for word in candidates(line, commands)), end="")
         case [shell] if shell in SCRIPTS:
             print(SCRIPTS[shell], end="")
         case _:
@@ -82,7 +83,8 @@ def candidates(line: str, commands: Sequence[str]) -> list[str]:
     command, *overrides = words[1:]
     if command == "completion":
         return [f"{shell} " for shell in SCRIPTS if shell.startswith(last)]
-    if command not in commands or last.startswith("-"):
+    is_path = last.rpartition("=")[2].startswith((".", "/", "~"))  # the shell completes files
+    if command not in commands or last.startswith("-") or is_path:
         return []
     return _keys(command, overrides, last)
 

@@ -17,7 +17,7 @@ from tests.helpers.repository import REPOSITORY
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["env=panda5dof"], "unknown env 'panda5dof'; valid are pair, panda3dof, panda4dof, panda7dof"),
+        (["env=panda5dof"], "unknown env 'panda5dof'; valid are bimanual, pair, panda3dof, panda4dof, panda7dof"),
         (["trainer=sac"], "unknown trainer 'sac'; valid are "),
         (["env.previw=1"], "unknown key 'env.previw'; valid are"),
         (["seed=one"], "could not be converted to Integer"),
@@ -87,6 +87,7 @@ def test_the_console_script_runs_a_command(monkeypatch):
     ("arguments", "message"),
     [
         (["trian"], "unknown command 'trian'; valid are collect, "),
+        (["complete"], "render, retarget, train, view, completion; did you mean completion?"),
         (["trian"], "; did you mean train?"),
         (["env=panda4dof"], "expected a command before 'env=panda4dof', as in mimic train env=panda4dof"),
         (["completion", "csh"], "completion: expected one of bash, zsh, fish, got 'csh'"),

@@ -49,6 +49,11 @@ def rejection(path, data):
     return str(error.value)
 
 
+def test_text_beside_large_arrays_is_read(tmp_path):
+    np.savez(tmp_path / "a.npz", qpos=np.zeros(MAX_TEXT // 8 + 1), arm=np.array("panda"))
+    assert read_arrays(tmp_path / "a.npz", ("qpos", "arm"))["arm"] == "panda"
+
+
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_arrays_are_those_of_numpy(tmp_path, save):
     arrays = {

@@ -31,6 +31,7 @@ KINDS = {  # module and function
     "npz": ("benchmarks.fuzzing.files", "npz_case"),
     "models": ("benchmarks.fuzzing.files", "model_case"),
     "command_lines": ("benchmarks.fuzzing.configs", "command_line_case"),
+    "captures": ("benchmarks.fuzzing.captures", "capture_case"),
     "runs": ("benchmarks.fuzzing.runs", "run_case"),
 }
 

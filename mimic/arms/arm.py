@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import mujoco
@@ -14,6 +14,7 @@ from mimic.arms.chain import Links
 from mimic.arms.compile_check import VELOCITY_LIMIT
 from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, planar_arm
 from mimic.arms.ignored_elements import ignored_elements
+from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.model_files import read_spec
 from mimic.arms.named_arms import BUILT_IN, is_arm_name, named_arm
 from mimic.arms.simulation_model import effective_inertia, simulation_model
@@ -38,12 +39,13 @@ class ArmConfig:
     """Model of an arm, and changes to it.
 
     Attributes:
-      model: "panda", "planar", the path of an MJCF or URDF file, or the name of an arm, see `named_arm`; a path is made
-        absolute, and a name becomes the path.
+      model: "panda", "planar", "panda_pair" (two Pandas side by side, 0.6 m apart, as one embodiment), the path of an
+        MJCF or URDF file, or the name of an arm, see `named_arm`; a path is made absolute, and a name becomes the path.
       locked: joint names or numbers, or a mapping from these to angles [rad].
       link_lengths: lengths of the links of a planar arm [m].
       base: for a file, name of the body that carries the chain.
-      tip: for a file, name of the body or site at the end of the chain; default: see `find_chain`.
+      tip: for a file, name of the body or site at the end of the chain; default: see `find_chain`. A list of names
+        gives a tree with a chain to each of them, and ["*"] one to each end of the model.
       armature: minimum rotor inertia of each joint, at the joint [kg m^2], or a mapping from joints to it; many models
         state none.
       damping: minimum damping of each joint [N m s/rad], or a mapping from joints to it.
@@ -57,7 +59,7 @@ class ArmConfig:
     # From a micromanipulator's links to a crane's; the kinematics of 100 links take minutes to compile.
     link_lengths: list[float] = number(list, at_least=1e-3, at_most=100.0, entries=(0, 100))
     base: str | None = None
-    tip: str | None = None
+    tip: Any = None
     # Joints of the largest industrial robots have some 1000 kg m^2 and 1000 N m s/rad.
     armature: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
     damping: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
@@ -68,12 +70,17 @@ class ArmConfig:
         if not self.model:
             raise ValueError(f"model: expected {', '.join(BUILT_IN)} or the path of an MJCF or URDF file, got nothing")
         check_ranges(self)
+        is_list = isinstance(self.tip, Sequence) and not isinstance(self.tip, str)
+        if self.tip is not None and not all(isinstance(name, str) for name in (self.tip if is_list else [self.tip])):
+            raise ValueError(f"tip: expected the name of a body or site, or a list of names, got {self.tip!r:.80}")
         for name in ("armature", "damping"):
             if getattr(self, name) is None:
                 raise ValueError(f"{name}: expected a number, or a mapping from joints to numbers, got null")
         if self.is_file:  # absolute, so that a run can be loaded from any folder
             path = named_arm(self.model) if is_arm_name(self.model) else os.path.expanduser(self.model)
             object.__setattr__(self, "model", os.path.abspath(path))
+        if self.model == "panda_pair" and self.tip is None:
+            object.__setattr__(self, "tip", [ALL_ENDS])
 
     @property
     def is_file(self) -> bool:
@@ -118,8 +125,7 @@ def arm_spec(config: ArmConfig) -> mujoco.MjSpec:
     """
     if config.model == "planar":
         return _planar_spec(planar_arm(config.link_lengths))
-    path = panda_path() if config.model == "panda" else config.model
-    return read_spec(path)
+    return read_spec(config.model if config.is_file else panda_path(config.model))
 
 
 def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> Arm:
@@ -147,10 +153,9 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         return with_minimum_armature(
             Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config
         )
-    is_panda = config.model == "panda"
     embodiment, source, angles = load_arm(
-        panda_path() if is_panda else config.model,
-        name="panda" if is_panda else None,
+        config.model if config.is_file else panda_path(config.model),
+        name=None if config.is_file else config.model,
         locked=config.locked or (),
         base=config.base,
         tip=config.tip,
@@ -159,7 +164,7 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         home=config.home,
         base_segment=config.base_segment,
     )
-    notes = () if is_panda else ignored_elements(source, config.base, config.tip)
+    notes = () if not config.is_file else ignored_elements(source, config.base, config.tip)
     return with_minimum_armature(
         Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, notes), config
     )

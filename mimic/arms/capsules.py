@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
-from mimic.arms.kinematic_tree import ancestors, body_id, find_chain
+from mimic.arms.kinematic_tree import ChainIds, ancestors, find_chain
 from mimic.arms.mujoco_chain import zero_pose
 
 _SPHERE, _CAPSULE, _CYLINDER, _MESH, _PLANE = (
@@ -33,12 +33,26 @@ class Capsules:
       start, end: [capsules, 3] ends of their axes, in m.
       radius: [capsules], in m.
       joint: index of the last free joint that moves each capsule; -1 for the base.
+      joint_parent: see `Embodiment`; where None, that of a serial chain.
     """
 
     start: Float[Any, "capsules 3"]
     end: Float[Any, "capsules 3"]
     radius: Float[Any, " capsules"]
     joint: tuple[int, ...]
+    joint_parent: tuple[int, ...] | None = None
+
+    @property
+    def near_base(self) -> tuple[bool, ...]:
+        """Whether each capsule is on the base, or on a joint whose parent is the base."""
+        return tuple(joint < 0 or self._parent(joint) < 0 for joint in self.joint)
+
+    def _parent(self, joint: int) -> int:
+        return joint - 1 if self.joint_parent is None else self.joint_parent[joint]
+
+    def _are_neighbours(self, a: int, b: int) -> bool:
+        """Whether two joints are the same, or one is the parent of the other; -1 stands for the base."""
+        return a == b or (a >= 0 and self._parent(a) == b) or (b >= 0 and self._parent(b) == a)
 
     @property
     def pairs(self) -> tuple[tuple[int, int], ...]:
@@ -51,7 +65,8 @@ class Capsules:
             return bool(distances.min() > self.radius[i] + self.radius[j])
 
         indices = range(len(self.joint))
-        distant = ((i, j) for i in indices for j in indices[i + 1 :] if abs(self.joint[i] - self.joint[j]) > 1)
+        pairs = ((i, j) for i in indices for j in indices[i + 1 :])
+        distant = ((i, j) for i, j in pairs if not self._are_neighbours(self.joint[i], self.joint[j]))
         return tuple(pair for pair in distant if are_apart(*pair))
 
 
@@ -76,28 +91,38 @@ def fit_capsules(config: ArmConfig, limits: str = "none") -> Capsules:
     for name, angle in arm.locked.items():
         data.qpos[model.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(model, data)
-    base = int(model.body_parentid[chain.bodies[0]]) if config.base is None else body_id(model, config.base)
+    base = chain.base
     R_base_world, origin = data.xmat[base].reshape(3, 3).T, data.xpos[base]
     free = {int(model.joint(name).bodyid[0]): i for i, name in enumerate(arm.embodiment.joint_names)}
-    geoms = [(geom, joint) for geom, joint in _joints_of_geoms(model, base, chain.bodies[0], free) if joint is not None]
+    moved = _joints_of_geoms(model, base, _first_bodies(model, chain), free)
+    geoms = [(geom, joint) for geom, joint in moved if joint is not None]
     solid = [(geom, joint) for geom, joint in geoms if model.geom_contype[geom] or model.geom_conaffinity[geom]]
     if not geoms:
         raise ValueError(f"capsules: {arm.embodiment.name} has no geoms to fit them to")
     fits = [(*_capsule(model, data, geom), joint) for geom, joint in solid or geoms]
     starts, ends, radii, joints = zip(*fits, strict=True)
     points = [(np.stack(ends_) - origin) @ R_base_world.T for ends_ in (starts, ends)]
-    return Capsules(points[0], points[1], np.array(radii), tuple(joints))
+    return Capsules(points[0], points[1], np.array(radii), tuple(joints), arm.embodiment.joint_parent)
+
+
+def _first_bodies(model: mujoco.MjModel, chain: ChainIds) -> set[int]:
+    """Bodies from which on the model is the arm's: those of the first joints, and the mounts of a tree's arms."""
+    roots = chain.roots(model)
+    if len(roots) == 1:
+        return set(roots)
+    lines = [ancestors(model, root)[::-1] for root in roots]
+    return {line[line.index(chain.base) + 1] for line in lines}
 
 
 def _joints_of_geoms(
-    model: mujoco.MjModel, base: int, first: int, free: dict[int, int]
+    model: mujoco.MjModel, base: int, first_bodies: set[int], free: dict[int, int]
 ) -> list[tuple[int, int | None]]:
     """Each geom with the last free joint that moves it; None for geoms that are not on the arm."""
     result = []
     for geom in range(model.ngeom):
         body = int(model.geom_bodyid[geom])
         parents = [body, *ancestors(model, body)]
-        on_arm = first in parents or (body == base and base != 0)
+        on_arm = not first_bodies.isdisjoint(parents) or (body == base and base != 0)
         joints = [free[parent] for parent in parents if parent in free]
         is_shape = int(model.geom_type[geom]) != _PLANE
         result.append((geom, max(joints, default=-1) if on_arm and is_shape else None))

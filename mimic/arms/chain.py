@@ -1,4 +1,4 @@
-"""A serial chain of revolute joints as plain numbers, and the chain with some joints locked."""
+"""Joints and links of an arm as plain numbers, in one chain or a tree of chains, and with some joints locked."""
 
 import dataclasses
 import functools
@@ -48,6 +48,7 @@ class Link:
       start, end: [3] [m].
       joint: index of the last joint that moves it; -1 for a link fixed to the base.
       merged: segments of the arm's centre line that were merged into this link; empty for a link of one segment.
+      chains: indices of the chains that it is part of.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Link:
     end: np.ndarray
     joint: int
     merged: tuple[Segment, ...] = ()
+    chains: tuple[int, ...] = (0,)
 
     @property
     def length(self) -> float:
@@ -69,10 +71,24 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Chain:
-    """Joints and links from the base to the tip."""
+    """Joints and links from the base to the tip, or to the tips of a tree of chains.
+
+    Attributes:
+      joints: each after its parent.
+      links: in the order of the joints that move them.
+      parents: index of each joint's parent, -1 for a joint at the base; None for one chain.
+      names: of the chains.
+    """
 
     joints: tuple[Joint, ...]
     links: tuple[Link, ...]
+    parents: tuple[int, ...] | None = None
+    names: tuple[str, ...] = ("arm",)
+
+    @property
+    def joint_parents(self) -> tuple[int, ...]:
+        """Index of each joint's parent, -1 for a joint at the base."""
+        return tuple(range(-1, len(self.joints) - 1)) if self.parents is None else self.parents
 
 
 def resolve_locked(
@@ -139,22 +155,12 @@ def lock(chain: Chain, locked: Mapping[str, float], links: Links = "kept") -> Ch
         start of the first to the end of the last (paper: as many links as joints).
 
     Raises:
-      ValueError: an unknown value of `links`.
+      ValueError: an unknown value of `links`, or "merged" for a tree of several chains.
     """
     check_choice("links", links, LINKS)
-    rotation, offset = np.eye(3), np.zeros(3)  # transform of all distal bodies by the locked joints so far
-    new_index: dict[int, int] = {-1: -1}  # last free joint up to each joint of the chain
-    placement: dict[int, tuple[np.ndarray, np.ndarray]] = {-1: (rotation, offset)}
-    joints: list[Joint] = []
-    for index, joint in enumerate(chain.joints):
-        axis, anchor = rotation @ joint.axis, rotation @ joint.anchor + offset
-        if joint.name in locked:
-            joint_rotation = _axis_rotation(axis, locked[joint.name])
-            rotation, offset = joint_rotation @ rotation, joint_rotation @ (offset - anchor) + anchor
-        else:
-            joints.append(dataclasses.replace(joint, axis=axis, anchor=anchor))
-        new_index[index] = len(joints) - 1
-        placement[index] = rotation, offset
+    if links == "merged" and len(chain.names) > 1:
+        raise ValueError(f"links: expected kept for a tree of {len(chain.names)} chains, got merged")
+    joints, parents, new_index, placement = _free_joints(chain, locked)
     result: list[Link] = []
     previous_joint = None
     for link in chain.links:
@@ -163,7 +169,33 @@ def lock(chain: Chain, locked: Mapping[str, float], links: Links = "kept") -> Ch
             moved = _merged(result.pop(), moved)
         result.append(moved)
         previous_joint = link.joint
-    return Chain(tuple(joints), drop_zero_length(result))
+    parents = None if chain.parents is None else parents
+    return dataclasses.replace(chain, joints=joints, links=drop_zero_length(result), parents=parents)
+
+
+_Placements = dict[int, tuple[np.ndarray, np.ndarray]]
+
+
+def _free_joints(
+    chain: Chain, locked: Mapping[str, float]
+) -> tuple[tuple[Joint, ...], tuple[int, ...], dict[int, int], _Placements]:
+    """The free joints and their parents; for each joint of the chain, the last free one and the transform by locks."""
+    new_index: dict[int, int] = {-1: -1}
+    placement: _Placements = {-1: (np.eye(3), np.zeros(3))}
+    joints: list[Joint] = []
+    parents: list[int] = []
+    for index, (joint, parent) in enumerate(zip(chain.joints, chain.joint_parents, strict=True)):
+        rotation, offset = placement[parent]
+        axis, anchor = rotation @ joint.axis, rotation @ joint.anchor + offset
+        if joint.name in locked:
+            joint_rotation = _axis_rotation(axis, locked[joint.name])
+            rotation, offset = joint_rotation @ rotation, joint_rotation @ (offset - anchor) + anchor
+        else:
+            joints.append(dataclasses.replace(joint, axis=axis, anchor=anchor))
+            parents.append(new_index[parent])
+        new_index[index] = new_index[parent] if joint.name in locked else len(joints) - 1
+        placement[index] = rotation, offset
+    return tuple(joints), tuple(parents), new_index, placement
 
 
 def _moved(link: Link, rotation: np.ndarray, offset: np.ndarray, joint: int) -> Link:
@@ -171,7 +203,7 @@ def _moved(link: Link, rotation: np.ndarray, offset: np.ndarray, joint: int) -> 
         return rotation @ point + offset
 
     merged = tuple((move(start), move(end)) for start, end in link.merged)
-    return Link(link.name, move(link.start), move(link.end), joint, merged)
+    return dataclasses.replace(link, start=move(link.start), end=move(link.end), joint=joint, merged=merged)
 
 
 def _merged(first: Link, second: Link) -> Link:

@@ -1,4 +1,4 @@
-"""Embodiments, the kinematics that the metric uses: planar arms, the Panda, a serial chain from any MJCF or URDF."""
+"""Embodiments, the kinematics that the metric uses: planar arms, the Panda, chains and trees from any MJCF or URDF."""
 
 import dataclasses
 import importlib.resources
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
@@ -16,6 +17,7 @@ from jaxtyping import Float
 
 from mimic.arms.chain import Chain, Joint, Link, Links, Locked, lock, resolve_locked
 from mimic.arms.compile_check import check_magnitudes
+from mimic.arms.kinematic_tree import Tip
 from mimic.arms.model_files import model_name, read_model
 from mimic.arms.mujoco_chain import read_chain
 from mimic.arms.start_pose import with_home
@@ -27,7 +29,7 @@ LIMITS = ("none", "hardware")
 
 @struct.dataclass
 class Embodiment:
-    """A serial chain of links with revolute joints, in the base frame (paper, eqs. 5-6).
+    """Links with revolute joints in one serial chain (paper, eqs. 5-6) or in a tree of chains, in the base frame.
 
     A frozen pytree: the arrays are leaves, names and structure are static. The constructors return NumPy arrays in
     float64; functions compute in the dtype of the pose. Close over an arm rather than pass it as an argument of
@@ -45,12 +47,15 @@ class Embodiment:
       velocity_limit: [num_joints] maximum speed [rad/s]; inf where the model states none.
       home: [num_joints] pose at the start of an episode [rad].
       name: of the arm, followed by its locked joints.
-      joint_names: base to tip.
+      joint_names: base to tip; in a tree, each joint after its parent.
       link_names: base to tip; merged links are joined by "+".
       link_joint: index of the last joint that moves each link; -1 for a link fixed to the base.
       segment_start, segment_end: [num_segments, 3] segments of the arm's centre line in the zero pose, base to tip [m];
         one for each link, more where locked joints merged links into chords.
       segment_link: index of the link of each segment.
+      joint_parent: index of each joint's parent, -1 for a joint at the base.
+      chains: indices of the links of each chain, base to tip; several chains may begin with the same links.
+      chain_names: names of the chains: "arm", or those of the tips of a tree.
     """
 
     joint_axis: Float[Any, "joints 3"]
@@ -69,6 +74,9 @@ class Embodiment:
     link_names: tuple[str, ...] = struct.field(pytree_node=False)
     link_joint: tuple[int, ...] = struct.field(pytree_node=False)
     segment_link: tuple[int, ...] = struct.field(pytree_node=False)
+    joint_parent: tuple[int, ...] = struct.field(pytree_node=False)
+    chains: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
+    chain_names: tuple[str, ...] = struct.field(pytree_node=False)
 
     def __repr__(self) -> str:
         limits = [
@@ -93,8 +101,16 @@ class Embodiment:
 
     @property
     def chain_length(self) -> Float[Any, ""]:
-        """Sum of the link lengths [m]."""
-        return self.link_lengths.sum()
+        """Sum of the link lengths [m]; of a tree, that of the longest chain from the base to a tip."""
+        if len(self.chains) == 1:
+            return self.link_lengths.sum()
+        numpy = np if isinstance(self.link_lengths, np.ndarray) else jnp
+        return numpy.max(numpy.stack([self.link_lengths[np.array(chain)].sum() for chain in self.chains]))
+
+    @property
+    def is_serial(self) -> bool:
+        """Whether each joint is the child of the one before it."""
+        return self.joint_parent == tuple(range(-1, self.num_joints - 1))
 
 
 def _extent(values: Any, unit: str) -> str:
@@ -128,9 +144,9 @@ def planar_arm(link_lengths: Sequence[float] | Float[ArrayLike, " n"], *, frame_
     return from_chain(Chain(joints, links), name=f"planar{lengths.size}", frame_at=frame_at)
 
 
-def panda_path() -> str:
-    """Path of the Panda's MJCF file."""
-    return str(importlib.resources.files("mimic") / "xml" / "panda.xml")
+def panda_path(name: str = "panda") -> str:
+    """Path of the MJCF file of the Panda, or of the two of "panda_pair"."""
+    return str(importlib.resources.files("mimic") / "xml" / f"{name}.xml")
 
 
 def panda(*, locked: Locked = (), links: Links = "kept", limits: Limits = "none") -> Embodiment:
@@ -155,11 +171,11 @@ def load_mjcf(
     *,
     locked: Locked = (),
     base: str | None = None,
-    tip: str | None = None,
+    tip: Tip = None,
     links: Links = "kept",
     base_segment: bool = True,
 ) -> Embodiment:
-    """A serial chain of revolute joints from any MJCF or URDF, with the joint ranges and limits of the model.
+    """Revolute joints of any MJCF or URDF, in a serial chain or a tree, with the ranges and limits of the model.
 
     Capsule sites named link… are the links (`fromto` gives start and end). In a model without such sites, the links are
     the segments from the origin of the base to the first joint's anchor, and from each anchor to the next; the last one
@@ -171,8 +187,9 @@ def load_mjcf(
       path_or_model: an MJCF or URDF file, or a compiled model.
       locked: as for `panda`; joints without an angle are locked at 0.
       base: name of the body that carries the chain; the base frame is then its frame.
-      tip: name of the body or site at the end of the chain.
-      links: as for `panda`.
+      tip: name of the body or site at the end of the chain. A list of names gives a tree with a chain to each of them:
+        two arms on a torso, a hand with fingers. ["*"] stands for all ends of the model.
+      links: as for `panda`; of a tree always "kept".
       base_segment: whether the segment from the base to the first joint is a link; without effect where links are
         merged, because the paper has as many links as joints.
 
@@ -192,7 +209,7 @@ def load_arm(
     name: str | None = None,
     locked: Locked = (),
     base: str | None = None,
-    tip: str | None = None,
+    tip: Tip = None,
     links: Links = "kept",
     limits: Limits = "hardware",
     home: Any = None,
@@ -207,9 +224,9 @@ def load_arm(
     chain = read_chain(model, base, tip, base_segment=base_segment and links == "kept")
     if limits == "none":
         unlimited = (dataclasses.replace(joint, range=(-np.pi, np.pi), home=0.0) for joint in chain.joints)
-        chain = Chain(tuple(unlimited), chain.links)
+        chain = dataclasses.replace(chain, joints=tuple(unlimited))
     if home is not None:
-        chain = Chain(with_home(chain.joints, home, model), chain.links)
+        chain = dataclasses.replace(chain, joints=with_home(chain.joints, home, model))
     angles_at_home = {joint.name: joint.home for joint in chain.joints}
     angles = resolve_locked(locked, tuple(angles_at_home), angles_at_home)
     return _locked_embodiment(chain, angles, name or _name(path_or_model, model), links), model, angles
@@ -243,6 +260,12 @@ def from_chain(chain: Chain, *, name: str, frame_at: float = 0.5) -> Embodiment:
         link_names=tuple(link.name for link in links),
         link_joint=tuple(link.joint for link in links),
         segment_link=tuple(index for _, _, index in segments),
+        joint_parent=chain.joint_parents,
+        chains=tuple(
+            tuple(index for index, link in enumerate(links) if number in link.chains)
+            for number in range(len(chain.names))
+        ),
+        chain_names=chain.names,
     )
 
 
@@ -259,6 +282,9 @@ def segment_arm(arm: Embodiment) -> Embodiment:
         link_names=tuple(f"segment{i + 1}" for i in range(len(lengths))),
         link_joint=tuple(arm.link_joint[link] for link in arm.segment_link),
         segment_link=tuple(range(len(lengths))),
+        chains=tuple(
+            tuple(index for index, link in enumerate(arm.segment_link) if link in chain) for chain in arm.chains
+        ),
     )
 
 

@@ -3,13 +3,13 @@
 import mujoco
 import numpy as np
 
-from mimic.arms.kinematic_tree import ChainIds, find_chain, joint_kind
+from mimic.arms.kinematic_tree import ChainIds, Tip, find_chain, joint_kind
 
 _MAX_NAMES = 6  # in a list; the others are counted
 _AFFINE = int(mujoco.mjtBias.mjBIAS_AFFINE)
 
 
-def ignored_elements(model: mujoco.MjModel, base: str | None = None, tip: str | None = None) -> tuple[str, ...]:
+def ignored_elements(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) -> tuple[str, ...]:
     """One line for each kind of element that the model has and the simulated arm lacks.
 
     Args:

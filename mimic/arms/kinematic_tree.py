@@ -1,6 +1,7 @@
-"""Finds the arm in a MuJoCo model: the serial chain of revolute joints from base to tip."""
+"""Finds the arm in a MuJoCo model: the serial chain of revolute joints to a tip, or the tree to several."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import mujoco
 
@@ -11,17 +12,24 @@ _CONNECT, _WELD = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
 _SITE = int(mujoco.mjtObj.mjOBJ_SITE)
 _KINDS = {int(kind): kind.name.removeprefix("mjJNT_").lower() for kind in mujoco.mjtJoint.__members__.values()}
 
+Tip = str | Sequence[str] | None
+ALL_ENDS = "*"  # in a list of tips
+
 
 @dataclasses.dataclass(frozen=True)
 class ChainIds:
     """Ids of the bodies and joints of an arm within a model.
 
     Attributes:
-      bodies: bodies with a joint of the chain, base to tip.
-      joints: revolute joints of the chain, base to tip.
-      proximal: joints between the world and the chain, which are fixed.
-      distal: joints distal to the last body of the chain, which are fixed: those of a gripper or hand.
+      bodies: bodies with a joint of the arm, each after its parent.
+      joints: revolute joints of the arm, in the order of these bodies.
+      proximal: joints between the world and the arm, which are fixed.
+      distal: joints distal to the last body of a chain, which are fixed: those of a gripper or hand.
       other: the model's other joints.
+      base: body that carries the arm.
+      chains: joints of each chain, base to tip; one chain unless the arm is a tree.
+      tips: name of the body or site at the end of each chain, None where none is named.
+      names: of the chains: of the tips, or of the last bodies.
     """
 
     bodies: tuple[int, ...]
@@ -29,29 +37,88 @@ class ChainIds:
     proximal: tuple[int, ...]
     distal: tuple[int, ...]
     other: tuple[int, ...]
+    base: int
+    chains: tuple[tuple[int, ...], ...]
+    tips: tuple[str | None, ...]
+    names: tuple[str, ...]
+
+    def roots(self, model: mujoco.MjModel) -> tuple[int, ...]:
+        """The first body of each chain, each once."""
+        return tuple(dict.fromkeys(int(model.jnt_bodyid[chain[0]]) for chain in self.chains))
 
 
-def find_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None = None) -> ChainIds:
-    """The serial chain of revolute joints of a model.
+def find_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) -> ChainIds:
+    """The revolute joints of an arm within a model: a serial chain, or a tree of chains to several tips.
 
     Args:
       model: any.
-      base: name of the body that carries the chain; the world where None.
+      base: name of the body that carries the arm; where None, the parent of the first body with a joint of the arm, or
+        the nearest common ancestor of several.
       tip: name of the body or site at the end of the chain. Where None, the chain follows the longest branch, but stops
-        before a hand: branches that all have fewer revolute joints than the chain so far.
+        before a hand: branches that all have fewer revolute joints than the chain so far. A list of names gives a tree;
+        ["*"] stands for the ends of all branches.
 
     Raises:
       ValueError: no revolute joint, a joint of another kind between two revolute ones, branches of equal length, a
-        loop, or a name that the model lacks.
+        loop, or a name that the model lacks or that is listed twice.
     """
     start = 0 if base is None else body_id(model, base)
-    last = _longest(model, start) if tip is None else tip_body(model, tip)
+    tips, lasts = _ends(model, start, tip)
+    names = tuple(name or model.body(last).name for name, last in zip(tips, lasts, strict=True))
+    chains = tuple(_revolute_joints(model, start, last) for last in lasts)
+    of_tree = {joint for chain in chains for joint in chain}
+    revolute = tuple(joint for joint in range(model.njnt) if joint in of_tree)
+    bodies = tuple(dict.fromkeys(int(model.jnt_bodyid[joint]) for joint in revolute))
+    _reject_loops(model, list(bodies))
+    roots = {int(model.jnt_bodyid[chain[0]]) for chain in chains}
+    others = [joint for joint in range(model.njnt) if joint not in of_tree]
+    trunk = {body for root in roots for body in ancestors(model, root)}
+    proximal = [joint for joint in others if model.jnt_bodyid[joint] in trunk]
+    ends = {int(model.jnt_bodyid[chain[-1]]) for chain in chains}
+    distal = [j for j in others if j not in proximal and ends & set(ancestors(model, int(model.jnt_bodyid[j])))]
+    rest = [joint for joint in others if joint not in proximal and joint not in distal]
+    base_body = start if base is not None else _common_parent(model, roots)
+    return ChainIds(bodies, revolute, tuple(proximal), tuple(distal), tuple(rest), base_body, chains, tips, names)
+
+
+def _ends(model: mujoco.MjModel, start: int, tip: Tip) -> tuple[tuple[str | None, ...], tuple[int, ...]]:
+    """The name of each tip, None where none is named, and the last body of each chain."""
+    if tip is None:
+        return (None,), (_longest(model, start),)
+    names = (tip,) if isinstance(tip, str) else tuple(tip)
+    if names == (ALL_ENDS,) and not isinstance(tip, str):
+        ends = tuple(_all_ends(model, start))
+        names = (None,) * len(ends)
+    else:
+        ends = tuple(tip_body(model, str(name)) for name in names)
+    if not ends:
+        raise ValueError("tip: expected one name or more, and for '*' a model with revolute joints, got none")
+    if len(set(ends)) < len(ends):
+        raise ValueError(f"tip: expected tips on different bodies, got {', '.join(map(str, names))}")
+    return names, ends
+
+
+def _all_ends(model: mujoco.MjModel, start: int) -> list[int]:
+    """Bodies with a revolute joint, distal to a body, that have no such body distal to them."""
+    moved = [body for body in range(1, model.nbody) if any(is_revolute(model, j) for j in joint_ids(model, body))]
+    lines = {body: ancestors(model, body)[1:] for body in moved}
+    return [b for b in moved if start in lines[b] and not any(b in lines[other] for other in moved)]
+
+
+def _common_parent(model: mujoco.MjModel, bodies: set[int]) -> int:
+    """The last body that is a proper ancestor of all bodies."""
+    lines = [ancestors(model, body)[:0:-1] for body in sorted(bodies)]
+    return [same[0] for same in zip(*lines, strict=False) if len(set(same)) == 1][-1]
+
+
+def _revolute_joints(model: mujoco.MjModel, start: int, last: int) -> tuple[int, ...]:
+    """The revolute joints from a body to another, without those of the first."""
     line = ancestors(model, last)[::-1]
     bodies_from_base = line[line.index(start) + 1 :] if start in line else []
     joints = [joint for body in bodies_from_base for joint in joint_ids(model, body)]
     revolute = [joint for joint in joints if is_revolute(model, joint)]
     if not revolute:
-        raise ValueError("the model has no revolute joint" + (" between base and tip" if base or tip else ""))
+        raise ValueError("the model has no revolute joint" + (" between base and tip" if start or last else ""))
     between = [j for j in joints[joints.index(revolute[0]) : joints.index(revolute[-1])] if not is_revolute(model, j)]
     if between:
         name = model.joint(between[-1]).name
@@ -59,14 +126,7 @@ def find_chain(model: mujoco.MjModel, base: str | None = None, tip: str | None =
             f"expected revolute joints only; joint {name!r} on the chain is a {joint_kind(model, between[-1])}: start "
             "distal to it with base=, or end proximal to it with tip="
         )
-    bodies = list(dict.fromkeys(int(model.jnt_bodyid[joint]) for joint in revolute))
-    _reject_loops(model, bodies)
-    others = [joint for joint in range(model.njnt) if joint not in revolute]
-    trunk = set(ancestors(model, bodies[0]))
-    proximal = [joint for joint in others if model.jnt_bodyid[joint] in trunk]
-    distal = [j for j in others if j not in proximal and bodies[-1] in ancestors(model, int(model.jnt_bodyid[j]))]
-    rest = [joint for joint in others if joint not in proximal and joint not in distal]
-    return ChainIds(tuple(bodies), tuple(revolute), tuple(proximal), tuple(distal), tuple(rest))
+    return tuple(revolute)
 
 
 def joint_kind(model: mujoco.MjModel, joint: int) -> str:
@@ -161,4 +221,4 @@ def _reject_loops(model: mujoco.MjModel, path: list[int]) -> None:
             continue
         if between & set(path):
             name = model.eq(equality).name or f"number {equality + 1}"
-            raise ValueError(f"expected a serial chain; the model has a loop, closed by equality constraint {name}")
+            raise ValueError(f"expected a chain or a tree; the model has a loop, closed by equality constraint {name}")

@@ -94,9 +94,9 @@ def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.n
 
 def joint_transforms(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> list[Float[np.ndarray, "4 4"]]:
     """Transforms of what is distal to no joint, to the first joint, … from the zero pose to a pose [rad]."""
-    transforms = [np.eye(4)]
-    for axis, anchor, angle in zip(np.asarray(arm.joint_axis), np.asarray(arm.joint_anchor), qpos, strict=True):
-        transforms.append(transforms[-1] @ _rotation_about(axis, anchor, float(angle)))
+    transforms, (axes, anchors) = [np.eye(4)], map(np.asarray, (arm.joint_axis, arm.joint_anchor))
+    for parent, axis, anchor, angle in zip(arm.joint_parent, axes, anchors, qpos, strict=True):
+        transforms.append(transforms[parent + 1] @ _rotation_about(axis, anchor, float(angle)))
     return transforms
 
 

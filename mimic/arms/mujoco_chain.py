@@ -1,13 +1,15 @@
-"""Reads a serial chain of revolute joints from a MuJoCo model."""
+"""Reads the revolute joints and links of an arm from a MuJoCo model: a serial chain, or a tree."""
 
-from collections.abc import Callable
+import dataclasses
+import re
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
 
 from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
 from mimic.arms.compile_check import VELOCITY_LIMIT
-from mimic.arms.kinematic_tree import ChainIds, ancestors, body_id, find_chain, is_revolute, tip_body
+from mimic.arms.kinematic_tree import Tip, ancestors, find_chain, is_revolute, tip_body
 
 START_POSES = "ready", "home"  # keyframes with the start pose of a model, in order of preference
 
@@ -16,51 +18,68 @@ _CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjG
 _ON_JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 _NO_BIAS = int(mujoco.mjtBias.mjBIAS_NONE)
 _WORLD = 0  # body
+_LINK, _PREFIXED = re.compile("link"), re.compile(r"(.*[^A-Za-z0-9])?link")  # names of sites
 _ALONG_AXIS = 1e-3  # rad; files round directions
 
 
 # Above 40 lines because of its docstring.
-def read_chain(
-    model: mujoco.MjModel, base: str | None = None, tip: str | None = None, *, base_segment: bool = True
-) -> Chain:
-    """The serial chain of revolute joints of a model, from body `base` to body or site `tip`.
+def read_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None, *, base_segment: bool = True) -> Chain:
+    """The revolute joints and links of a model, in a serial chain from body `base` to `tip`, or in a tree to its tips.
 
     Args:
       model: any.
       base, tip: see `find_chain`.
-      base_segment: add a link from the origin of the base body to the first joint, unless the model marks its links
-        itself. The world is a base body only where `base` names it.
+      base_segment: add a link from the origin of the base body to the first joint, or to that of each branch at the
+        base, unless the model marks its links itself. The world is a base body only where `base` names it.
 
     Raises:
       ValueError: no revolute joint, a joint of another kind, a branch, a loop, or a name that the model lacks.
     """
     chain_ids = find_chain(model, base, tip)
-    path = chain_ids.bodies
     data = mujoco.MjData(model)
     data.qpos[:] = zero_pose(model)
     mujoco.mj_kinematics(model, data)
-    base_body = int(model.body_parentid[path[0]]) if base is None else body_id(model, base)
-    origin, R_base_world = data.xpos[base_body], data.xmat[base_body].reshape(3, 3).T
+    origin, R_base_world = data.xpos[chain_ids.base], data.xmat[chain_ids.base].reshape(3, 3).T
 
     def in_base(point: np.ndarray) -> np.ndarray:
         return R_base_world @ (point - origin)
 
+    index = {joint_id: joint for joint, joint_id in enumerate(chain_ids.joints)}
+    paths = [[index[joint_id] for joint_id in chain] for chain in chain_ids.chains]
     joints: list[Joint] = []
     links: list[Link] = []
-    for body in path:
+    for body in chain_ids.bodies:
         for joint_id in (joint for joint in chain_ids.joints if model.jnt_bodyid[joint] == body):
             axis, anchor = R_base_world @ data.xaxis[joint_id], in_base(data.xanchor[joint_id])
             joints.append(_joint(model, joint_id, axis, anchor, f"joint{len(joints) + 1}"))
-        links += _site_links(model, data, body, len(joints) - 1, in_base)
+        links += _site_links(model, data, body, len(joints) - 1, in_base, paths)
+    _check_names(joints)
+    if not links:
+        has_base = base_segment and (base is not None or chain_ids.base != _WORLD)
+        ends = zip(chain_ids.chains, chain_ids.tips, strict=True)
+        tips = [in_base(_tip_point(model, data, chain, name)) for chain, name in ends]
+        links = (_base_links(joints, paths) if has_base else []) + _anchor_links(joints, paths, tips)
+    if len(paths) == 1:
+        return Chain(tuple(joints), drop_zero_length(links))
+    parents = tuple(_parent(joint, paths) for joint in range(len(joints)))
+    return Chain(tuple(joints), drop_zero_length(links), parents, chain_ids.names)
+
+
+def _check_names(joints: Sequence[Joint]) -> None:
     names = [joint.name for joint in joints]
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
         raise ValueError(f"two joints of the chain are called {', '.join(duplicates)}; name the unnamed ones in MJCF")
-    if not links:
-        has_base = base_segment and (base is not None or base_body != _WORLD)
-        links = _base_links(joints[0]) if has_base else []
-        links += _anchor_links(joints, in_base(_tip_point(model, data, chain_ids, tip)))
-    return Chain(tuple(joints), drop_zero_length(links))
+
+
+def _parent(joint: int, paths: Sequence[Sequence[int]]) -> int:
+    """The joint before this one on the chains, -1 for none."""
+    path = next(path for path in paths if joint in path)
+    return [-1, *path][path.index(joint)]
+
+
+def _chains_with(joint: int, paths: Sequence[Sequence[int]]) -> tuple[int, ...]:
+    return tuple(number for number, path in enumerate(paths) if joint in path)
 
 
 def _joint(model: mujoco.MjModel, joint_id: int, axis: np.ndarray, anchor: np.ndarray, default_name: str) -> Joint:
@@ -81,37 +100,67 @@ def _joint(model: mujoco.MjModel, joint_id: int, axis: np.ndarray, anchor: np.nd
 
 
 def _site_links(
-    model: mujoco.MjModel, data: mujoco.MjData, body: int, joint: int, in_base: Callable[[np.ndarray], np.ndarray]
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    body: int,
+    joint: int,
+    in_base: Callable[[np.ndarray], np.ndarray],
+    paths: Sequence[Sequence[int]],
 ) -> list[Link]:
-    """Links that the model marks itself, as capsule sites named link…; start and end as in their `fromto`."""
-    links = []
+    """Links that the model marks itself, as capsule sites named link…; start and end as in their `fromto`.
+
+    In a tree the names may have a prefix, as of the models that MuJoCo attaches: left_link1.
+    """
+    links, pattern = [], _PREFIXED if len(paths) > 1 else _LINK
     for site in (s for s in range(model.nsite) if model.body_weldid[model.site_bodyid[s]] == body):
         name = model.site(site).name
-        if name.startswith("link") and model.site_type[site] == _CAPSULE:
+        if pattern.match(name) and model.site_type[site] == _CAPSULE:
             half = data.site_xmat[site].reshape(3, 3)[:, 2] * model.site_size[site, 1]  # points from end to start
-            centre = data.site_xpos[site]
-            links.append(Link(name, in_base(centre + half), in_base(centre - half), joint))
+            centre, chains = data.site_xpos[site], _chains_with(joint, paths)
+            links.append(Link(name, in_base(centre + half), in_base(centre - half), joint, chains=chains))
     return links
 
 
-def _base_links(first: Joint) -> list[Link]:
-    """The link from the base body to the first joint; none where they are at the same point.
+def _base_links(joints: Sequence[Joint], paths: Sequence[Sequence[int]]) -> list[Link]:
+    """The links from the base body to the first joints; none where they are at the same point.
 
     A link along the joint's axis rotates with it, as the Panda's first link does; its position is the same either way.
     """
-    length = np.linalg.norm(first.anchor)
-    is_along_axis = np.linalg.norm(np.cross(first.axis, first.anchor)) <= _ALONG_AXIS * length
-    link = Link("base", np.zeros(3), first.anchor, 0 if is_along_axis else -1)
-    return [link] if length > SHORTEST_LINK else []
+    links = []
+    for first in dict.fromkeys(path[0] for path in paths):
+        joint = joints[first]
+        length = np.linalg.norm(joint.anchor)
+        is_along_axis = np.linalg.norm(np.cross(joint.axis, joint.anchor)) <= _ALONG_AXIS * length
+        name, chains = "base" if len(paths) == 1 else f"base-{joint.name}", _chains_with(first, paths)
+        if length > SHORTEST_LINK:
+            links.append(Link(name, np.zeros(3), joint.anchor, first if is_along_axis else -1, chains=chains))
+    return links
 
 
-def _anchor_links(joints: list[Joint], tip: np.ndarray) -> list[Link]:
-    ends = [joint.anchor for joint in joints[1:]] + [tip]
-    return [Link(f"link{i + 1}", joint.anchor, end, i) for i, (joint, end) in enumerate(zip(joints, ends, strict=True))]
+def _anchor_links(joints: Sequence[Joint], paths: Sequence[Sequence[int]], tips: Sequence[np.ndarray]) -> list[Link]:
+    """Links from each joint to the next ones on the chains, and from the last ones to the tips."""
+    links: dict[tuple[int, int], Link] = {}  # by the joints at both ends; -1 - number of the chain for a tip
+    for number, (path, tip) in enumerate(zip(paths, tips, strict=True)):
+        for joint, following in zip(path, [*path[1:], -1 - number], strict=True):
+            end = joints[following].anchor if following >= 0 else tip
+            known = links.get((joint, following))
+            chains = (*(known.chains if known else ()), number)
+            links[joint, following] = Link("", joints[joint].anchor, end, joint, chains=chains)
+    ends = sorted(links, key=lambda pair: pair[0])  # stable: branches in the order of the chains
+    return [dataclasses.replace(links[pair], name=_link_name(pair, ends, joints, len(paths))) for pair in ends]
 
 
-def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, chain_ids: ChainIds, tip: str | None) -> np.ndarray:
-    """End of the last link.
+def _link_name(pair: tuple[int, int], pairs: Sequence[tuple[int, int]], joints: Sequence[Joint], chains: int) -> str:
+    """The number of a link on one chain; in a tree its joint, with the next one where links branch."""
+    joint, following = pair
+    if chains == 1:
+        return f"link{joint + 1}"
+    branches = sum(first == joint for first, _ in pairs) > 1
+    return joints[joint].name + (f"-{joints[following].name if following >= 0 else 'tip'}" if branches else "")
+
+
+def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[int], tip: str | None) -> np.ndarray:
+    """End of the last link of a chain of joints.
 
     The named tip; else the farthest site or body distal to the last joint; else the farthest end of a geom; else the
     centre of mass of the last body.
@@ -119,11 +168,11 @@ def _tip_point(model: mujoco.MjModel, data: mujoco.MjData, chain_ids: ChainIds, 
     if tip is not None:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
         return data.site_xpos[site] if site >= 0 else data.xpos[tip_body(model, tip)]
-    last = chain_ids.bodies[-1]
+    last = int(model.jnt_bodyid[joints[-1]])
     subtree = [body for body in range(1, model.nbody) if last in ancestors(model, body)]
     points = [data.site_xpos[site] for site in range(model.nsite) if model.site_bodyid[site] in subtree]
     points += [data.xpos[body] for body in subtree if body != last]
-    anchor = data.xanchor[chain_ids.joints[-1]]
+    anchor = data.xanchor[joints[-1]]
 
     def distance(point: np.ndarray) -> float:
         return float(np.linalg.norm(point - anchor))

@@ -15,7 +15,7 @@ from mimic.config import suggestion
 MENAGERIE = "MUJOCO_MENAGERIE"  # environment variable with the folder of a clone
 _CACHE, _DEFAULT_CACHE = "ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions"  # of robot_descriptions
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-BUILT_IN = "panda", "planar"  # mimic's own arms, which no other arm of the name replaces
+BUILT_IN = "panda", "planar", "panda_pair"  # mimic's own arms, which no other arm of the name replaces
 _SHOWN = 30  # names in a message
 _WAYS = (
     "install the package robosuite, load it once with robot_descriptions, or name a clone of mujoco_menagerie by the "
@@ -40,8 +40,8 @@ def named_arm(name: str) -> Path:
     listed = ", ".join(list(arms)[:_SHOWN]) + (", ..." if len(arms) > _SHOWN else "")
     here = f"here are {listed}{suggestion(name, arms)}" if arms else "here are none"
     raise ValueError(
-        f"model: expected panda, planar, an MJCF or URDF file, or the name of an arm that is here, got {name!r}; "
-        f"{_WAYS}; {here}"
+        f"model: expected {', '.join(BUILT_IN)}, an MJCF or URDF file, or the name of an arm that is here, got "
+        f"{name!r}; {_WAYS}; {here}"
     )
 
 

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from mimic import compat
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import Capsule, Colour, link_ends
@@ -19,6 +20,7 @@ from mimic.arms.visual_model import visual_spec
 
 SPACING, FLAT_SPACING = 0.9, 1.5  # chain lengths between two arms; planar ones are seen from above, and reach sideways
 LOCKED = (0.85, 0.12, 0.10, 1.0)
+_ROUNDING = 1e-6  # m
 _FLOOR, _GRID = (0.94, 0.95, 0.96), (0.88, 0.89, 0.91)
 _SHADOWS, _SAMPLES = 2048, 4  # pixels of the shadow map, samples of a pixel
 _SOFTWARE = "llvmpipe", "softpipe", "swrast", "SWR"  # names of Mesa's renderers on the CPU
@@ -85,7 +87,10 @@ class ArmScene:
         self._renderer = _renderer(self._model, width, height, fast)
 
     def fit(self, poses: Sequence[Float[np.ndarray, "frames joints"]]) -> None:
-        """Moves arms and camera so that the arms fill the image in all these poses [rad], those of each arm in turn."""
+        """Moves arms and camera so that the arms fill the image in all these poses [rad], those of each arm in turn.
+
+        The floor is at the bases, or below the lowest link where an arm reaches below its base, as a person's does.
+        """
         margin = MARGIN * max(float(arm.chain_length) for arm in self._arms)
         points = [
             np.concatenate([base[:3, 3][None], _points(arm, arm_poses) @ base[:3, :3].T + base[:3, 3]])
@@ -103,6 +108,8 @@ class ArmScene:
         self._centres = [
             float(np.ptp(x) / 2 + x.min()) for x in (self.flattened(arm_points)[:, 0] for arm_points in points)
         ]
+        lowest = min(float(arm_points[:, 2].min()) for arm_points in points)
+        self._data.mocap_pos[0, 2] = min(0.0, lowest - margin) if lowest < -_ROUNDING else 0.0
         self._look_at(np.concatenate(points), margin)
 
     def centres(self) -> list[float]:
@@ -202,7 +209,8 @@ def _empty_room(width: int, height: int) -> mujoco.MjSpec:
     )  # fmt: skip
     floor = spec.add_material(name="floor", texrepeat=[2, 2], texuniform=True)
     floor.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = "floor"
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="floor")
+    ground = spec.worldbody.add_body(name="ground", mocap=True)  # the only body that `fit` moves by its pose
+    ground.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="floor")
     for place, strength in (([1.5, -2.0, 3.5], 0.55), ([1.5, 2.5, 3.0], 0.2)):
         spec.worldbody.add_light(
             pos=place, dir=[-x for x in place], diffuse=[strength] * 3, castshadow=strength > 0.5,
@@ -237,10 +245,10 @@ def _renderer(model: mujoco.MjModel, width: int, height: int, fast: bool) -> muj
             model.vis.quality.offsamples = 0
         _choose_window_system()
         renderer = mujoco.Renderer(model, height, width)
-    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+    except (*compat.NO_GRAPHICS, ImportError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(
-            "rendering: no OpenGL library works; expected EGL (Debian, Ubuntu: libegl1), or MUJOCO_GL=osmesa with "
-            f"libosmesa6: {' '.join(str(error).split())}"
+            "rendering: no OpenGL library works; expected EGL (Debian, Ubuntu: libegl1 and libgl1), or "
+            f"MUJOCO_GL=osmesa with libosmesa6: {' '.join(str(error).split())}"
         ) from error
     if is_plain:
         renderer.scene.flags[int(mujoco.mjtRndFlag.mjRND_SHADOW)] = 0

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
 from mimic.arms.embodiment import Embodiment
-from mimic.arms.kinematic_tree import ChainIds, ancestors, body_id, find_chain
+from mimic.arms.kinematic_tree import ChainIds, ancestors, find_chain
 from mimic.arms.link_match import Colour
 from mimic.arms.mujoco_chain import zero_pose
 
@@ -50,7 +50,7 @@ def visual_spec(
         for body in spec.bodies[1:]:
             if body.name in by_body:
                 _colour_geoms(spec, body, by_body[body.name])
-    base = int(model.body_parentid[chain_ids.bodies[0]]) if config.base is None else body_id(model, config.base)
+    base = chain_ids.base
     T_world_base = np.eye(4)
     T_world_base[:3, :3], T_world_base[:3, 3] = data.xmat[base].reshape(3, 3), data.xpos[base]
     return spec, T_world_base
@@ -78,7 +78,13 @@ def _moved_link(arm: Embodiment, joint: int) -> int:
     moved = [link for link, mover in enumerate(arm.link_joint) if mover == joint]
     if moved:
         return max(moved, key=lambda link: float(arm.link_lengths[link]))
-    return next((link for link, mover in enumerate(arm.link_joint) if mover > joint), arm.num_links - 1)
+    distal, proximal = {joint}, {joint}
+    for index, parent in enumerate(arm.joint_parent):
+        distal |= {index} if parent in distal else set()
+    while -1 not in proximal:
+        proximal.add(arm.joint_parent[min(proximal)])
+    nearest = max((link for link, mover in enumerate(arm.link_joint) if mover in proximal), default=0)
+    return next((link for link, mover in enumerate(arm.link_joint) if mover in distal), nearest)
 
 
 def is_dark(rgba: Sequence[float] | np.ndarray) -> bool:
@@ -95,14 +101,14 @@ def _colour_geoms(spec: mujoco.MjSpec, body: Any, colour: Colour) -> None:
 
 
 def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, chain_ids: ChainIds) -> None:
-    """Removes everything but the root body of the arm."""
+    """Removes everything but the root bodies of the arm."""
     for kind in _SCENE_ELEMENTS:
         for item in list(getattr(spec, kind)):
             spec.delete(item)
-    root = model.body(ancestors(model, chain_ids.bodies[0])[-2]).name
+    roots = {model.body(ancestors(model, root)[-2]).name for root in chain_ids.roots(model)}
     for item in [*spec.worldbody.geoms, *spec.worldbody.sites]:
         spec.delete(item)
-    for body in [body for body in spec.worldbody.bodies if body.name != root]:
+    for body in [body for body in spec.worldbody.bodies if body.name not in roots]:
         spec.delete(body)
     visual = [geom for geom in spec.geoms if not (geom.contype or geom.conaffinity)]
     if visual:  # the model has visual geoms, so its collision geoms are hidden
@@ -113,13 +119,18 @@ def _remove_scene(spec: mujoco.MjSpec, model: mujoco.MjModel, chain_ids: ChainId
 
 def _draw_links(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec, chain_ids: ChainIds) -> None:
     """Capsules from each joint to the next, for models without any geom."""
-    points = [data.xanchor[joint] for joint in chain_ids.joints]
-    distal = [body for body in range(model.nbody) if chain_ids.bodies[-1] in ancestors(model, body)]
+    for joints in chain_ids.chains:
+        _draw_chain(model, data, spec, joints)
+
+
+def _draw_chain(model: mujoco.MjModel, data: mujoco.MjData, spec: mujoco.MjSpec, joints: Sequence[int]) -> None:
+    points = [data.xanchor[joint] for joint in joints]
+    distal = [body for body in range(model.nbody) if model.jnt_bodyid[joints[-1]] in ancestors(model, body)]
     points.append(
         max((data.xpos[body] for body in distal), key=lambda point: float(np.linalg.norm(point - points[-1])))
     )
     lengths = [float(np.linalg.norm(end - start)) for start, end in zip(points[:-1], points[1:], strict=True)]
-    for joint, start, end, length in zip(chain_ids.joints, points[:-1], points[1:], lengths, strict=True):
+    for joint, start, end, length in zip(joints, points[:-1], points[1:], lengths, strict=True):
         body = int(model.jnt_bodyid[joint])
         R_body_world = data.xmat[body].reshape(3, 3).T
         if length > _THICKNESS * sum(lengths) / 10:

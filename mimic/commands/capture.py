@@ -16,7 +16,7 @@ from mimic.metric.kinematics import link_state_table
 from mimic.mocap.arms import SIDES, find_arms
 from mimic.mocap.ball_chain import ball_chain_xml, zero_frames
 from mimic.mocap.clips import Windows, relative_speeds, slow_down_for, turned, windows
-from mimic.mocap.link_motion import LinkMotion, arm_motion, rigid_error
+from mimic.mocap.link_motion import BOTH, LinkMotion, arm_motion, rigid_error, sides
 from mimic.mocap.picture import draw_skeleton, draw_windows
 from mimic.mocap.points import PointMotion, bridge_gaps, gaps, jumps, segment_lengths
 from mimic.mocap.reading import read_motion
@@ -29,11 +29,11 @@ _STILL = 1e-5  # of a chain: single precision rounds by 1e-7
 
 @dataclasses.dataclass(frozen=True)
 class Capture:
-    """An arm's motion from a file.
+    """The motion of an arm, or of both, from a file.
 
     Attributes:
       body: all points, as they were read.
-      parts: the arm's motion between gaps.
+      parts: the motion of the links between gaps.
       starts: time of each part in the file [s].
       bridged: number of bridged gaps.
     """
@@ -45,11 +45,11 @@ class Capture:
 
 
 def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0) -> Capture:
-    """Reads the motion of one arm of a body.
+    """Reads the motion of one arm of a body, or of both.
 
     Args:
       source: the file.
-      side: "left" or "right".
+      side: "left", "right" or "both".
       config: how it is read.
       fixed: fraction of the robot's chain that no joint moves, for the length of the trunk.
 
@@ -58,24 +58,24 @@ def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0)
     """
     body = read_motion(source, unit=config.unit, up=config.up)
     arms = find_arms(body)
-    if side not in arms:
-        found = " and ".join(arms) or "none"
-        raise ValueError(f"arm: expected {' or '.join(SIDES)}, of which {str(source)!r} has {found}, got {side!r}")
+    if not set(sides(side)) <= set(arms):
+        found, valid = " and ".join(arms) or "none", f"{', '.join(SIDES)} or {BOTH}"
+        raise ValueError(f"arm: expected {valid}, of which {str(source)!r} has {found}, got {side!r}")
     # Of the other arm, the shoulder shows where the body faces.
-    groups = [*arms[side][1:], *(arm.shoulder for arm in arms.values())]
+    groups = [*(group for one in sides(side) for group in arms[one][1:]), *(arm.shoulder for arm in arms.values())]
     names = [name for group in groups for name in group]
     used = body.select(list(dict.fromkeys(names)))
     pieces, bridged = bridge_gaps(used)
+    label = "both arms" if side == BOTH else f"the {side} arm"
     # Split where a point jumps: a first frame in another pose, or markers that were exchanged.
     pieces = [piece.cut(*span) for piece in pieces for span in _between(jumps(piece), len(piece.positions))]
     pieces = [piece for piece in pieces if len(piece.positions) > 1]
     if not pieces:
-        raise ValueError(f"source: {str(source)!r} has no time at which all points of the {side} arm are known")
+        raise ValueError(f"source: {str(source)!r} has no time at which all points of {label} are known")
     longest = max(pieces, key=lambda piece: len(piece.positions))
     chain = arm_motion(longest, side, arms=arms).chain_length
     settings: dict[str, Any] = {
-        "arms": arms, "cutoff": config.cutoff, "name": f"{side}_arm",
-        "trunk": chain * fixed / (1 - fixed) if config.trunk is None else config.trunk,
+        "arms": arms, "cutoff": config.cutoff, "trunk": trunk_length(chain, config, fixed),
     }  # fmt: skip
     angles = np.radians([config.yaw, config.pitch, config.roll])
     parts = [turned(arm_motion(piece, side, **settings), *angles) for piece in pieces]
@@ -84,12 +84,21 @@ def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0)
     return Capture(body, [_with_lengths(part, lengths) for part in parts], starts, bridged)
 
 
+def trunk_length(chain: float, config: CaptureConfig, fixed: float) -> float:
+    """Length of the trunk [m] below an arm with a length [m], for a robot with a fixed fraction of its chain."""
+    return chain * fixed / (1 - fixed) if config.trunk is None else config.trunk
+
+
 def fixed_fraction(arm: Embodiment) -> float:
-    """Fraction of an arm's chain that stands still, at its base: before joints, or on the axis of the first one."""
+    """Fraction of an arm's chain that stands still, at its base: before joints, or on the axis of the first one.
+
+    The mean over the chains of a tree.
+    """
     poses = np.random.default_rng(0).uniform(-1, 1, (8, arm.num_joints))
     states = link_state_table(arm, poses, np.zeros_like(poses))
     moves = np.ptp(states.position, axis=0).max(axis=1) + np.ptp(np.asarray(states.direction), axis=0).max(axis=1)
-    return float(np.asarray(arm.link_lengths)[moves < _STILL].sum() / arm.chain_length)
+    still = np.where(moves < _STILL, np.asarray(arm.link_lengths), 0)
+    return float(np.mean([still[list(chain)].sum() for chain in arm.chains]) / arm.chain_length)
 
 
 def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Path) -> Callable[[], None]:
@@ -126,7 +135,7 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
         console.print(f"results: {out}, {model}", soft_wrap=True, highlight=False)
         command = (
             f"python -m mimic.train env={env.name} env.expert={model} env.demonstrations.path={out} "
-            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out}"
+            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out} env.start=nearest"
         )
         console.print(f"train on it: {command}", soft_wrap=True, highlight=False, markup=False)
 
@@ -149,8 +158,10 @@ def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | 
             out.mkdir()
             draw_skeleton(body, out / "skeleton.png", source.name)
             console.print(f"results: {out}", soft_wrap=True, highlight=False)
-        for side in find_arms(body):
-            command = f"python -m mimic.demonstrations source={source} arm={side} out={source.stem}_{side}.npz"
+        both = [f"{BOTH} env=bimanual"] if len(find_arms(body)) == len(SIDES) else []
+        for side in [*find_arms(body), *both]:
+            out_file = f"{source.stem}_{side.split()[0]}.npz"
+            command = f"python -m mimic.demonstrations source={source} arm={side} out={out_file}"
             console.print(f"demonstrations: {command}", soft_wrap=True, highlight=False, markup=False)
 
     return run

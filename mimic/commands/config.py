@@ -20,6 +20,7 @@ from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
 
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "searched")
+ARM_SIDES = ("left", "right")
 EXPORT_FORMATS = ("onnx", "jax")
 
 
@@ -216,7 +217,7 @@ class RecordingConfig:
       limits: see `EnvConfig`. Default None: those of the environment.
       source: file of motions to import instead of recording, see `import_demonstrations`.
       joints: names of the expert's joints in `source`, base to tip. Default []: the expert's own names.
-      arm: "left" or "right" arm of the person in a motion capture file `source`. Default "": right.
+      arm: "left" or "right" arm of the person in a motion capture file `source`, or "both". Default "": right.
       capture: how such a file is read and cut.
       out: .npz file of the demonstrations; must not exist.
       plot: .png, .pdf or .svg file of the plot; must not exist. Default "": `out` with the suffix .png.
@@ -315,7 +316,12 @@ class ViewConfig:
         `named_arm`), or an MJCF file.
       mapper: run directory of a pose mapper that moves the learner instead of the optimiser. Its arms are used.
       run: run directory of a policy to play. Its arms and demonstrations are used.
+      source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
+        that takes points as lines of JSON.
+      arm: "left" or "right" arm of the person in `source`. Default "": right.
+      capture: how `source` is read.
       checkpoint: steps of the checkpoint of the policy or the mapper. Default None: the last checkpoint.
+      follow: whether to play each new checkpoint of `run`, which another process trains.
       split: "held_out" or "train": demonstrations of the run to show first.
       host: address of the server; 0.0.0.0 is every address of this machine.
       port: port of the server.
@@ -327,7 +333,11 @@ class ViewConfig:
     learner: str = ""
     mapper: str = ""
     run: str = ""
+    source: str = ""
+    arm: str = ""
+    capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
     checkpoint: int | None = _steps()
+    follow: bool = False
     split: str = "held_out"
     host: str = "127.0.0.1"
     port: int = number(8080, at_least=1, at_most=65_535)
@@ -338,8 +348,19 @@ class ViewConfig:
         check_choice("split", self.split, SPLITS)
         if self.run and self.mapper:
             raise ValueError(f"run, mapper: expected one of them, got {self.run!r} and {self.mapper!r}")
+        if self.follow and (not self.run or self.checkpoint is not None):
+            raise ValueError(
+                f"follow: expected with run= and without checkpoint=, as in run=runs/NAME follow=true, "
+                f"got run={self.run!r} and checkpoint={self.checkpoint}"
+            )
         if (self.run or self.mapper) and (self.expert or self.learner):
             raise ValueError("expert, learner: expected neither with run= or mapper=, whose arms are used")
+        if self.source and (self.run or self.mapper or self.expert):
+            raise ValueError("expert, run, mapper: expected none with source=, whose person is the expert")
+        if not self.source and (self.arm or self.capture != CaptureConfig()):
+            raise ValueError("arm, capture: expected only with source=")
+        if self.arm:
+            check_choice("arm", self.arm, ARM_SIDES)
 
     def resolve_env(self) -> EnvConfig:
         """Returns the environment with the arms named in `expert` and `learner`.

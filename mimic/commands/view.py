@@ -9,25 +9,42 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import jax
+from rich.console import Console
 
 from mimic import compat
 from mimic.arms.arm import build_arm
 from mimic.commands.config import ViewConfig
+from mimic.commands.view_capture import (
+    CapturedExpert,
+    clip_expert,
+    is_address,
+    listen,
+    live_expert,
+    read_clip,
+    wait_for_arm,
+)
 from mimic.distribution import install_command
 from mimic.envs.config import EnvConfig
+from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.signals import Signals, noted_signals
-from mimic.trainers.run_config import load_config
-from mimic.viewer.history import RATE, History
-from mimic.viewer.live_session import Frame, LiveSession
+from mimic.trainers.run_config import load_config, policy_config, policy_run
+from mimic.viewer.history import RATE
+from mimic.viewer.live_session import LiveSession
 from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
+    from mimic.viewer.newest_checkpoint import NewestCheckpoint
     from mimic.viewer.page import Page
+    from mimic.viewer.playback import Playback
+    from mimic.viewer.player import Player
     from mimic.viewer.recorder import Recorder
 
 _MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
-_AT_BOUND = 1e-3  # fraction of the distance within which it counts as the bound
+CAPTURE_RATE = 100.0  # frames per second of a captured person, at most
+_NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a browser more than the arms
 
 
 def prepare_view(config: ViewConfig) -> Callable[[], int]:
@@ -45,26 +62,105 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     from mimic.compilation import use_compilation_cache
 
     use_compilation_cache(config.compilation_cache)
+    if config.follow:
+        return _prepare_training_view(config)
     if config.run:
-        compat.import_mjx()
-        from mimic.trainers.run_config import policy_run
-        from mimic.viewer.playback import Playback
-
-        run_dir, trained = policy_run(config.run, config.checkpoint)
-        playback = Playback(trained, run_dir, config.checkpoint)
-        return lambda: serve(
-            config, trained.env, lambda page, times: _play(page, times, playback, config.split), playback.run
-        )
+        return _prepare_playback(config)
     mapper, env = None, config.resolve_env()
     if config.mapper:
         from mimic.trainers.pose_mapper.model import PoseMapper
 
         mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
         env = load_config(Path(config.mapper).expanduser()).env
+    # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    if config.source:
+        return _prepare_captured(config, env)
     live = LiveSession(env, mapper)
+
+    def follow(page: "Page", times: Iterator[float]) -> None:
+        from mimic.viewer.live_page import show_live
+        from mimic.viewer.manual_controls import ManualControls
+
+        show_live(page, times, live, env, ManualControls(live, env, page.expert), mapper is None)
+
+    return lambda: serve(config, env, follow, None, live.finish)
+
+
+def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
+    """Checks the captured person of `source`; the returned function shows it."""
+
+    def show(expert: CapturedExpert) -> int:
+        live = LiveSession(expert.env)
+
+        def follow(page: "Page", times: Iterator[float]) -> None:
+            from mimic.viewer.live_page import show_live
+
+            show_live(page, times, live, expert.env, expert.controls(live), True, _NUMBERS_RATE)
+
+        return serve(config, expert.env, follow, None, live.finish, rate=CAPTURE_RATE)
+
+    if is_address(config.source):
+        listener = listen(config)
+
+        def run_live() -> int:
+            with contextlib.closing(listener):
+                measured = wait_for_arm(listener, config, env)
+                if measured is None:
+                    return 0
+                with live_expert(env, *measured, listener) as expert:
+                    return show(expert)
+
+        return run_live
+    content = read_clip(config, env)
+
+    def run_clip() -> int:
+        with clip_expert(env, *content) as expert:
+            return show(expert)
+
+    return run_clip
+
+
+def _prepare_playback(config: ViewConfig) -> Callable[[], int]:
+    """Prepares the playback of a checkpoint."""
+    compat.import_mjx()
+    from mimic.trainers.make import make_ppo_trainer
+    from mimic.viewer.playback import Playback
+
+    run_dir, trained = policy_run(config.run, config.checkpoint)
+    trainer = make_ppo_trainer(trained, run_dir)
+    _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
+    playback = Playback(trained.env, trainer.evaluator)
+
+    def evaluate() -> None:
+        with Console().status("running the policy on all demonstrations and computing the kinematic bound"):
+            playback.replace(trainer.evaluate(params))
+            _ = trainer.evaluator.lower_bound
+
     return lambda: serve(
-        config, env, lambda page, times: _follow(page, times, live, env, mapper is None), None, live.finish
+        config, trained.env, lambda page, times: _play(page, times, playback, config.split), before=evaluate
     )
+
+
+def _prepare_training_view(config: ViewConfig) -> Callable[[], int]:
+    """Prepares the playback of the newest checkpoint of a run that another process trains."""
+    jax.config.update("jax_platforms", "cpu")  # the training may take the whole memory of the GPU
+    compat.import_mjx()
+    from mimic.trainers.make import make_ppo_trainer
+    from mimic.viewer.newest_checkpoint import NewestCheckpoint
+    from mimic.viewer.playback import Playback
+
+    run_dir, trained = policy_config(config.run)
+    trainer = make_ppo_trainer(trained, run_dir)
+    newest, playback = NewestCheckpoint(trainer, run_dir), Playback(trained.env, trainer.evaluator)
+
+    def show(page: "Page", times: Iterator[float]) -> None:
+        newest.start()
+        if not newest.exists:
+            print(f"view: {run_dir} has no checkpoint yet; waiting for the first one", flush=True)
+        _play_newest(page, times, playback, newest, config.split)
+
+    return lambda: serve(config, trained.env, show, after=newest.finish)
 
 
 def is_installed() -> bool:
@@ -97,8 +193,12 @@ def serve(
     show: "Callable[[Page, Iterator[float]], None]",
     before: Callable[[], None] | None = None,
     after: Callable[[], None] | None = None,
+    rate: float = RATE,
 ) -> int:
-    """Serves a page until a signal. Calls `before` before the server starts and `after` when it has ended."""
+    """Serves a page until a signal, with a rate of frames [1/s].
+
+    Calls `before` before the server starts and `after` when it has ended.
+    """
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
     from mimic.viewer.recorder import Recorder
@@ -126,7 +226,7 @@ def serve(
             is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
             page = Page(server, shapes, names, _title(config, env), is_flat, match)
             print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
-            show(page, _recorded(Recorder(server), ticks(signals)))
+            show(page, _recorded(Recorder(server), ticks(signals, rate)))
         finally:
             with contextlib.redirect_stdout(io.StringIO()):
                 server.stop()
@@ -145,42 +245,49 @@ def address(host: str, port: int) -> str:
 
 
 def _title(config: ViewConfig, env: EnvConfig) -> str:
-    controller = f"policy of {Path(config.run).name}" if config.run else "pose mapper" if config.mapper else "optimiser"
+    policy = f"{'newest policy' if config.follow else 'policy'} of {Path(config.run).name}"
+    controller = policy if config.run else "pose mapper" if config.mapper else "optimiser"
     return f"{env.name or 'mimic'}: the learner is moved by the {controller}"
 
 
-def _follow(page: "Page", times: Iterator[float], live: LiveSession, env: EnvConfig, can_lock: bool) -> None:
-    from mimic.viewer.controls import LiveControls
-
-    controls = LiveControls(page.server, live, env, can_lock, page.expert)
-    history, frame, was_compiling = History(), None, True
-    for dt in times:
-        try:
-            new_frame = live.advance(dt)
-        except ValueError as error:
-            for client in page.server.get_clients().values():
-                client.add_notification("not possible", str(error), color="red", auto_close_seconds=6.0)
-            new_frame = None
-            controls.undo_locks()
-        compiling = live.is_compiling
-        if new_frame is None and (compiling == was_compiling or frame is None):
-            continue
-        frame, was_compiling = new_frame or frame, compiling
-        assert frame is not None
-        history.add(frame)
-        page.show(frame, history.chart(), _note(frame, compiling, can_lock))
-        controls.update()
-
-
-def _play(page: "Page", times: Iterator[float], playback: Any, split: str) -> None:
+def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:
     from mimic.viewer.player import Player
 
     player = Player(page.server, playback, split)
     for dt in times:
         if player.advance(dt):
-            episode = player.split, player.demonstration
-            frame = playback.frame(*episode, player.time)
-            page.show(frame, playback.chart(*episode, player.time), playback.note(*episode))
+            _show_playback(page, playback, player)
+
+
+def _show_playback(page: "Page", playback: "Playback", player: "Player", text: str = "") -> None:
+    """Shows the current frame of a playback, below a text."""
+    episode = player.split, player.demonstration
+    frame, note = playback.frame(*episode, player.time), playback.note(*episode)
+    page.show(frame, playback.chart(*episode, player.time), f"{text}\n{note}" if text else note)
+
+
+def _play_newest(
+    page: "Page", times: Iterator[float], playback: "Playback", newest: "NewestCheckpoint", split: str
+) -> None:
+    """Plays each new checkpoint from when it is evaluated; the time in the episode goes on."""
+    from mimic.viewer.player import Player
+
+    page.show_note("waiting for the first checkpoint" if not newest.exists else "evaluating the newest checkpoint …")
+    player, text = None, ""
+    for dt in times:
+        try:
+            evaluation = newest.advance()
+        except ValueError as error:
+            evaluation = None
+            print(f"view: {error}; waiting for the next one", file=sys.stderr, flush=True)
+        if evaluation is not None:
+            playback.replace(evaluation.rollouts)
+            text = evaluation.text
+            print(f"view: {text}", flush=True)
+            player = player or Player(page.server, playback, split)
+            player.refresh()
+        if player is not None and player.advance(dt):
+            _show_playback(page, playback, player, text)
 
 
 def _recorded(recorder: "Recorder", times: Iterator[float]) -> Iterator[float]:
@@ -190,20 +297,11 @@ def _recorded(recorder: "Recorder", times: Iterator[float]) -> Iterator[float]:
         yield dt
 
 
-def ticks(signals: Signals) -> Iterator[float]:
-    """Yields the time since the last tick [s], at most `RATE` times per second, until a signal."""
+def ticks(signals: Signals, rate: float = RATE) -> Iterator[float]:
+    """Yields the time since the last tick [s], at a rate [1/s] at most, until a signal."""
     last = time.perf_counter()
     while not signals.caught:
-        time.sleep(max(0.0, last + 1 / RATE - time.perf_counter()))
+        time.sleep(max(0.0, last + 1 / rate - time.perf_counter()))
         now = time.perf_counter()
         yield min(now - last, _MAX_STEP)
         last = now
-
-
-def _note(frame: Frame, compiling: bool, by_optimiser: bool) -> str:
-    if compiling:
-        return "compiling …"
-    excess = frame.distance - frame.bound
-    if excess <= _AT_BOUND * max(frame.distance, _AT_BOUND):
-        return "at the kinematic bound"
-    return f"{excess:.4f} above the bound: " + ("moving, or in a local minimum" if by_optimiser else "pose mapper")

@@ -7,6 +7,7 @@ from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
 from mimic.config import check_choice
 from mimic.envs.recording import KINDS
+from mimic.envs.start_poses import START_POSES
 from mimic.metric.config import MetricConfig
 from mimic.ranges import check_ranges, number
 
@@ -106,6 +107,8 @@ class EnvConfig:
         ranges).
       metric: embodiment distance of the reward.
       demonstrations: motions to imitate.
+      start: where the learner starts an episode, at rest: "home", in its home pose (paper); or "nearest", in the pose
+        nearest to the expert's first one, for demonstrations that start anywhere.
       horizon: control steps of an episode.
       control_dt: duration of a control step [s]; the torque is constant within it.
       substeps: physics steps in a control step.
@@ -128,6 +131,7 @@ class EnvConfig:
     limits: str = "none"
     metric: MetricConfig = dataclasses.field(default_factory=MetricConfig)
     demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
+    start: str = "home"
     horizon: int = number(50, at_least=1, at_most=10_000)
     control_dt: float = number(0.1, at_least=1e-4, at_most=10.0)  # robots are controlled at 10 kHz at most
     substeps: int = number(10, at_least=1, at_most=1000)  # 0.1 ms for the default control step
@@ -144,6 +148,7 @@ class EnvConfig:
 
     def __post_init__(self) -> None:
         check_choice("limits", self.limits, LIMITS)
+        check_choice("start", self.start, START_POSES)
         check_choice("physics", self.physics, (AUTO, *PHYSICS))
         check_ranges(self)
         for name in self.reward.terms:

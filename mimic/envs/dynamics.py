@@ -1,4 +1,4 @@
-"""Dynamics of a serial arm on scalar components: the equations of MJX without small arrays, for a fused kernel.
+"""Dynamics of a chain or tree of joints on scalar components: the equations of MJX without arrays, for a fused kernel.
 
 The composite rigid body algorithm computes the mass matrix, the recursive Newton-Euler algorithm the Coriolis and
 centrifugal forces (Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 6 and 5). Frames are at the joints,
@@ -59,9 +59,10 @@ class Inertia:
 
 @dataclasses.dataclass(frozen=True)
 class Segment:
-    """Parameters of a joint and of the body that it moves. The parent frame is that of the previous joint.
+    """Parameters of a joint and of the body that it moves. The parent frame is that of the parent joint.
 
     Attributes:
+      parent: index of the parent joint, -1 for a joint at the base.
       placement: maps this joint's frame into the parent frame, at the angle `reference`.
       offset: origin of this joint's frame in the parent frame [m]: the point on its axis nearest to the parent's
         origin.
@@ -71,6 +72,7 @@ class Segment:
       damping: viscous damping [N m s/rad].
     """
 
+    parent: int
     placement: Rotation
     offset: Vector
     reference: float
@@ -80,21 +82,24 @@ class Segment:
 
 
 def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
-    """The segments of an arm, base to tip.
+    """The segments of an arm, each after its parent.
 
     Args:
-      model: from `simulation_model`: one serial chain of revolute joints.
+      model: from `simulation_model`: revolute joints in a chain or a tree.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
     assert model.nq == model.njnt and list(model.jnt_bodyid) == sorted(model.jnt_bodyid)
     last_joint = {int(body): joint for joint, body in enumerate(model.jnt_bodyid)}
-    frame, origin = _frame(data.xaxis[0], np.eye(3)), data.xanchor[0]
-    poses, masses = [], []
+    poses, masses, frames = [], [], []
+    parents = _joint_parents(model)
     for joint, (axis, anchor) in enumerate(zip(data.xaxis, data.xanchor, strict=True)):
-        previous_frame, previous_origin = frame, origin
+        # A joint at the base has itself as its parent frame.
+        at_base = _frame(axis, np.eye(3)), anchor
+        previous_frame, previous_origin = frames[parents[joint]] if parents[joint] >= 0 else at_base
         frame, origin = _frame(axis, previous_frame), anchor + axis @ (previous_origin - anchor) * axis
+        frames.append((frame, origin))
         pose = np.eye(4)
         pose[:3, :3] = snap_to_units(previous_frame.T @ frame)
         pose[:3, 3] = snap_to_units(previous_frame.T @ (origin - previous_origin))
@@ -106,10 +111,11 @@ def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
         on_axis = np.zeros((4, 4))
         on_axis[2:, 2:] = masses[joint][2:, 2:]
         masses[joint] -= on_axis
-        if joint:
-            masses[joint - 1] += poses[joint] @ on_axis @ poses[joint].T
+        if parents[joint] >= 0:
+            masses[parents[joint]] += poses[joint] @ on_axis @ poses[joint].T
     return tuple(
         Segment(
+            parent=parents[joint],
             placement=rotation(pose[:3, :3]),
             offset=vector(pose[:3, 3]),
             reference=float(model.qpos0[joint]),
@@ -121,12 +127,24 @@ def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
     )
 
 
+def _joint_parents(model: mujoco.MjModel) -> list[int]:
+    """Index of each joint's parent, -1 for a joint at the base."""
+    last = dict.fromkeys(range(model.nbody), -1)  # joint of each body so far, or of its parent
+    parents = []
+    for body in range(1, model.nbody):
+        last[body] = last[int(model.body_parentid[body])]
+        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+            parents.append(last[body])
+            last[body] = joint
+    return parents
+
+
 def uncovered_elements(model: mujoco.MjModel) -> list[str]:
     """What a model has that changes its motion and that these dynamics lack; empty where they are exact."""
     no_gravity = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
     elements = {
         "joints that are not revolute": np.any(model.jnt_type != mujoco.mjtJoint.mjJNT_HINGE),
-        "several branches": not _is_serial(model),
+        "bodies that no joint moves": bool(np.any(model.body_jntnum[1:] == 0)),
         "gravity": not no_gravity and np.any(model.opt.gravity),
         "contacts": model.ngeom > 0,
         "constraints": model.neq > 0,
@@ -140,11 +158,6 @@ def uncovered_elements(model: mujoco.MjModel) -> list[str]:
         "another integrator": model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4,
     }
     return [name for name, is_there in elements.items() if is_there]
-
-
-def _is_serial(model: mujoco.MjModel) -> bool:
-    """Whether each moving body is the child of the one before it, and all bodies move."""
-    return list(model.body_parentid[1:]) == list(range(model.nbody - 1)) and bool(np.all(model.body_jntnum[1:] > 0))
 
 
 def acceleration(
@@ -190,10 +203,12 @@ def inverse(
 
 
 def _rotations(arm: Sequence[Segment], qpos: Sequence[Scalar]) -> list[Rotation]:
-    """Rotation of each joint's frame into its parent frame; the identity for the first, whose angle has no effect."""
-    return [IDENTITY] + [
-        compose(segment.placement, axis_rotation(_Z, plus(angle, -segment.reference)))
-        for segment, angle in zip(arm[1:], qpos[1:], strict=True)
+    """Rotation of each joint's frame into its parent frame; the identity at the base, where angles have no effect."""
+    return [
+        IDENTITY
+        if segment.parent < 0
+        else compose(segment.placement, axis_rotation(_Z, plus(angle, -segment.reference)))
+        for segment, angle in zip(arm, qpos, strict=True)
     ]
 
 
@@ -205,12 +220,12 @@ def mass_matrix(arm: Sequence[Segment], rotations: Sequence[Rotation]) -> list[l
       rotations: rotation of each joint's frame into its parent frame.
     """
     matrix: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(len(arm))]
-    composite = Inertia(ZERO, _NONE)
+    composites = [Inertia(ZERO, _NONE) for _ in arm]  # of the bodies distal to each joint
     for i in reversed(range(len(arm))):
-        composite = _summed(composite, arm[i].inertia)
+        composite, parent = _summed(composites[i], arm[i].inertia), arm[i].parent
         matrix[i][i] = plus(composite.second[0][0], composite.second[1][1])
-        if i == 0:
-            break
+        if parent < 0:
+            continue
         trace = plus(matrix[i][i], composite.second[2][2])
         composite = _rotated(composite, rotations[i])
         # Force and moment of a unit acceleration about this joint, in the frames of the proximal joints.
@@ -218,11 +233,13 @@ def mass_matrix(arm: Sequence[Segment], rotations: Sequence[Rotation]) -> list[l
         force = cross(axis, composite.first)
         moment = add(scale(trace, axis), rotate(composite.second, scale(-1.0, axis)))
         moment = add(moment, cross(offset, force))
-        matrix[i][i - 1] = moment[2]
-        for j in reversed(range(1, i)):
-            force, moment = _passed_on(arm[: j + 1], rotations[j], force, moment)
-            matrix[i][j - 1] = moment[2]
-        composite = _shifted(composite, offset)
+        matrix[i][parent] = moment[2]
+        while arm[parent].parent >= 0:
+            force, moment = _passed_on(arm, parent, rotations[parent], force, moment)
+            parent = arm[parent].parent
+            matrix[i][parent] = moment[2]
+        parent, shifted = arm[i].parent, _shifted(composite, offset)
+        composites[parent] = _summed(composites[parent], shifted)
     return matrix
 
 
@@ -234,34 +251,42 @@ def bias_forces(arm: Sequence[Segment], rotations: Sequence[Rotation], qvel: Seq
       rotations: rotation of each joint's frame into its parent frame.
       qvel: joint velocities [rad/s].
     """
-    omega, alpha, linear = ZERO, ZERO, ZERO  # angular velocity and acceleration, linear acceleration of the origin
-    field = _NONE  # the acceleration of the body's point r is linear + field r
+    # Angular velocity and acceleration of each body, linear acceleration of its origin, and a field: the acceleration
+    # of its point r is linear + field r.
+    motions: list[tuple[Vector, Vector, Vector, Rotation]] = []
     wrenches: list[tuple[Vector, Vector]] = []
     for segment, parent_rotation, speed in zip(arm, rotations, qvel, strict=True):
+        omega, alpha, linear, field = motions[segment.parent] if segment.parent >= 0 else (ZERO, ZERO, ZERO, _NONE)
         to_child = transpose(parent_rotation)
         linear = rotate(to_child, add(linear, rotate(field, segment.offset)))
         spin, carried = scale(speed, _Z), rotate(to_child, omega)
         omega, alpha = add(carried, spin), add(rotate(to_child, alpha), cross(carried, spin))
         field = _acceleration_field(omega, alpha)
+        motions.append((omega, alpha, linear, field))
         first, second = segment.inertia.first, segment.inertia.second
         moment = add(_moment(field, second), cross(first, linear))
         wrenches.append((rotate(field, first), moment))
     torques: list[Scalar] = [0.0] * len(arm)
-    force, moment = ZERO, ZERO
+    of_children = [(ZERO, ZERO) for _ in arm]
     for i in reversed(range(len(arm))):
-        force, moment = add(force, wrenches[i][0]), add(moment, wrenches[i][1])
-        torques[i] = moment[2]
-        force, moment = _passed_on(arm[: i + 1], rotations[i], force, moment)
+        force, moment = add(of_children[i][0], wrenches[i][0]), add(of_children[i][1], wrenches[i][1])
+        torques[i], parent = moment[2], arm[i].parent
+        if parent >= 0:
+            force, moment = _passed_on(arm, i, rotations[i], force, moment)
+            of_children[parent] = add(of_children[parent][0], force), add(of_children[parent][1], moment)
     return torques
 
 
 def _passed_on(
-    arm: Sequence[Segment], parent_rotation: Rotation, force: Vector, moment: Vector
+    arm: Sequence[Segment], joint: int, parent_rotation: Rotation, force: Vector, moment: Vector
 ) -> tuple[Vector, Vector]:
-    """Transforms a wrench from the last joint's frame to its parent; the force is dropped where it has no effect."""
+    """Transforms a wrench from a joint's frame to its parent; the force is dropped where it has no effect."""
     force, moment = rotate(parent_rotation, force), rotate(parent_rotation, moment)
-    moment = add(moment, cross(arm[-1].offset, force))
-    return force if any(any(segment.offset) for segment in arm[:-1]) else ZERO, moment
+    moment = add(moment, cross(arm[joint].offset, force))
+    parent = arm[joint].parent
+    while parent >= 0 and not any(arm[parent].offset):
+        parent = arm[parent].parent
+    return force if parent >= 0 else ZERO, moment
 
 
 def _acceleration_field(omega: Vector, alpha: Vector) -> Rotation:

@@ -19,6 +19,7 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.envs.physics import Load, PhysicsChoice, choose_physics, make_advance
 from mimic.envs.recording import record_demonstrations
+from mimic.envs.start_poses import home_poses, nearest_poses
 from mimic.envs.terms import Transition, observation_layout_of_terms, observation_terms, observed, reward_terms
 from mimic.metric.distance import LinkDistance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
@@ -55,6 +56,7 @@ class ImitationEnv(Env):
       metric: metric of the reward.
       demonstrations: motions to imitate.
       expert_states: link states of the demonstrations, [demonstrations, time, links, 3] each.
+      start_poses: [demonstrations, joints] where the learner starts each demonstration, at rest [rad].
       reward_terms, observation_terms: the functions that the config adds to reward and observation.
       torque_scale: [joints] maximum torque [N m].
 
@@ -112,9 +114,15 @@ class ImitationEnv(Env):
         # Computed once: `step` only looks them up.
         table = link_state_table(self.expert, demonstrations.qpos, demonstrations.qvel)
         self.expert_states: LinkStates = jax.tree.map(jnp.asarray, table)
+        self.start_poses = self._start_poses_of(demonstrations)
+
+    def _start_poses_of(self, demonstrations: Demonstrations) -> Float[np.ndarray, "demonstrations joints"]:
+        if self.config.start == "home" or not demonstrations.count:
+            return home_poses(self.learner, demonstrations.count)
+        return nearest_poses(self.expert, self.learner, demonstrations.qpos[:, 0], self.metric.arguments)
 
     def reset(self, rng: Array) -> State:
-        """Starts an episode: the learner at rest in its home pose, a random demonstration at its first step."""
+        """Starts an episode: a random demonstration at its first step, the learner as the config's `start` says."""
         return self.begin(self.start(rng))
 
     def begin(self, arm_state: ArmState) -> State:
@@ -122,17 +130,18 @@ class ImitationEnv(Env):
         zero = jnp.zeros(())
         metrics = {"distance": zero, "limit_excess": zero, "torque_saturation": zero, "runaway": zero}
         metrics |= {term.metric: zero for term in self.reward_terms}
-        return State(arm_state, self.observe_home(arm_state), zero, zero, metrics, {})
+        return State(arm_state, self.observe_start(arm_state), zero, zero, metrics, {})
 
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> ArmState:
         """The first state of an episode; the demonstration is random where None."""
         key_demonstration, key_load, key_next = jax.random.split(key, 3)
         if demonstration is None:
             demonstration = jax.random.randint(key_demonstration, (), 0, self.demonstrations.count)
-        home = jnp.asarray(self.learner.home, jnp.float32)
-        zero = jnp.zeros((), jnp.int32)
         demonstration = jnp.asarray(demonstration, jnp.int32)
-        return ArmState(home, jnp.zeros_like(home), zero, demonstration, key_next, self._draw_load(key_load))
+        poses = jnp.asarray(self.start_poses)
+        qpos = poses[0 if self.config.start == "home" else demonstration]
+        zero = jnp.zeros((), jnp.int32)
+        return ArmState(qpos, jnp.zeros_like(qpos), zero, demonstration, key_next, self._draw_load(key_load))
 
     def _draw_load(self, key: Array) -> Load | None:
         mass, damping = self.config.randomization.mass, self.config.randomization.damping
@@ -245,9 +254,9 @@ class ImitationEnv(Env):
         """
         return self._link_observation(state, link_states(self.learner, state.qpos, state.qvel))
 
-    def observe_home(self, state: ArmState) -> Float[Array, " observation"]:
-        """The observation of an arm at rest in its home pose, with less to compute and to compile than `observe`."""
-        return self._observe_states(state, self._home_states)
+    def observe_start(self, state: ArmState) -> Float[Array, " observation"]:
+        """The observation of a state of `start`; at rest in the home pose it costs less than `observe`."""
+        return self._observe_states(state, self._home_states) if self.config.start == "home" else self.observe(state)
 
     @property
     def _has_own_observation(self) -> bool:

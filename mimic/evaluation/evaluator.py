@@ -85,7 +85,7 @@ class Evaluator:
 
     @property
     def hold_distance(self) -> Float[np.ndarray, "demonstrations time"]:
-        """Embodiment distance at each step of a learner that stays at rest in its home pose."""
+        """Embodiment distance at each step of a learner that stays at rest in its start pose."""
         return self._references().hold
 
     def only(self, index: int) -> "Evaluator":
@@ -224,13 +224,13 @@ class References(NamedTuple):
 
 
 def _references(env: ImitationEnv) -> References:
-    steps, home = env.config.horizon, np.asarray(env.learner.home)
+    steps = env.config.horizon
     qpos, qvel = (x[:, 1 : steps + 1] for x in (env.demonstrations.qpos, env.demonstrations.qvel))
     copied_qpos, copied_qvel = (shared_joints(env.expert, env.learner, x) for x in (qpos, qvel))
     copied_qpos = np.clip(copied_qpos, *pose_limits(env.learner, float))
     expert = jax.tree.map(lambda x: np.asarray(x)[:, 1 : steps + 1], env.expert_states)
     distance = jax.jit(jax.vmap(jax.vmap(env.states_distance)))
-    held_qpos = np.broadcast_to(home, copied_qpos.shape)
+    held_qpos = np.broadcast_to(env.start_poses[:, None], copied_qpos.shape)
     copied, hold = (
         np.asarray(distance(expert, link_state_table(env.learner, *motion)))
         for motion in ((copied_qpos, copied_qvel), (held_qpos, np.zeros_like(copied_qvel)))

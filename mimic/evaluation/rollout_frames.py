@@ -38,9 +38,9 @@ class RolloutFrames:
     def __init__(self, evaluator: Evaluator, rollouts: Rollouts, index: int, frames_per_second: int):
         env, demonstrations = evaluator.env, evaluator.env.demonstrations
         horizon, dt = env.config.horizon, env.config.control_dt
-        home = np.asarray(env.learner.home)[None]
-        qpos = np.concatenate([home, np.asarray(rollouts.qpos[index])])
-        qvel = np.concatenate([0 * home, np.asarray(rollouts.qvel[index])])
+        start = env.start_poses[index][None]
+        qpos = np.concatenate([start, np.asarray(rollouts.qpos[index])])
+        qvel = np.concatenate([0 * start, np.asarray(rollouts.qvel[index])])
         span = slice(0, horizon + 1)
         self.dt = dt
         self.time = np.arange(0, horizon * dt + 1e-9, 1 / frames_per_second)

@@ -126,7 +126,7 @@ def _task(env: ImitationEnv, demonstrations: np.ndarray) -> Task:
         constant = env.config.randomization
         loads = Load(*(jnp.full(len(demonstrations), factor[0]) for factor in (constant.mass, constant.damping)))
     expert = jax.tree.map(lambda table: table[demonstrations, 1 : env.config.horizon + 1], env.expert_states)
-    return Task(expert, loads)
+    return Task(expert, loads, env.start_poses[demonstrations])
 
 
 def _objective(env: ImitationEnv, rollouts: Rollouts) -> Float[np.ndarray, " demonstrations"]:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.envs.imitation import ImitationEnv
@@ -52,15 +53,17 @@ class Episodes(NamedTuple):
 
 
 class Task(NamedTuple):
-    """The expert's motion and the learner's load of each sequence.
+    """The expert's motion, the learner's load and its start pose of each sequence.
 
     Attributes:
       expert: link states after each step, [sequences, T, links, 3] each.
       load: factors on mass and damping of the learner, [sequences] each.
+      start: [sequences, joints] joint angles at the start, which is at rest [rad].
     """
 
     expert: LinkStates
     load: Load
+    start: Float[np.ndarray, "sequences joints"]
 
 
 class _Model(NamedTuple):
@@ -98,7 +101,7 @@ class TrajectoryDescent:
         """Rolls out sequences."""
         action = jnp.clip(action, -1.0, 1.0)
         over_time = jnp.swapaxes(action, 0, 1)
-        qpos, qvel, _ = self._rollout(task, lambda now, qpos, qvel: now, over_time, len(action))
+        qpos, qvel, _ = self._rollout(task, lambda now, qpos, qvel: now, over_time)
         objective = self._objective(task, qpos, qvel)
         return Episodes(action, qpos, qvel, objective, jnp.full(len(action), _DAMPING, action.dtype))
 
@@ -119,7 +122,7 @@ class TrajectoryDescent:
 
         old = jnp.concatenate([episodes.qpos, episodes.qvel], axis=-1)[:, :-1]
         over_time = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (episodes.action, change, gain, old))
-        qpos, qvel, action = self._rollout(repeated_task, law, over_time, len(_STEPS) * count)
+        qpos, qvel, action = self._rollout(repeated_task, law, over_time)
         objective = self._objective(repeated_task, qpos, qvel).reshape(len(_STEPS), count)
         best = jnp.argmin(objective, axis=0)  # the objective is never NaN
 
@@ -134,16 +137,15 @@ class TrajectoryDescent:
         kept = episodes._replace(damping=damping)
         return jax.tree.map(lambda x, y: jnp.where(better.reshape(-1, *[1] * (x.ndim - 1)), x, y), new, kept)
 
-    def _rollout(self, task: Task, law: Callable[..., Array], over_time: Any, count: int) -> tuple[Array, Array, Array]:
+    def _rollout(self, task: Task, law: Callable[..., Array], over_time: Any) -> tuple[Array, Array, Array]:
         """Joint states [count, T + 1, joints] and actions [count, T, joints] of a law (now, qpos, qvel) -> action."""
-        home = jnp.broadcast_to(jnp.asarray(self._env.learner.home, jnp.float32), (count, self._env.action_size))
 
         def step(state: tuple[Array, Array], now: Any) -> tuple[tuple[Array, Array], Any]:
             action = law(now, *state)
             state = jax.vmap(self._advance)(*state, action * self._env.torque_scale, task.load)
             return state, (*state, action)
 
-        start = home, jnp.zeros_like(home)
+        start = jnp.asarray(task.start, jnp.float32), jnp.zeros(task.start.shape, jnp.float32)
         _, (qpos, qvel, action) = jax.lax.scan(step, start, over_time)
         qpos, qvel = (jnp.concatenate([first[None], x]) for first, x in zip(start, (qpos, qvel), strict=True))
         return jnp.swapaxes(qpos, 0, 1), jnp.swapaxes(qvel, 0, 1), jnp.swapaxes(action, 0, 1)

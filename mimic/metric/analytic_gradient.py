@@ -116,9 +116,10 @@ def _by_joints(
     arm: Embodiment, frames: Sequence[JointFrame], links: Sequence[LinkVectors], gradients: Sequence[LinkVectors]
 ) -> tuple[list[Scalar], list[Scalar]]:
     """The gradients with respect to qpos and qvel."""
-    distal = NO_ADJOINTS
     by_qpos, by_qvel = [], []
+    of_children: dict[int, Adjoints] = {}
     for joint in reversed(range(arm.num_joints)):
+        distal = of_children.get(joint, NO_ADJOINTS)
         for link in (link for link, mover in enumerate(arm.link_joint) if mover == joint):
             distal = with_link(distal, links[link], gradients[link])
         frame = frames[joint + 1]
@@ -126,7 +127,13 @@ def _by_joints(
         by_angle, by_speed = by_joint(frame, axis, distal)
         by_qpos.append(by_angle)
         by_qvel.append(by_speed)
+        parent = arm.joint_parent[joint]
+        of_children[parent] = _summed(of_children[parent], distal) if parent in of_children else distal
     return by_qpos[::-1], by_qvel[::-1]
+
+
+def _summed(a: Adjoints, b: Adjoints) -> Adjoints:
+    return Adjoints(*map(add, a, b))
 
 
 def with_link(distal: Adjoints, link: LinkVectors, gradient: LinkVectors) -> Adjoints:

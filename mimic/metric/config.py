@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from mimic import registry
 from mimic.arms.chain import LINKS
+from mimic.arms.chain_match import CHAIN_MATCHES, ChainMatch
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import LinkMatch
 from mimic.config import check_choice
@@ -60,6 +61,7 @@ class MetricConfig:
       link_distance: a registered function of two links, in place of the weighted parts; none where empty.
       xi: sharpness of the soft correspondence, below 0.
       reduction: "mean" or "frobenius".
+      chains: which chains of trees correspond: "name" (left to left, thumb to thumb) or "order", see `matched_chains`.
     """
 
     # The sum of weighted squares stays far from float32's maximum of 3e38.
@@ -74,9 +76,11 @@ class MetricConfig:
     reduction: str = "mean"
     links: str = "kept"
     link_distance: str = ""
+    chains: str = "name"
 
     def __post_init__(self) -> None:
         check_choice("links", self.links, LINKS)
+        check_choice("chains", self.chains, CHAIN_MATCHES)
         check_correspondence(self.correspondence)
         if self.link_distance:
             registry.check("link_distance", self.link_distance, "link_distance")
@@ -101,10 +105,11 @@ class MetricConfig:
         """
         if is_correspondence_file(self.correspondence):
             return load_correspondence(self.correspondence, expert, learner)
+        chains = cast(ChainMatch, self.chains)
         constructors: dict[str, Callable[[], Correspondence]] = {
-            "arc_length": lambda: arc_length_correspondence(expert, learner),
-            "overlap": lambda: overlap_correspondence(expert, learner),
-            "chord_overlap": lambda: overlap_correspondence(expert, learner, lengths="chord"),
+            "arc_length": lambda: arc_length_correspondence(expert, learner, chains=chains),
+            "overlap": lambda: overlap_correspondence(expert, learner, chains=chains),
+            "chord_overlap": lambda: overlap_correspondence(expert, learner, lengths="chord", chains=chains),
             "hard": lambda: hard_correspondence,
             "soft": lambda: partial(soft_correspondence, xi=self.xi),
         }

@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from mimic.arms.chain_match import ChainMatch, matched_chains
 from mimic.arms.embodiment import Embodiment
 
 LinkLengths = Literal["path", "chord"]
@@ -48,49 +49,90 @@ def soft_correspondence(distances: Float[Array, "expert learner"], *, xi: ArrayL
 
 
 def overlap_correspondence(
-    expert: Embodiment, learner: Embodiment, *, lengths: LinkLengths = "path"
+    expert: Embodiment, learner: Embodiment, *, lengths: LinkLengths = "path", chains: ChainMatch = "name"
 ) -> Float[Array, "expert learner"]:
     """Static correspondence by the overlap of links along their chains, with the same weight for each link (paper).
 
     Both chains are mapped onto [0, 1]. Links i and j overlap there by a length o_ij, and W_ij = o_ij / l_i + o_ij / l_j
     with the link lengths l. Each row of the first term and each column of the second sums to 1. For two equal arms W is
-    2 I.
+    2 I. In trees o_ij is the sum over the pairs of corresponding chains.
 
     Args:
       expert: n links.
       learner: n_hat links.
       lengths: lengths of the links: "path" along the centre line, or "chord" from start to end. They differ only for
         merged links.
+      chains: see `matched_chains`.
+
+    Raises:
+      ValueError: trees whose chains do not match.
     """
-    overlap, (length_a, length_b), numpy = _overlaps(expert, learner, lengths)
+    overlap, (length_a, length_b), numpy = _overlaps(expert, learner, lengths, chains)
     return jnp.asarray(overlap / length_a[:, None] + overlap / length_b[None, :])
 
 
-def arc_length_correspondence(expert: Embodiment, learner: Embodiment) -> Float[Array, "expert learner"]:
+def arc_length_correspondence(
+    expert: Embodiment, learner: Embodiment, *, chains: ChainMatch = "name"
+) -> Float[Array, "expert learner"]:
     """Static correspondence by arc length: W_ij = n n_hat o_ij, with o_ij as in `overlap_correspondence`.
 
     The mean of W o D' is then the integral of the pair distance along both arms: links count by their length, and
-    cutting a straight link in two changes nothing. For two equal arms of n links W is n^2 diag(l) / sum(l).
+    cutting a straight link in two changes nothing. For two equal arms of n links W is n^2 diag(l) / sum(l). For
+    trees it is the mean over the pairs of corresponding chains; a link that several have in common counts in each.
 
     Args:
       expert: n links.
       learner: n_hat links.
+      chains: see `matched_chains`.
+
+    Raises:
+      ValueError: trees whose chains do not match.
     """
-    overlap, _, numpy = _overlaps(expert, learner, "path")
+    overlap, _, numpy = _overlaps(expert, learner, "path", chains)
     return jnp.asarray(expert.num_links * learner.num_links * overlap / numpy.sum(overlap))
 
 
-def _overlaps(expert: Embodiment, learner: Embodiment, lengths: LinkLengths) -> tuple[Any, Any, ModuleType]:
-    """Overlap of each pair of links on [0, 1], [n, n_hat]; the links' lengths there; and the array library."""
+def _overlaps(
+    expert: Embodiment, learner: Embodiment, lengths: LinkLengths, chains: ChainMatch
+) -> tuple[Any, Any, ModuleType]:
+    """Overlap of each pair of links on [0, 1], [n, n_hat]; the links' lengths there; and the array library.
+
+    In trees, overlaps are summed over pairs of chains, and so are the lengths.
+    """
     arms = expert, learner
     is_constant = all(isinstance(leaf, np.ndarray) for arm in arms for leaf in (arm.link_lengths, arm.segment_start))
     numpy = np if is_constant else jnp
     link_lengths = [arm.link_lengths if lengths == "chord" else _path_lengths(arm, numpy) for arm in arms]
-    (start_a, end_a), (start_b, end_b) = (_on_unit_interval(length, numpy) for length in link_lengths)
+    pairs = matched_chains(expert.chain_names, learner.chain_names, chains)
+    if len(expert.chains) == len(learner.chains) == 1:
+        return *_overlaps_of_chains(link_lengths[0], link_lengths[1], numpy), numpy
+    shape = expert.num_links, learner.num_links
+    overlap, sums = numpy.zeros(shape), [numpy.zeros(size) for size in shape]
+    for pair in pairs:
+        places = [np.eye(arm.num_links)[:, np.array(arm.chains[i])] for arm, i in zip(arms, pair, strict=True)]
+        of_chains = [length[np.array(arm.chains[i])] for arm, i, length in zip(arms, pair, link_lengths, strict=True)]
+        own_overlap, own_lengths = _overlaps_of_chains(of_chains[0], of_chains[1], numpy)
+        overlap = overlap + _placed(places[1], _placed(places[0], own_overlap, numpy).T, numpy).T
+        sums = [
+            total + _placed(place, own[:, None], numpy)[:, 0]
+            for total, place, own in zip(sums, places, own_lengths, strict=True)
+        ]
+    unmatched = [numpy.where(total > 0, total, 1) for total in sums]  # links of chains without a counterpart
+    return overlap, unmatched, numpy
+
+
+def _placed(places: np.ndarray, rows: Any, numpy: ModuleType) -> Any:
+    """Rows of a chain's links at the rows of all links; elementwise, so that nothing is rounded to TF32."""
+    return numpy.sum(places[:, :, None] * rows[None], axis=1)
+
+
+def _overlaps_of_chains(lengths_a: Any, lengths_b: Any, numpy: ModuleType) -> tuple[Any, Any]:
+    """Overlap of each pair of links of two chains, both on [0, 1], and the links' lengths there."""
+    (start_a, end_a), (start_b, end_b) = (_on_unit_interval(length, numpy) for length in (lengths_a, lengths_b))
     overlap = numpy.minimum(end_a[:, None], end_b[None, :]) - numpy.maximum(start_a[:, None], start_b[None, :])
     # Overlaps of neighbours that only touch are rounding errors.
     rounding = 4 * sum(overlap.shape) * numpy.finfo(overlap.dtype).eps
-    return numpy.where(overlap > rounding, overlap, 0), (end_a - start_a, end_b - start_b), numpy
+    return numpy.where(overlap > rounding, overlap, 0), (end_a - start_a, end_b - start_b)
 
 
 def _path_lengths(arm: Embodiment, numpy: ModuleType) -> Any:

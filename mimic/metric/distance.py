@@ -156,9 +156,14 @@ class Metric:
 
     @property
     def is_static(self) -> bool:
-        """Whether W and weights are constant, with "cosine" and "mean"; such a metric has closed forms."""
+        """Whether it is a weighted sum with "cosine"; such a metric has closed forms."""
+        return self.is_weighted_sum and self.rotation == "cosine"
+
+    @property
+    def is_weighted_sum(self) -> bool:
+        """Whether W and weights are constant, and the reduction "mean"."""
         constant = not callable(self.correspondence) and isinstance(self.weights, DistanceWeights)
-        return constant and self.rotation == "cosine" and self.reduction == "mean"
+        return constant and self.reduction == "mean"
 
     def __call__(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, ""]:
         """See `embodiment_distance`."""

@@ -122,7 +122,19 @@ def link_states(
 
 @functools.partial(jax.jit, static_argnames="normalized")
 def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: bool) -> LinkStates:
-    """`link_states` by a loop over the joints, compiled once for all of them; all numbers have one dtype."""
+    """`link_states` of many joints, whose code does not grow with their number; all numbers have one dtype."""
+    frames = (_frames_of_chain if arm.is_serial else _frames_of_tree)(arm, qpos, qvel)
+    anchors = jnp.concatenate([jnp.zeros((1, 3), qpos.dtype), arm.joint_anchor])  # the base's first
+    frame_index = np.asarray(arm.link_joint) + 1
+    frames = jax.tree.map(lambda leaf: leaf[frame_index], frames)
+    offsets, directions = arm.link_position - anchors[frame_index], arm.link_rotation[:, :, 0]
+    links = link_state(frames, spatial.vector(offsets.T), spatial.vector(directions.T))
+    unit = 1 / arm.chain_length if normalized else 1.0
+    return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, links)))
+
+
+def _frames_of_chain(arm: Embodiment, qpos: Array, qvel: Array) -> JointFrame:
+    """Frames of the base and of each joint's child body [joints + 1], by a loop over the joints of a chain."""
     base = jax.tree.map(lambda number: jnp.asarray(number, qpos.dtype), BASE)
 
     def next_frame(parent: JointFrame, joint: Any) -> tuple[JointFrame, JointFrame]:
@@ -132,12 +144,23 @@ def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: b
 
     anchors = jnp.concatenate([jnp.zeros((1, 3), qpos.dtype), arm.joint_anchor])  # the base's first
     _, frames = jax.lax.scan(next_frame, base, (jnp.diff(anchors, axis=0), arm.joint_axis, qpos, qvel))
-    frame_index = np.asarray(arm.link_joint) + 1
-    frames = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest])[frame_index], base, frames)
-    offsets, directions = arm.link_position - anchors[frame_index], arm.link_rotation[:, :, 0]
-    links = link_state(frames, spatial.vector(offsets.T), spatial.vector(directions.T))
-    unit = 1 / arm.chain_length if normalized else 1.0
-    return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, links)))
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), base, frames)
+
+
+def _frames_of_tree(arm: Embodiment, qpos: Array, qvel: Array) -> JointFrame:
+    """As `_frames_of_chain`, by a loop that looks up the frame of each joint's parent."""
+    frames = jax.tree.map(lambda number: jnp.full(arm.num_joints + 1, number, qpos.dtype), BASE)
+    anchors = jnp.concatenate([jnp.zeros((1, 3), qpos.dtype), arm.joint_anchor])
+    parent_rows = np.array(arm.joint_parent) + 1
+    offsets, rows = arm.joint_anchor - anchors[parent_rows], np.arange(arm.num_joints) + 1
+
+    def next_frame(frames: JointFrame, joint: Any) -> tuple[JointFrame, None]:
+        row, parent_row, offset, axis, angle, speed = joint
+        parent = jax.tree.map(lambda leaf: leaf[parent_row], frames)
+        frame = child_frame(parent, spatial.vector(offset), spatial.vector(axis), angle, speed)
+        return jax.tree.map(lambda leaf, value: leaf.at[row].set(value), frames, frame), None
+
+    return jax.lax.scan(next_frame, frames, (rows, parent_rows, offsets, arm.joint_axis, qpos, qvel))[0]
 
 
 def resting_link_states(arm: Embodiment, qpos: Float[Array, "joints poses"]) -> LinkStates:
@@ -152,35 +175,42 @@ def resting_link_states(arm: Embodiment, qpos: Float[Array, "joints poses"]) -> 
     Returns:
       Arrays [links, 3, poses].
     """
-    rotations = _joint_rotations(arm, qpos)
+    rotations, positions = _resting_frames(arm, qpos)
     frame_index = np.asarray(arm.link_joint) + 1
     anchors = np.concatenate([np.zeros((1, 3)), np.asarray(arm.joint_anchor, float)])
+
+    def rotated(vectors: np.ndarray) -> Array:  # elementwise: TF32 never touches it
+        return jnp.sum(rotations[frame_index] * jnp.asarray(vectors, qpos.dtype)[:, None, :, None], axis=2)
+
     offsets = np.asarray(arm.link_position, float) - anchors[frame_index]
-    is_proximal = np.arange(1, len(anchors))[None] <= frame_index[:, None]
-
-    def rotated(index: np.ndarray, vectors: np.ndarray) -> Array:  # elementwise: TF32 never touches it
-        return jnp.sum(rotations[index] * jnp.asarray(vectors, qpos.dtype)[:, None, :, None], axis=2)
-
-    steps = rotated(np.arange(arm.num_joints), np.diff(anchors, axis=0))
-    position = jnp.sum(jnp.asarray(is_proximal, qpos.dtype)[:, :, None, None] * steps, axis=1)
-    position = (position + rotated(frame_index, offsets)) / np.asarray(arm.chain_length, qpos.dtype)
-    direction = rotated(frame_index, np.asarray(arm.link_rotation, float)[:, :, 0])
+    position = (positions[frame_index] + rotated(offsets)) / np.asarray(arm.chain_length, qpos.dtype)
+    direction = rotated(np.asarray(arm.link_rotation, float)[:, :, 0])
     return LinkStates(position, direction, jnp.zeros_like(position), jnp.zeros_like(position))
 
 
-def _joint_rotations(arm: Embodiment, qpos: Float[Array, "joints poses"]) -> Float[Array, "frames 3 3 poses"]:
-    """Rotations of the base and of each joint's child body (Rodrigues)."""
+def _resting_frames(
+    arm: Embodiment, qpos: Float[Array, "joints poses"]
+) -> tuple[Float[Array, "frames 3 3 poses"], Float[Array, "frames 3 poses"]]:
+    """Rotation of the base and of each joint's child body, and positions of the joints' anchors."""
+    turns, proximal = _axis_rotations(arm, qpos), np.array(arm.joint_parent) + 1
+    anchors = np.concatenate([np.zeros((1, 3)), np.asarray(arm.joint_anchor, float)])
+    offsets = jnp.asarray((anchors[1:] - anchors[proximal])[:, None, :, None], qpos.dtype)
+    rotations = [jnp.broadcast_to(jnp.eye(3, dtype=qpos.dtype)[:, :, None], turns.shape[1:])]
+    positions = [jnp.zeros_like(turns[0, 0])]
+    for parent, offset, turn in zip(proximal, offsets, turns, strict=True):
+        positions.append(positions[parent] + jnp.sum(rotations[parent] * offset, axis=1))
+        rotations.append(jnp.sum(rotations[parent][:, :, None] * turn[None], axis=1))
+    return jnp.stack(rotations), jnp.stack(positions)
+
+
+def _axis_rotations(arm: Embodiment, qpos: Float[Array, "joints poses"]) -> Float[Array, "joints 3 3 poses"]:
+    """Rotation of each joint's child body relative to its parent (Rodrigues)."""
     x, y, z = np.asarray(arm.joint_axis, float).T
     zero = np.zeros_like(x)
     skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
     first, second = (jnp.asarray(matrix[..., None], qpos.dtype) for matrix in (skew, skew @ skew))
-    identity = jnp.eye(3, dtype=qpos.dtype)[:, :, None]
     angle = qpos[:, None, None]
-    turns = identity + jnp.sin(angle) * first + (1 - jnp.cos(angle)) * second
-    rotations = [jnp.broadcast_to(identity, turns.shape[1:])]
-    for turn in turns:
-        rotations.append(jnp.sum(rotations[-1][:, :, None] * turn[None], axis=1))
-    return jnp.stack(rotations)
+    return jnp.eye(3, dtype=qpos.dtype)[:, :, None] + jnp.sin(angle) * first + (1 - jnp.cos(angle)) * second
 
 
 def link_state_table(
@@ -246,9 +276,9 @@ def body_twists(
     """
     qpos = joint_values(arm, qpos, "qpos")
     qvel = joint_values(arm, qvel, "qvel")
-    omega, v = spatial.ZERO, spatial.ZERO
-    twists = [(omega, v)]
-    for joint in range(arm.num_joints):
+    twists = [(spatial.ZERO, spatial.ZERO)]
+    for joint, parent in enumerate(arm.joint_parent):
+        omega, v = twists[parent + 1]
         axis, anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
         rotation = spatial.axis_rotation(axis, qpos[joint])
         shift = spatial.subtract(anchor, spatial.rotate(rotation, anchor))  # exp(q S) = [rotation, shift]
@@ -293,13 +323,12 @@ def joint_frames(
       qpos: angle of each joint [rad].
       qvel: velocity of each joint [rad/s]; zero where None.
     """
-    frames = [BASE]
-    previous_anchor = spatial.ZERO  # in the zero pose
-    for joint in range(arm.num_joints):
+    frames, anchors = [BASE], [spatial.ZERO]  # anchors in the zero pose
+    for joint, parent in enumerate(arm.joint_parent):
         axis, anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
-        speed = 0.0 if qvel is None else qvel[joint]
-        frames.append(child_frame(frames[-1], spatial.subtract(anchor, previous_anchor), axis, qpos[joint], speed))
-        previous_anchor = anchor
+        speed, offset = 0.0 if qvel is None else qvel[joint], spatial.subtract(anchor, anchors[parent + 1])
+        frames.append(child_frame(frames[parent + 1], offset, axis, qpos[joint], speed))
+        anchors.append(anchor)
     return frames
 
 

@@ -87,12 +87,14 @@ class Schedule:
 def plan(arms: Sequence[Embodiment], factors: Float[np.ndarray, "parts expert learner"]) -> Schedule | None:
     """The walk that reaches all pairs of links with a nonzero factor, and ends at the last of them.
 
-    None where the pairs do not lie in order, or where no joint moves the links of one arm.
+    None where the pairs do not lie in order, where no joint moves the links of one arm, and where one is a tree.
 
     Args:
       arms: expert and learner, each in units of its chain length.
       factors: see `analytic_gradient.distance_and_gradient`.
     """
+    if not all(arm.is_serial for arm in arms):
+        return None
 
     def movers(pair: Sequence[int]) -> list[int]:
         return [arm.link_joint[link] for arm, link in zip(arms, pair, strict=True)]

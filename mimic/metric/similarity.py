@@ -2,7 +2,7 @@
 
 An arm's centre line is the polyline of its segments from base to tip, in units of its own length; its hand is the tip.
 The measures thus compare arms of different size and number of links, independently of the metric that was optimised.
-They assume that both base frames coincide.
+They assume that both base frames coincide. Those of trees are means over the pairs of corresponding chains.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.metric.spatial import array_library
@@ -33,12 +34,14 @@ class CentreLine:
       tangents: [*batch, samples, 3] unit directions of the centre line at these points.
       hand_position: [*batch, 3] position of the tip [chain lengths].
       hand_direction: [*batch, 3] unit direction of the last segment.
+      chains: names of the chains of a tree, which has an axis of its chains behind those of the batch; none for one.
     """
 
     points: Float[Any, "*batch samples 3"]
     tangents: Float[Any, "*batch samples 3"]
     hand_position: Float[Any, "*batch 3"]
     hand_direction: Float[Any, "*batch 3"]
+    chains: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
 
 def centre_line(arm: Embodiment, qpos: Float[ArrayLike, " joints"], *, samples: int = SAMPLES) -> CentreLine:
@@ -71,15 +74,33 @@ def _sampled(arm: Embodiment, segments: LinkStates, samples: int) -> CentreLine:
         raise ValueError(f"samples: expected at least 1, got {samples}")
     start, direction = segments.position, segments.direction
     assert direction is not None
+    if len(arm.chains) == 1:
+        return _sampled_chain(arm, start, direction, samples)
+    segment_chains = [np.array([s for s, link in enumerate(arm.segment_link) if link in chain]) for chain in arm.chains]
+    lines = [_sampled_chain(arm, start, direction, samples, segments) for segments in segment_chains]
+    numpy = array_library(start)
+    points, tangents = (numpy.stack([getattr(line, name) for line in lines], -3) for name in ("points", "tangents"))
+    hands = (numpy.stack([getattr(line, f"hand_{name}") for line in lines], -2) for name in ("position", "direction"))
+    return CentreLine(points, tangents, *hands, chains=arm.chain_names)
+
+
+def _sampled_chain(
+    arm: Embodiment, start: Any, direction: Any, samples: int, segments: np.ndarray | None = None
+) -> CentreLine:
+    """The centre line of the segments of one chain, all of the arm's where None."""
     numpy = array_library(start)
     lengths = np.linalg.norm(np.asarray(arm.segment_end) - np.asarray(arm.segment_start), axis=1)
+    reach = float(np.cumsum(lengths)[-1])
+    if segments is not None:
+        start, direction, lengths = start[..., segments, :], direction[..., segments, :], lengths[segments]
+        reach = float(segment_arm(arm).chain_length)
     ends = np.cumsum(lengths)
     arc = (np.arange(samples) + 0.5) / samples * ends[-1]
     index = np.minimum(np.searchsorted(ends, arc), len(ends) - 1)
     offset = (arc - (ends - lengths)[index]).astype(start.dtype)
     points = start[..., index, :] + offset[:, None] * direction[..., index, :]
     hand = start[..., -1, :] + numpy.asarray(lengths[-1], start.dtype) * direction[..., -1, :]
-    unit = numpy.asarray(1 / ends[-1], start.dtype)
+    unit = numpy.asarray(1 / reach, start.dtype)
     return CentreLine(unit * points, direction[..., index, :], unit * hand, direction[..., -1, :])
 
 
@@ -178,8 +199,14 @@ def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, 
     Args:
       expert: centre line of the expert.
       learner: centre line of the learner, with as many samples.
+
+    Raises:
+      ValueError: trees whose chains do not match, see `matched_chains`.
     """
     degrees = 180 / np.pi
+    is_tree = bool(expert.chains or learner.chains)
+    if is_tree:
+        expert, learner = _matched(expert, learner)
     values = (
         centre_line_distance(expert, learner),
         degrees * tangent_angle(expert, learner),
@@ -187,7 +214,26 @@ def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, 
         hand_position_error(expert, learner),
         degrees * hand_angle(expert, learner),
     )
+    if is_tree:
+        values = tuple(value.mean(axis=-1) for value in values)
     return dict(zip(MEASURES, values, strict=True))
+
+
+def _matched(expert: CentreLine, learner: CentreLine) -> tuple[CentreLine, CentreLine]:
+    """Both lines with an axis of their corresponding chains."""
+    lines = [line if line.chains else _with_chain(line) for line in (expert, learner)]
+    pairs = np.array(matched_chains(lines[0].chains, lines[1].chains))
+    matched = []
+    for line, index in zip(lines, pairs.T, strict=True):
+        points, tangents = line.points[..., index, :, :], line.tangents[..., index, :, :]
+        hands = line.hand_position[..., index, :], line.hand_direction[..., index, :]
+        matched.append(CentreLine(points, tangents, *hands))
+    return matched[0], matched[1]
+
+
+def _with_chain(line: CentreLine) -> CentreLine:
+    parts = line.points[..., None, :, :], line.tangents[..., None, :, :]
+    return CentreLine(*parts, line.hand_position[..., None, :], line.hand_direction[..., None, :], chains=("arm",))
 
 
 def _norm(vectors: Any) -> Any:

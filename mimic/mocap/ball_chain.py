@@ -1,8 +1,10 @@
-"""A captured chain of links as an arm: three revolute joints for each link, so that each link turns freely.
+"""Captured links as an arm or a tree: three revolute joints for each link, so that each link turns freely.
 
 The joints are a way to write the motion down, not those of the body: they let a captured motion take every place of an
 expert's, such as demonstrations, files and views. Link states do not depend on them.
 """
+
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -15,47 +17,48 @@ _COLOUR = "0.80 0.62 0.50 1"
 
 
 def ball_chain_xml(motion: LinkMotion, zero: Float[np.ndarray, "links 3 3"]) -> str:
-    """An MJCF model of the chain, with a capsule and a site for each link.
+    """An MJCF model of the links, with a capsule and a site for each of them.
 
     Args:
-      motion: a serial chain of links.
+      motion: the links.
       zero: frames of the links in the zero pose; see `zero_frames`.
     """
-    _check_serial(motion)
-    lengths, radius = motion.link_lengths, _RADIUS * motion.chain_length
-    bodies, previous, place = "", np.eye(3), "0 0 0"
-    for name, length, frame in zip(motion.names, lengths, zero, strict=True):
-        quaternion = _text(_quaternion(previous.T @ frame))
+    lengths, radius, base_points = motion.link_lengths, _RADIUS * motion.chain_length, motion.base_points
+
+    def body(link: int) -> str:
+        name, length, parent = motion.names[link], lengths[link], motion.parents[link]
+        place = f"{lengths[parent]:.9g} 0 0" if parent >= 0 else _text(base_points[link])
+        quaternion = _text(_quaternion((zero[parent] if parent >= 0 else np.eye(3)).T @ zero[link]))
         tip = f"0 0 0 {length:.9g} 0 0"
         joints = "".join(f'<joint name="{name}_{axis}" axis="{_text(np.eye(3)["xyz".index(axis)])}"/>' for axis in AXES)
         mass = 1000 * np.pi * radius**2 * length  # of water
         inertia = mass * np.array([radius**2 / 2, length**2 / 12, length**2 / 12])
-        bodies += (
+        shapes = (
             f'<body name="{name}" pos="{place}" quat="{quaternion}">{joints}'
             f'<inertial pos="{length / 2:.9g} 0 0" mass="{mass:.6g}" diaginertia="{_text(inertia)}"/>'
             f'<site name="link_{name}" type="capsule" fromto="{tip}" size="0.01"/>'
             f'<geom type="capsule" fromto="{tip}" size="{radius:.4g}" rgba="{_COLOUR}" contype="0" conaffinity="0"/>\n'
         )
-        previous, place = frame, f"{length:.9g} 0 0"
+        return f"{shapes}{''.join(map(body, motion.children(link)))}</body>\n"
+
     return (
         f'<mujoco model="{motion.name}">\n<compiler angle="radian"/>\n<option gravity="0 0 0"/>\n<worldbody>\n'
-        f"{bodies}{'</body>' * motion.num_links}\n</worldbody>\n</mujoco>\n"
+        f"{''.join(map(body, motion.children(-1)))}</worldbody>\n</mujoco>\n"
     )
 
 
 def zero_frames(motion: LinkMotion) -> Float[np.ndarray, "links 3 3"]:
-    """Frames of the links in the zero pose: their mean directions in the frame of the link before.
+    """Frames of the links in the zero pose: their mean directions in the frame of the parent.
 
     A joint's angles are singular 90 deg from there.
     """
     frames = _no_roll_frames(np.asarray(motion_states(motion, cutoff=np.inf).direction))
-    zero, previous = [], np.eye(3)
-    for link in range(motion.num_links):
-        before = frames[:, link - 1] if link else np.tile(np.eye(3), (len(frames), 1, 1))
+    zero: list[np.ndarray] = []
+    for link, parent in enumerate(motion.parents):
+        before = frames[:, parent] if parent >= 0 else np.tile(np.eye(3), (len(frames), 1, 1))
         relative = np.einsum("tji,tj->ti", before, frames[:, link, :, 0]).mean(axis=0)
         direction = relative / np.linalg.norm(relative) if np.linalg.norm(relative) > 1e-3 else np.eye(3)[0]
-        previous = previous @ _frame_along(direction)
-        zero.append(previous)
+        zero.append((zero[parent] if parent >= 0 else np.eye(3)) @ _frame_along(direction))
     return np.stack(zero)
 
 
@@ -67,34 +70,54 @@ def ball_chain_motion(
     Directions and angular velocities are the same; positions and linear velocities as far as links keep their length.
 
     Args:
-      motion: a serial chain of links.
+      motion: the links.
       zero: frames of the links in the zero pose.
       cutoff: see `motion_states`.
 
     Returns:
       qpos [rad] and qvel [rad/s], three for each link.
     """
-    _check_serial(motion)
     states = motion_states(motion, cutoff=cutoff)
-    frames = _no_roll_frames(np.asarray(states.direction))
-    parent, parent_zero = np.tile(np.eye(3), (len(frames), 1, 1)), np.eye(3)
-    parent_velocity = np.zeros((len(frames), 3))
+    frames, velocities = _no_roll_frames(np.asarray(states.direction)), np.asarray(states.angular_velocity)
+    at_base = np.tile(np.eye(3), (len(frames), 1, 1)), np.eye(3), np.zeros((len(frames), 3))
     qpos, qvel = [], []
-    for link in range(motion.num_links):
+    for link, index in enumerate(motion.parents):
+        of_parent = frames[:, index], zero[index], velocities[:, index]
+        parent, parent_zero, parent_velocity = of_parent if index >= 0 else at_base
         offset = parent_zero.T @ zero[link]  # of the zero frame in its parent's
         base = parent @ offset
         angles = _zyx_angles(np.swapaxes(base, 1, 2) @ frames[:, link])
-        relative = np.einsum("tji,tj->ti", base, np.asarray(states.angular_velocity)[:, link] - parent_velocity)
+        relative = np.einsum("tji,tj->ti", base, velocities[:, link] - parent_velocity)
         qpos.append(angles)
         qvel.append(np.linalg.solve(_joint_axes(angles), relative[:, :, None])[:, :, 0])
-        parent, parent_zero = frames[:, link], zero[link]
-        parent_velocity = np.asarray(states.angular_velocity)[:, link]
     return np.concatenate(qpos, axis=1), np.concatenate(qvel, axis=1)
 
 
-def _check_serial(motion: LinkMotion) -> None:
-    if motion.parents != tuple(range(-1, motion.num_links - 1)):
-        raise ValueError(f"motion: expected links in a chain, each on the one before, got parents {motion.parents}")
+def ball_chain_pose(
+    directions: Float[np.ndarray, "links 3"], zero: Float[np.ndarray, "links 3 3"]
+) -> Float[np.ndarray, " joints"]:
+    """Angles of the joints of `ball_chain_xml` [rad] in which the links point in these directions.
+
+    Each link is turned from its zero pose without a rotation about itself, so that the angles depend on nothing else.
+
+    Args:
+      directions: of the links, of length 1.
+      zero: frames of the links in the zero pose.
+    """
+    parent, parent_zero, angles = np.eye(3), np.eye(3), []
+    for direction, own_zero in zip(directions, zero, strict=True):
+        base = parent @ parent_zero.T @ own_zero
+        x, y, z = base.T @ direction
+        yaw, pitch = math.atan2(y, x), math.asin(min(max(-z, -1.0), 1.0))
+        angles.append((yaw, pitch, 0.0))
+        parent, parent_zero = base @ _yaw_pitch(yaw, pitch), own_zero
+    return np.array(angles).reshape(-1)
+
+
+def _yaw_pitch(yaw: float, pitch: float) -> np.ndarray:
+    """Rotation about z, then the new y."""
+    cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+    return np.array([[cy * cp, -sy, cy * sp], [sy * cp, cy, sy * sp], [-sp, 0.0, cp]])
 
 
 def _no_roll_frames(directions: np.ndarray) -> np.ndarray:

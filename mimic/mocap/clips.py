@@ -1,6 +1,7 @@
 """Cuts a captured motion into demonstrations: slowed down for the robot, in windows, held out by time."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -118,7 +119,13 @@ def _principal(qpos: np.ndarray) -> np.ndarray:
 
 def turned(motion: LinkMotion, yaw: float, pitch: float = 0.0, roll: float = 0.0) -> LinkMotion:
     """The motion in a base frame that is turned about z, then y, then x [rad]: how it is laid on a robot's base."""
+    rotation = turn_matrix(yaw, pitch, roll)
+    return dataclasses.replace(motion, start=motion.start @ rotation.T, end=motion.end @ rotation.T)
+
+
+@functools.lru_cache(maxsize=8)
+def turn_matrix(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> Float[np.ndarray, "3 3"]:
+    """Rotation about z, then the new y, then the new x [rad]."""
     from scipy.spatial.transform import Rotation
 
-    rotation = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
-    return dataclasses.replace(motion, start=motion.start @ rotation.T, end=motion.end @ rotation.T)
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()

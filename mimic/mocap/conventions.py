@@ -7,21 +7,21 @@ from mimic.mocap.points import PointMotion
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "foot": 0.3048, "cmu": 0.0254 / 0.45}
 UPS = ("x", "y", "z", "-x", "-y", "-z")
-# Shoulder to wrist of adults. No two units have the same range of numbers.
+# Shoulder to wrist of adults. Of two units, only dm and cmu have numbers in common there: 7.1 to 7.5.
 _ARM_LENGTH = 0.4, 0.75  # m
+STATED_ARM_LENGTH = 0.3, 0.9  # m, also of children: where a file states the unit
 _HIGH, _LOW = ("head", "neck", "nose", "c7", "lfhd", "rfhd"), ("foot", "ankle", "toe", "heel", "lank", "rank")
 
 
-def guessed_unit(motion: PointMotion, arms: dict[str, ArmPoints]) -> str | None:
-    """The unit in which the arms have an adult's length; None where there is none."""
+def guessed_units(motion: PointMotion, arms: dict[str, ArmPoints]) -> list[str]:
+    """The units in which the arms have an adult's length."""
     lengths = [arm_length(motion, arm) for arm in arms.values()]
     minimum, maximum = _ARM_LENGTH
-    fitting = [
+    return [
         unit
         for unit, metres in UNITS.items()
         if lengths and all(minimum <= length * metres <= maximum for length in lengths)
     ]
-    return fitting[0] if fitting else None
 
 
 def arm_length(motion: PointMotion, arm: ArmPoints) -> float:
@@ -33,6 +33,8 @@ def arm_length(motion: PointMotion, arm: ArmPoints) -> float:
 
 def mean_point(motion: PointMotion, names: tuple[str, ...]) -> np.ndarray:
     """Mean position of some points [time, 3]."""
+    if len(names) == 1:
+        return motion.point(names[0])
     return np.mean([motion.point(name) for name in names], axis=0)
 
 

@@ -9,13 +9,14 @@ from jaxtyping import Float
 from scipy import signal
 
 from mimic.metric.kinematics import LinkStates
-from mimic.mocap.arms import ArmPoints, find_arms
+from mimic.mocap.arms import SIDES, ArmPoints, find_arms
 from mimic.mocap.conventions import mean_point
 from mimic.mocap.points import PointMotion
 
 CUTOFF = 6.0  # Hz; usual for human motion (Winter, Biomechanics and Motor Control of Human Movement)
 ARM_LINKS = ("upper_arm", "forearm", "hand")
 TRUNK = "trunk"
+BOTH = "both"  # arms
 _SHORTEST = 1e-3  # m
 
 
@@ -69,6 +70,18 @@ class LinkMotion:
             reach.append(float(length) + (reach[parent] if parent >= 0 else 0.0))
         return max(reach)
 
+    @property
+    def base_points(self) -> Float[np.ndarray, "links 3"]:
+        """Mean start of the tree that each link belongs to [m]."""
+        roots: list[int] = []
+        for link, parent in enumerate(self.parents):
+            roots.append(roots[parent] if parent >= 0 else link)
+        return self.start[:, roots].mean(axis=0)
+
+    def children(self, link: int) -> list[int]:
+        """Indices of the links that start at a link, or at the base for -1."""
+        return [child for child, parent in enumerate(self.parents) if parent == link]
+
     def cut(self, start: int, stop: int) -> "LinkMotion":
         """The samples from `start` up to `stop`."""
         return dataclasses.replace(self, start=self.start[start:stop], end=self.end[start:stop])
@@ -83,14 +96,15 @@ def arm_motion(
     cutoff: float = CUTOFF,
     name: str = "",
 ) -> LinkMotion:
-    """Upper arm, forearm and, if it was captured, hand of a body, as seen from the shoulder.
+    """Upper arm, forearm and, if it was captured, hand of a body, as seen from the shoulder; of one arm or of both.
 
     The base frame has its origin in the shoulder, z up, and x to where the body faces: perpendicular to the line
-    through both shoulders, low-pass filtered. Without the other shoulder, x is that of the capture.
+    through both shoulders, low-pass filtered. Without the other shoulder, x is that of the capture. For both arms the
+    origin is in the middle between the shoulders, and each arm starts at the mean place of its own.
 
     Args:
       motion: all points must be known at all times; see `bridge_gaps`.
-      side: "left" or "right".
+      side: "left", "right" or "both".
       arms: names of the points of both arms; found where None.
       trunk: length of a link that stands upright below the shoulder [m], as the base column of most robots; the base
         frame is then at its lower end. 0 for none.
@@ -101,20 +115,59 @@ def arm_motion(
       ValueError: the body has no such arm, or a point is missing at some time.
     """
     arms = find_arms(motion) if arms is None else arms
+    if not set(sides(side)) <= set(arms):
+        raise ValueError(f"arm: expected one of {', '.join(arms) or 'none that was found'}, got {side!r}")
+    shoulders = [mean_point(motion, arms[arm].shoulder) for arm in sides(side)]
+    origin, frames = np.mean(shoulders, axis=0), facing_frames(motion, arms, cutoff)
+    names: list[str] = []
+    parents: list[int] = []
+    start, end = [], []
+    for arm in sides(side):
+        points = _link_ends(motion, arms[arm], origin, frames, trunk)
+        links = ((TRUNK,) if trunk else ()) + ARM_LINKS
+        links = links[: points.shape[1] - 1]
+        parents += [-1, *range(len(names), len(names) + len(links) - 1)]
+        names += [f"{arm}_{link}" if side == BOTH else link for link in links]
+        start.append(points[:, :-1])
+        end.append(points[:, 1:])
+    points = np.concatenate(start, axis=1), np.concatenate(end, axis=1)
+    default = "both_arms" if side == BOTH else f"{side}_arm"
+    return LinkMotion(tuple(names), tuple(parents), *points, motion.rate, name or default)
+
+
+def link_ends_from_shoulder(
+    motion: PointMotion, side: str, *, arms: dict[str, ArmPoints], trunk: float, cutoff: float
+) -> Float[np.ndarray, "time ends 3"]:
+    """Ends of the links of one arm in its base frame, in the order of the chain [m]; arguments as for `arm_motion`.
+
+    Raises:
+      ValueError: the body has no such arm, or a point is missing at some time.
+    """
     if side not in arms:
         raise ValueError(f"arm: expected one of {', '.join(arms) or 'none that was found'}, got {side!r}")
-    arm = arms[side]
+    origin = mean_point(motion, arms[side].shoulder)
+    return _link_ends(motion, arms[side], origin, facing_frames(motion, arms, cutoff), trunk)
+
+
+def sides(side: str) -> tuple[str, ...]:
+    """The sides of "left", "right" or "both"."""
+    return SIDES if side == BOTH else (side,)
+
+
+def _link_ends(
+    motion: PointMotion,
+    arm: ArmPoints,
+    origin: Float[np.ndarray, "time 3"],
+    frames: Float[np.ndarray, "time 3 3"],
+    trunk: float,
+) -> Float[np.ndarray, "time ends 3"]:
+    """Lower end of the trunk if it has a length, shoulder, elbow, wrist and, if it was captured, hand, in frames."""
     groups = [group for group in (arm.shoulder, arm.elbow, arm.wrist, arm.hand) if group]
     points = np.stack([mean_point(motion, group) for group in groups], axis=1)
     if not np.all(np.isfinite(points)):
         raise ValueError("motion: expected all points of the arm at all times; bridge or split at gaps first")
-    seen = (points - points[:, :1]) @ facing_frames(motion, arms, cutoff)
-    names = ARM_LINKS[: len(groups) - 1]
-    if trunk:
-        seen = np.concatenate([np.zeros_like(seen[:, :1]), seen + [0, 0, trunk]], axis=1)
-        names = (TRUNK, *names)
-    parents = tuple(range(-1, len(names) - 1))
-    return LinkMotion(names, parents, seen[:, :-1], seen[:, 1:], motion.rate, name or f"{side}_arm")
+    seen = (points - origin[:, None]) @ frames
+    return np.concatenate([seen[:, :1], seen + [0, 0, trunk]], axis=1) if trunk else seen
 
 
 def facing_frames(
@@ -163,7 +216,7 @@ def motion_states(motion: LinkMotion, *, cutoff: float = CUTOFF, normalized: boo
         _along_tree(motion, np.cross(angular, direction) * lengths),
     )
     unit = 1 / motion.chain_length if normalized else 1.0
-    states: Any = unit * (middle + _base(motion)), direction, unit * middle_velocity, angular  # NumPy's arrays
+    states: Any = unit * (middle + motion.base_points), direction, unit * middle_velocity, angular  # NumPy's arrays
     return LinkStates(*states)
 
 
@@ -182,14 +235,6 @@ def _along_tree(motion: LinkMotion, spans: np.ndarray) -> np.ndarray:
         middles.append(start + 0.5 * spans[:, link])
         ends.append(start + spans[:, link])
     return np.stack(middles, axis=1)
-
-
-def _base(motion: LinkMotion) -> np.ndarray:
-    """Mean start of the tree that each link belongs to, [links, 3]."""
-    roots: list[int] = []
-    for link, parent in enumerate(motion.parents):
-        roots.append(roots[parent] if parent >= 0 else link)
-    return motion.start[:, roots].mean(axis=0)
 
 
 def low_pass(values: Float[np.ndarray, "time *axes"], rate: float, cutoff: float) -> Float[np.ndarray, "time *axes"]:

@@ -9,7 +9,7 @@ import numpy as np
 from mimic.config import check_choice
 from mimic.mocap.arms import find_arms
 from mimic.mocap.bvh import joint_positions, read_bvh
-from mimic.mocap.conventions import UNITS, UPS, arm_length, guessed_unit, guessed_up, z_up
+from mimic.mocap.conventions import STATED_ARM_LENGTH, UNITS, UPS, arm_length, guessed_units, guessed_up, z_up
 from mimic.mocap.points import PointMotion
 from mimic.mocap.tables import Table, read_csv, read_npz, read_trc
 
@@ -31,7 +31,8 @@ def read_motion(path: str | os.PathLike[str], *, unit: str = "", up: str = "") -
     """Reads a motion capture file.
 
     Where neither the file nor an argument says: the unit is that in which the arms have the length of an adult's, and
-    up is the axis from the feet to the head. Notes of the result say what was found.
+    up is the axis from the feet to the head. Notes of the result say what was found. A unit that the file states is
+    rejected where the arms are not those of a person in it.
 
     Args:
       path: a BVH, C3D, TRC, CSV or npz file.
@@ -53,7 +54,10 @@ def read_motion(path: str | os.PathLike[str], *, unit: str = "", up: str = "") -
     try:
         table, notes = _read(source, suffix)
         motion = _even(table, notes)
-        return _in_metres_z_up(motion, unit or _stated(table.unit, UNITS), up or _stated(table.up, UPS), _UP[suffix])
+        stated = _stated(table.unit, UNITS)
+        if stated and not unit:
+            _check_stated(motion, stated)
+        return _in_metres_z_up(motion, unit or stated, up or _stated(table.up, UPS), _UP[suffix])
     except (ValueError, OSError) as error:
         raise ValueError(f"source: {str(source)!r}: {error}") from error
 
@@ -104,16 +108,30 @@ def _stated(value: str | None, choices: object) -> str:
     return text if text in choices else ""  # type: ignore[operator]
 
 
+def _check_stated(motion: PointMotion, unit: str) -> None:
+    """Rejects a stated unit in which the arms are not those of a person: many tools state one that is not used."""
+    lengths = [arm_length(motion, arm) * UNITS[unit] for arm in find_arms(motion).values()]
+    known = [length for length in lengths if np.isfinite(length)]
+    minimum, maximum = STATED_ARM_LENGTH
+    if not all(minimum <= length <= maximum for length in known):
+        raise ValueError(
+            f"unit: the file states {unit}, in which its arms have lengths of "
+            f"{', '.join(f'{length:.3g}' for length in known)} m; expected {minimum} to {maximum} m, or a unit for it "
+            "(capture.unit=)"
+        )
+
+
 def _in_metres_z_up(motion: PointMotion, unit: str, up: str, usual_up: str) -> PointMotion:
     notes = list(motion.notes)
     arms = find_arms(motion)
     if not unit:
-        found = guessed_unit(motion, arms)
-        if found is None:
+        fitting = guessed_units(motion, arms)
+        if len(fitting) != 1:
             lengths = ", ".join(f"{arm_length(motion, arm):.4g}" for arm in arms.values())
-            known = f"its arms have lengths of {lengths}, as an adult's in no unit" if lengths else "no arm was found"
+            units = " and in ".join(fitting) or "no unit"
+            known = f"its arms have lengths of {lengths}, as an adult's in {units}" if lengths else "no arm was found"
             raise ValueError(f"unit: expected one of {', '.join(UNITS)}, since {known}")
-        unit = found
+        unit = fitting[0]
         notes.append(f"unit: {unit}, found from the length of the arms")
     if not up:
         found = guessed_up(motion)

@@ -87,7 +87,7 @@ def nearest_poses(
 
 
 def save_poses(path: Path, expert: Arm, learner: Arm, env: EnvConfig, pairs: PosePairs) -> None:
-    """Draws each pose of the expert, the learner's pose below it, and below that both centre lines in one panel.
+    """Draws each pose of the expert, the learner's pose over the expert's ghost, and both centre lines in one panel.
 
     Raises:
       ValueError: OpenGL is not available.
@@ -101,21 +101,24 @@ def save_poses(path: Path, expert: Arm, learner: Arm, env: EnvConfig, pairs: Pos
     for row, (config, arm, poses, role), arm_colours in zip(rows[:2], arms, colours, strict=True):
         with ArmScene([config], limits=env.limits, width=_PIXELS, height=_PIXELS, colours=[arm_colours]) as scene:
             scene.fit([poses])
-            show_images(row, [scene.image([pose]) for pose in poses], f"{role}: {arm.embodiment.name}")
+            ghosts = map(match.ghost, pairs.expert_qpos, pairs.learner_qpos) if role == "learner" else [()] * columns
+            images = [scene.image([pose], ghost) for pose, ghost in zip(poses, ghosts, strict=True)]
+            show_images(row, images, f"{role}: {arm.embodiment.name}")
             lines.append((role, scene.flattened(_with_ends(centre_line_table(arm.embodiment, poses)))))
     for column, axes in enumerate(rows[2]):
         for (role, points), colour, width in zip(lines, (EXPERT_COLOUR, LEARNER_COLOUR), (6, 2.5), strict=True):
             alpha = 0.45 if role == "expert" else 1.0
             axes.plot(*points[column].T, color=colour, lw=width, alpha=alpha, label=role, solid_capstyle="round")
-        axes.set(aspect="equal", xlim=(-0.62, 0.62), ylim=(-0.15, 0.95), xticks=[], yticks=[])
+        axes.set(aspect="equal", xlim=(-0.6, 0.6), ylim=(-0.06, 0.9), xticks=[], yticks=[])
+        axes.spines[:].set_visible(False)
         measures = {name: float(values[column]) for name, values in pairs.similarity.items()}
-        rows[2][column].set_title(
+        axes.set_xlabel(
             f"centre line {measures['centre_line_distance']:.3f}\n"
             f"hand {measures['hand_position_error']:.3f}, {measures['hand_angle_deg']:.0f}°",
             fontsize="medium",
         )
     rows[2][0].set_ylabel("centre lines,\neach arm of length 1")
-    rows[2][0].legend(fontsize="small", loc="lower left")
+    rows[2][0].legend(fontsize="small", loc="upper left", frameon=False)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

@@ -13,8 +13,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
+from matplotlib.lines import Line2D  # noqa: E402
 
 from mimic.arms.embodiment import planar_arm  # noqa: E402
+from mimic.arms.link_match import LinkMatch  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs import env_config  # noqa: E402
 from mimic.metric.config import MetricConfig  # noqa: E402
@@ -23,7 +25,7 @@ from mimic.metric.distance import DistanceWeights, adaptive_weights  # noqa: E40
 from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
 from mimic.paper_figures import candidate_points, similarity
 from mimic.paper_figures import metric as metric_figures  # noqa: E402
-from mimic.paper_figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR, draw_arm  # noqa: E402
+from mimic.paper_figures.planar_arms import add_match_legend, draw_match, fit, joint_points  # noqa: E402
 from mimic.paper_figures.pose_picture import PANDA_POSES, show_images  # noqa: E402
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
 from mimic.trainers.pose_mapper.model import PoseMapper  # noqa: E402
@@ -36,21 +38,21 @@ _WEIGHTS_POSE = np.array([2.3, -2.0])
 _OTHER_TWO_LINKS = planar_arm([0.25, 0.75])  # identical arms would match for any weights
 _PANDA_POSES = PANDA_POSES[:3]
 _PIXELS = 420
+_OPTIMUM: dict[str, Any] = {"color": "black", "lw": 0.7, "marker": "o", "ms": 1.5}
 
 
 def draw_weights(load_mapper: LoadMapper) -> Any:
     """Draws the nearest pose of an arm of other link lengths under three weights (paper, Fig. 2 a-c)."""
     del load_mapper
     figure, all_axes = plt.subplots(1, 3, figsize=(8, 2.9), layout="constrained")
+    match = LinkMatch(_TWO_LINKS, _OTHER_TWO_LINKS, np.eye(2))  # as `hard_correspondence` pairs them
     for letter, axes, (translation, rotation) in zip("abc", all_axes, ((0.5, 1), (3, 1), (1, 1)), strict=True):
         weights = DistanceWeights(float(translation), float(rotation))
         solution = imitate_pose(_TWO_LINKS, _OTHER_TWO_LINKS, _WEIGHTS_POSE, hard_correspondence, weights)
-        draw_arm(axes, _TWO_LINKS, _WEIGHTS_POSE, EXPERT_COLOUR, "expert")
-        draw_arm(axes, _OTHER_TWO_LINKS, solution.qpos, LEARNER_COLOUR, "learner")
-        axes.set_title(rf"({letter})  $\alpha_{{tr}}={translation}$, $\alpha_{{rot}}={rotation}$", fontsize="medium")
-        axes.set(xlim=(-0.75, 0.65), ylim=(-0.15, 0.85), aspect="equal")
-        axes.grid(alpha=0.3)
-    all_axes[0].legend(fontsize="small", loc="upper right")
+        draw_match(axes, match, _WEIGHTS_POSE, solution.qpos)
+        axes.set_xlabel(rf"({letter})  $\alpha_{{tr}}={translation}$, $\alpha_{{rot}}={rotation}$")
+    fit(all_axes)
+    add_match_legend(figure)
     return figure
 
 
@@ -87,27 +89,29 @@ def draw_contours(load_mapper: LoadMapper) -> Any:
 def draw_planar(load_mapper: LoadMapper) -> Any:
     """Draws the poses of trained pose mappers for unseen poses of planar arms (paper, Fig. 3)."""
     columns = 4
-    figure, rows = plt.subplots(2, columns, figsize=(10, 5.4), layout="constrained")
+    figure, rows = plt.subplots(2, columns, figsize=(10, 5.8), layout="constrained")
     for name, row in zip(MAPPERS["planar"], rows, strict=True):
         mapper = load_mapper(name)
         expert, learner = mapper.expert, mapper.learner
         rng = np.random.default_rng(7)  # half the range trained on, so that arms overlap less
         poses = rng.uniform(-0.5 * np.pi, 0.5 * np.pi, (columns, expert.num_joints)).astype(np.float32)
+        match = mapper.model.metric.match_links(expert, learner)
         mapped, optimal, excess = _mapped_and_optimal(mapper, poses)
         for axes, pose, learner_qpos, best, percent in zip(row, poses, mapped, optimal, excess, strict=True):
-            draw_arm(axes, expert, pose, EXPERT_COLOUR, "expert", width=5, alpha=0.55)
-            draw_arm(axes, learner, learner_qpos, LEARNER_COLOUR, "learner, mapper", width=3)
-            draw_arm(axes, learner, best, "black", "learner, optimum", width=0.8)
-            axes.set_title(f"{percent:.2f} % above the optimum", fontsize="small")
-            axes.set(xlim=(-1.05, 1.05), ylim=(-1.05, 1.05), aspect="equal")
-            axes.grid(alpha=0.3)
+            draw_match(axes, match, pose, learner_qpos)
+            axes.plot(*joint_points(learner, best).T, **_OPTIMUM)
+            axes.set_xlabel(f"{percent:.2f} % above the optimum")
         row[0].set_ylabel(f"{expert.num_joints} to {learner.num_joints} joints")
-    rows[0][0].legend(fontsize="small", loc="lower left")
+    fit(rows.ravel())
+    add_match_legend(figure, Line2D([], [], label="learner, optimum", **_OPTIMUM))
     return figure
 
 
 def draw_panda(load_mapper: LoadMapper) -> Any:
-    """Draws the poses of trained pose mappers for unseen poses of the Panda; locked joints are red (paper, Fig. 4)."""
+    """Draws poses of trained pose mappers for unseen poses of the Panda, over its ghost (paper, Fig. 4).
+
+    Locked joints are red.
+    """
     names = MAPPERS["panda"]
     expert = env_config(names[0]).expert
     figure, rows = plt.subplots(len(names) + 1, len(_PANDA_POSES), figsize=(7.6, 10.2), layout="constrained")
@@ -123,7 +127,9 @@ def draw_panda(load_mapper: LoadMapper) -> Any:
         colours, learner = matches[name].learner_colours, env_config(name).learner
         with ArmScene([learner], width=_PIXELS, height=_PIXELS, colours=[colours]) as scene:
             scene.fit([mapped])
-            show_images(row, [scene.image([pose]) for pose in mapped], f"learner, {mapper.learner.num_joints} joints")
+            pairs = zip(_PANDA_POSES, mapped, strict=True)
+            images = [scene.image([pose], matches[name].ghost(expert_pose, pose)) for expert_pose, pose in pairs]
+            show_images(row, images, f"learner, {mapper.learner.num_joints} joints")
         for axes, percent in zip(row, excess, strict=True):
             axes.set_xlabel(f"{percent:.2f} % above the optimum", fontsize="small")
     return figure

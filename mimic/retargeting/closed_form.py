@@ -1,17 +1,21 @@
 """First and second derivatives of the static distance with respect to the learner's joint angles, in closed form.
 
-The expert pulls each link of the learner: its direction e towards a unit vector t with strength c, and its position p
-towards points p_i with weights w_i. Up to a constant of the expert, the distance is the sum over the links of
+The expert pulls each link of the learner: its direction e towards unit vectors t_i with strengths c_i, and its position
+p towards points p_i with weights w_i. Up to a constant of the expert, the distance is the sum over the links of
 
-    c (1 - e . t) + sum_i w_i h(|p - p_i|)        with a smoothed length, h(d) = sqrt(d^2 + s^2) - s.
+    sum_i c_i f(e . t_i) + sum_i w_i h(|p - p_i|)        with a smoothed length, h(d) = sqrt(d^2 + s^2) - s.
+
+f is 1 - e . t for the cosine, or a smoothed angle, f(x) = arccos(x cos a) - a: near a match it is h of the angle with
+s = a, and it is also smooth where both are opposite. It has a derivative of c_i f' e x t_i with
+respect to a rotation, and c_i f'' (e x t_i)(e x t_i)^T in the second one.
 
 A length has a kink at 0, where Newton's method would divide by it; a sum of lengths often has its minimum there, at
 links that match exactly. The smoothed length is 0 with derivative 0 at a match, and its error is at most s.
 
 The computation is on scalar components (see `mimic.metric.spatial`). Rotating joint k moves all distal links: with its
 axis a and a point c on it, a link's position by J = a x (p - c) = m + a x p, m = c x a. Sums over the distal links are
-accumulated from tip to base, as for a composite rigid body: the force g = grad h, the moments M of force and pull, and
-the stiffness of position.
+accumulated from the tips to the base, as for a composite rigid body: the force g = grad h, the moments M of force and
+pull, and the stiffness of position.
 """
 
 from collections.abc import Sequence
@@ -20,13 +24,27 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from mimic.metric import spatial
+from mimic.metric.distance import RotationMeasure
 from mimic.metric.spatial import Rotation, Scalar, Vector
 from mimic.retargeting.optimizers import Derivatives
 
-# s [chain lengths]. Newton steps overshoot a kink that is many s away, so a descent begins with the rough smoothing.
+
+class Smoothing(NamedTuple):
+    """Smoothing of the distance.
+
+    Attributes:
+      length: s [chain lengths].
+      angle: a [rad]; of no effect on the cosine.
+    """
+
+    length: Scalar
+    angle: Scalar
+
+
+# Newton steps overshoot a kink that is many s away, so a descent begins with the rough smoothing.
 # Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone leaves
 # more than 1e-4 of distance on 55 % of them, both on 3 %; with 1e-4 alone 89 % converge.
-ROUGH_SMOOTHING, SMOOTHING = 1e-2, 1e-3
+ROUGH_SMOOTHING, SMOOTHING = Smoothing(1e-2, 0.1), Smoothing(1e-3, 0.01)
 
 Symmetric = tuple[Scalar, ...]  # xx, xy, xz, yy, yz, zz of a symmetric 3x3 matrix
 _NONE: Symmetric = (0.0,) * 6
@@ -37,14 +55,14 @@ class Pull(NamedTuple):
     """Pull of the expert on one link.
 
     Attributes:
-      unit: t, target of its direction.
-      strength: c, at least 0.
+      units: t_i, targets of its direction; one for the cosine, since the sum of cosines is that of one target.
+      strengths: c_i.
       points: p_i, targets of its position [chain lengths].
       weights: w_i.
     """
 
-    unit: Vector
-    strength: Scalar
+    units: Sequence[Vector]
+    strengths: Sequence[Scalar]
     points: Sequence[Vector]
     weights: Sequence[Scalar]
 
@@ -63,7 +81,7 @@ class _Load(NamedTuple):
     Attributes:
       value: of the distance.
       force: its gradient with respect to a translation.
-      moment: sum of p g^T - c e t^T. Its antisymmetric part is the gradient with respect to a rotation.
+      moment: sum of p g^T + c f' e t^T. Its antisymmetric part is the gradient with respect to a rotation.
       linear, coupling, angular: second derivative K, B, C of the position terms with respect to a twist (a, m):
         force K m + B a, torque C a + B^T m.
     """
@@ -86,28 +104,36 @@ def static_derivatives(
     anchors: Sequence[Vector],
     links: Sequence[Body],
     pulls: Sequence[Pull],
-    smoothing: Scalar,
+    parents: Sequence[int],
+    smoothing: Smoothing,
+    *,
+    rotation: RotationMeasure = "cosine",
 ) -> Derivatives:
     """Derivatives of the static distance, whose value is up to a constant of the pulls.
 
     With M taken about a point on axis l, and the twist's torque and force of the stiffness,
 
-        d/dq_l       = a_l . (M_zy - M_yz, M_xz - M_zx, M_yx - M_xy), the sum of (p - c) x g and -c e x t,
-        d^2/dq_k dq_l = a_k . (torque_l + M a_l - tr(M) a_l) + m_k . force_l         for k <= l.
+        d/dq_l       = a_l . (M_zy - M_yz, M_xz - M_zx, M_yx - M_xy), the sum of (p - c) x g and c f' e x t,
+        d^2/dq_k dq_l = a_k . (torque_l + M a_l - tr(M) a_l) + m_k . force_l         for l and its ancestors k, else 0.
 
     Args:
       axes: unit axis of each joint, base to tip.
       anchors: a point on each axis [chain lengths].
       links: links of the learner.
       pulls: pull on each link.
-      smoothing: s [chain lengths].
+      parents: index of each joint's parent, -1 for a joint at the base.
+      smoothing: s and a.
+      rotation: measure of directions.
     """
     moments = [spatial.cross(anchor, axis) for anchor, axis in zip(anchors, axes, strict=True)]
-    load, gradient, rows = _Load(), [], []
+    gradient, rows = [], []
+    of_children: dict[int, _Load] = {}
     for joint in reversed(range(len(axes))):
+        load = of_children.get(joint, _Load())
         for link, pull in zip(links, pulls, strict=True):
             if link.joint == joint:
-                load = _add_position(_add_direction(load, link.direction, pull), link.position, pull, smoothing)
+                load = _add_directions(load, link.direction, pull, rotation, smoothing.angle)
+                load = _add_position(load, link.position, pull, smoothing.length)
         axis, moment = axes[joint], moments[joint]
         local = spatial.add_outer(load.moment, spatial.scale(-1.0, anchors[joint]), load.force)
         gradient.append(spatial.dot(axis, _twice_antisymmetric(local)))
@@ -116,16 +142,62 @@ def static_derivatives(
         torque = spatial.rotate(spatial.transpose(load.coupling), moment)
         torque = spatial.add(torque, spatial.rotate(_rows(load.angular), axis))
         torque = spatial.add(torque, spatial.subtract(spatial.rotate(local, axis), spatial.scale(trace, axis)))
-        row = [(spatial.dot(axes[k], torque), spatial.dot(moments[k], force)) for k in range(joint + 1)]
-        rows.append([spatial.plus(*parts) for parts in row])
-    return Derivatives(load.value, tuple(gradient[::-1]), rows[::-1])
+        row: list[Scalar] = [0.0] * (joint + 1)
+        for k in _with_ancestors(joint, parents):
+            row[k] = spatial.plus(spatial.dot(axes[k], torque), spatial.dot(moments[k], force))
+        rows.append(row)
+        parent = parents[joint]
+        of_children[parent] = _total(of_children[parent], load) if parent in of_children else load
+    return Derivatives(of_children[-1].value, tuple(gradient[::-1]), rows[::-1])
 
 
-def _add_direction(load: _Load, direction: Vector, pull: Pull) -> _Load:
-    difference = spatial.subtract(direction, pull.unit)  # |e - t|^2 / 2 = 1 - e . t, exactly 0 at a match
-    value = 0.5 * pull.strength * spatial.dot(difference, difference)
-    moment = spatial.add_outer(load.moment, spatial.scale(-pull.strength, direction), pull.unit)
-    return load._replace(value=spatial.plus(load.value, value), moment=moment)
+def _with_ancestors(joint: int, parents: Sequence[int]) -> list[int]:
+    line = [joint]
+    while parents[line[-1]] >= 0:
+        line.append(parents[line[-1]])
+    return line[::-1]
+
+
+def _total(a: _Load, b: _Load) -> _Load:
+    return _Load(
+        value=spatial.plus(a.value, b.value),
+        force=spatial.add(a.force, b.force),
+        moment=_sum(a.moment, b.moment),
+        linear=tuple(map(spatial.plus, a.linear, b.linear)),
+        coupling=_sum(a.coupling, b.coupling),
+        angular=tuple(map(spatial.plus, a.angular, b.angular)),
+    )
+
+
+def _add_directions(load: _Load, direction: Vector, pull: Pull, rotation: RotationMeasure, smoothing: Scalar) -> _Load:
+    for unit, strength in zip(pull.units, pull.strengths, strict=True):
+        if rotation == "cosine":
+            difference = spatial.subtract(direction, unit)  # |e - t|^2 / 2 = 1 - e . t, exactly 0 at a match
+            value, slope = 0.5 * strength * spatial.dot(difference, difference), -strength
+        else:
+            cross = spatial.cross(direction, unit)
+            value, slope, curvature = (strength * x for x in _angle_derivatives(direction, unit, cross, smoothing))
+            load = load._replace(angular=tuple(map(spatial.plus, load.angular, _outer(curvature, cross))))
+        moment = spatial.add_outer(load.moment, spatial.scale(slope, direction), unit)
+        load = load._replace(value=spatial.plus(load.value, value), moment=moment)
+    return load
+
+
+def smoothed_angle(cosine: Scalar, sine_square: Scalar, smoothing: Scalar) -> Scalar:
+    """Smoothed angle f [rad] of two unit vectors, from e . t and |e x t|^2."""
+    return jnp.arctan2(_smoothed_sine(sine_square, smoothing), jnp.cos(smoothing) * cosine) - smoothing
+
+
+def _angle_derivatives(a: Vector, b: Vector, cross: Vector, smoothing: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Smoothed angle of two unit vectors, and its first and second derivative with respect to their cosine."""
+    cosine, square = spatial.dot(a, b), spatial.dot(cross, cross)
+    slope = -jnp.cos(smoothing) / _smoothed_sine(square, smoothing)
+    return smoothed_angle(cosine, square, smoothing), slope, cosine * slope**3
+
+
+def _smoothed_sine(sine_square: Scalar, smoothing: Scalar) -> Scalar:
+    """sqrt(1 - (e . t)^2 cos^2 a), without cancellation at 0."""
+    return jnp.sqrt(jnp.sin(smoothing) ** 2 + jnp.cos(smoothing) ** 2 * sine_square)
 
 
 def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: Scalar) -> _Load:
@@ -159,6 +231,13 @@ def _projection(factor: Scalar, unit: Vector) -> Symmetric:
     x, y, z = unit
     u, v, w = (spatial.times(-factor, component) for component in unit)
     return factor + u * x, u * y, u * z, factor + v * y, v * z, factor + w * z
+
+
+def _outer(factor: Scalar, vector: Vector) -> Symmetric:
+    """The matrix factor v v^T."""
+    x, y, z = vector
+    u, v, w = (spatial.times(factor, component) for component in vector)
+    return u * x, u * y, u * z, v * y, v * z, w * z
 
 
 def _sum(a: Rotation, b: Rotation) -> Rotation:

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.arms.capsules import Capsules
+from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment
 from mimic.metric import spatial
 from mimic.metric.kinematics import LinkStates, forward_kinematics, joint_frames
-from mimic.metric.spatial import Scalar
 from mimic.ranges import check_ranges, number
-from mimic.retargeting.closed_form import SMOOTHING
+from mimic.retargeting.closed_form import SMOOTHING, Smoothing
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 from mimic.retargeting.pose_objective import PoseObjective, Target
 
@@ -34,8 +34,9 @@ class Costs:
     """Weights of costs that are added to the embodiment distance; 0 removes a cost.
 
     Attributes:
-      hand_position: squared distance of the frames of the last links, each in its arm's chain lengths.
-      hand_orientation: 1 - cos of the angle between these frames.
+      hand_position: squared distance of the tips of the centre lines, each in its arm's chain lengths; of trees, the
+        sum over the pairs of corresponding chains.
+      hand_orientation: 1 - cos of the angle between the frames of the last links, likewise.
       home: mean over the joints of the squared distance from the home pose, in half ranges.
       limits: mean over the joints of the squared intrusion into the last tenth of the range at each end; 1 at a limit.
       velocity, acceleration: mean over the joints of the squared first and second difference of the angles [rad^2] from
@@ -102,7 +103,7 @@ def pose_cost(
             distance = pair_distances(capsules, start, end)
             total += costs.self_collision * _intrusion(distance, costs.clearance)
         if costs.floor:
-            moves = np.flatnonzero(np.array(capsules.joint) > 0)
+            moves = np.flatnonzero(~np.array(capsules.near_base))
             height = jnp.minimum(start[moves, 2], end[moves, 2]) - jnp.asarray(capsules.radius[moves], qpos.dtype)
             total += costs.floor * _intrusion(height - costs.floor_height, costs.clearance)
     return total
@@ -111,17 +112,32 @@ def pose_cost(
 def hand_cost(
     expert: Embodiment, learner: Embodiment, expert_qpos: Array, qpos: Array, position: float, orientation: float
 ) -> Float[Array, ""]:
-    """Weighted costs of the position and the orientation of the last links."""
-    hands = [forward_kinematics(arm, q) for arm, q in ((expert, expert_qpos), (learner, qpos))]
+    """Weighted costs of the position of the tips and the orientation of the last links, summed over pairs of chains."""
+    arms = (expert, expert_qpos), (learner, qpos)
+    pairs = np.array(matched_chains(expert.chain_names, learner.chain_names)).T
     points = [
-        frames.position[-1] / spatial.scalar(arm.chain_length)
-        for frames, arm in zip(hands, (expert, learner), strict=True)
+        tip_positions(arm, q)[chains] / spatial.scalar(arm.chain_length)
+        for (arm, q), chains in zip(arms, pairs, strict=True)
     ]
-    rotations = [frames.rotation[-1] for frames in hands]
+    total = position * jnp.sum((points[0] - points[1]) ** 2)
+    if not orientation:
+        return total
+    last = [np.array([chain[-1] for chain in arm.chains])[chains] for (arm, _), chains in zip(arms, pairs, strict=True)]
+    rotations = [forward_kinematics(arm, q).rotation[links] for (arm, q), links in zip(arms, last, strict=True)]
     # |R - S|^2 = 4 (1 - cos) of the angle of R^T S, without cancellation at a match.
-    return position * jnp.sum((points[0] - points[1]) ** 2) + orientation / 4 * jnp.sum(
-        (rotations[0] - rotations[1]) ** 2
-    )
+    return total + orientation / 4 * jnp.sum((rotations[0] - rotations[1]) ** 2)
+
+
+def tip_positions(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, "chains 3"]:
+    """End of the last segment of each chain [m]."""
+    frames, tips = joint_frames(arm, qpos, None), []
+    for chain in arm.chains:
+        joint = arm.link_joint[chain[-1]]
+        last = max(segment for segment, link in enumerate(arm.segment_link) if link == chain[-1])
+        anchor = arm.joint_anchor[joint] if joint >= 0 else np.zeros(3)
+        offset = spatial.vector(arm.segment_end[last] - anchor)
+        tips.append(spatial.add(frames[joint + 1].anchor, spatial.rotate(frames[joint + 1].rotation, offset)))
+    return spatial.stack(tips, qpos.dtype)
 
 
 def home_cost(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, ""]:
@@ -202,7 +218,7 @@ def with_costs(
     def value(target: Target, states: LinkStates) -> Array:  # of initial guesses, so without the costs
         return objective.value(target[0], states)
 
-    def total(target: Target, qpos: Scalars, store: Store = call, smoothing: Scalar = SMOOTHING) -> Derivatives:
+    def total(target: Target, qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING) -> Derivatives:
         base = objective.derivatives(target[0], qpos, store, smoothing)
         cost = automatic_derivatives(lambda q: pose_cost(costs, expert, learner, capsules, target[1], q), qpos)
         return sum_of(base, cost)

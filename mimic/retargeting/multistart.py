@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic import compat
-from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING
+from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING, Smoothing
 from mimic.retargeting.optimizers import (
     Derivatives,
     Limits,
@@ -89,7 +89,7 @@ class _Step(NamedTuple):
     begins: Any
     is_last: Any
     round: Any
-    smoothing: Any
+    smoothing: Smoothing
 
 
 def _schedule(rounds: int, descents: Descents, dtype: Any) -> _Step:
@@ -101,7 +101,7 @@ def _schedule(rounds: int, descents: Descents, dtype: Any) -> _Step:
         begins=np.concatenate([np.arange(length) == 0 for length in lengths]),
         is_last=is_last,
         round=np.minimum(round_of_step, rounds - 1),
-        smoothing=np.where(is_last, SMOOTHING, ROUGH_SMOOTHING).astype(dtype),
+        smoothing=jax.tree.map(lambda *x: np.where(is_last, *x).astype(dtype), SMOOTHING, ROUGH_SMOOTHING),
     )
 
 

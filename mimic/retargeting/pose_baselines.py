@@ -50,7 +50,7 @@ def hold_home(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses:
     return np.broadcast_to(np.asarray(learner.home, qpos.dtype), (*shape, learner.num_joints)).copy()
 
 
-def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int = IK_EVERY) -> Poses:
+def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int = IK_EVERY) -> Poses | None:
     """Inverse kinematics of the hand with mink: matches the position of the tip, and less strictly its direction.
 
     The objective is |p - p*|^2 + (0.1 angle(e, e*))^2, with the tip p in chain lengths and the direction e of the last
@@ -64,9 +64,14 @@ def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int 
       qpos: the expert's poses [rad].
       every: interval between solved samples; 1 solves all.
 
+    Returns:
+      The learner's poses [rad]; None for trees, which have several hands.
+
     Raises:
       ValueError: `qpos` is not [..., time, n] or not finite, or `every` is below 1.
     """
+    if len(expert.chains) > 1 or len(learner.chains) > 1:
+        return None
     qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
     if every < 1:
         raise ValueError(f"every: expected at least 1, got {every}")
@@ -108,7 +113,7 @@ class _HandSolver:
         import mink  # takes half a second, and few need it
 
         self._mink = mink
-        self._model = _kinematic_model(learner)
+        self._model = kinematic_model(learner, {_HAND: len(learner.segment_end) - 1})
         self._configuration = mink.Configuration(self._model, np.array(learner.home, float))
         # The hand's x-axis is its direction: rotation about it has no cost.
         self._task = mink.FrameTask(
@@ -139,7 +144,7 @@ class _HandSolver:
         configuration.update(start)
         for _ in range(steps):
             frame = self._frame()
-            rotated = _smallest_rotation(frame[:, 0], direction) @ frame
+            rotated = smallest_rotation(frame[:, 0], direction) @ frame
             self._task.set_target(mink.SE3.from_rotation_and_translation(mink.SO3.from_matrix(rotated), position))
             change = mink.solve_ik(
                 configuration, [self._task], 1.0, solver="daqp", damping=_DAMPING, limits=self._limits
@@ -155,33 +160,40 @@ class _HandSolver:
         return self._configuration.data.site(_HAND).xmat.reshape(3, 3).copy()
 
 
-def _kinematic_model(arm: Embodiment) -> mujoco.MjModel:
-    """MuJoCo model of an embodiment's joints and hand, in chain lengths; its masses are arbitrary."""
+def kinematic_model(arm: Embodiment, sites: dict[str, int]) -> mujoco.MjModel:
+    """MuJoCo model of an embodiment's joints, in chain lengths; its masses are arbitrary.
+
+    Args:
+      arm: the embodiment.
+      sites: segment at whose end each site is, with its x-axis along the segment, by name.
+    """
     spec = mujoco.MjSpec()
     spec.compiler.autolimits = False
     spec.compiler.degree = False
     unit = 1 / float(segment_arm(arm).chain_length)
     bodies = [(spec.worldbody, np.zeros(3))]
     lower, upper = pose_limits(arm, float)
-    for name, axis, anchor, low, high in zip(
-        arm.joint_names, arm.joint_axis, unit * np.asarray(arm.joint_anchor), lower, upper, strict=True
+    anchors = unit * np.asarray(arm.joint_anchor)
+    for name, before, axis, anchor, low, high in zip(
+        arm.joint_names, arm.joint_parent, arm.joint_axis, anchors, lower, upper, strict=True
     ):
-        parent, origin = bodies[-1]
+        parent, origin = bodies[before + 1]
         body = parent.add_body(pos=anchor - origin, mass=1.0, inertia=np.ones(3), explicitinertial=True)
         limited = bool(np.isfinite(low))
         joint_range = [low, high] if limited else [0.0, 0.0]
         body.add_joint(name=name, axis=axis, range=joint_range, limited=limited)
         bodies.append((body, anchor))
-    start, end = unit * np.asarray(arm.segment_start[-1]), unit * np.asarray(arm.segment_end[-1])
-    rotation = _smallest_rotation(np.array([1.0, 0.0, 0.0]), (end - start) / np.linalg.norm(end - start))
-    quaternion = np.zeros(4)
-    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
-    body, origin = bodies[arm.link_joint[arm.segment_link[-1]] + 1]
-    body.add_site(name=_HAND, pos=end - origin, quat=quaternion)
+    for name, segment in sites.items():
+        start, end = unit * np.asarray(arm.segment_start[segment]), unit * np.asarray(arm.segment_end[segment])
+        rotation = smallest_rotation(np.array([1.0, 0.0, 0.0]), (end - start) / np.linalg.norm(end - start))
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+        body, origin = bodies[arm.link_joint[arm.segment_link[segment]] + 1]
+        body.add_site(name=name, pos=end - origin, quat=quaternion)
     return spec.compile()
 
 
-def _smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The smallest rotation that maps a unit vector onto another, [3, 3]; about any axis where they are opposite."""
     middle = a + b
     square = middle @ middle

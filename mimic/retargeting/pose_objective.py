@@ -15,8 +15,16 @@ from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.metric import spatial
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
-from mimic.metric.spatial import Scalar, Vector
-from mimic.retargeting.closed_form import SMOOTHING, Body, Pull, smoothed_length, static_derivatives
+from mimic.metric.spatial import Vector
+from mimic.retargeting.closed_form import (
+    SMOOTHING,
+    Body,
+    Pull,
+    Smoothing,
+    smoothed_angle,
+    smoothed_length,
+    static_derivatives,
+)
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 
 Target = Any  # pytree: the data of the expert's pose that the objective needs
@@ -29,10 +37,10 @@ class PoseObjective:
     Attributes:
       distance: (expert's link states, learner's link states) -> embodiment distance, both at rest.
       target: (expert's link states, expert's pose) -> target.
-      value: (target, learner's link states) -> distance with smoothed lengths.
+      value: (target, learner's link states) -> distance with smoothed lengths and angles.
       derivatives: (target, joint angles, store, smoothing) -> derivatives of the distance; the value up to a constant
-        of the target. `store`, a `mimic.retargeting.optimizers.Store`, and `smoothing` [chain lengths] may be omitted.
-      is_smoothed: whether the smoothing has an effect.
+        of the target. `store`, a `mimic.retargeting.optimizers.Store`, and `smoothing`, a
+        `mimic.retargeting.closed_form.Smoothing`, may be omitted.
       is_elementwise: whether `derivatives` also takes arrays of poses for each joint, which broadcast with arrays of
         targets; see `of_batch`.
     """
@@ -41,7 +49,6 @@ class PoseObjective:
     target: Callable[..., Target]
     value: Callable[[Target, LinkStates], Array]
     derivatives: Callable[..., Derivatives]
-    is_smoothed: bool = False
     is_elementwise: bool = False
 
     def of_batch(self, targets: Target) -> Callable[..., Derivatives]:
@@ -53,7 +60,7 @@ class PoseObjective:
         if self.is_elementwise:
             return functools.partial(self.derivatives, targets)
 
-        def derivatives(qpos: Scalars, store: Store = call, smoothing: Scalar = SMOOTHING) -> Derivatives:
+        def derivatives(qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING) -> Derivatives:
             def at(target: Target, qpos: Scalars) -> Derivatives:
                 return self.derivatives(target, qpos, store, smoothing)
 
@@ -63,8 +70,8 @@ class PoseObjective:
 
 
 def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
-    """The objective: in closed form for a static metric, see `_static`; else by automatic differentiation."""
-    return _static(learner, metric) if metric.is_static else _differentiated(learner, metric)
+    """The objective: in closed form for a weighted sum, see `_static`; else by automatic differentiation."""
+    return _static(learner, metric) if metric.is_weighted_sum else _differentiated(learner, metric)
 
 
 def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
@@ -80,45 +87,60 @@ def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
 
 
 class StaticTarget(NamedTuple):
-    """Target of a static metric: pulls on the learner's directions and positions (`mimic.retargeting.closed_form`).
+    """Target of a weighted sum: pulls on the learner's directions and positions (`mimic.retargeting.closed_form`).
 
     Attributes:
-      unit, strength: [links, 3], [links] of the pulls on directions.
+      units, strengths: [directions, 3], [directions] of the pulls on directions.
       points, weights: [pairs, 3], [pairs] of the pulls on positions.
     """
 
-    unit: Array
-    strength: Array
+    units: Array
+    strengths: Array
     points: Array
     weights: Array
 
 
 def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
-    """Constant W and weights, cosines and the mean: sums of W_ij (pi/2) (1 - e_i . e^_j) and W_ij |p_i - p^_j|.
+    """Constant W and weights, and the mean: sums of W_ij (pi/2) (1 - e_i . e^_j) or angles, and W_ij |p_i - p^_j|.
 
-    For the directions the expert reduces to one pull for each link of the learner, t_j = sum_i W_ij e_i.
+    For the cosines the expert reduces to one pull on each link of the learner, t_j = sum_i W_ij e_i.
     """
     correspondence, weights = metric.correspondence, cast(DistanceWeights, metric.weights)
     directions, positions = (_pair_weights(correspondence, w) for w in (weights.rotation, weights.translation))
     pairs = _weighted_pairs(correspondence, weights.translation)
+    angles = _weighted_pairs(correspondence, weights.rotation) if metric.rotation == "angle" else None
+    directed = np.arange(learner.num_links) if angles is None else angles[:, 1]  # link of each pull on a direction
     arm = in_chain_lengths(learner)
+
+    def pulls_on_directions(direction: Array) -> tuple[Array, Array]:
+        if angles is not None:
+            return direction[angles[:, 0]], jnp.asarray(directions[angles[:, 0], angles[:, 1]], direction.dtype)
+        # Elementwise, so that nothing is rounded to TF32.
+        pull = np.pi / 2 * jnp.sum(directions[:, :, None] * direction[:, None, :], axis=0)
+        strength = spatial.safe_sqrt(jnp.sum(pull * pull, axis=-1))
+        unit = pull / jnp.maximum(strength, jnp.finfo(pull.dtype).tiny)[:, None]
+        return unit.astype(direction.dtype), strength.astype(direction.dtype)
 
     def target(states: LinkStates, _: Any = None) -> StaticTarget:
         assert states.direction is not None
-        dtype = states.direction.dtype
-        # Elementwise, so that nothing is rounded to TF32.
-        pull = np.pi / 2 * jnp.sum(directions[:, :, None] * states.direction[:, None, :], axis=0)
-        strength = spatial.safe_sqrt(jnp.sum(pull * pull, axis=-1))
-        unit = pull / jnp.maximum(strength, jnp.finfo(pull.dtype).tiny)[:, None]
-        weight = jnp.asarray(positions[pairs[:, 0], pairs[:, 1]], dtype)
-        return StaticTarget(unit.astype(dtype), strength.astype(dtype), states.position[pairs[:, 0]], weight)
+        units, strengths = pulls_on_directions(states.direction)
+        points = states.position[pairs[:, 0]]
+        weights = jnp.asarray(positions[pairs[:, 0], pairs[:, 1]], points.dtype)
+        return StaticTarget(units, strengths, points, weights)
 
     def value(target: StaticTarget, states: LinkStates) -> Array:
         assert states.direction is not None
-        aligned = jnp.vdot(target.strength[:, None] * target.unit, states.direction)
+        direction = states.direction[directed]
+        if angles is None:
+            turned = np.pi / 2 * directions.sum() - jnp.vdot(target.strengths[:, None] * target.units, direction)
+        else:
+            sine = jnp.cross(direction, target.units)
+            cosine = jnp.sum(direction * target.units, axis=-1)
+            angle = smoothed_angle(cosine, jnp.sum(sine * sine, axis=-1), SMOOTHING.angle)
+            turned = jnp.sum(target.strengths * angle)
         difference = states.position[pairs[:, 1]] - target.points
         square = jnp.sum(difference * difference, axis=-1)
-        return jnp.sum(target.weights * smoothed_length(square, SMOOTHING)) + np.pi / 2 * directions.sum() - aligned
+        return jnp.sum(target.weights * smoothed_length(square, SMOOTHING.length)) + turned
 
     def kinematics(qpos: Scalars) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Vector]]]:
         frames = joint_frames(arm, qpos, None)
@@ -126,14 +148,14 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
         return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], vectors
 
     def derivatives(
-        target: StaticTarget, qpos: Scalars, store: Store = call, smoothing: Scalar = SMOOTHING
+        target: StaticTarget, qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING
     ) -> Derivatives:
         axes, anchors, vectors = store(kinematics, tuple(qpos))
         links = [Body(joint, *vector) for joint, vector in zip(arm.link_joint, vectors, strict=True)]
-        pulls = [_pull(target, j, pairs[:, 1] == j) for j in range(learner.num_links)]
-        return static_derivatives(axes, anchors, links, pulls, smoothing)
+        pulls = [_pull(target, directed == link, pairs[:, 1] == link) for link in range(learner.num_links)]
+        return static_derivatives(axes, anchors, links, pulls, arm.joint_parent, smoothing, rotation=metric.rotation)
 
-    return PoseObjective(metric, target, value, derivatives, is_smoothed=bool(len(pairs)), is_elementwise=True)
+    return PoseObjective(metric, target, value, derivatives, is_elementwise=True)
 
 
 def _pair_weights(correspondence: Any, weight: Any) -> Any:
@@ -154,8 +176,12 @@ def _weighted_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 
     return np.argwhere(has_weight)
 
 
-def _pull(target: StaticTarget, link: int, is_on_link: Bool[np.ndarray, " pairs"]) -> Pull:
-    """Pull on one link as scalars."""
-    indices = np.flatnonzero(is_on_link)
-    points = [spatial.vector(target.points[i]) for i in indices]
-    return Pull(spatial.vector(target.unit[link]), target.strength[link], points, [target.weights[i] for i in indices])
+def _pull(target: StaticTarget, directions: Bool[np.ndarray, " directions"], pairs: Bool[np.ndarray, " pairs"]) -> Pull:
+    """Pull on one link as scalars, from those of the target's directions and pairs that are on it."""
+    directions, pairs = np.flatnonzero(directions), np.flatnonzero(pairs)
+    return Pull(
+        [spatial.vector(target.units[i]) for i in directions],
+        [target.strengths[i] for i in directions],
+        [spatial.vector(target.points[i]) for i in pairs],
+        [target.weights[i] for i in pairs],
+    )

@@ -61,7 +61,9 @@ class Placement(NamedTuple):
     vertices: Float[np.ndarray, "vertices poses 3"]
 
 
-def align_segments(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Poses | None:
+def align_segments(
+    expert: Embodiment, learner: Embodiment, qpos: Poses, *, expert_marks: Landmarks | None = None
+) -> Poses | None:
     """Rotates upper arm, forearm and hand to the directions of the expert's, as nearly as the learner's joints allow.
 
     From base to tip, the joints that orient a part rotate it to the expert's direction: two joints by Paden and Kahan's
@@ -74,15 +76,20 @@ def align_segments(expert: Embodiment, learner: Embodiment, qpos: Poses) -> Pose
       expert: n joints.
       learner: n_hat joints.
       qpos: the expert's poses [rad].
+      expert_marks: shoulder, elbow, wrist and hand of the expert where they are known, as of a captured arm; those of
+        `landmarks` where None.
 
     Returns:
-      The learner's poses [rad]; None where an arm has no elbow: fewer than three segments that a joint rotates.
+      The learner's poses [rad]; None where an arm has no elbow: fewer than three segments that a joint rotates. None
+      for trees.
 
     Raises:
       ValueError: `qpos` is not [..., time, n], or not finite.
     """
     qpos = checked_poses(expert, np.asarray(qpos), axes=("time",))
-    expert_marks = landmarks(expert)
+    if not all(arm.is_serial and len(arm.chains) == 1 for arm in (expert, learner)):
+        return None
+    expert_marks = landmarks(expert) if expert_marks is None else expert_marks
     learner_marks = expert_marks if _same_segments(expert, learner) else landmarks(learner)
     if expert_marks is None or learner_marks is None:
         return None

@@ -32,6 +32,7 @@ from mimic.retargeting.pose import (
 from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
 
 _TRACKING_ITERATIONS = 6  # Newton steps from the pose at the neighbouring time
+_LEAP = 1.5  # of the maximum change of a joint: a path that changes by more passes from one minimum to another
 _ANCHORS = 3  # times with a search for minima; at the others minima are tracked
 
 
@@ -53,8 +54,10 @@ def imitate_trajectory(
     """Nearest poses that form a continuous motion: the pose at each time starts from that of the neighbouring time.
 
     Minima are searched at three times: the first, the middle and the last. Each minimum is tracked over the whole
-    motion, and the track of minimum mean distance is returned. Where a minimum vanishes, the joints move to another one
-    in steps of at most `largest_jump`. The first pose lies in [-pi, pi]; later, joints with a range of a full
+    motion. The motion follows the tracks of minimum mean distance: it changes to another track where this gains more
+    than the time on the way costs, in steps of at most `largest_jump`, as it also does where a minimum vanishes. It
+    stays on one track where costs of collisions or of motions count, because poses on the way are not optimised. The
+    first pose lies in [-pi, pi]; later, joints with a range of a full
     revolution may pass pi.
 
     Args:
@@ -117,15 +120,40 @@ def _trajectory_solver(
 
         tracks = jax.vmap(from_anchor)(jnp.asarray(anchors))
         tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tracks)
-        best = jnp.argmin(tracks.value.mean(axis=1))
-        solution: Solution = jax.tree.map(lambda x: x[best], tracks)
-        if objective.is_smoothed:
-            solution = tracker.refine(solution)
+        if costs.of_motion or costs.of_capsules:
+            path = tracks.qpos[jnp.argmin(tracks.value.mean(axis=1))]
+        else:
+            path = _best_path(tracks, jump, continuous_joints(learner), scale)
+        solution = tracker.refine(path)
         distance = jax.vmap(lambda state, q: objective.distance(state, link_states(learner, q)))(states, solution.qpos)
         shift = wrap_angles(solution.qpos[0], continuous_joints(learner)) - solution.qpos[0]
         return PoseImitation(solution.qpos + shift, distance, solution.gradient_norm <= FLAT * scale)
 
     return solve
+
+
+def _best_path(
+    tracks: Solution, jump: Float[Array, " joints"], continuous: np.ndarray, cost_of_step: Array
+) -> Float[Array, "time joints"]:
+    """Poses on the tracks [tracks, time] with the minimum sum of values and changes of track, by dynamic programming.
+
+    A change costs as much for each step on the way as a random pose.
+    """
+    every = jnp.arange(len(tracks.value))
+
+    def advance(total: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        qpos, value = now
+        apart = wrap_angles(qpos[:, None] - qpos, continuous)
+        steps = jnp.ceil(jnp.max(jnp.abs(apart) / jump, axis=-1))
+        steps = jnp.where(every[:, None] == every, 0.0, jnp.maximum(steps, 1.0))
+        through = total[:, None] + cost_of_step * steps
+        return value + through.min(axis=0), through.argmin(axis=0)
+
+    over_time = jnp.swapaxes(tracks.qpos, 0, 1), tracks.value.T
+    total, previous = jax.lax.scan(advance, jnp.zeros_like(tracks.value[:, 0]), over_time)
+    last = jnp.argmin(total)
+    _, followed = jax.lax.scan(lambda track, before: (before[track], track), last, previous, reverse=True)
+    return over_time[0][jnp.arange(len(followed)), followed]
 
 
 _Past = tuple[Array, Array]  # the previous pose, and the one before it
@@ -146,7 +174,7 @@ class _Tracker:
 
     objective: PoseObjective
     targets: Target
-    limits: tuple[Array | np.ndarray, Array | np.ndarray]
+    limits: tuple[np.ndarray, np.ndarray]
     jump: Float[Array, " joints"]
     times: int
     costs: Costs
@@ -166,16 +194,22 @@ class _Tracker:
         solutions = jax.lax.scan(follow, (begin, begin), path)[1]
         return jax.tree.map(lambda x: x[: self.times - 1 : -1], solutions)
 
-    def refine(self, rough: Solution) -> Solution:
-        """A track, optimised with the exact derivatives."""
+    def refine(self, path: Float[Array, "time joints"]) -> Solution:
+        """A path, optimised with the exact derivatives; where it leaps, in steps of at most `jump` without these."""
 
         def follow(past: _Past, guess_and_time: tuple[Array, Array]) -> tuple[_Past, Solution]:
             guess, time = guess_and_time
-            solution = self._near(self.objective.derivatives, past, guess, time)
+            lower, upper = self.limits
+            endless = np.isinf(lower) & np.isinf(upper)
+            guess = wrap_angles(guess, endless, centre=past[0])
+            reached = jnp.clip(guess, past[0] - self.jump, past[0] + self.jump)
+            solution = self._near(self.objective.derivatives, past, reached, time)
+            leaps = jnp.any(jnp.abs(guess - past[0]) > _LEAP * self.jump)
+            on_the_way = Solution(reached, solution.value, jnp.inf * solution.value)
+            solution = jax.tree.map(lambda x, y: jnp.where(leaps, x, y), on_the_way, solution)
             return (solution.qpos, past[0]), solution
 
-        begin = rough.qpos[0], rough.qpos[0]
-        return jax.lax.scan(follow, begin, (rough.qpos, jnp.arange(self.times)))[1]
+        return jax.lax.scan(follow, (path[0], path[0]), (path, jnp.arange(self.times)))[1]
 
     def _at(self, derivatives: Callable[..., Derivatives], time: Array) -> Callable[..., Derivatives]:
         return functools.partial(derivatives, jax.tree.map(lambda x: x[time], self.targets))

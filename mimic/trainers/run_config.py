@@ -125,17 +125,27 @@ def _with_old_default_metric(content: DictConfig) -> DictConfig:
     return merged(content, {"env": {"metric": metric}})
 
 
-def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
-    """The directory and the config of a run, for a command that shows its policy.
+def policy_config(run: str) -> tuple[Path, TrainConfig]:
+    """The directory and the config of a run that trains a policy; it may have no checkpoint yet.
 
     Raises:
-      ValueError: no run directory, a run of another trainer than PPO, or no such checkpoint.
+      ValueError: no run directory, or a run of another trainer than PPO.
     """
     if not run:
         raise ValueError("run: expected the run directory to show, as in run=runs/NAME")
     run_dir = Path(run).expanduser()
     trained = load_config(run_dir)
-    check_checkpoint(run_dir, checkpoint)
     if trained.trainer.name != "ppo":
         raise ValueError(f"run: expected a run of trainer=ppo, got one of {trained.trainer.name}")
+    return run_dir, trained
+
+
+def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
+    """The directory and the config of a run, for a command that shows its policy.
+
+    Raises:
+      ValueError: see `policy_config`; or no such checkpoint.
+    """
+    run_dir, trained = policy_config(run)
+    check_checkpoint(run_dir, checkpoint)
     return run_dir, trained

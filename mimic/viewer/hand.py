@@ -39,9 +39,12 @@ def pose_of_hand(
 def _jacobian(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "3 joints"]:
     """Derivative of the hand's position by the joints that move it."""
     hand, columns = hand_position(arm, qpos), []
+    movers = {arm.link_joint[-1]}  # of the last link
+    while -1 not in movers:
+        movers.add(arm.joint_parent[min(movers)])
     for joint, transform in enumerate(joint_transforms(arm, qpos)[1:]):
         axis = transform[:3, :3] @ np.asarray(arm.joint_axis)[joint]
         anchor = transform[:3, :3] @ np.asarray(arm.joint_anchor)[joint] + transform[:3, 3]
-        moves = joint <= arm.link_joint[-1]
+        moves = joint in movers
         columns.append(np.cross(axis, hand - anchor) if moves else np.zeros(3))
     return np.stack(columns, axis=1)

@@ -11,13 +11,19 @@ from mimic.evaluation.labels import similarity_texts
 
 EXPERT, LEARNER, BOUND, HOLD = "#3b6fd4", "#1b9e77", "#222222", "#9a9a9a"
 _BLUES, _ORANGES = (8, 69, 148), (200, 80, 10)
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 120, 34, 18, 8  # pixels of a chart and its margins
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 360, 96, 34, 18, 8  # pixels of a chart and its margins
+LAST = 1e12  # order of an element below all others, whose orders are times in seconds
+_SHORT_NAME, _LONG_NAME = 4, 6  # characters: names that fit into a column of numbers, and the longest that is not cut
 _MIN_TOP = 0.01  # of a chart's scale, so that the scale is readable at distance 0
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Link names without the prefix "link": link1, link2+link3 -> 1, 2+3."""
-    return [name.replace("link", "") or name for name in names]
+    """Link names without the prefix "link": link1, link2+link3, link_hand -> 1, 2+3, hand."""
+    return [name.replace("link_", "").replace("link", "") or name for name in names]
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= _LONG_NAME or "+" in name else f"{name[: _LONG_NAME - 1]}…"
 
 
 def heat_map(
@@ -43,14 +49,15 @@ def heat_map(
     """
     scale = max(float(values.max()) if maximum is None else maximum, 1e-9)
     head = "".join(f"<th>{html.escape(column)}</th>" for column in columns)
+    width = f' style="width:{_LONG_NAME / 2}em"' if max(map(len, rows)) > _SHORT_NAME else ""
     body = "".join(
-        f"<tr><th>{html.escape(row)}</th>{''.join(_cell(float(value), scale, colour) for value in line)}</tr>"
+        f"<tr><th>{html.escape(_cut(row))}</th>{''.join(_cell(float(value), scale, colour) for value in line)}</tr>"
         for row, line in zip(rows, values, strict=True)
     )
     style = "border-collapse:separate;border-spacing:1px;font-size:10px;line-height:15px;width:100%;table-layout:fixed"
     return (
         f'<div style="flex:1 1 0;min-width:0"><div style="font-size:11px">{html.escape(title)}</div>'
-        f'<table id="{name}" style="{style}"><tr><th></th>{head}</tr>{body}</table></div>'
+        f'<table id="{name}" style="{style}"><tr><th{width}></th>{head}</tr>{body}</table></div>'
     )
 
 
@@ -79,6 +86,11 @@ def heat_maps(
     )
 
 
+def title(text: str) -> str:
+    """Returns the title of a page."""
+    return f'<div style="font-weight:bold;font-size:13px;padding:2px 12px 0">{html.escape(text)}</div>'
+
+
 def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[str, float] | None = None) -> str:
     """Returns distance and bound in large type, a note, and the measures of `mimic.metric.similarity`."""
 
@@ -93,7 +105,8 @@ def numbers(distance: float, bound: float, note: str = "", similarity: Mapping[s
         '<div style="display:flex;gap:22px;padding:4px 12px">'
         + cell("mimic-distance", "embodiment distance", distance, LEARNER)
         + cell("mimic-bound", "kinematic bound", bound, BOUND)
-        + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px">'
+        + f'</div><div id="mimic-note" style="font-size:11px;color:#777;padding:0 12px;min-height:16px;'
+        f'white-space:pre-line">'
         f"{html.escape(note)}</div>{_measures(similarity or {})}"
     )
 

@@ -84,6 +84,7 @@ class LiveSession:
         self._time = 0.0  # s, since the start of the motion
         self._rest_time = 0.0  # s, since the expert moved
         self._goal: np.ndarray | None = None  # pose of the learner to move to instead of following the optimiser
+        self._seeks = False  # whether the learner is on its way to the best pose while the expert moves
         self._solved: tuple[Any, np.ndarray, float] | None = None  # request, best pose and bound
         self._active = self.settings  # the last settings with compiled functions
         self._rest_key: Any = None  # request for which the learner is at rest
@@ -107,6 +108,18 @@ class LiveSession:
             pose = self.pose
             pose[joint] = np.clip(angle, *self.expert.joint_range[joint])
             self._pose, self._rest_time, self._goal = pose, 0.0, None
+
+    def show_pose(self, pose: Float[np.ndarray, " joints"]) -> None:
+        """Sets the expert's pose [rad], one of a motion: the learner follows from where it is."""
+        if not np.all(np.isfinite(pose)):
+            return
+        with self._lock:
+            self._motion, self._pose, self._rest_time = None, np.asarray(pose, np.float32), 0.0
+
+    def seek(self) -> None:
+        """Moves the learner to the best pose of many initial guesses before it follows; for motions that jump."""
+        with self._lock:
+            self._seeks = self._escape
 
     def drag(self, position: Float[np.ndarray, "3"]) -> None:
         """Moves the expert's hand to a position in its base frame [m], or near it, and stops any motion."""
@@ -256,13 +269,15 @@ class LiveSession:
         """The learner's next pose; no joint exceeds its velocity limit."""
         arm = functions.learner.embodiment
         jump = finite_velocity_limit(arm).astype(np.float32) * dt
+        if self._seeks and functions.best is not None:
+            self._goal = best
         goal = self._goal
         if goal is None or goal.shape != current.shape:
             goal = np.asarray(functions.follow(self._pose, current, weights))
             self._goal = None
         pose, is_there = step_towards(arm, current, goal, jump)
         if self._goal is not None:
-            self._goal = None if is_there else self._goal
+            self._goal, self._seeks = (None, False) if is_there else (self._goal, self._seeks)
         elif is_there and self._escape and self._rest_time > _REST_TIME:
             distance = float(functions.compare(self._pose, pose, weights).distance)
             if distance - bound > _MIN_GAIN * max(distance, _MIN_GAIN):

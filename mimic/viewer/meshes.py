@@ -10,7 +10,7 @@ import trimesh
 from jaxtyping import Float, Int
 
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
-from mimic.arms.kinematic_tree import body_id, find_chain
+from mimic.arms.kinematic_tree import find_chain
 from mimic.arms.link_match import Capsule, Colour
 from mimic.arms.rendering import LOCKED, MARK, SPACING
 from mimic.arms.visual_model import body_links, is_dark
@@ -64,8 +64,7 @@ class ArmShape:
         self._model = arm_spec(config).compile()
         self._data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, self._data)
-        first = find_chain(self._model, config.base, config.tip).bodies[0]
-        self._base = int(self._model.body_parentid[first]) if config.base is None else body_id(self._model, config.base)
+        self._base = find_chain(self._model, config.base, config.tip).base
         self.joint_names = free.joint_names
         self.num_bodies = int(self._model.nbody)
         self.reach = float(free.chain_length)

@@ -16,8 +16,10 @@ _ROLES = ("expert", "learner")
 _GRID = 0.1, 0.5  # m, sizes of a cell and of a section
 _STANCE = np.array([2.5, -0.1, 0.75])  # camera position relative to its target, in arm lengths
 _FROM_ABOVE = np.array([0.55, -0.01, 2.9])
-_LAST = 1e12  # order of an element below all others, whose orders are times in seconds
-_FIELD_OF_VIEW = 0.75  # rad
+_FIELD_OF_VIEW = 0.75  # rad, vertical
+_UNMOVED = 1e-3  # of the height of the view: a camera that moved less, moved by rounding
+_PANEL_WIDTH = 384.0  # pixels; the heat maps of two arms with seven joints fit
+_MIN_WIDTH, _MIN_FLAT_WIDTH = 1.9, 2.6  # arm lengths that a narrow window shows: both arms, with room for elbows
 
 
 class Page:
@@ -46,40 +48,64 @@ class Page:
         match: LinkMatch,
     ):
         self.server, self.expert = server, shapes[0]
-        _set_stage(server, max(shape.reach for shape in shapes), is_flat)
+        reach = max(shape.reach for shape in shapes)
+        _set_stage(server, reach, is_flat)
+        width = reach * (_MIN_FLAT_WIDTH if is_flat else _MIN_WIDTH)
+        server.on_client_connect(lambda client: _keep_in_view(client.camera, server.initial_camera, width))
         self._arms = [
-            _DrawnArm(server, f"/{role}", shape, place, f"{role}: {name}")
+            _DrawnArm(server, f"/{role}", shape, place, f"{role}: {name}", -0.3 if is_flat else 0.3)
             for role, shape, place, name in zip(_ROLES, shapes, places(shapes), names, strict=True)
         ]
         self._ghost = _Ghost(server, shapes[1], match)
-        server.gui.add_markdown(f"**{title}**")
-        self._numbers = server.gui.add_html(html.numbers(float("nan"), float("nan"), "compiling …"))
+        self._title = html.title(title)
+        self._numbers = server.gui.add_html("")
+        self.show_note("compiling …")
         self._chart = server.gui.add_html("")
-        self._maps = server.gui.add_html("", order=_LAST)  # below the controls, which then fit 800 pixels
+        self._maps = server.gui.add_html("", order=html.LAST)  # below the controls
+
+    def show_note(self, note: str) -> None:
+        """Shows a line in the place of the numbers, before the first frame."""
+        self._numbers.content = self._title + html.numbers(float("nan"), float("nan"), note)
+
+    def move(self, frame: Frame) -> None:
+        """Moves the arms to those of a frame; numbers, chart and maps stay."""
+        with self.server.atomic():
+            self._move(frame)
 
     def show(self, frame: Frame, chart: str, note: str) -> None:
         """Shows a frame; all elements change together."""
         with self.server.atomic():
-            self._arms[0].move_to(frame.expert, ())
-            self._arms[1].move_to(frame.learner, frame.locked)
-            self._ghost.move_to(frame)
-            self._numbers.content = html.numbers(frame.distance, frame.bound, note, frame.similarity)
+            self._move(frame)
+            numbers = html.numbers(frame.distance, frame.bound, note, frame.similarity)
+            self._numbers.content = self._title + numbers
             self._maps.content = html.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
             self._chart.content = chart
+
+    def _move(self, frame: Frame) -> None:
+        self._arms[0].move_to(frame.expert, ())
+        self._arms[1].move_to(frame.learner, frame.locked)
+        self._ghost.move_to(frame)
 
 
 class _DrawnArm:
     """The meshes of an arm in the scene."""
 
-    def __init__(self, server: viser.ViserServer, path: str, shape: ArmShape, place: np.ndarray, label: str):
+    def __init__(
+        self, server: viser.ViserServer, path: str, shape: ArmShape, place: np.ndarray, label: str, label_at: float
+    ):
         self._shape = shape
         scene = server.scene
         scene.add_frame(path, show_axes=False, position=place)
-        scene.add_label(
-            f"{path}/label", label, position=(0.3 * shape.reach, 0.0, 0.0), anchor="top-center", font_screen_scale=1.1
-        )
+        place_of_label = (label_at * shape.reach, 0.0, 0.0)
+        scene.add_label(f"{path}/label", label, position=place_of_label, anchor="top-center", font_screen_scale=1.1)
         bodies = sorted({part.body for part in shape.parts})
-        self._frames = {body: scene.add_frame(f"{path}/body{body}", show_axes=False) for body in bodies}
+        positions, quaternions = shape.bodies({})
+        self._frames = {
+            body: scene.add_frame(
+                f"{path}/body{body}", show_axes=False, position=positions[body], wxyz=quaternions[body]
+            )
+            for body in bodies
+        }
         self._marks: dict[str, Any] = {}
         for index, part in enumerate(shape.parts):
             mesh = _mesh(scene, f"{path}/body{part.body}/part{index}", part)
@@ -143,6 +169,7 @@ def _mesh(scene: viser.SceneApi, path: str, part: Part) -> Any:
 def _set_stage(server: viser.ViserServer, reach: float, is_flat: bool) -> None:
     server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(_PANEL_WIDTH)  # otherwise it may dock with the width before that of the theme
     server.scene.set_up_direction("+z")
     server.scene.configure_default_lights(True, cast_shadow=True)
     server.scene.add_grid(
@@ -155,3 +182,19 @@ def _set_stage(server: viser.ViserServer, reach: float, is_flat: bool) -> None:
     camera.look_at = target
     camera.position = target + reach * (_FROM_ABOVE if is_flat else _STANCE)
     camera.fov = _FIELD_OF_VIEW
+
+
+def _keep_in_view(camera: viser.CameraHandle, start: viser.InitialCameraConfig, width: float) -> None:
+    """Moves a client's camera back until its window shows a width [m] at the target, unless the user moved it."""
+    target, stance = np.array(start.look_at), start.position - start.look_at
+    height = 2 * np.tan(_FIELD_OF_VIEW / 2) * np.linalg.norm(stance)  # of the view at the target
+    last = start.position
+
+    @camera.on_update
+    def _(_: Any) -> None:
+        nonlocal last
+        position = target + stance * max(1.0, width / (height * camera.aspect))
+        is_ours = np.linalg.norm(camera.position - last) < _UNMOVED * height
+        if is_ours and np.linalg.norm(position - last) > _UNMOVED * height:
+            camera.position = last = position
+            camera.look_at = target

@@ -1,20 +1,15 @@
 """Frames of a trained policy's rollouts. Needs no browser."""
 
 import functools
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
+from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.similarity import centre_line_table, similarity
-from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import TrainConfig
-from mimic.trainers.make import make_ppo_trainer
 from mimic.viewer import html
 from mimic.viewer.live_session import Frame
 
@@ -26,34 +21,27 @@ class Playback:
     """Rollouts of the policy of a run on its demonstrations.
 
     Args:
-      trained: config of the run.
-      run_dir: directory of the run.
-      checkpoint: environment steps of the checkpoint. Default None: the last checkpoint.
-
-    Raises:
-      ValueError: the run cannot be read.
+      env: environment of the run.
+      evaluator: evaluator of the run.
     """
 
-    def __init__(self, trained: TrainConfig, run_dir: Path, checkpoint: int | None):
-        trainer = make_ppo_trainer(trained, run_dir)
-        self.env: EnvConfig = trained.env
-        self._trainer, self._evaluator = trainer, trainer.evaluator
-        self._params = load_checkpoint(run_dir, trainer.params_template(), checkpoint)[1]
-        self._rollouts: Any = None
-        self._locked = dict(build_arm(self.env.learner, self.env.limits).locked)
+    def __init__(self, env: EnvConfig, evaluator: Evaluator):
+        self._evaluator = evaluator
+        self._rollouts: Rollouts | None = None
+        self._locked = dict(build_arm(env.learner, env.limits).locked)
         self._rollout = functools.lru_cache(maxsize=16)(self._compute_rollout)
 
-    def run(self) -> None:
-        """Runs the policy on all demonstrations and computes their kinematic bounds."""
-        with Console().status("running the policy on all demonstrations and computing the kinematic bound"):
-            self._rollouts = self._trainer.evaluate(self._params)
-            _ = self._evaluator.lower_bound
+    def replace(self, rollouts: Rollouts) -> None:
+        """Plays these rollouts of all demonstrations from now on."""
+        self._rollouts = rollouts
+        self._rollout.cache_clear()
 
     def count(self, split: str) -> int:
         """Number of demonstrations in a split."""
         return len(range(self._evaluator.env.demonstrations.count)[self._evaluator.parts[split]])
 
     def _compute_rollout(self, split: str, demonstration: int) -> RolloutFrames:
+        assert self._rollouts is not None
         index = demonstration_index(self._evaluator, split, demonstration)
         return RolloutFrames(self._evaluator, self._rollouts, index, FRAMES_PER_SECOND)
 

@@ -4,6 +4,8 @@ from typing import Any
 
 import viser
 
+from mimic.viewer.html import LAST
+
 LONGEST = 120.0  # s of a recording; it is kept in memory
 FILE = "mimic-recording.html"
 
@@ -20,7 +22,7 @@ class Recorder:
         self._serializer: Any = None
         self._client: Any = None
         self._duration = 0.0
-        self._box = server.gui.add_checkbox("record", False, hint=f"as {FILE}, at most {LONGEST:.0f} s")
+        self._box = server.gui.add_checkbox("record", False, hint=f"as {FILE}, at most {LONGEST:.0f} s", order=LAST + 1)
         self._box.on_update(lambda event: self._toggle(event.client))
 
     def advance(self, dt: float) -> None:

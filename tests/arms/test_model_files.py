@@ -1,9 +1,5 @@
 """Arms from files: kinematics and dynamics equal those of the original model in C MuJoCo."""
 
-import os
-import pathlib
-from importlib.util import find_spec
-
 import jax
 import mujoco
 import numpy as np
@@ -33,16 +29,9 @@ OTHERS = {
 
 
 def other(name):
-    """The file of a third-party arm, from the installed package or from the folder MIMIC_ARMS."""
+    """The file of a third-party arm, and its tip."""
     path, tip = OTHERS[name]
-    package, _, inside = path.partition("/")
-    found = find_spec(package)
-    folders = [pathlib.Path(os.environ["MIMIC_ARMS"]) / package] if "MIMIC_ARMS" in os.environ else []
-    folders += [pathlib.Path(folder) for folder in (found.submodule_search_locations or [] if found else [])]
-    file = next((folder / inside for folder in folders if (folder / inside).is_file()), None)
-    if file is None:
-        pytest.skip(f"no {path}: install {package}, or unpack its wheel in a folder and name that with MIMIC_ARMS")
-    return file, tip
+    return original_model.package_file(path), tip
 
 
 def largest_errors(file, original, tip, base=None):

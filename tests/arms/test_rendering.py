@@ -14,10 +14,11 @@ from mimic.arms.link_match import Capsule
 from mimic.arms.rendering import ArmScene
 
 
-def test_a_missing_graphics_library_is_reported_when_something_is_drawn(tmp_path):
-    """PyOpenGL fails in this way where there is no libEGL."""
+@pytest.mark.parametrize("error", ["AttributeError('no eglQueryString')", "ctypes.ArgumentError('no glGetError')"])
+def test_a_missing_graphics_library_is_reported_when_something_is_drawn(error, tmp_path):
+    """PyOpenGL fails in these ways where there is no libEGL, and no libGL."""
     (tmp_path / "OpenGL").mkdir()
-    (tmp_path / "OpenGL" / "__init__.py").write_text("raise AttributeError('no eglQueryString')")
+    (tmp_path / "OpenGL" / "__init__.py").write_text(f"import ctypes\nraise {error}")
     code = "import mimic, mujoco.mjx; from mimic import ArmScene; ArmScene([mimic.ArmConfig()])"
     found = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}", "MUJOCO_GL": "egl"}
     ended = subprocess.run([sys.executable, "-c", code], env=found, capture_output=True, text=True, check=False)
@@ -84,6 +85,15 @@ def test_fitted_arms_fill_the_image(config):
     moved = np.any(np.abs(images - images[0]).max(axis=-1) > 30, axis=0)
     assert not moved[:3].any() and not moved[-3:].any() and not moved[:, :3].any() and not moved[:, -3:].any()
     assert np.ptp(np.flatnonzero(moved.any(axis=0))) > 100
+
+
+def test_the_floor_is_below_an_arm_that_reaches_below_its_base():
+    down, up = (np.array([0.0, angle, 0, 0, 0, 0]) for angle in (2.8, 0.0))
+    with ArmScene([ArmConfig(locked=[6])], width=160, height=120) as scene:
+        scene.fit([down[None]])
+        assert red_share(scene.image([down])) > 0.002  # the locked joint, near the hand
+        scene.fit([up[None]])
+        assert red_share(scene.image([up])) > 0 and scene._data.mocap_pos[0, 2] == 0
 
 
 def test_an_overlay_is_drawn_at_the_last_arm():

@@ -8,10 +8,15 @@ import pytest
 
 from benchmarks import fuzzing
 from benchmarks.fuzzing import ACCEPTED, Case, runner
+from benchmarks.fuzzing.captures import CAPTURE_DAMAGES
 from benchmarks.fuzzing.files import MODEL_DAMAGES, NPZ_DAMAGES
 from benchmarks.fuzzing.runner import GOOD, REJECTED, run_cases, run_here, summary
 
-COUNTS = {"npz": 6 * len(NPZ_DAMAGES), "models": 3 * len(MODEL_DAMAGES)}  # each damage some times
+COUNTS = {
+    "npz": 6 * len(NPZ_DAMAGES),
+    "models": 3 * len(MODEL_DAMAGES),
+    "captures": 4 * len(CAPTURE_DAMAGES),
+}  # each damage some times
 
 
 @pytest.mark.parametrize("kind", COUNTS)

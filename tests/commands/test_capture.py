@@ -49,6 +49,27 @@ def test_demonstrations_fit_the_arm_that_is_written_with_them(written):
     assert (folder / "left.png").stat().st_size > 10_000
 
 
+@pytest.fixture(scope="module")
+def both(clip):
+    """Demonstrations of both arms, and what the command printed."""
+    done = run(clip.parent, "demonstrations", f"source={clip}", "arm=both", "out=both.npz", "env=bimanual")
+    assert done.returncode == 0, done.stderr
+    return clip.parent, done.stdout
+
+
+def test_demonstrations_of_both_arms_fit_the_bimanual_environment(both):
+    folder, printed = both
+    env = mimic.env_config("bimanual", expert={"model": str(folder / "both.xml")})
+    expert, learner = env.build_arms().embodiments
+    mimic.load_demonstrations(folder / "both.npz").check_fits(expert, 0.1, 50)
+    assert expert.chain_names == ("left_hand", "right_hand") and learner.chain_names == ("left_body7", "right_body7")
+    matrix = np.asarray(env.metric.build(expert, learner).correspondence)
+    assert np.all(matrix[:4, 7:] == 0) and np.all(matrix[4:, :7] == 0)  # left to left
+    assert matrix[0, 0] > 0 and matrix[7, 13] > 0
+    assert expert.link_lengths[0] / expert.chain_length == pytest.approx(0.333 / learner.chain_length, rel=1e-3)
+    assert "env=bimanual env.expert=" in printed
+
+
 def test_a_gap_in_the_other_arm_splits_nothing(tmp_path):
     body = person(300)
     positions = body.positions.copy()
@@ -58,18 +79,23 @@ def test_a_gap_in_the_other_arm_splits_nothing(tmp_path):
     assert [len(part.start) for part in capture.parts] == [300] and capture.starts == [0.0]
     capture = read_arm(tmp_path / "clip.npz", "left", CaptureConfig())
     assert [len(part.start) for part in capture.parts] == [100, 100]
-    assert capture.starts == pytest.approx([0.0, 200 / body.rate])
+    assert capture.starts == pytest.approx([0.0, 200 / body.rate]) and capture.bridged == 0
+    positions[100:194] = body.positions[100:194]  # 0.1 s remain
+    np.savez(tmp_path / "short.npz", names=np.array(body.names), positions=positions, rate=body.rate)
+    capture = read_arm(tmp_path / "short.npz", "left", CaptureConfig())
+    assert [len(part.start) for part in capture.parts] == [300] and capture.bridged == 1
 
 
 @pytest.mark.slow
-def test_the_printed_command_trains(written):
-    folder, printed = written
+@pytest.mark.parametrize("arms", ["written", "both"])
+def test_the_printed_command_trains(request, arms):
+    folder, printed = request.getfixturevalue(arms)
     command = next(line for line in printed.splitlines() if line.startswith("train on it: "))
     arguments = command.removeprefix("train on it: python -m mimic.train ").split()
     small = ["trainer.num_timesteps=4096", "trainer.num_envs=16", "trainer.batch_size=16", "trainer.evaluations=1"]
-    done = run(folder, "train", *arguments, *small, "env.physics=fused", "run_dir=run")
+    done = run(folder, "train", *arguments, *small, "env.physics=fused", f"run_dir={arms}")
     assert done.returncode == 0, done.stderr
-    assert (folder / "run" / "report.json").is_file()
+    assert (folder / arms / "report.json").is_file()
 
 
 def test_inspect_shows_what_a_clip_has(clip, tmp_path):
@@ -83,7 +109,7 @@ def test_inspect_shows_what_a_clip_has(clip, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("arm=middle",), "arm: expected left or right"),
+        (("arm=middle",), "arm: expected left, right or both"),
         (("capture.unit=mile",), "unit"),
         (("count=3",), "count: expected none with source=FILE"),
         (("env.horizon=9000",), "expected a motion without gaps of"),

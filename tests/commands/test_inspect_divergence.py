@@ -45,7 +45,7 @@ def diverged(tmp_path_factory):
     save_config(run_dir, config)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "_learning_rate", learning_rate)
-        patch.setattr(trainer, "_prepare", lambda: None)
+        patch.setattr(trainer, "prepare_evaluation", lambda: None)
         with pytest.raises(Diverged) as error:
             trainer.train(run_dir, lambda *_: False, Signals(), None)
         assert error.value.file == run_dir / FILE

@@ -1,17 +1,27 @@
 """`python -m mimic.view`: what it rejects, and how it ends."""
 
+import contextlib
 import importlib.util
+import itertools
 import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 
+import numpy as np
 import pytest
 
-from mimic.commands import view
+from mimic.arms.arm import build_arm
+from mimic.commands import view, view_capture
+from mimic.commands.capture import fixed_fraction
 from mimic.commands.config import ViewConfig
+from mimic.commands.view_capture import listen, wait_for_arm
 from mimic.envs import env_config
+from mimic.mocap.live_points import Sample, sample_line
 from mimic.runs.signals import Signals
+from tests.mocap.bodies import bvh_text, person
 
 
 @pytest.mark.parametrize(
@@ -25,6 +35,20 @@ from mimic.runs.signals import Signals
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),
         (["run=a", "expert=panda"], "expected neither with run= or mapper="),
+        (["source=missing.bvh"], "source: no file at 'missing.bvh'"),
+        (["source=a.bvh", "expert=panda"], "expert, run, mapper: expected none with source="),
+        (["arm=left"], "arm, capture: expected only with source="),
+        (["capture.yaw=3"], "arm, capture: expected only with source="),
+        (["source=a.bvh", "arm=middle"], "arm: expected one of left, right, got 'middle'"),
+        (["source=a.bvh", "capture.overlap=0.1"], "capture.overlap: expected none with this source of a view"),
+        (["source=tcp://localhost"], "source: expected a file or tcp://localhost:PORT"),
+        (["source=tcp://localhost:99999"], "source: expected a file or tcp://localhost:PORT"),
+        (["source=tcp://localhost:9000/x"], "source: expected a file or tcp://localhost:PORT"),
+        (["source=tcp://localhost:9000", "capture.slow_down=2"], "capture.slow_down: expected none with this source"),
+        (["source=tcp://0.0.0.0:9000"], "to take points from other machines, set host=0.0.0.0 too"),
+        (["follow=true"], "follow: expected with run= and without checkpoint="),
+        (["run=a", "follow=true", "checkpoint=5"], "got run='a' and checkpoint=5"),
+        (["run=missing", "follow=true"], "not a run directory"),
         (["split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
@@ -49,10 +73,8 @@ def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
 
 
 def test_only_the_page_of_the_view_imports_viser():
-    modules = ", ".join(
-        f"mimic.viewer.{name}" for name in ("html", "live_session", "playback", "meshes", "follower", "history")
-    )
-    code = f"import sys; sys.modules['viser'] = None; import {modules}"
+    names = "html", "live_session", "playback", "meshes", "follower", "history", "newest_checkpoint", "captured"
+    code = f"import sys; sys.modules['viser'] = None; import {', '.join(f'mimic.viewer.{name}' for name in names)}"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
@@ -105,3 +127,84 @@ def test_signals_end_the_command_cleanly(number):
     process.send_signal(number)  # most likely while it compiles
     out, error = process.communicate(timeout=120)
     assert process.returncode == 0 and "Traceback" not in error and "view: ended" in out
+
+
+@pytest.fixture
+def sends():
+    """A function that starts to send samples of the generated person to a port, in a thread."""
+    started = []
+
+    def start(port, change=lambda sample: sample):
+        stop = threading.Event()
+        thread = threading.Thread(target=_send, args=(port, stop, change), daemon=True)
+        thread.start()
+        started.append((stop, thread))
+
+    yield start
+    for stop, thread in started:
+        stop.set()
+        thread.join()
+
+
+def _send(port, stop, change):
+    body = person(30)
+    with socket.create_connection(("localhost", port)) as connection, contextlib.suppress(OSError):
+        for number in itertools.count():
+            sample = Sample(number / 100, dict(zip(body.names, body.positions[number % 30], strict=True)))
+            connection.sendall(sample_line(change(sample)))
+            if stop.wait(0.005):
+                return
+
+
+def test_the_arm_of_live_points_is_measured(sends):
+    config = ViewConfig(env=env_config("panda4dof"), source=f"tcp://localhost:{free_port()}", arm="left")
+    with contextlib.closing(listen(config)) as listener:
+        sends(listener.port)
+        measured = wait_for_arm(listener, config, config.env)
+    assert measured is not None
+    arm, links = measured
+    assert links.names == ("trunk", "upper_arm", "forearm", "hand") and arm.zero is not None
+    np.testing.assert_allclose(links.link_lengths[1:], [0.28, 0.25, 0.09], atol=1e-9)
+    # As large a part of the chain as the Panda's column, as for demonstrations.
+    learner = build_arm(config.env.learner, config.env.limits, config.env.metric.links).embodiment
+    assert links.link_lengths[0] / links.chain_length == pytest.approx(fixed_fraction(learner))
+
+
+def test_points_in_another_unit_are_said_and_not_taken(sends, capsys, monkeypatch):
+    config = ViewConfig(env=env_config("panda4dof"), source=f"tcp://localhost:{free_port()}")
+    signals = Signals()
+    monkeypatch.setattr(view_capture, "Signals", lambda: signals)
+    with contextlib.closing(listen(config)) as listener:
+        sends(listener.port, lambda sample: Sample(sample.time, {n: 1000 * p for n, p in sample.points.items()}))
+        threading.Timer(1.0, lambda: signals.caught.append(signal.SIGINT)).start()
+        assert wait_for_arm(listener, config, config.env) is None
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "points: expected metres, got arms 530, 530 long, as an adult's in mm" in error
+
+
+def test_an_address_of_other_machines_needs_the_host_too():
+    with contextlib.closing(listen(ViewConfig(source=f"tcp://0.0.0.0:{free_port()}", host="0.0.0.0"))):
+        pass
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-arms[view]'")
+def test_a_clip_and_live_points_move_the_learner(tmp_path, sends):
+    """The whole command: the clip is played, then points arrive and stop."""
+    (tmp_path / "clip.bvh").write_text(bvh_text(120))
+    port = free_port()
+    for source in (str(tmp_path / "clip.bvh"), f"tcp://localhost:{port}"):
+        command = [sys.executable, "-m", "mimic.view", f"source={source}", "learner=panda", f"port={free_port()}"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        assert "right_arm: " in first or "waiting for points at tcp://localhost" in first
+        if "waiting" in first:
+            sends(port)
+        assert "view: http://127.0.0.1:" in process.stdout.readline()
+        time.sleep(1)
+        process.send_signal(signal.SIGINT)
+        out, error = process.communicate(timeout=200)
+        assert process.returncode == 0 and "Traceback" not in error and "view: ended" in out
+        assert ("samples" in out) == ("waiting" in first)

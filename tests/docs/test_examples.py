@@ -50,9 +50,9 @@ def is_picture(path):
     return len([count for count, _ in colours if count > 20]) > 10
 
 
-def test_the_index_lists_all_eight_examples():
+def test_the_index_lists_all_nine_examples():
     index = (EXAMPLES / "README.md").read_text()
-    assert [name[:2] for name in NAMES] == [f"{n:02}" for n in range(1, 9)]
+    assert [name[:2] for name in NAMES] == [f"{n:02}" for n in range(1, 10)]
     for name in NAMES:
         assert f"]({name}.py)" in index
 
@@ -176,3 +176,14 @@ def test_other_tools(said, tmp_path):
     ((here, reported),) = re.findall(r"demonstrations: (\S+) by Gymnasium and ONNX Runtime, (\S+) in the report", said)
     assert float(here) == pytest.approx(float(reported), rel=1e-3)  # 50 steps in float32, rounded in another order
     assert (tmp_path / "policy.onnx").stat().st_size > 1000
+
+
+@example("09_swarm")
+def test_swarm(said, tmp_path):
+    assert number(r"order of its numbers: (\S+)", said) > number(r"shortest flights: +(\S+)", said)
+    ((before, after),) = re.findall(r"distance at the start: (\S+);.* mean of the last 5 s: (\S+)", said)
+    assert float(after) < 0.05 * float(before)
+    ((far, near),) = re.findall(r"(\S+) at the start, (\S+) in the last 5 s", said)
+    assert float(near) < 0.03 < 0.3 < float(far)  # chain lengths; the bodies of a straight arm are 0.07 apart
+    assert number(r"fastest body .*: (\S+), in", said) <= 0.5
+    assert is_picture(tmp_path / "swarm.png")

@@ -15,6 +15,7 @@ from mimic.envs.physics import Load, PhysicsChoice, choose_physics, make_advance
 from mimic.metric import fused_kernel
 from tests.helpers.lowering import gpu_program
 from tests.helpers.random_arms import SEEDS, random_arm
+from tests.helpers.trees import torso
 
 # Double precision leaves 1e-16 of each of a few thousand operations, and bodies much lighter than others amplify
 # it: up to 1e-12 on the random arms, 1e-15 on the Panda.
@@ -104,6 +105,30 @@ def test_random_arms_move_as_in_their_own_model(x64, seed):
     assert_near(ours(dynamics.inverse, model, qpos, qvel, qacc), torque)
 
 
+@pytest.mark.parametrize("name", ["panda_pair", "torso"])
+def test_trees_move_as_in_mujoco(x64, name):
+    if name == "torso":
+        source = mujoco.MjModel.from_xml_string(torso(2))
+        model = simulation_model(source, tuple(source.joint(i).name for i in range(source.njnt)))
+    else:
+        model = build_arm(ArmConfig(model=name)).model
+    assert choose_physics("auto", model).name == "fused"
+    qpos, qvel, torque = random_states(model)
+    qacc = mujoco_acceleration(model, qpos, qvel, torque)
+    assert_near(ours(dynamics.acceleration, model, qpos, qvel, torque), qacc)
+    assert_near(ours(dynamics.inverse, model, qpos, qvel, qacc), torque)
+
+
+def test_arms_that_do_not_touch_move_on_their_own(x64):
+    """The sum of two serial arms, but for the rounding of where they are mounted."""
+    pair, arm = (build_arm(ArmConfig(model=name)).model for name in ("panda_pair", "panda"))
+    states = random_states(pair)
+    both = ours(dynamics.acceleration, pair, *states)
+    for joints in (slice(0, 7), slice(7, 14)):
+        alone = ours(dynamics.acceleration, arm, *(values[:, joints] for values in states))
+        assert_near(both[:, joints], alone, 1e-12)
+
+
 def test_random_arms_include_the_hard_cases():
     sources = [random_arm(seed) for seed in SEEDS]
     assert any(source.body_jntnum.max() == 2 for source in sources)
@@ -146,7 +171,7 @@ UNCOVERED = {
     "a fluid": lambda: with_option(viscosity=1.0),
     "another integrator": lambda: with_option(integrator=mujoco.mjtIntegrator.mjINT_EULER),
     "joints that are not revolute": lambda: from_xml(_TWO.format("", 'type="slide"')),
-    "several branches": lambda: from_xml(_TWO.format('<body pos="0 1 0">+<joint name="c"/></body>', "")),
+    "bodies that no joint moves": lambda: from_xml(_TWO.format('<body pos="0 1 0">+</body>', "")),
     "contacts": lambda: from_xml(_TWO.format('<geom size="0.1"/>', "")),
     "constraints": lambda: from_xml(
         _TWO.format("", ""), '<equality><joint joint1="a" joint2="b"/></equality>'

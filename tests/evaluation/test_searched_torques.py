@@ -46,7 +46,7 @@ def descent_and_task(evaluator, chunk=4_000):
     env = evaluator.env
     expert = jax.tree.map(lambda table: table[:, 1:], env.expert_states)
     loads = Load(*jnp.ones((2, env.demonstrations.count)))
-    return TrajectoryDescent(env, chunk), Task(expert, loads)
+    return TrajectoryDescent(env, chunk), Task(expert, loads, env.start_poses)
 
 
 def random_actions(evaluator, size=0.2):

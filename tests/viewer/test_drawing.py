@@ -80,3 +80,10 @@ def test_the_chart_is_flat_while_the_arms_rest(monkeypatch):
     history.chart()
     assert np.interp(8.9, drawn["time"], drawn["distance"]) == 0  # at rest until 9 s, no ramp from 1 s on
     assert list(drawn["distance"]) == [0.0, 0.0, 0.0, 0.4, 0.2]
+
+
+def test_names_of_links_fit_their_column():
+    assert html.short_names(["link1", "link2+link3", "link_hand", "tip"]) == ["1", "2+3", "hand", "tip"]
+    table = html.heat_map(np.eye(2), ["upper_arm", "hand"], ["1", "2"], "W", name="w")
+    assert ">upper…<" in table and ">hand<" in table and "width:3.0em" in table
+    assert "em" not in html.heat_map(np.eye(2), ["1", "2"], ["1", "2"], "W", name="w").partition("<th>1")[0]

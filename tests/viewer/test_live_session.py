@@ -75,6 +75,24 @@ def test_the_learner_follows_and_rests_at_the_bound(live):
     assert live.advance(TICK) is None  # nothing is computed while nothing moves
 
 
+def test_a_shown_pose_is_followed_and_a_jump_seeks_the_best_pose(live):
+    """From where it is, tracking ends in a local minimum at this pose; `seek` ends at the bound while poses arrive."""
+    pose = np.array([1.44, -2.04, 2.28, 0.26, -1.26, -0.49, -2.96], np.float32)
+    frames = []
+    for seeks in (False, True):
+        if seeks:
+            live.seek()
+        for _ in range(120):
+            live.show_pose(pose + 1e-3 * np.random.default_rng(0).standard_normal(7))  # never at rest
+            frame = live.advance(TICK)
+        frames.append(frame)
+    assert frames[1].expert["joint1"] == pytest.approx(1.44, abs=0.01)
+    assert frames[0].distance > 1.05 * frames[0].bound
+    assert frames[1].distance < 1.01 * frames[1].bound
+    live.show_pose(np.full(7, np.nan))
+    assert np.isfinite(live.pose).all()
+
+
 def test_what_is_shown_is_the_metric(live, env):
     live.move(0, 0.5)
     frame = settle(live)

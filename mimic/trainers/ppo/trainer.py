@@ -104,7 +104,7 @@ class PPOTrainer(Trainer):
         template = jax.eval_shape(self.params_template)
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), template)
 
-    def _prepare(self) -> None:
+    def prepare_evaluation(self) -> None:
         """Starts to compile the evaluation, and to compute the bound and the baselines."""
         self._rollouts.start()
         self.evaluator.prepare()
@@ -128,7 +128,7 @@ class PPOTrainer(Trainer):
             on_evaluation=evaluated,
             signals=signals,
             restored=restored,
-            on_compiling=self._prepare,
+            on_compiling=self.prepare_evaluation,
         )
 
     def follow(self, restored: Checkpoint | None) -> None:

@@ -1,0 +1,47 @@
+"""Where the learner starts its episodes, at rest: in its home pose, or in the pose nearest to the demonstration's."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mimic.arms.embodiment import Embodiment
+from mimic.compilation import on_host
+from mimic.retargeting.costs import Costs
+from mimic.retargeting.pose import imitate_pose
+
+START_POSES = ("home", "nearest")
+# Weight of the distance from the home pose, so that redundant joints start alike where many poses are equally near. It
+# adds 0.1 % to the mean distance of a Panda from a captured arm.
+_HOME = 0.01
+_CHUNK = 256  # poses at a time: one function is compiled for any number of demonstrations
+
+
+def home_poses(learner: Embodiment, count: int) -> Float[np.ndarray, "demonstrations joints"]:
+    """The learner's home pose for each demonstration [rad]."""
+    return np.tile(np.asarray(learner.home, np.float32), (count, 1))
+
+
+def nearest_poses(
+    expert: Embodiment,
+    learner: Embodiment,
+    qpos: Float[np.ndarray, "demonstrations expert_joints"],
+    metric: dict[str, Any],
+) -> Float[np.ndarray, "demonstrations joints"]:
+    """The learner's poses nearest to poses of the expert [rad], see `imitate_pose`.
+
+    Args:
+      expert: n joints.
+      learner: n_hat joints.
+      qpos: first poses of the demonstrations [rad].
+      metric: correspondence, weights, rotation and reduction of the embodiment distance.
+    """
+    count = len(qpos)
+    padded = np.asarray(qpos, np.float32)[np.minimum(np.arange(-(-count // _CHUNK) * _CHUNK), count - 1)]
+    with on_host():  # compiles several times faster, and runs once
+        chunks = [
+            np.asarray(imitate_pose(expert, learner, jnp.asarray(chunk), costs=Costs(home=_HOME), **metric).qpos)
+            for chunk in padded.reshape(-1, _CHUNK, expert.num_joints)
+        ]
+    return np.concatenate(chunks)[:count]

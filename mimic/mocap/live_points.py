@@ -1,0 +1,170 @@
+"""Points of a person that arrive one sample at a time, and the pose of an arm in each.
+
+A sample is a line of JSON: {"time": 12.34, "points": {"LeftArm": [0.1, 0.2, 1.4], ...}}, in seconds and metres, z up. A
+point that is not seen is null or left out.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.mocap.arms import ArmPoints, find_arms
+from mimic.mocap.ball_chain import ball_chain_pose
+from mimic.mocap.clips import turn_matrix, turned
+from mimic.mocap.conventions import UNITS, arm_length, guessed_units, z_up
+from mimic.mocap.link_motion import LinkMotion, arm_motion, link_ends_from_shoulder
+from mimic.mocap.points import PointMotion
+
+MAX_POINTS = 2000
+_MAX_NAME = 200  # characters
+_MAX_VALUE = 1e6  # of a coordinate
+_NO_PARENT = -1
+_UNSEEN = math.nan, math.nan, math.nan
+_SHORTEST = 1e-3  # m; of a link
+
+
+class Sample(NamedTuple):
+    """Positions of points at one time [s]; NaN where a point was not seen."""
+
+    time: float
+    points: Mapping[str, Float[np.ndarray, "3"]]
+
+
+def parse_sample(line: bytes) -> Sample:
+    """The sample in a line of JSON.
+
+    Raises:
+      ValueError: what is wrong with it.
+    """
+    try:
+        content = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise ValueError("expected a line of JSON") from error
+    if not isinstance(content, dict) or not isinstance(content.get("points"), dict):
+        raise ValueError("expected an object with 'time' and 'points'")
+    time: Any = content.get("time")
+    points = content["points"]
+    if not _is_number(time) or not math.isfinite(time):
+        raise ValueError("time: expected a finite number of seconds")
+    if len(points) > MAX_POINTS or any(len(name) > _MAX_NAME for name in points):
+        raise ValueError(f"points: expected at most {MAX_POINTS}, with names of at most {_MAX_NAME} characters")
+    positions = np.array([_position(name, point) for name, point in points.items()], float).reshape(-1, 3)
+    return Sample(float(time), dict(zip(points, positions, strict=True)))
+
+
+def _position(name: str, point: Any) -> tuple[float, float, float]:
+    if point is None:
+        return _UNSEEN
+    if not isinstance(point, list) or len(point) != 3 or not all(map(_is_number, point)):
+        raise ValueError(f"points: expected three numbers or null for {name!r:.60}")
+    x, y, z = point
+    if max(abs(x), abs(y), abs(z)) > _MAX_VALUE:
+        raise ValueError(f"points: expected coordinates of at most {_MAX_VALUE:g} for {name!r:.60}")
+    return x, y, z
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value of JSON is a number that NumPy can hold; true and false are none."""
+    return type(value) is float or (type(value) is int and abs(value) < 2**63)
+
+
+def sample_line(sample: Sample) -> bytes:
+    """The line of JSON of a sample, with its line break; points that were not seen are null."""
+    points = {name: point.tolist() if np.isfinite(point).all() else None for name, point in sample.points.items()}
+    return json.dumps({"time": sample.time, "points": points}).encode() + b"\n"
+
+
+@dataclasses.dataclass(frozen=True)
+class LiveArm:
+    """An arm of a person whose points arrive one sample at a time.
+
+    Attributes:
+      arms: names of the points of the arms that were found.
+      side: the arm that is followed, "left" or "right".
+      unit: of the points [m].
+      up: axis of the points that points up.
+      trunk: length of the upright link below the shoulder [m], see `arm_motion`.
+      turn: yaw, pitch and roll by which the person is turned [rad], see `turned`.
+      zero: frames of the links in the zero pose, see `ball_chain_xml`.
+    """
+
+    arms: dict[str, ArmPoints]
+    side: str
+    unit: float
+    up: str
+    trunk: float
+    turn: tuple[float, float, float]
+    zero: Float[np.ndarray, "links 3 3"] | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the points that a sample must have: those of the arm and the shoulders."""
+        groups = [*self.arms[self.side][1:], *(arm.shoulder for arm in self.arms.values())]
+        return tuple(dict.fromkeys(name for group in groups for name in group))
+
+    def has_all(self, sample: Sample) -> bool:
+        """Whether all points of the arm were seen."""
+        return all(name in sample.points and np.isfinite(sample.points[name]).all() for name in self.names)
+
+    def motion(self, samples: Sequence[Sample]) -> LinkMotion:
+        """Links of the arm in some samples, without a filter, which would delay them."""
+        links = arm_motion(self._body(samples), self.side, arms=self.arms, trunk=self.trunk, cutoff=np.inf)
+        return turned(links, *self.turn)
+
+    def _body(self, samples: Sequence[Sample]) -> PointMotion:
+        names = self.names
+        positions = np.array([[sample.points[name] for name in names] for sample in samples])
+        return PointMotion(names, (_NO_PARENT,) * len(names), z_up(positions, self.up) * self.unit, 1.0)
+
+    def pose(self, sample: Sample) -> Float[np.ndarray, " joints"]:
+        """Joint angles of the arm's model in a sample that has all points [rad].
+
+        Raises:
+          ValueError: points coincide, so that a link has no direction.
+        """
+        assert self.zero is not None, "the arm has no zero pose"
+        ends = link_ends_from_shoulder(
+            self._body([sample]), self.side, arms=self.arms, trunk=self.trunk, cutoff=np.inf
+        )[0]
+        span = np.diff(ends, axis=0) @ turn_matrix(*self.turn).T
+        length = np.linalg.norm(span, axis=1, keepdims=True)
+        if length.min() < _SHORTEST:
+            raise ValueError("points: expected those of a link apart")
+        return ball_chain_pose(span / length, self.zero)
+
+
+def find_live_arms(sample: Sample, unit: str, *, up: str = "z") -> dict[str, ArmPoints]:
+    """The arms among the points of a sample, by their names.
+
+    Args:
+      sample: the sample.
+      unit: "" for metres, which are then checked against the length of an adult's arm.
+      up: axis that points up.
+
+    Raises:
+      ValueError: no arm is complete, or the points are not in metres.
+    """
+    names = tuple(sample.points)
+    positions = np.array([[sample.points[name] for name in names]]).reshape(1, len(names), 3)
+    body = PointMotion(names, (_NO_PARENT,) * len(names), z_up(positions, up), 1.0)
+    arms = find_arms(body)
+    complete = {side: arm for side, arm in arms.items() if np.isfinite(arm_length(body, arm))} if arms else {}
+    if not arms:
+        raise ValueError(f"points: expected shoulder, elbow and wrist of an arm by their names, got {_few(names)}")
+    fitting = guessed_units(body, complete) if complete else ["m"]
+    if not unit and fitting != ["m"]:
+        lengths = ", ".join(f"{arm_length(body, arm):.4g}" for arm in complete.values())
+        known = f"in {' and '.join(fitting)}" if fitting else f"in none of {', '.join(UNITS)}"
+        raise ValueError(
+            f"points: expected metres, got arms {lengths} long, as an adult's {known}; capture.unit= sets the unit"
+        )
+    return arms
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (", ..." if len(names) > 5 else "") if names else "none"

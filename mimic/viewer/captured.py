@@ -1,0 +1,153 @@
+"""Captured motions that move the expert of a view: a clip that is played, or points that arrive. Need no browser."""
+
+import bisect
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.mocap.ball_chain import ball_chain_motion
+from mimic.mocap.link_motion import LinkMotion
+from mimic.mocap.live_points import LiveArm
+from mimic.mocap.point_socket import PointListener
+
+SILENCE = 1.0  # s without a sample, after which the sender counts as stopped
+PAUSE = 1.0  # s; after a longer one, the next pose may be anywhere
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Clip:
+    """Poses of a captured arm over time; between its parts, which gaps separate, it holds the last pose.
+
+    Attributes:
+      starts: time of each part [s], as it is played.
+      poses: [samples, joints] of each part [rad].
+      interval: time between samples [s], as it is played.
+    """
+
+    starts: Sequence[float]
+    poses: Sequence[Float[np.ndarray, "samples joints"]]
+    interval: float
+
+    @property
+    def duration(self) -> float:
+        """Time of the last sample [s]."""
+        return self.starts[-1] + (len(self.poses[-1]) - 1) * self.interval
+
+    def part(self, time: float) -> int:
+        """The part at a time [s], or the last one before it."""
+        return max(bisect.bisect_right(self.starts, time) - 1, 0)
+
+    def pose(self, time: float) -> Float[np.ndarray, " joints"]:
+        """Pose at a time [s], linear between samples [rad]."""
+        part = self.part(time)
+        poses = self.poses[part]
+        sample = float(np.clip((time - self.starts[part]) / self.interval, 0, len(poses) - 1))
+        before = min(int(sample), len(poses) - 2)
+        return poses[before] + (sample - before) * (poses[before + 1] - poses[before])
+
+
+def make_clip(
+    parts: Sequence[LinkMotion],
+    starts: Sequence[float],
+    zero: Float[np.ndarray, "links 3 3"],
+    *,
+    slow_down: float = 1.0,
+    cutoff: float,
+) -> Clip:
+    """The clip of a captured arm.
+
+    Args:
+      parts: motions of the arm, in the order of time.
+      starts: time of each part in the capture [s].
+      zero: see `ball_chain_xml`.
+      slow_down: factor on times.
+      cutoff: see `motion_states`.
+    """
+    poses = [ball_chain_motion(part, zero, cutoff=cutoff)[0] for part in parts]
+    return Clip([slow_down * (start - starts[0]) for start in starts], poses, slow_down / parts[0].rate)
+
+
+class ClipPlayer:
+    """Plays a clip.
+
+    Attributes:
+      time: since the start of the clip [s].
+      is_playing: whether time goes on.
+      repeats: whether it starts again at its end.
+    """
+
+    def __init__(self, clip: Clip):
+        self.clip = clip
+        self.time, self.is_playing, self.repeats = 0.0, True, True
+        self._jumped = self._changed = True
+
+    def advance(self, dt: float) -> tuple[np.ndarray | None, bool]:
+        """Advances by a time step [s]; returns the pose, None where it has not changed, and whether it jumped."""
+        before = self.clip.part(self.time)
+        if self.is_playing:
+            self._changed = True
+            if self.time >= self.clip.duration:
+                self.is_playing = self.repeats
+                self.go_to(0.0 if self.repeats else self.clip.duration)
+            else:
+                self.time = min(self.time + dt, self.clip.duration)
+        jumped = self._jumped or self.clip.part(self.time) != before
+        changed, self._changed, self._jumped = self._changed, False, False
+        return (self.clip.pose(self.time), jumped) if changed else (None, False)
+
+    def go_to(self, time: float) -> None:
+        """Continues at another time [s]; NaN is dropped."""
+        if math.isfinite(time):
+            self.time = float(np.clip(time, 0, self.clip.duration))
+            self._jumped = self._changed = True
+
+
+class PointFollower:
+    """Poses of an arm from the newest points of a listener.
+
+    Attributes:
+      incomplete: number of samples without all points of the arm; the arm stays where it is.
+    """
+
+    def __init__(self, listener: PointListener, arm: LiveArm):
+        self._listener, self._arm = listener, arm
+        self.incomplete = 0
+        self._paused = PAUSE  # s since the last pose
+
+    def advance(self, dt: float) -> tuple[np.ndarray | None, bool]:
+        """The pose of the newest sample, None where none has arrived, and whether there was a pause before it."""
+        self._paused += dt
+        sample = self._listener.take()
+        if sample is None:
+            return None, False
+        try:
+            pose = self._arm.pose(sample) if self._arm.has_all(sample) else None
+        except ValueError:  # points that coincide
+            pose = None
+        if pose is None:
+            self.incomplete += 1
+            return None, False
+        paused, self._paused = self._paused, 0.0
+        return pose, paused >= PAUSE
+
+    @property
+    def state(self) -> str:
+        """Whether points arrive, as a phrase."""
+        silence = self._listener.silence
+        if silence < SILENCE:
+            return "points arrive"
+        cause = "the sender is silent" if self._listener.is_connected else "no sender is connected"
+        return f"{cause}, the arms hold their pose"
+
+    @property
+    def summary(self) -> str:
+        """Numbers of samples, as a phrase."""
+        counts = self._listener.counts
+        faults = {
+            "bad lines": counts.bad, "without all points of the arm": self.incomplete,
+            "replaced by newer ones": counts.unused, "rejected connections": counts.rejected,
+        }  # fmt: skip
+        return ", ".join([f"{counts.received} samples", *(f"{n} {what}" for what, n in faults.items() if n)])

@@ -1,0 +1,177 @@
+"""Embodiments of several chains: against MuJoCo, against serial chains, and their matching."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.capsules import fit_capsules
+from mimic.arms.chain_match import matched_chains
+from mimic.arms.embodiment import load_mjcf, panda_path, segment_arm
+from mimic.metric.kinematics import body_twists, forward_kinematics, link_state_table, link_states
+from tests.helpers.original_model import package_file
+from tests.helpers.trees import TORSO_TIPS, hand, largest_error, torso
+
+GENERATED = {
+    "torso": (torso(2), TORSO_TIPS, {}),
+    "torso with a locked waist and elbow": (torso(), TORSO_TIPS, {"waist": 0.4, "left_joint1": -0.3}),
+    "hand of 19 joints": (hand(), ["*"], {}),
+    "locked hand": (hand(), ["*"], {"wrist": 0.2, "thumb_0": 0.5, "index_2": -0.3}),
+}
+# Models that others wrote, in packages that need not be installed.
+OTHERS = {
+    "Baxter": ("robosuite/models/assets/robots/baxter/robot.xml", ["left_hand", "right_hand"], {}),
+    "GR1's upper body": (
+        "robosuite/models/assets/robots/gr1/robot.xml",
+        ["left_eef", "right_eef", "head_pitch"],
+        {"torso_waist_roll": 0.1},
+    ),
+    "Shadow hand": ("gymnasium_robotics/envs/assets/hand/reach.xml", ["*"], {"robot0:WRJ0": 0.3, "robot0:FFJ3": 0.1}),
+}
+
+
+def tree(text=None, tips=TORSO_TIPS, **options):
+    return load_mjcf(mujoco.MjModel.from_xml_string(text or torso()), tip=tips, **options)
+
+
+def poses(arm, count=2, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1, 1, (count, arm.num_joints)), rng.normal(size=(count, arm.num_joints))
+
+
+@pytest.mark.parametrize("name", [*GENERATED, *OTHERS])
+def test_link_states_are_those_of_mujoco(x64, name):
+    if name in OTHERS:
+        file, tips, locked = OTHERS[name]
+        model = mujoco.MjModel.from_xml_path(str(package_file(file)))
+    else:
+        text, tips, locked = GENERATED[name]
+        model = mujoco.MjModel.from_xml_string(text)
+    arm = load_mjcf(model, tip=tips, locked=locked)
+    if name != "torso with a locked waist and elbow":  # its compilation takes longest
+        error = largest_error(model, arm, tips, locked, jax.jit(lambda q, v: link_states(arm, q, v, normalized=False)))
+        print(f"{name}: {arm.num_joints} joints, {arm.num_links} links, {len(arm.chains)} chains: off by {error:.1e}")
+        assert error < 1e-9
+    by_numpy = largest_error(model, arm, tips, locked, lambda q, v: _in_metres(arm, link_state_table(arm, q, v, float)))
+    assert by_numpy < 1e-9
+
+
+def _in_metres(arm, states):
+    length = float(arm.chain_length)
+    return states.replace(position=length * states.position, linear_velocity=length * states.linear_velocity)
+
+
+def test_a_tree_of_one_chain_is_that_chain_to_the_bit():
+    one, chain = (load_mjcf(panda_path(), tip=tip, locked=[3]) for tip in (["flange"], "flange"))
+    for name, leaf in vars(chain).items():
+        assert np.array_equal(getattr(one, name), leaf), name
+    # The same operations, so the same numbers at the same speed.
+    qpos, qvel = np.full(6, 0.1), np.full(6, 0.2)
+    programs = [str(jax.make_jaxpr(lambda *x, arm=arm: link_states(arm, *x))(qpos, qvel)) for arm in (one, chain)]
+    assert programs[0] == programs[1]
+
+
+def test_the_chain_length_is_that_of_the_longest_chain():
+    arm = tree()
+    lengths = [sum(arm.link_lengths[link] for link in chain) for chain in arm.chains]
+    assert arm.chain_names == ("left_hand", "right_hand")
+    assert float(arm.chain_length) == pytest.approx(max(lengths)) and lengths[1] > lengths[0]
+    assert float(jax.jit(lambda arm: arm.chain_length)(arm)) == pytest.approx(max(lengths))
+    assert float(segment_arm(arm).chain_length) == pytest.approx(max(lengths))
+
+
+def test_both_arms_hang_on_the_torso():
+    arm = tree()
+    waist = arm.joint_names.index("waist")
+    assert [arm.joint_names[j] for j in range(arm.num_joints) if arm.joint_parent[j] == waist] == [
+        "left_joint0",
+        "right_joint0",
+    ]
+    assert "neck" not in arm.joint_names
+    shared = set(arm.chains[0]) & set(arm.chains[1])
+    assert {arm.link_names[link] for link in shared} == {"base-waist"}
+
+
+def test_locked_joints_of_a_tree_keep_the_link_states():
+    locked = {"waist": 0.3, "left_joint1": -0.4}
+    free, held = tree(), tree(locked=locked)
+    (qpos,), (qvel,) = poses(free, 1)
+    for name, angle in locked.items():
+        qpos[free.joint_names.index(name)], qvel[free.joint_names.index(name)] = angle, 0
+    kept = [free.joint_names.index(name) for name in held.joint_names]
+    for a, b in zip(
+        jax.tree.leaves(link_state_table(free, qpos, qvel, float)),
+        jax.tree.leaves(link_state_table(held, qpos[kept], qvel[kept], float)),
+        strict=True,
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_body_twists_of_a_tree(x64):
+    arm = tree()
+    (qpos,), (qvel,) = poses(arm, 1)
+    rotations, states = (
+        np.asarray(forward_kinematics(arm, qpos).rotation),
+        link_states(arm, qpos, qvel, normalized=False),
+    )
+    expected = np.concatenate(
+        [np.einsum("lji,lj->li", rotations, np.asarray(x)) for x in (states.angular_velocity, states.linear_velocity)],
+        axis=1,
+    )
+    np.testing.assert_allclose(body_twists(arm, qpos, qvel), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("tips", "message"),
+    [
+        ([], "tip: expected one name or more"),
+        (["left_hand", "left_hand"], "tip: expected tips on different bodies"),
+        (["left_hand", "nose"], "no body 'nose'"),
+        (["left_hand", "stand"], "no revolute joint between base and tip"),
+    ],
+)
+def test_wrong_tips(tips, message):
+    with pytest.raises(ValueError, match=message):
+        tree(tips=tips)
+
+
+def test_wrong_tips_of_a_config():
+    with pytest.raises(ValueError, match="tip: expected the name of a body or site, or a list"):
+        ArmConfig(tip=[1, 2])
+
+
+def test_links_of_a_tree_are_not_merged():
+    with pytest.raises(ValueError, match="links: expected kept for a tree of 2 chains"):
+        tree(links="merged", locked=["waist"])
+
+
+@pytest.mark.parametrize(
+    ("expert", "learner", "pairs"),
+    [
+        (("left_hand", "right_hand"), ("r_wrist", "l_wrist"), ((0, 1), (1, 0))),
+        (("leftHand", "RightHand", "head"), ("right", "left"), ((0, 1), (1, 0))),
+        (("thumb", "index", "pinky"), ("robot0:ffdistal", "robot0:thdistal"), ((0, 1), (1, 0))),
+        (("a", "b"), ("c", "d"), ((0, 0), (1, 1))),
+        (("arm",), ("left_hand",), ((0, 0),)),
+    ],
+)
+def test_matched_chains(expert, learner, pairs):
+    assert matched_chains(expert, learner) == pairs
+
+
+def test_chains_in_their_order():
+    assert matched_chains(("left", "right"), ("right", "left"), "order") == ((0, 0), (1, 1))
+    with pytest.raises(ValueError, match="as many chains of the expert as of the learner"):
+        matched_chains(("a", "b"), ("c",))
+
+
+def test_capsules_of_both_arms_can_collide(tmp_path):
+    file = tmp_path / "torso.xml"
+    file.write_text(torso())
+    config = ArmConfig(model=str(file), tip=TORSO_TIPS)
+    capsules, arm = fit_capsules(config), build_arm(config).embodiment
+    joints = {(capsules.joint[i], capsules.joint[j]) for i, j in capsules.pairs}
+    last_left, first_right = (arm.joint_names.index(name) for name in ("left_joint2", "right_joint0"))
+    assert (last_left, first_right) in joints  # neighbours by number, not in the tree
+    assert not any(arm.joint_parent[b] == a or arm.joint_parent[a] == b for a, b in joints if min(a, b) >= 0)

@@ -1,0 +1,43 @@
+"""`python -m benchmarks.costs`: its motions, its weights, and the quantities of its rows."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+
+import mimic
+from benchmarks import costs as benchmark
+from mimic.metric.similarity import MEASURES
+from mimic.retargeting.costs import Costs
+
+
+def test_all_has_the_weight_of_each_row():
+    weights = {name: dataclasses.asdict(cost) for name, cost in benchmark.COSTS.items()}
+    total, plain = weights.pop("all"), weights.pop("none")
+    assert plain == dataclasses.asdict(Costs())
+    for name, weight in weights.items():
+        assert weight == plain | {name: total[name]} and weight[name] > 0
+
+
+def test_random_motions_stay_within_the_limits():
+    arm = mimic.panda(limits="hardware")
+    motions = benchmark.random_motions(arm, 3)
+    lower, upper = np.asarray(arm.joint_range, np.float32).T
+    assert motions.shape == (3, benchmark.STEPS, 7) and np.all((motions >= lower) & (motions <= upper))
+    assert np.abs(np.diff(motions, axis=1)).max() < 1.0  # rad in a step: no jump
+
+
+def test_rows_say_what_the_learner_does(monkeypatch):
+    """A learner that copies the free joints: its hand is off, and a step of its motion is that of the expert."""
+    free = [0, 1, 3, 4]
+
+    def copy(expert, learner, motion, **_):
+        return SimpleNamespace(qpos=motion[:, free], distance=np.full(len(motion), 0.5))
+
+    monkeypatch.setattr(mimic, "imitate_trajectory", copy)
+    kinds = {row["motions"]: row for row in benchmark.measure(2, ["none"])}
+    motions = benchmark.random_motions(mimic.panda(limits="hardware"), 2)[..., free]
+    row = kinds["random"]
+    np.testing.assert_allclose(row["step_rms"], np.sqrt(np.mean(np.diff(motions, axis=1) ** 2)), rtol=1e-5)
+    assert set(row["similarity"]) == set(MEASURES) and row["similarity"]["hand_position_error"] > 0.01
+    assert row["distance"] == 0.5 and 0 < row["below_floor"] < 1 and kinds["demonstrations"]["below_floor"] == 0

@@ -1,0 +1,92 @@
+"""Where the learner starts its episodes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.envs.demonstrations import Demonstrations
+from mimic.envs.imitation import ImitationEnv, training_and_held_out
+from mimic.envs.start_poses import nearest_poses
+from mimic.envs.wrappers import fresh_episodes
+from mimic.evaluation.evaluator import Evaluator
+from mimic.evaluation.rollout_frames import RolloutFrames
+from mimic.evaluation.searched_torques import _task
+
+SETTINGS = {"demonstrations": {"count": 3, "held_out": 2}, "horizon": 6}
+
+
+def moved(demonstrations, seed):
+    """The same motions, each around another pose, where they start."""
+    offsets = np.random.default_rng(seed).uniform(-1, 1, (demonstrations.count, 1, demonstrations.qpos.shape[2]))
+    values = {name: getattr(demonstrations, name) for name in ("dt", "arm", "joint_names", "qvel")}
+    return Demonstrations(qpos=demonstrations.qpos + offsets, goals=demonstrations.goals + offsets[:, 0], **values)
+
+
+@pytest.fixture(scope="module")
+def evaluator():
+    config = mimic.env_config("planar4dof", start="nearest", **SETTINGS)
+    training, held_out = training_and_held_out(config)
+    return Evaluator(ImitationEnv(config, moved(training, 0)), moved(held_out, 1))
+
+
+def distance_of(env, demonstration, qpos):
+    zero = jnp.zeros((), jnp.int32)
+    return float(env.distance(jnp.asarray(qpos), jnp.zeros(len(qpos)), jnp.asarray(demonstration), zero))
+
+
+def test_each_episode_starts_at_rest_in_the_nearest_pose_of_its_demonstration(evaluator):
+    env = evaluator.env
+    for demonstration in range(env.demonstrations.count):
+        start = env.start(jax.random.PRNGKey(0), demonstration)
+        np.testing.assert_array_equal(start.qpos, env.start_poses[demonstration])
+        assert not np.any(start.qvel)
+        # Of the static distance: the expert's velocity at its first step is zero here.
+        poses = np.random.default_rng(0).normal(start.qpos, 0.3, (20, env.action_size)).astype(np.float32)
+        nearest = distance_of(env, demonstration, start.qpos)
+        assert nearest < min(distance_of(env, demonstration, pose) for pose in poses)
+        assert nearest < distance_of(env, demonstration, env.learner.home) - 0.05
+        np.testing.assert_allclose(env.begin(start).obs, env.observe(start), atol=1e-6)
+
+
+def test_an_equal_arm_starts_where_the_expert_does():
+    arm = mimic.panda()
+    qpos = np.random.default_rng(0).uniform(-1, 1, (3, arm.num_joints))
+    env = mimic.make("panda7dof", physics="fused", **SETTINGS)
+    poses = nearest_poses(arm, arm, qpos, env.metric.arguments)
+    states, expert = (mimic.link_states(arm, jnp.asarray(q, jnp.float32)) for q in (poses[0], qpos[0]))
+    assert float(env.states_distance(expert, states)) < 1e-3
+
+
+def test_holding_the_start_pose_and_videos_begin_there(evaluator):
+    env = evaluator.env
+    still = np.tile(env.start_poses[:, None], (1, 6, 1))
+    held = [
+        [float(env.distance(still[i, t], jnp.zeros(4), jnp.asarray(i), jnp.asarray(t + 1))) for t in range(6)]
+        for i in range(env.demonstrations.count)
+    ]
+    np.testing.assert_allclose(evaluator.hold_distance, held, atol=1e-5)
+    rollouts = jax.jit(lambda: evaluator.rollout(lambda state: jnp.zeros(4)))()
+    frames = RolloutFrames(evaluator, rollouts, 1, 30)
+    np.testing.assert_allclose(frames.learner[0], env.start_poses[1], atol=1e-6)
+    np.testing.assert_array_equal(_task(env, np.array([2, 0])).start, env.start_poses[[2, 0]])
+
+
+def test_episodes_that_restart_do_so_where_their_demonstration_starts(evaluator):
+    env = evaluator.env
+    episodes = fresh_episodes(env)
+    state = episodes.reset(jax.random.split(jax.random.PRNGKey(0), 8))
+    again = env.restart_done(state.replace(done=jnp.ones(8)))
+    for states in (state, again):
+        arm = states.pipeline_state
+        np.testing.assert_array_equal(arm.qpos, env.start_poses[np.asarray(arm.demonstration)])
+        np.testing.assert_allclose(states.obs, jax.vmap(env.observe)(arm), atol=1e-6)
+
+
+def test_home_is_the_default_and_other_names_are_rejected():
+    env = mimic.make("planar4dof", **SETTINGS)
+    assert env.config.start == "home"
+    np.testing.assert_array_equal(env.start_poses, np.tile(np.float32(env.learner.home), (3, 1)))
+    with pytest.raises(ValueError, match="start: expected one of home, nearest"):
+        mimic.env_config("planar4dof", start="first")
