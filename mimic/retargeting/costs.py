@@ -130,7 +130,7 @@ def hand_cost(
 
 def tip_positions(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, "chains 3"]:
     """End of the last segment of each chain [m]."""
-    frames, tips = joint_frames(arm, qpos, None), []
+    frames, tips = joint_frames(arm, jnp.asarray(qpos), None), []
     for chain in arm.chains:
         joint = arm.link_joint[chain[-1]]
         last = max(segment for segment, link in enumerate(arm.segment_link) if link == chain[-1])
