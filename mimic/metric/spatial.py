@@ -169,6 +169,12 @@ def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:
     return row(0), row(1), row(2)
 
 
+def stack_batches(vectors: Sequence[Vector], batch: Float[Array, " n"]) -> Float[Array, "vectors 3 n"]:
+    """One array of vectors whose components are numbers or batches with the shape and type of `batch`."""
+    scalars = compat.computed_once([jnp.zeros_like(batch) + x for vector in vectors for x in vector])
+    return jnp.stack([jnp.stack(scalars[i : i + 3]) for i in range(0, len(scalars), 3)])
+
+
 def stack(vectors: Sequence[Sequence[Scalar]], dtype: Any) -> Float[Array, "n m"]:
     """One array of rows of scalars."""
     scalars = [jnp.asarray(x, dtype) for row in vectors for x in row]

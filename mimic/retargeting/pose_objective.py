@@ -132,7 +132,7 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
         assert states.direction is not None
         direction = states.direction[directed]
         if angles is None:
-            turned = np.pi / 2 * directions.sum() - jnp.vdot(target.strengths[:, None] * target.units, direction)
+            turned = np.pi / 2 * directions.sum() - jnp.sum(target.strengths[:, None] * target.units * direction)
         else:
             sine = jnp.cross(direction, target.units)
             cosine = jnp.sum(direction * target.units, axis=-1)

@@ -1,5 +1,7 @@
 """Descents from several guesses: one loop on a CPU, two elsewhere, and the same poses."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,7 @@ EXPERT, LEARNER = planar_arm([0.4, 0.35, 0.25]), planar_arm([0.6, 0.4])
 def descend(guesses, *, kept, static=True):
     """Best descents of three poses from guesses [guesses, 2, 3]; so short that each guess ends elsewhere."""
     metric = MetricConfig().build(EXPERT, LEARNER)
-    weights = metric.weights if static else lambda _: metric.weights
+    weights: Any = metric.weights if static else lambda _: metric.weights
     objective = pose_objective(LEARNER, Metric(metric.correspondence, weights))
     poses = jnp.asarray(np.random.default_rng(0).uniform(-3, 3, (3, 3)), guesses.dtype)
     targets = jax.vmap(objective.target, -1, -1)(resting_link_states(EXPERT, poses.T))
