@@ -98,7 +98,7 @@ def test_stored_values_are_those_of_the_function_in_half_as_many_arrays(count):
     for _ in range(3):
         expected = sum(parts(expected)["arrays"])
     np.testing.assert_allclose(loop(x), expected)
-    gradient = jax.grad(lambda x: loop(x).sum())(x)
+    gradient = jax.grad(lambda x: jnp.sum(loop(x)))(x)
     np.testing.assert_allclose(gradient, count**3)
     (scan,) = [e for e in jax.make_jaxpr(loop)(x).eqns if e.primitive.name == "scan"]
     (cond,) = [e for e in scan.params["jaxpr"].jaxpr.eqns if e.primitive.name == "cond"]

@@ -110,12 +110,13 @@ def _descend_in_one_loop(
 ) -> Solution:
     kept = descents.kept or len(guesses)
     rounds = _rounds(guesses, kept)
-    repeated = np.arange(kept)[:, None] >= kept - -len(guesses) % kept  # lanes of the last round
+    repetitions = rounds.shape[0] * kept - len(guesses)  # the last lanes of the last round
+    is_repeated = np.arange(kept)[:, None] >= kept - repetitions
 
     def begin(carry: tuple[NewtonState, Solution], step: _Step) -> tuple[NewtonState, Solution]:
         state, best = carry
         ends = solution_at(state, limits)
-        ends = ends._replace(value=jnp.where(step.is_last & repeated, jnp.inf, ends.value))
+        ends = ends._replace(value=jnp.where(step.is_last & is_repeated, jnp.inf, ends.value))
         best = _best_lanes(jax.tree.map(lambda *x: jnp.concatenate(x, axis=-2), best, ends), kept)
         guess = jax.lax.dynamic_index_in_dim(rounds, step.round, keepdims=False)
         return newton_start(jnp.where(step.is_last, best.qpos, guess), limits), best
