@@ -86,7 +86,7 @@ def imitate_pose(
       method: "newton" or "gradient_descent".
       iterations: of each descent; where None, 16 for Newton's method and 1000 for gradient descent.
       kept: number of best descents that continue after a third of the iterations. None continues all, which doubles
-        the computation but halves the compilation.
+        the computation; on a GPU it halves the compilation.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
       costs: see `Costs`; None for the embodiment distance alone. The returned distance is without them.
