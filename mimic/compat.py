@@ -122,7 +122,14 @@ def computed_once(scalars: list[Any]) -> list[Any]:
     """
     import jax
 
-    return scalars if jax.default_backend() == "cpu" else jax.lax.optimization_barrier(scalars)
+    return scalars if is_cpu() else jax.lax.optimization_barrier(scalars)
+
+
+def is_cpu() -> bool:
+    """Whether JAX's default backend is the CPU."""
+    import jax
+
+    return jax.default_backend() == "cpu"
 
 
 def stored(index: Any, function: Callable[[Any], Any], argument: Any) -> Any:
@@ -132,30 +139,50 @@ def stored(index: Any, function: Callable[[Any], Any], argument: Any) -> Any:
     in common once for each: a Newton step 5 times, its sines 30 times. It removes `jax.lax.optimization_barrier` before
     it fuses, but not a conditional. GPUs, where a conditional costs more, do without.
 
+    A kernel of this backend has one result, so pairs of real numbers are stored as complex ones: half the kernels, and
+    half the computation that they repeat.
+
     Args:
-      index: of the loop, from 0 on; the same in a whole batch.
+      index: of the loop, from 0 on; the same in a whole batch. Not constants: XLA would see that they are not negative.
       function: from a pytree of arrays to a pytree of arrays and Python numbers.
       argument: of the function.
     """
     import jax
 
-    if jax.default_backend() != "cpu":
+    if not is_cpu():
         return function(argument)
-    result: Any = None  # that of the trace: its Python numbers, and the shapes of its arrays
+    result: Any = None  # that of the trace: its Python numbers, and the types of its arrays
+    stored_types: list[Any] | None = None
 
     def arrays_of(argument: Any) -> list[Any]:
-        nonlocal result
+        nonlocal result, stored_types
         value = function(argument)
         result = jax.tree.map(lambda x: x if _is_number(x) else jax.ShapeDtypeStruct(x.shape, x.dtype), value)
-        return [leaf for leaf in jax.tree.leaves(value) if not _is_number(leaf)]
+        arrays = _in_pairs([leaf for leaf in jax.tree.leaves(value) if not _is_number(leaf)])
+        stored_types = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
+        return arrays
 
-    def never(_: Any) -> list[Any]:
-        if result is None:
-            jax.eval_shape(arrays_of, argument)
-        return [jax.numpy.zeros(x.shape, x.dtype) for x in jax.tree.leaves(result) if not _is_number(x)]
+    def never(argument: Any) -> list[Any]:
+        types = stored_types or jax.eval_shape(arrays_of, argument)
+        return [jax.numpy.zeros(x.shape, x.dtype) for x in types]
 
-    arrays = iter(jax.lax.cond(index >= 0, arrays_of, never, argument))
+    arrays = iter(_from_pairs(jax.lax.cond(index >= 0, arrays_of, never, argument)))
     return jax.tree.map(lambda x: x if _is_number(x) else next(arrays), result)
+
+
+def _in_pairs(arrays: list[Any]) -> list[Any]:
+    """Real arrays as half as many complex ones; the last one stays real if their number is odd."""
+    import jax
+
+    pairs = zip(arrays[::2], arrays[1::2], strict=False)
+    return [jax.lax.complex(*pair) for pair in pairs] + arrays[len(arrays) // 2 * 2 :]
+
+
+def _from_pairs(arrays: list[Any]) -> list[Any]:
+    import jax
+
+    is_complex = jax.numpy.iscomplexobj
+    return [part for x in arrays for part in ([jax.lax.real(x), jax.lax.imag(x)] if is_complex(x) else [x])]
 
 
 def _is_number(value: Any) -> bool:

@@ -6,6 +6,9 @@ import os
 import subprocess
 import sys
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from hydra.core.config_store import ConfigStore
 
@@ -73,3 +76,30 @@ def test_the_cpu_flag_speeds_up_kinematics(capsys):
     with capsys.disabled():
         print(f"\nspeed-up of MJX kinematics by the CPU flag: {seconds[1] / seconds[0]:.0f} times")
     assert seconds[1] > 5 * seconds[0]  # several hundred times where it was measured first; 5 is beyond noise
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_stored_values_are_those_of_the_function_in_half_as_many_arrays(count):
+    """Pairs become complex numbers, because a kernel of XLA's CPU backend has one result."""
+
+    def parts(x):
+        return {"arrays": [x + k for k in range(count)], "number": 2.0}
+
+    def loop(x):
+        def step(total, index):
+            result = compat.stored(index, parts, total)
+            assert result["number"] == 2.0
+            return sum(result["arrays"]), None
+
+        return jax.lax.scan(step, x, jnp.arange(3))[0]
+
+    x = jnp.array([0.5, -1.0])
+    expected = x
+    for _ in range(3):
+        expected = sum(parts(expected)["arrays"])
+    np.testing.assert_allclose(loop(x), expected)
+    gradient = jax.grad(lambda x: jnp.sum(loop(x)))(x)
+    np.testing.assert_allclose(gradient, count**3)
+    (scan,) = [e for e in jax.make_jaxpr(loop)(x).eqns if e.primitive.name == "scan"]
+    (cond,) = [e for e in scan.params["jaxpr"].jaxpr.eqns if e.primitive.name == "cond"]
+    assert len(cond.outvars) == (count + 1) // 2

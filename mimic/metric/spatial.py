@@ -13,6 +13,8 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from mimic import compat
@@ -55,7 +57,7 @@ def times(x: Scalar, y: Scalar) -> Scalar:
                 return 0.0
             if abs(constant) == 1:
                 return other if constant > 0 else -other
-    return x * y
+    return lax.mul(x, y) if _are_alike(x, y) else x * y
 
 
 def plus(x: Scalar, y: Scalar) -> Scalar:
@@ -64,7 +66,7 @@ def plus(x: Scalar, y: Scalar) -> Scalar:
         return y
     if isinstance(y, float) and y == 0:
         return x
-    return x + y
+    return lax.add(x, y) if _are_alike(x, y) else x + y
 
 
 def minus(x: Scalar, y: Scalar) -> Scalar:
@@ -73,7 +75,14 @@ def minus(x: Scalar, y: Scalar) -> Scalar:
         return times(-1.0, y)
     if isinstance(y, float) and y == 0:
         return x
-    return x - y
+    return lax.sub(x, y) if _are_alike(x, y) else x - y
+
+
+def _are_alike(x: Scalar, y: Scalar) -> bool:
+    """Whether both are traced with one shape and type, so that operations of `jax.lax` apply: they trace faster."""
+    if not (isinstance(x, Tracer) and isinstance(y, Tracer)):
+        return False
+    return x.aval.shape == y.aval.shape and x.aval.dtype == y.aval.dtype  # type: ignore[attr-defined]
 
 
 def add(a: Vector, b: Vector) -> Vector:
@@ -158,6 +167,12 @@ def axis_rotation(axis: Vector, angle: Scalar) -> Rotation:
         return entry(i, 0), entry(i, 1), entry(i, 2)
 
     return row(0), row(1), row(2)
+
+
+def stack_batches(vectors: Sequence[Vector], batch: Float[Array, " n"]) -> Float[Array, "vectors 3 n"]:
+    """One array of vectors whose components are numbers or batches with the shape and type of `batch`."""
+    scalars = compat.computed_once([jnp.zeros_like(batch) + x for vector in vectors for x in vector])
+    return jnp.stack([jnp.stack(scalars[i : i + 3]) for i in range(0, len(scalars), 3)])
 
 
 def stack(vectors: Sequence[Sequence[Scalar]], dtype: Any) -> Float[Array, "n m"]:

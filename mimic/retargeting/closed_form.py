@@ -5,8 +5,8 @@ p towards points p_i with weights w_i. Up to a constant of the expert, the dista
 
     sum_i c_i f(e . t_i) + sum_i w_i h(|p - p_i|)        with a smoothed length, h(d) = sqrt(d^2 + s^2) - s.
 
-f is 1 - e . t for the cosine, or a smoothed angle, f(x) = arccos(k x) - arccos(k), k = 1 / (1 + a^2 / 2): near a match
-it is h of the angle with s = a, and also smooth where both are opposite. It has a derivative of c_i f' e x t_i with
+f is 1 - e . t for the cosine, or a smoothed angle, f(x) = arccos(x cos a) - a: near a match it is h of the angle with
+s = a, and it is also smooth where both are opposite. It has a derivative of c_i f' e x t_i with
 respect to a rotation, and c_i f'' (e x t_i)(e x t_i)^T in the second one.
 
 A length has a kink at 0, where Newton's method would divide by it; a sum of lengths often has its minimum there, at
@@ -22,17 +22,29 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 
 from mimic.metric import spatial
+from mimic.metric.distance import RotationMeasure
 from mimic.metric.spatial import Rotation, Scalar, Vector
 from mimic.retargeting.optimizers import Derivatives
 
-# s [chain lengths]. Newton steps overshoot a kink that is many s away, so a descent begins with the rough smoothing.
+
+class Smoothing(NamedTuple):
+    """Smoothing of the distance.
+
+    Attributes:
+      length: s [chain lengths].
+      angle: a [rad]; of no effect on the cosine.
+    """
+
+    length: Scalar
+    angle: Scalar
+
+
+# Newton steps overshoot a kink that is many s away, so a descent begins with the rough smoothing.
 # Panda 7 to 4, weights (2, 1), 16 steps: 93 % of 256 poses converge with 1e-3 alone, 98 % with both; 1e-2 alone leaves
 # more than 1e-4 of distance on 55 % of them, both on 3 %; with 1e-4 alone 89 % converge.
-ROUGH_SMOOTHING, SMOOTHING = 1e-2, 1e-3
-ROUGH_ANGLE_SMOOTHING, ANGLE_SMOOTHING = 0.1, 0.01  # a [rad]
+ROUGH_SMOOTHING, SMOOTHING = Smoothing(1e-2, 0.1), Smoothing(1e-3, 0.01)
 
 Symmetric = tuple[Scalar, ...]  # xx, xy, xz, yy, yz, zz of a symmetric 3x3 matrix
 _NONE: Symmetric = (0.0,) * 6
@@ -82,7 +94,7 @@ class _Load(NamedTuple):
     angular: Symmetric = _NONE
 
 
-def smoothed_length(square: Scalar, smoothing: float) -> Scalar:
+def smoothed_length(square: Scalar, smoothing: Scalar) -> Scalar:
     """Smoothed length h [chain lengths] from the square of the length, without cancellation at 0."""
     return square / (jnp.sqrt(square + smoothing**2) + smoothing)
 
@@ -92,9 +104,10 @@ def static_derivatives(
     anchors: Sequence[Vector],
     links: Sequence[Body],
     pulls: Sequence[Pull],
-    smoothing: float,
     parents: Sequence[int],
-    angle_smoothing: float | None = None,
+    smoothing: Smoothing,
+    *,
+    rotation: RotationMeasure = "cosine",
 ) -> Derivatives:
     """Derivatives of the static distance, whose value is up to a constant of the pulls.
 
@@ -108,9 +121,9 @@ def static_derivatives(
       anchors: a point on each axis [chain lengths].
       links: links of the learner.
       pulls: pull on each link.
-      smoothing: s [chain lengths].
       parents: index of each joint's parent, -1 for a joint at the base.
-      angle_smoothing: a [rad] where the measure of directions is their angle; None where it is the cosine.
+      smoothing: s and a.
+      rotation: measure of directions.
     """
     moments = [spatial.cross(anchor, axis) for anchor, axis in zip(anchors, axes, strict=True)]
     gradient, rows = [], []
@@ -119,8 +132,8 @@ def static_derivatives(
         load = of_children.get(joint, _Load())
         for link, pull in zip(links, pulls, strict=True):
             if link.joint == joint:
-                load = _add_directions(load, link.direction, pull, angle_smoothing)
-                load = _add_position(load, link.position, pull, smoothing)
+                load = _add_directions(load, link.direction, pull, rotation, smoothing.angle)
+                load = _add_position(load, link.position, pull, smoothing.length)
         axis, moment = axes[joint], moments[joint]
         local = spatial.add_outer(load.moment, spatial.scale(-1.0, anchors[joint]), load.force)
         gradient.append(spatial.dot(axis, _twice_antisymmetric(local)))
@@ -156,42 +169,38 @@ def _total(a: _Load, b: _Load) -> _Load:
     )
 
 
-def _add_directions(load: _Load, direction: Vector, pull: Pull, angle_smoothing: float | None) -> _Load:
+def _add_directions(load: _Load, direction: Vector, pull: Pull, rotation: RotationMeasure, smoothing: Scalar) -> _Load:
     for unit, strength in zip(pull.units, pull.strengths, strict=True):
-        if angle_smoothing is None:
+        if rotation == "cosine":
             difference = spatial.subtract(direction, unit)  # |e - t|^2 / 2 = 1 - e . t, exactly 0 at a match
             value, slope = 0.5 * strength * spatial.dot(difference, difference), -strength
         else:
             cross = spatial.cross(direction, unit)
-            value, slope, curvature = (
-                strength * x for x in _angle_derivatives(direction, unit, cross, angle_smoothing)
-            )
+            value, slope, curvature = (strength * x for x in _angle_derivatives(direction, unit, cross, smoothing))
             load = load._replace(angular=tuple(map(spatial.plus, load.angular, _outer(curvature, cross))))
         moment = spatial.add_outer(load.moment, spatial.scale(slope, direction), unit)
         load = load._replace(value=spatial.plus(load.value, value), moment=moment)
     return load
 
 
-def smoothed_angle(cosine: Scalar, sine_square: Scalar, smoothing: float) -> Scalar:
+def smoothed_angle(cosine: Scalar, sine_square: Scalar, smoothing: Scalar) -> Scalar:
     """Smoothed angle f [rad] of two unit vectors, from e . t and |e x t|^2."""
-    factor = 1 / (1 + 0.5 * smoothing**2)
-    return jnp.arctan2(_scaled_sine(sine_square, factor), factor * cosine) - np.arccos(factor)
+    return jnp.arctan2(_smoothed_sine(sine_square, smoothing), jnp.cos(smoothing) * cosine) - smoothing
 
 
-def _angle_derivatives(a: Vector, b: Vector, cross: Vector, smoothing: float) -> tuple[Scalar, Scalar, Scalar]:
+def _angle_derivatives(a: Vector, b: Vector, cross: Vector, smoothing: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """Smoothed angle of two unit vectors, and its first and second derivative with respect to their cosine."""
-    factor = 1 / (1 + 0.5 * smoothing**2)
     cosine, square = spatial.dot(a, b), spatial.dot(cross, cross)
-    slope = -factor / _scaled_sine(square, factor)
+    slope = -jnp.cos(smoothing) / _smoothed_sine(square, smoothing)
     return smoothed_angle(cosine, square, smoothing), slope, cosine * slope**3
 
 
-def _scaled_sine(sine_square: Scalar, factor: float) -> Scalar:
-    """sqrt(1 - k^2 cos^2), without cancellation at 0."""
-    return jnp.sqrt((1 - factor**2) + factor**2 * sine_square)
+def _smoothed_sine(sine_square: Scalar, smoothing: Scalar) -> Scalar:
+    """sqrt(1 - (e . t)^2 cos^2 a), without cancellation at 0."""
+    return jnp.sqrt(jnp.sin(smoothing) ** 2 + jnp.cos(smoothing) ** 2 * sine_square)
 
 
-def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: float) -> _Load:
+def _add_position(load: _Load, position: Vector, pull: Pull, smoothing: Scalar) -> _Load:
     if not pull.points or all(isinstance(x, float) for x in position):  # such a position cannot move
         return load
     value, force, stiffness = load.value, spatial.ZERO, _NONE

@@ -15,6 +15,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.metric import spatial
 from mimic.metric.kinematics import LinkStates, forward_kinematics, joint_frames
 from mimic.ranges import check_ranges, number
+from mimic.retargeting.closed_form import SMOOTHING, Smoothing
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 from mimic.retargeting.pose_objective import PoseObjective, Target
 
@@ -129,7 +130,7 @@ def hand_cost(
 
 def tip_positions(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, "chains 3"]:
     """End of the last segment of each chain [m]."""
-    frames, tips = joint_frames(arm, qpos, None), []
+    frames, tips = joint_frames(arm, jnp.asarray(qpos), None), []
     for chain in arm.chains:
         joint = arm.link_joint[chain[-1]]
         last = max(segment for segment, link in enumerate(arm.segment_link) if link == chain[-1])
@@ -217,18 +218,12 @@ def with_costs(
     def value(target: Target, states: LinkStates) -> Array:  # of initial guesses, so without the costs
         return objective.value(target[0], states)
 
-    def added(derivatives: Callable[..., Derivatives]) -> Callable[..., Derivatives]:
-        def total(target: Target, qpos: Scalars, store: Store = call) -> Derivatives:
-            base = derivatives(target[0], qpos, store)
-            cost = automatic_derivatives(lambda q: pose_cost(costs, expert, learner, capsules, target[1], q), qpos)
-            return sum_of(base, cost)
+    def total(target: Target, qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING) -> Derivatives:
+        base = objective.derivatives(target[0], qpos, store, smoothing)
+        cost = automatic_derivatives(lambda q: pose_cost(costs, expert, learner, capsules, target[1], q), qpos)
+        return sum_of(base, cost)
 
-        return total
-
-    fine = added(objective.derivatives)
-    is_same = objective.rough_derivatives is objective.derivatives
-    rough = fine if is_same else added(objective.rough_derivatives)
-    return dataclasses.replace(objective, target=target, value=value, derivatives=fine, rough_derivatives=rough)
+    return dataclasses.replace(objective, target=target, value=value, derivatives=total, is_elementwise=False)
 
 
 def automatic_derivatives(function: Callable[[Array], Array], qpos: Scalars) -> Derivatives:

@@ -15,6 +15,7 @@ from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.retargeting.pose_objective import PoseObjective, Target
 
 _POSES = 256  # random poses whose distances are compared to choose the initial guesses
+_TYPICAL_POSES = 16  # at least; of these, whose mean distance is the scale of the metric
 
 
 class RandomPoses(NamedTuple):
@@ -79,10 +80,11 @@ def _range(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def typical_distance(objective: PoseObjective, expert_states: LinkStates, candidates: RandomPoses) -> Float[Array, ""]:
+def typical_distance(objective: PoseObjective, target: Target, candidates: RandomPoses) -> Float[Array, ""]:
     """Mean distance of random poses to a pose of the expert: the scale of the metric."""
-    distance = jax.vmap(jax.vmap(lambda learner_states: objective.distance(expert_states, learner_states)))
-    return distance(jax.tree.map(jnp.asarray, candidates.states)).mean()
+    count = -(-_TYPICAL_POSES // candidates.qpos.shape[0])
+    some = jax.tree.map(lambda x: jnp.asarray(x[:, :count]), candidates.states)
+    return jax.vmap(jax.vmap(functools.partial(objective.value, target)))(some).mean()
 
 
 def initial_guesses(

@@ -1,6 +1,7 @@
-"""Minimisers of a smooth function of joint angles within limits, from one start; batch them with `jax.vmap`.
+"""Minimisers of a smooth function of joint angles within limits, from one start or from a batch of them.
 
-They compute on scalar components (see `mimic.metric.spatial`), so that a batch of descents is elementwise.
+They compute on scalar components (see `mimic.metric.spatial`), so that a batch of descents is elementwise: its lanes
+are the last axes of the start, and the objective gets joint angles of the shape of the lanes.
 """
 
 import functools
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic import compat
-from mimic.metric.spatial import Scalar, plus, times
+from mimic.metric.spatial import Scalar, minus, plus, times
 
 _MAX_STEP = 1.0  # rad, of a joint in one Newton step
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: initial value, factors after a success and a failure
@@ -43,14 +44,14 @@ class Solution(NamedTuple):
     """Result of a descent.
 
     Attributes:
-      qpos: [joints] [rad].
-      value: of the objective at this pose.
-      gradient_norm: maximum absolute derivative with respect to a joint that no limit holds.
+      qpos: [joints, *lanes] [rad].
+      value: [*lanes] of the objective at this pose.
+      gradient_norm: [*lanes] maximum absolute derivative with respect to a joint that no limit holds.
     """
 
-    qpos: Float[Array, " joints"]
-    value: Float[Array, ""]
-    gradient_norm: Float[Array, ""]
+    qpos: Float[Array, "joints *lanes"]
+    value: Float[Array, "*lanes"]
+    gradient_norm: Float[Array, "*lanes"]
 
 
 # Derivatives at joint angles. The second argument is a `Store`.
@@ -64,33 +65,63 @@ def call(function: Callable[[Any], Any], argument: Any) -> Any:
     return function(argument)
 
 
-def newton(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> Solution:
+class NewtonState(NamedTuple):
+    """State of a Newton descent.
+
+    Attributes:
+      qpos: joint angles [rad], as scalar components.
+      here: derivatives at these; a value of infinity before the first evaluation.
+      damping: of the Hessian.
+    """
+
+    qpos: tuple[Scalar, ...]
+    here: Derivatives
+    damping: Scalar
+
+
+def newton(objective: Objective, start: Float[Array, "joints *lanes"], limits: Limits, iterations: int) -> Solution:
     """Damped Newton descent with the exact second derivative and negative curvature flipped (saddle-free Newton)."""
+
+    def iterate(state: NewtonState, index: Array) -> tuple[NewtonState, None]:
+        return newton_step(objective, state, limits, index), None
+
+    state, _ = jax.lax.scan(iterate, newton_start(start, limits), jnp.arange(iterations + 1))
+    return solution_at(state, limits)
+
+
+def newton_start(start: Float[Array, "joints *lanes"], limits: Limits) -> NewtonState:
+    """The state before the first step, which is zero and evaluates the start, whose value is below infinity."""
     joints = start.shape[0]
-    bounds = _bounds(limits, joints)
-
-    def iterate(carry: Any, index: Array) -> tuple[Any, None]:
-        qpos, here, damping = carry
-        store = functools.partial(compat.stored, index)
-        free = _free(qpos, here.gradient, bounds)
-        step = _descent_step(here, free, damping)
-        scale = 1 / jnp.maximum(_max_abs(step) / _MAX_STEP, 1.0)
-        new_qpos = _within([q + s * scale for q, s in zip(qpos, step, strict=True)], bounds)
-        there = store(lambda qpos: _symmetric(objective(qpos, store)), new_qpos)
-        better = there.value < here.value
-        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), (new_qpos, there), (qpos, here))
-        return (*kept, damping * jnp.where(better, _LESS, _MORE)), None
-
-    qpos = _within([start[k] for k in range(joints)], bounds)
-    # The start is not evaluated yet: the first step is zero, and its value is below infinity.
     zero = jnp.zeros_like(start[0])
     unevaluated = Derivatives(zero + jnp.inf, (zero,) * joints, tuple((zero,) * (k + 1) for k in range(joints)))
-    initial = qpos, unevaluated, zero + _FIRST_DAMPING / _LESS
-    (qpos, here, _), _ = jax.lax.scan(iterate, initial, jnp.arange(iterations + 1))
-    return _solution(qpos, here, bounds)
+    return NewtonState(_within(list(start), _bounds(limits, joints)), unevaluated, zero + _FIRST_DAMPING / _LESS)
 
 
-def gradient_descent(objective: Objective, start: Float[Array, " joints"], limits: Limits, iterations: int) -> Solution:
+def newton_step(objective: Objective, state: NewtonState, limits: Limits, index: Any) -> NewtonState:
+    """One step, which is undone where the objective does not get smaller.
+
+    Args:
+      objective: to minimise.
+      state: before the step.
+      limits: of the joints [rad].
+      index: of a loop, for `mimic.compat.stored`.
+    """
+    qpos, here, damping = state
+    bounds = _bounds(limits, len(qpos))
+    store = functools.partial(compat.stored, index)
+    free = _free(qpos, here.gradient, bounds)
+    step = _descent_step(here, free, damping)
+    scale = 1 / jnp.maximum(_max_abs(step) / _MAX_STEP, 1.0)
+    new_qpos = _within([q + s * scale for q, s in zip(qpos, step, strict=True)], bounds)
+    there = store(lambda qpos: _symmetric(objective(qpos, store)), new_qpos)
+    better = there.value < here.value
+    best_qpos, best = jax.tree.map(functools.partial(jnp.where, better), (new_qpos, there), (qpos, here))
+    return NewtonState(best_qpos, best, damping * jnp.where(better, _LESS, _MORE))
+
+
+def gradient_descent(
+    objective: Objective, start: Float[Array, "joints *lanes"], limits: Limits, iterations: int
+) -> Solution:
     """Gradient descent with a constant step size (paper)."""
     bounds = _bounds(limits, start.shape[0])
 
@@ -117,14 +148,14 @@ def _descent_step(here: Derivatives, free: Scalars, damping: Scalar) -> Scalars:
         below = [matrix[i][k] for i in range(joints) if i > k]
         for i in range(k + 1, joints):
             matrix[i][k] = matrix[i][k] / pivot  # from now on an entry of L
-            step[i] = step[i] - matrix[i][k] * step[k]
+            step[i] = minus(step[i], times(matrix[i][k], step[k]))
             for j in range(k + 1, i + 1):
-                matrix[i][j] = matrix[i][j] - matrix[i][k] * below[j - k - 1]
+                matrix[i][j] = minus(matrix[i][j], times(matrix[i][k], below[j - k - 1]))
         pivots.append(jnp.abs(pivot))
     step = [s / pivot for s, pivot in zip(step, pivots, strict=True)]
     for k in reversed(range(joints)):
         for i in range(k + 1, joints):
-            step[k] = step[k] - matrix[i][k] * step[i]
+            step[k] = minus(step[k], times(matrix[i][k], step[i]))
     return step
 
 
@@ -166,6 +197,11 @@ def _max_abs(values: Scalars) -> Scalar:
     for value in values[1:]:
         maximum = jnp.maximum(maximum, jnp.abs(value))
     return maximum
+
+
+def solution_at(state: NewtonState, limits: Limits) -> Solution:
+    """The result of a descent that ends in this state."""
+    return _solution(state.qpos, state.here, _bounds(limits, len(state.qpos)))
 
 
 def _solution(qpos: Scalars, here: Derivatives, bounds: Sequence[tuple[Scalar, Scalar] | None]) -> Solution:

@@ -1,9 +1,8 @@
 """Static pose imitation (pose retargeting): the learner's pose nearest to a pose of the expert."""
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,19 +16,18 @@ from mimic.arms.embodiment import Embodiment
 from mimic.compilation import compiled_once
 from mimic.config import check_choice
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
-from mimic.metric.kinematics import LinkStates, link_states
+from mimic.metric.kinematics import resting_link_states
 from mimic.metric.spatial import array_library
 from mimic.retargeting.costs import Costs, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
-from mimic.retargeting.optimizers import Solution, gradient_descent, newton
-from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
+from mimic.retargeting.multistart import Descents, Method, best_descent
+from mimic.retargeting.pose_objective import pose_objective
 
-Method = Literal["newton", "gradient_descent"]
 METHODS = ("newton", "gradient_descent")
 AnyArray = TypeVar("AnyArray", Array, np.ndarray)
 
 ITERATIONS = {"newton": 16, "gradient_descent": 1000}
-_ROUGH_FRACTION = 0.35  # of the iterations, for descents from all initial guesses; the best ones get the others
+_NO_COSTS = Costs()
 FLAT = 1e-3  # gradient [1/rad] of a converged pose, as a fraction of the mean distance of random poses
 
 
@@ -88,7 +86,7 @@ def imitate_pose(
       method: "newton" or "gradient_descent".
       iterations: of each descent; where None, 16 for Newton's method and 1000 for gradient descent.
       kept: number of best descents that continue after a third of the iterations. None continues all, which doubles
-        the computation but halves the compilation.
+        the computation; on a GPU it halves the compilation.
       rotation: see `embodiment_distance`.
       reduction: see `embodiment_distance`.
       costs: see `Costs`; None for the embodiment distance alone. The returned distance is without them.
@@ -97,7 +95,7 @@ def imitate_pose(
     Raises:
       ValueError: poses of the wrong shape or not finite, an unknown method, or a count below its minimum.
     """
-    poses = checked_poses(expert, jnp.asarray(qpos))
+    poses = checked_poses(expert, _concrete(qpos))
     check_choice("method", method, METHODS)
     # Longer than 40 lines: argument checks, and functions that share the arguments.
     count = ITERATIONS[method] if iterations is None else iterations
@@ -105,33 +103,25 @@ def imitate_pose(
         raise ValueError(f"starts, iterations: expected at least 0 and 2, got {starts} and {count}")
     if kept is not None and kept < 1:
         raise ValueError(f"kept: expected at least 1, or None for all, got {kept}")
-    costs = Costs() if costs is None else costs
+    costs = _NO_COSTS if costs is None else costs
     costs.check_capsules(capsules)
     if costs.of_motion:
         raise ValueError(
             "costs: expected velocity and acceleration of 0 for single poses; imitate_trajectory takes them"
         )
-    batch = poses.shape[:-1]
-    flat_warm = None
-    if warm_start is not None:
-        flat_warm = checked_poses(learner, jnp.asarray(warm_start), "warm_start").reshape(-1, learner.num_joints)
-        flat_warm = jnp.broadcast_to(flat_warm, (int(np.prod(batch)), learner.num_joints))
+    warm = None if warm_start is None else checked_poses(learner, _concrete(warm_start), "warm_start")
     metric = Metric(correspondence, weights, rotation, reduction)
-    descents = _Descents(method, count, kept, bool(starts))
-    solve = _pose_solver(expert, learner, metric, descents, costs, capsules if costs.of_capsules else None)
-    candidates = random_poses(learner, key, max(starts, 1), poses.dtype)
-    solutions = solve(poses.reshape(-1, expert.num_joints), flat_warm, candidates)
-    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), solutions)
+    descents = Descents(method, count, kept)
+    solve = _pose_solver(
+        expert, learner, metric, descents, bool(starts), costs, capsules if costs.of_capsules else None
+    )
+    dtype = jax.dtypes.canonicalize_dtype(poses.dtype)
+    return solve(poses, warm, random_poses(learner, key, max(starts, 1), dtype))
 
 
-@dataclasses.dataclass(frozen=True)
-class _Descents:
-    """Settings of the descents to a pose: see `imitate_pose`; `random` is whether there are random initial guesses."""
-
-    method: Method
-    iterations: int
-    kept: int | None
-    random: bool
+def _concrete(values: ArrayLike) -> Any:
+    """The values as an array, without a copy to a device: functions of `jax.numpy` outside of `jax.jit` are slow."""
+    return values if isinstance(values, jax.Array) else np.asarray(values)  # a tracer is a `jax.Array`
 
 
 @compiled_once
@@ -139,53 +129,33 @@ def _pose_solver(
     expert: Embodiment,
     learner: Embodiment,
     metric: Metric,
-    descents: _Descents,
+    descents: Descents,
+    random: bool,
     costs: Costs,
     capsules: Capsules | None,
 ) -> Callable[[Array, Array | None, RandomPoses], PoseImitation]:
-    """The function of poses [N, n], warm starts [N, n_hat] and random poses that `imitate_pose` compiles."""
+    """The function of poses [..., n], warm starts [..., n_hat] and random poses that `imitate_pose` compiles."""
     objective = with_costs(pose_objective(learner, metric), costs, expert, learner, capsules)
 
-    def solve(poses: Array, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
-        limits, continuous = pose_limits(learner, poses.dtype), continuous_joints(learner)
-        states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
-        scale = typical_distance(objective, jax.tree.map(lambda x: x[0], states), candidates)
-
-        def solve_pose(pose: Array, states: LinkStates, warm: Array | None) -> PoseImitation:
-            target = objective.target(states, pose)
-            if warm is None:
-                first = shared_joints(expert, learner, pose)
-                guesses = initial_guesses(objective, target, first, candidates if descents.random else None)
-            else:
-                guesses = warm[None]
-            solution = _minimise(objective, target, guesses, limits, descents)
-            distance = objective.distance(states, link_states(learner, solution.qpos))
-            is_flat = solution.gradient_norm <= FLAT * scale
-            return PoseImitation(wrap_angles(solution.qpos, continuous), distance, is_flat)
-
-        return jax.vmap(solve_pose, (0, 0, None if warm is None else 0))(poses, states, warm)
+    def solve(batch: Array, warm: Array | None, candidates: RandomPoses) -> PoseImitation:
+        poses = jnp.asarray(batch).reshape(-1, expert.num_joints)
+        states = resting_link_states(expert, poses.T)
+        targets = jax.vmap(objective.target, (-1, 0), -1)(states, poses)
+        if warm is None:
+            first = shared_joints(expert, learner, poses)
+            guess = functools.partial(initial_guesses, objective, candidates=candidates if random else None)
+            guesses = jax.vmap(guess, (-1, 0), -1)(targets, first)
+        else:
+            warm = jnp.asarray(warm).reshape(-1, learner.num_joints)
+            guesses = jnp.broadcast_to(warm, (len(poses), learner.num_joints)).T[None]
+        solution = best_descent(objective.of_batch(targets), guesses, pose_limits(learner, poses.dtype), descents)
+        distance = jax.vmap(objective.distance, -1)(states, resting_link_states(learner, solution.qpos))
+        scale = typical_distance(objective, jax.tree.map(lambda x: x[..., 0], targets), candidates)
+        qpos = wrap_angles(solution.qpos.T, continuous_joints(learner))
+        solutions = PoseImitation(qpos, distance, solution.gradient_norm <= FLAT * scale)
+        return jax.tree.map(lambda x: x.reshape(*batch.shape[:-1], *x.shape[1:]), solutions)
 
     return solve
-
-
-def _minimise(
-    objective: PoseObjective,
-    target: Target,
-    guesses: Float[Array, "guesses joints"],
-    limits: tuple[np.ndarray, np.ndarray],
-    descents: _Descents,
-) -> Solution:
-    """The best of the descents from all guesses, of which `kept` continue after the rough iterations."""
-    iterations, kept = descents.iterations, descents.kept
-    descend = newton if descents.method == "newton" else gradient_descent
-    rough = iterations if kept is None else max(int(_ROUGH_FRACTION * iterations), 1)
-    of_qpos = functools.partial(objective.derivatives, target)
-    rough_of_qpos = of_qpos if kept is None else functools.partial(objective.rough_derivatives, target)
-    solutions = jax.vmap(lambda guess: descend(rough_of_qpos, guess, limits, rough))(guesses)
-    if kept is not None:
-        best = jax.lax.top_k(-solutions.value, min(kept, len(guesses)))[1]
-        solutions = jax.vmap(lambda guess: descend(of_qpos, guess, limits, iterations - rough))(solutions.qpos[best])
-    return jax.tree.map(lambda x: x[jnp.argmin(solutions.value)], solutions)
 
 
 def pose_limits(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -17,19 +17,16 @@ from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
 from mimic.metric.spatial import Vector
 from mimic.retargeting.closed_form import (
-    ANGLE_SMOOTHING,
-    ROUGH_ANGLE_SMOOTHING,
-    ROUGH_SMOOTHING,
     SMOOTHING,
     Body,
     Pull,
+    Smoothing,
     smoothed_angle,
     smoothed_length,
     static_derivatives,
 )
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 
-Smoothing = tuple[float, float | None]  # of lengths [chain lengths], and of angles [rad]; None for cosines
 Target = Any  # pytree: the data of the expert's pose that the objective needs
 
 
@@ -40,17 +37,36 @@ class PoseObjective:
     Attributes:
       distance: (expert's link states, learner's link states) -> embodiment distance, both at rest.
       target: (expert's link states, expert's pose) -> target.
-      value: (target, learner's link states) -> distance, up to a constant of the target.
-      derivatives: (target, joint angles, store) -> derivatives of the distance; the value up to this constant.
-        `store` is a `mimic.retargeting.optimizers.Store`, which may be omitted.
-      rough_derivatives: the same for a smoother function with nearby minima, for the first iterations.
+      value: (target, learner's link states) -> distance with smoothed lengths and angles.
+      derivatives: (target, joint angles, store, smoothing) -> derivatives of the distance; the value up to a constant
+        of the target. `store`, a `mimic.retargeting.optimizers.Store`, and `smoothing`, a
+        `mimic.retargeting.closed_form.Smoothing`, may be omitted.
+      is_elementwise: whether `derivatives` also takes arrays of poses for each joint, which broadcast with arrays of
+        targets; see `of_batch`.
     """
 
     distance: Callable[[LinkStates, LinkStates], Array]
     target: Callable[..., Target]
     value: Callable[[Target, LinkStates], Array]
     derivatives: Callable[..., Derivatives]
-    rough_derivatives: Callable[..., Derivatives]
+    is_elementwise: bool = False
+
+    def of_batch(self, targets: Target) -> Callable[..., Derivatives]:
+        """`derivatives` for joint angles [lanes, poses] each.
+
+        Args:
+          targets: one for each pose, along the last axis of each array.
+        """
+        if self.is_elementwise:
+            return functools.partial(self.derivatives, targets)
+
+        def derivatives(qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING) -> Derivatives:
+            def at(target: Target, qpos: Scalars) -> Derivatives:
+                return self.derivatives(target, qpos, store, smoothing)
+
+            return jax.vmap(jax.vmap(at, (None, 0)), (-1, -1), -1)(targets, tuple(qpos))
+
+        return derivatives
 
 
 def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
@@ -59,7 +75,7 @@ def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
 
 
 def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
-    def derivatives(target: LinkStates, qpos: Scalars, store: Store = call) -> Derivatives:
+    def derivatives(target: LinkStates, qpos: Scalars, store: Store = call, smoothing: Any = None) -> Derivatives:
         def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
             value, gradient = jax.value_and_grad(lambda q: metric(target, link_states(learner, q)))(qpos)
             return gradient, (value, gradient)
@@ -67,7 +83,7 @@ def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
         hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
         return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
 
-    return PoseObjective(metric, lambda states, _=None: states, metric, derivatives, derivatives)
+    return PoseObjective(metric, lambda states, _=None: states, metric, derivatives)
 
 
 class StaticTarget(NamedTuple):
@@ -76,14 +92,12 @@ class StaticTarget(NamedTuple):
     Attributes:
       units, strengths: [directions, 3], [directions] of the pulls on directions.
       points, weights: [pairs, 3], [pairs] of the pulls on positions.
-      pulls: both for each link, as scalar components.
     """
 
     units: Array
     strengths: Array
     points: Array
     weights: Array
-    pulls: tuple[Pull, ...]
 
 
 def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
@@ -111,43 +125,37 @@ def _static(learner: Embodiment, metric: Metric) -> PoseObjective:
         assert states.direction is not None
         units, strengths = pulls_on_directions(states.direction)
         points = states.position[pairs[:, 0]]
-        weight = jnp.asarray(positions[pairs[:, 0], pairs[:, 1]], points.dtype)
-        of_links = [(directed == link, pairs[:, 1] == link) for link in range(learner.num_links)]
-        pulls = [
-            Pull(*_on_link(units, strengths, is_on), *_on_link(points, weight, is_at)) for is_on, is_at in of_links
-        ]
-        return StaticTarget(units, strengths, points, weight, tuple(pulls))
+        weights = jnp.asarray(positions[pairs[:, 0], pairs[:, 1]], points.dtype)
+        return StaticTarget(units, strengths, points, weights)
 
     def value(target: StaticTarget, states: LinkStates) -> Array:
         assert states.direction is not None
         direction = states.direction[directed]
         if angles is None:
-            turned = -jnp.vdot(target.strengths[:, None] * target.units, direction)
+            turned = np.pi / 2 * directions.sum() - jnp.sum(target.strengths[:, None] * target.units * direction)
         else:
             sine = jnp.cross(direction, target.units)
             cosine = jnp.sum(direction * target.units, axis=-1)
-            turned = jnp.sum(target.strengths * smoothed_angle(cosine, jnp.sum(sine * sine, axis=-1), ANGLE_SMOOTHING))
+            angle = smoothed_angle(cosine, jnp.sum(sine * sine, axis=-1), SMOOTHING.angle)
+            turned = jnp.sum(target.strengths * angle)
         difference = states.position[pairs[:, 1]] - target.points
         square = jnp.sum(difference * difference, axis=-1)
-        return jnp.sum(target.weights * smoothed_length(square, SMOOTHING)) + turned
+        return jnp.sum(target.weights * smoothed_length(square, SMOOTHING.length)) + turned
 
     def kinematics(qpos: Scalars) -> tuple[list[Vector], list[Vector], list[tuple[Vector, Vector]]]:
         frames = joint_frames(arm, qpos, None)
         vectors = [(link.direction, link.position) for link in link_vectors(arm, frames)]
         return joint_axes(arm, frames), [frame.anchor for frame in frames[1:]], vectors
 
-    def derivatives(smoothing: Smoothing, target: StaticTarget, qpos: Scalars, store: Store = call) -> Derivatives:
+    def derivatives(
+        target: StaticTarget, qpos: Scalars, store: Store = call, smoothing: Smoothing = SMOOTHING
+    ) -> Derivatives:
         axes, anchors, vectors = store(kinematics, tuple(qpos))
         links = [Body(joint, *vector) for joint, vector in zip(arm.link_joint, vectors, strict=True)]
-        position_smoothing, angle_smoothing = smoothing
-        return static_derivatives(
-            axes, anchors, links, target.pulls, position_smoothing, arm.joint_parent, angle_smoothing
-        )
+        pulls = [_pull(target, directed == link, pairs[:, 1] == link) for link in range(learner.num_links)]
+        return static_derivatives(axes, anchors, links, pulls, arm.joint_parent, smoothing, rotation=metric.rotation)
 
-    is_angle = angles is not None
-    rough = functools.partial(derivatives, (ROUGH_SMOOTHING, ROUGH_ANGLE_SMOOTHING if is_angle else None))
-    fine = functools.partial(derivatives, (SMOOTHING, ANGLE_SMOOTHING if is_angle else None))
-    return PoseObjective(metric, target, value, fine, rough if len(pairs) or is_angle else fine)
+    return PoseObjective(metric, target, value, derivatives, is_elementwise=True)
 
 
 def _pair_weights(correspondence: Any, weight: Any) -> Any:
@@ -168,9 +176,12 @@ def _weighted_pairs(correspondence: Any, weight: Any) -> Int[np.ndarray, "pairs 
     return np.argwhere(has_weight)
 
 
-def _on_link(
-    vectors: Array, factors: Array, is_on_link: Bool[np.ndarray, " pulls"]
-) -> tuple[list[Vector], list[spatial.Scalar]]:
-    """Pulls on one link as scalars, extracted from the arrays once and not in each step of a descent."""
-    indices = np.flatnonzero(is_on_link)
-    return [spatial.vector(vectors[i]) for i in indices], [factors[i] for i in indices]
+def _pull(target: StaticTarget, directions: Bool[np.ndarray, " directions"], pairs: Bool[np.ndarray, " pairs"]) -> Pull:
+    """Pull on one link as scalars, from those of the target's directions and pairs that are on it."""
+    directions, pairs = np.flatnonzero(directions), np.flatnonzero(pairs)
+    return Pull(
+        [spatial.vector(target.units[i]) for i in directions],
+        [target.strengths[i] for i in directions],
+        [spatial.vector(target.points[i]) for i in pairs],
+        [target.weights[i] for i in pairs],
+    )

@@ -15,6 +15,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.compilation import compiled_once
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import link_states
+from mimic.retargeting.closed_form import ROUGH_SMOOTHING
 from mimic.retargeting.costs import Costs, smoothness_derivatives, sum_of, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, Store, newton
@@ -107,8 +108,8 @@ def _trajectory_solver(
     def solve(poses: Array, jump: Array, candidates: RandomPoses) -> PoseImitation:
         anchors = np.unique(np.linspace(0, poses.shape[0] - 1, _ANCHORS).round().astype(int))
         states = jax.vmap(lambda pose: link_states(expert, pose))(poses)
-        scale = typical_distance(objective, jax.tree.map(lambda x: x[0], states), candidates)
         targets = jax.vmap(objective.target)(states, poses)
+        scale = typical_distance(objective, jax.tree.map(lambda x: x[0], targets), candidates)
         tracker = _Tracker(objective, targets, pose_limits(learner, poses.dtype), jump, len(poses), costs)
 
         def from_anchor(anchor: Array) -> Solution:
@@ -180,7 +181,7 @@ class _Tracker:
 
     def track(self, anchor: Array, guess: Array) -> Solution:
         """The minimum near a guess at the anchor's time, tracked over all times with the rough derivatives."""
-        rough = self.objective.rough_derivatives
+        rough = functools.partial(self.objective.derivatives, smoothing=ROUGH_SMOOTHING)
         begin = newton(self._at(rough, anchor), guess, self.limits, ITERATIONS["newton"]).qpos
 
         def follow(past: _Past, time: Array) -> tuple[_Past, Solution]:

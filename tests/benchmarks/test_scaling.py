@@ -79,6 +79,7 @@ def test_a_run_that_fails_loses_none_of_those_before_it(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # eight trainings
 def test_two_devices_train_the_same_in_all_ways(monkeypatch):
     monkeypatch.setattr(scaling, "_EVALUATIONS", 3)
     sizes = {"env": "planar4dof", "num_envs": 16, "batch_size": 16, "steps": 3000, "arguments": SMALL}

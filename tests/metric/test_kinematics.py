@@ -4,6 +4,7 @@ import math
 import jax
 import jax.numpy as jnp
 import jaxtyping
+import mujoco
 import numpy as np
 import pytest
 
@@ -17,8 +18,10 @@ from mimic.metric.kinematics import (
     forward_kinematics,
     link_state_table,
     link_states,
+    resting_link_states,
 )
 from tests.helpers import random_arms
+from tests.helpers.trees import TORSO_TIPS, hand, torso
 
 # Against MuJoCo, in m, m/s and rad/s. Arms are up to 3 m long and move at up to 10 rad/s and 10 m/s.
 TOLERANCE = {
@@ -257,6 +260,27 @@ def test_wrong_shapes_are_rejected(unchecked, shape):
                 function()
             assert "\n" not in str(error.value)
             assert ("jax.vmap" in str(error.value)) == (len(shape) > 1)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize(
+    "arm",
+    [
+        panda(),
+        panda(locked=(3, 6, 7)),
+        load_mjcf(random_arms.random_arm(0)),
+        load_mjcf(mujoco.MjModel.from_xml_string(torso()), tip=TORSO_TIPS),
+        load_mjcf(mujoco.MjModel.from_xml_string(hand()), tip=["*"]),
+    ],
+    ids=lambda arm: arm.name,
+)
+def test_link_states_of_a_batch_at_rest_equal_link_states(arm):
+    """1e-12: double precision."""
+    qpos = np.random.default_rng(0).uniform(-3, 3, (3, arm.num_joints))
+    batch = resting_link_states(arm, jnp.asarray(qpos.T))
+    for pose, angles in enumerate(qpos):
+        one = link_states(arm, angles)
+        jax.tree.map(lambda a, b, p=pose: np.testing.assert_allclose(a[..., p], b, atol=1e-12), batch, one)
 
 
 def test_the_table_of_link_states_equals_link_states():

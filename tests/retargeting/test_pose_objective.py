@@ -12,7 +12,7 @@ from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import arc_length_correspondence, hard_correspondence, overlap_correspondence
 from mimic.metric.distance import DistanceWeights, Metric, adaptive_weights, embodiment_distance, rotation_distance
 from mimic.metric.kinematics import link_states
-from mimic.retargeting.closed_form import ANGLE_SMOOTHING, SMOOTHING
+from mimic.retargeting.closed_form import SMOOTHING
 from mimic.retargeting.pose_objective import pose_objective
 from tests.helpers.random_arms import random_arm
 
@@ -29,8 +29,7 @@ def learners():
 
 
 def smoothed_angle(direction_a, direction_b):
-    factor = 1 / (1 + ANGLE_SMOOTHING**2 / 2)
-    return jnp.arccos(factor * jnp.dot(direction_a, direction_b)) - jnp.arccos(factor)
+    return jnp.arccos(np.cos(SMOOTHING.angle) * jnp.dot(direction_a, direction_b)) - SMOOTHING.angle
 
 
 def smoothed_distance(expert_states, learner_states, matrix, weights, rotation):
@@ -39,7 +38,7 @@ def smoothed_distance(expert_states, learner_states, matrix, weights, rotation):
 
     def pair(position_a, direction_a, position_b, direction_b):
         square = jnp.sum((position_a - position_b) ** 2)
-        return jnp.sqrt(square + SMOOTHING**2) - SMOOTHING, turned(direction_a, direction_b)
+        return jnp.sqrt(square + SMOOTHING.length**2) - SMOOTHING.length, turned(direction_a, direction_b)
 
     expert, learner = ((states.position, states.direction) for states in (expert_states, learner_states))
     translation, rotation = jax.vmap(jax.vmap(pair, (None, None, 0, 0)), (0, 0, None, None))(*expert, *learner)
@@ -101,7 +100,7 @@ def test_arrays_of_weights_and_a_correspondence_known_only_at_run_time():
 
 @pytest.mark.parametrize("rotation", ["cosine", "angle"])
 def test_a_match_has_zero_gradient_and_finite_curvature(dtype, rotation):
-    """At the kink of lengths and angles. 1e-4: rounding moves a position by 1e-7 chain lengths; SMOOTHING is 1e-3."""
+    """At the kink of lengths and angles. 1e-4: rounding moves a position by 1e-7 chain lengths; s is 1e-3."""
     arm = panda()
     closed = pose_objective(arm, Metric(arc_length_correspondence(arm, arm), DEFAULT, rotation))
     for qpos in (np.zeros(7), np.linspace(-2, 2, 7)):
@@ -113,7 +112,7 @@ def test_a_match_has_zero_gradient_and_finite_curvature(dtype, rotation):
 
 
 def test_smoothing_changes_the_distance_by_less_than_its_own_size(dtype):
-    """Arc length W has entries that sum to n n_hat: the mean length is off by SMOOTHING at most; 1e-5 for float32."""
+    """Arc length W has entries that sum to n n_hat: the mean length is off by s at most; 1e-5 for float32."""
     expert, learner = panda(), panda(locked=(3, 6, 7))
     matrix = arc_length_correspondence(expert, learner)
     closed = pose_objective(learner, Metric(matrix, DEFAULT))
@@ -128,7 +127,7 @@ def test_smoothing_changes_the_distance_by_less_than_its_own_size(dtype):
     smoothed, exact = values(qpos)
     # A diagonal W: one pull for each direction, so the value has no constant.
     apart = exact - smoothed
-    assert np.all(apart > -1e-5) and np.all(apart <= DEFAULT.translation * SMOOTHING + 1e-5)
+    assert np.all(apart > -1e-5) and np.all(apart <= DEFAULT.translation * SMOOTHING.length + 1e-5)
 
 
 OVERLAP = overlap_correspondence(panda(), panda())

@@ -73,4 +73,4 @@ def test_the_optimiser_stays_at_the_zero_pose(joints):
 @pytest.mark.slow
 @pytest.mark.parametrize("joints", sorted(set(LOCKS) - set(HANDFUL)), ids=str)
 def test_the_optimiser_stays_at_the_zero_pose_whatever_is_locked(joints):
-    assert stays(joints, kept=None)  # which takes half as long to compile
+    assert stays(joints, kept=None)  # which takes less time to compile

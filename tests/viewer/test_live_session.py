@@ -139,8 +139,10 @@ def test_the_expert_plays_a_motion_and_a_slider_ends_it(live):
 
 
 def test_weights_change_without_compiling_and_the_distance_scales(live):
-    live.move(2, 1.0)  # a joint that the learner has not
+    live.move(1, 0.7)
+    live.move(2, 1.0)  # a joint that the learner has not; in the zero pose, joint 0 has the same axis
     before = settle(live).distance
+    assert before > 1e-2
     live.change(translation=2.0, rotation=2.0)
     frame = live.advance(TICK)
     assert frame is not None and frame.distance == pytest.approx(2 * before, rel=1e-3)  # the minimum stays in its place
