@@ -7,9 +7,8 @@ With `--trunks`, only the effect of the trunk's length [m] is measured instead: 
 Each arm of each clip is retargeted to the Panda, with and without locked joints, and to arms of an unpacked wheel of
 robosuite in FOLDER. Methods: `imitate_trajectory` with angles and positions of links that are cut alike, without and
 with the cost of the hand, and with the default metric; a pose mapper that was trained on the poses of the same arm of
-the clip, with the metric of the first; inverse kinematics of
-the scaled hand by mink, and of frames of the links as GMR does it; the closed form that aligns shoulder, elbow and
-wrist; holding the home pose. Besides the measures of similarity: the largest speed of a joint between two samples
+the clip, with the metric of the first; inverse kinematics of the scaled hand by mink, and of frames of the links as GMR
+does it; the closed form that aligns shoulder, elbow and wrist; holding the home pose. Besides the measures of similarity: the largest speed of a joint between two samples
 [rad/s], and the root mean square of the joints' jerk [rad/s^3], at the captured speed.
 """
 
@@ -82,13 +81,15 @@ class Case:
 
 
 def read_case(clip: Path, side: str, name: str, config: ArmConfig, rate: float) -> Case:
+    """The longest part of a clip without gaps, at about a rate [1/s]: a whole fraction of that of the clip."""
     learner = EnvConfig(name, learner=config).build_arms().learner.embodiment
     capture = read_arm(clip, side, CaptureConfig(), fixed_fraction(learner))
     part = max(capture.parts, key=lambda part: len(part.start))
+    every = max(1, round(part.rate / rate))
     with tempfile.TemporaryDirectory() as folder:
-        expert, qpos = _as_arm(part, Path(folder) / "person.xml", rate)
+        expert, qpos = _as_arm(part, Path(folder) / "person.xml", every)
     shoulder = int(TRUNK in part.names)
-    return Case(expert, learner, qpos, Landmarks(shoulder, shoulder + 1, shoulder + 2, len(part.names)), rate)
+    return Case(expert, learner, qpos, Landmarks(shoulder, shoulder + 1, shoulder + 2, len(part.names)), part.rate / every)
 
 
 def imitated(case: Case, metric: MetricConfig = METRIC, costs: mimic.Costs | None = None) -> np.ndarray:
@@ -147,7 +148,7 @@ def nearest_with_trunk(clip: Path, side: str, trunk: float) -> Row:
     """Similarity of the Panda's nearest poses to some of a clip's, with a trunk of a length [m]."""
     part = max(read_arm(clip, side, CaptureConfig(trunk=trunk)).parts, key=lambda part: len(part.start))
     with tempfile.TemporaryDirectory() as folder:
-        expert, qpos = _as_arm(part, Path(folder) / "person.xml", part.rate)
+        expert, qpos = _as_arm(part, Path(folder) / "person.xml", 1)
     qpos, learner = qpos[:: len(qpos) // _POSES][:_POSES], mimic.panda()
     metric = EnvConfig("trunk").metric.build(expert, learner)
     nearest = mimic.imitate_pose(expert, learner, jnp.asarray(qpos, jnp.float32), **metric.arguments)
@@ -156,11 +157,10 @@ def nearest_with_trunk(clip: Path, side: str, trunk: float) -> Row:
     return {"clip": clip.name, "arm": side, "trunk_m": trunk, "distance": float(nearest.distance.mean()), **means}
 
 
-def _as_arm(part: LinkMotion, path: Path, rate: float) -> tuple[mimic.Embodiment, np.ndarray]:
-    """The person's arm and its poses at a rate [1/s]."""
+def _as_arm(part: LinkMotion, path: Path, every: int) -> tuple[mimic.Embodiment, np.ndarray]:
+    """The person's arm, and its poses at one of so many samples."""
     zero = zero_frames(part)
     path.write_text(ball_chain_xml(part, zero))
-    every = max(1, round(part.rate / rate))
     return mimic.load_mjcf(path), ball_chain_motion(part, zero)[0][::every]
 
 
