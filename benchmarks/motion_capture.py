@@ -8,7 +8,8 @@ Each arm of each clip is retargeted to the Panda, with and without locked joints
 robosuite in FOLDER. Methods: `imitate_trajectory` with angles and positions of links that are cut alike, without and
 with the cost of the hand, and with the default metric; a pose mapper that was trained on the poses of the same arm of
 the clip, with the metric of the first; inverse kinematics of the scaled hand by mink, and of frames of the links as GMR
-does it; the closed form that aligns shoulder, elbow and wrist; holding the home pose. Besides the measures of similarity: the largest speed of a joint between two samples
+does it; the closed form that aligns shoulder, elbow and wrist; holding the home pose. Besides the measures
+of similarity: the largest speed of a joint between two samples
 [rad/s], and the root mean square of the joints' jerk [rad/s^3], at the captured speed.
 """
 
@@ -89,7 +90,8 @@ def read_case(clip: Path, side: str, name: str, config: ArmConfig, rate: float) 
     with tempfile.TemporaryDirectory() as folder:
         expert, qpos = _as_arm(part, Path(folder) / "person.xml", every)
     shoulder = int(TRUNK in part.names)
-    return Case(expert, learner, qpos, Landmarks(shoulder, shoulder + 1, shoulder + 2, len(part.names)), part.rate / every)
+    marks = Landmarks(shoulder, shoulder + 1, shoulder + 2, len(part.names))
+    return Case(expert, learner, qpos, marks, part.rate / every)
 
 
 def imitated(case: Case, metric: MetricConfig = METRIC, costs: mimic.Costs | None = None) -> np.ndarray:
