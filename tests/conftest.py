@@ -4,6 +4,7 @@ import functools
 import importlib
 import importlib.util
 import os
+import signal
 import sys
 
 import jax
@@ -43,6 +44,8 @@ def pytest_configure(config: pytest.Config) -> None:
         from tests.helpers import typechecking  # here already: the hook itself imports no more than `tests`
 
         install_import_hook([f"mimic.{module}" for module in CORE], f"{typechecking.__name__}.check")
+
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, by the commands that tests start too
 
     from mimic import compat  # importing mimic after the hook is in place, and before JAX starts
 
