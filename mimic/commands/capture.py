@@ -135,7 +135,8 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
         console.print(f"results: {out}, {model}", soft_wrap=True, highlight=False)
         command = (
             f"python -m mimic.train env={env.name} env.expert={model} env.demonstrations.path={out} "
-            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out} env.start=nearest"
+            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out} env.start=nearest "
+            "env.observation.terms=[distance_gradient]"
         )
         console.print(f"train on it: {command}", soft_wrap=True, highlight=False, markup=False)
 

@@ -200,7 +200,7 @@ class CaptureConfig:
     cutoff: float = number(6.0, at_least=0.1, at_most=1e4)
     speed: float = number(2.0, at_least=0.01, at_most=100.0)
     slow_down: float | None = number(None, at_least=0.1, at_most=100.0)
-    overlap: float = number(0.5, at_least=0.0, at_most=0.95)
+    overlap: float = number(0.9, at_least=0.0, at_most=0.95)
     held_out: float = number(0.2, at_least=0.01, at_most=0.9)
 
     def __post_init__(self) -> None:

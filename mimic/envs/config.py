@@ -13,6 +13,8 @@ from mimic.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
 AUTO = "auto"
+OBSERVATION_TERMS = ("distance_gradient",)  # built in, see mimic/envs/terms.py
+registry.reserve("observation_term", OBSERVATION_TERMS)
 _MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
 
@@ -85,7 +87,8 @@ class ObservationConfig:
     """What is added to the observation, see `mimic.register`.
 
     Attributes:
-      terms: names of registered observation terms, in the order of their numbers, after the link states.
+      terms: names of observation terms, in the order of their numbers, after the link states: "distance_gradient",
+        which is built in, or what `mimic.register` adds.
     """
 
     terms: list[str] = dataclasses.field(default_factory=list)

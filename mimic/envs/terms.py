@@ -1,4 +1,4 @@
-"""Reward and observation terms: functions that packages and notebooks add to an environment, see `mimic.register`."""
+"""Reward and observation terms: functions that a config adds to an environment, built in or of `mimic.register`."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from mimic import registry
 from mimic.envs.arm_state import ArmState
-from mimic.metric.kinematics import LinkStates
+from mimic.envs.config import OBSERVATION_TERMS
+from mimic.metric.kinematics import LinkStates, link_states
 
 Env = Any  # an `ImitationEnv`, which imports this module
 
@@ -66,9 +67,26 @@ def reward_terms(weights: Mapping[str, float]) -> tuple[WeightedTerm, ...]:
     )
 
 
+def distance_gradient(env: Env, state: ArmState) -> Float[Array, " 2*joints"]:
+    """Gradient of the embodiment distance to the expert one step ahead: by joint angles [1/rad], then speeds [s/rad].
+
+    It says which way each joint should move. Without it a policy learns the kinematics of the learner from rewards.
+    """
+    expert_states = env.expert_at(state.demonstration, state.step + 1)
+
+    def distance(qpos: Array, qvel: Array) -> Array:
+        return env.states_distance(expert_states, link_states(env.learner, qpos, qvel))
+
+    return jnp.concatenate(jax.grad(distance, argnums=(0, 1))(state.qpos, state.qvel))
+
+
+_BUILT_IN: dict[str, ObservationTerm] = dict(zip(OBSERVATION_TERMS, (distance_gradient,), strict=True))
+
+
 def observation_terms(names: Sequence[str]) -> tuple[tuple[str, ObservationTerm], ...]:
     """The terms of `observation.terms`. Raises a ValueError for an unknown name."""
-    return tuple((name, registry.find("observation_term", name, "observation.terms")) for name in names)
+    found = (_BUILT_IN.get(name) or registry.find("observation_term", name, "observation.terms") for name in names)
+    return tuple(zip(names, found, strict=True))
 
 
 def observed(name: str, term: ObservationTerm, env: Env, state: ArmState) -> Float[Array, " numbers"]:

@@ -55,7 +55,7 @@ def windows(
     dt: float,
     horizon: int,
     slow_down: float = 1.0,
-    overlap: float = 0.5,
+    overlap: float = 0.9,
     held_out: float = 0.2,
     cutoff: float = CUTOFF,
 ) -> Windows:

@@ -10,6 +10,8 @@ import pytest
 import mimic
 from mimic.envs.imitation import layout_of, make_env
 from mimic.envs.wrappers import fresh_episodes
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.run_plugins import used_plugins
 
 SMALL = {"horizon": 5, "demonstrations": {"count": 2, "held_out": 1}}
 
@@ -55,6 +57,34 @@ def test_terms_are_added_in_both_physics(terms, physics):
     layout = layout_of(env)
     assert [part["name"] for part in layout[-2:]] == ["term: angles", "term: demonstration"]
     assert layout[-1]["stop"] == env.observation_size and layout_of(plain)[-1]["stop"] == plain.observation_size
+
+
+@pytest.mark.parametrize("name", ["planar4dof", "panda4dof"])
+def test_the_distance_gradient_is_that_of_finite_differences(name):
+    env = mimic.make(name, physics="fused", observation={"terms": ["distance_gradient"]}, **SMALL)
+    state = one_step(env, jnp.linspace(-0.5, 0.8, env.action_size)).pipeline_state
+    observed = np.asarray(jax.jit(env.observe)(state)[-2 * env.action_size :])
+    distance = jax.jit(lambda motion: env.distance(*jnp.split(motion, 2), state.demonstration, state.step + 1))
+    motion, step = jnp.concatenate([state.qpos, state.qvel]), 1e-3  # float32
+    differences = [
+        (distance(motion + change) - distance(motion - change)) / (2 * step) for change in step * jnp.eye(len(motion))
+    ]
+    assert np.abs(observed[: env.action_size]).max() > 0.05
+    np.testing.assert_allclose(observed, differences, atol=5e-4)
+
+
+def test_the_distance_gradient_is_finite_where_arms_coincide():
+    env = mimic.make("panda7dof", physics="fused", observation={"terms": ["distance_gradient"]}, **SMALL)
+    state = env.start(jax.random.PRNGKey(0))
+    same = dataclasses.replace(state, qpos=jnp.asarray(env.demonstrations.qpos[state.demonstration, 1]))
+    assert np.isfinite(np.asarray(jax.jit(env.observe)(same))).all()
+
+
+def test_a_built_in_term_needs_no_plugin():
+    config = mimic.env_config("planar4dof", observation={"terms": ["distance_gradient"]}, **SMALL)
+    assert used_plugins(TrainConfig(env=config)) == {}
+    with pytest.raises(ValueError, match="'distance_gradient' is built in"):
+        mimic.register("observation_term", "distance_gradient", angles)
 
 
 def test_terms_are_in_batches_that_restart(terms):
