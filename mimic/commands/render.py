@@ -33,6 +33,7 @@ _CAPTIONS = 56  # pixels below it; the title is above it
 _GIF_EVERY, _GIF_SCALE = 3, 0.5
 _LEGEND_ROOM = 1.25  # height of the axes relative to the maximum distance, so that the legend hides no curve
 
+_LABELS_SIDE_BY_SIDE = 8  # below the bars; more are upright
 _LINES = 5  # of progress where there is no terminal
 _Frame = UInt8[np.ndarray, "height width 3"]
 Bounds = tuple[float, float, float, float]  # left, bottom, width, height as fractions of the frame
@@ -174,7 +175,9 @@ def _add_bars(figure: Figure, bounds: Bounds, clip: Clip) -> Any:
     axes = figure.add_axes(bounds)
     colours = [clip.match.learner_colours[name.split("+")[0]] for name in clip.bar_names]
     bars = axes.bar(range(len(clip.bar_names)), clip.bars[0], color=colours)
-    axes.set_xticks(range(len(clip.bar_names)), [name.replace("link", "") for name in clip.bar_names])
+    labels = [name.replace("link", "").replace("_", " ") for name in clip.bar_names]
+    upright = 90 if len(labels) > _LABELS_SIDE_BY_SIDE else 0
+    axes.set_xticks(range(len(labels)), labels, rotation=upright, fontsize=8 if upright else None)
     axes.set(title="contribution of each learner link", ylim=(0, 1.05 * clip.bars.max()))
     return bars
 
