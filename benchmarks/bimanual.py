@@ -24,14 +24,13 @@ from mimic.metric.config import MetricConfig
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
 from mimic.mocap.link_motion import BOTH
-from mimic.retargeting.costs import capsule_axes, pair_distances
+from mimic.retargeting.costs import capsule_axes, changing_pairs, pair_distances
 
 _PAIR = ArmConfig("panda_pair")
 _LIMITS = "none"  # as in env=bimanual
 _SPEED = 15.0  # rad/s, of a joint
 _STARTS = 8  # random initial guesses: each takes a minute of one core with the cost
 _CLOSE = 0.02  # m
-_RANDOM_POSES, _CHANGE = 1000, 1e-3  # m, of a distance that joints change
 # The cost is 0 from its clearance on; below, the distance pulls against it, so that it keeps less than its clearance.
 COSTS = {"with": mimic.Costs(self_collision=10.0, clearance=0.05), "without": None}
 
@@ -71,12 +70,11 @@ def capsule_distances(arm: mimic.Embodiment, capsules: mimic.Capsules, qpos: np.
     Without pairs whose distance no joint changes: one of a Panda's wrist is always 2.0 cm.
     """
     of_pose = jax.jit(jax.vmap(lambda q: pair_distances(capsules, *capsule_axes(arm, capsules, q))))
-    random = np.random.default_rng(0).uniform(-np.pi, np.pi, (_RANDOM_POSES, arm.num_joints))
-    distances, changes = np.asarray(of_pose(jnp.asarray(qpos))), np.ptp(np.asarray(of_pose(jnp.asarray(random))), 0)
+    distances, changing = np.asarray(of_pose(jnp.asarray(qpos))), changing_pairs(arm, capsules)
     sides = np.sign(capsules.start[:, 1])  # in the zero pose each arm is upright at its side
     are_apart = np.array([sides[i] != sides[j] for i, j in capsules.pairs])
     kinds = {"between_arms": are_apart, "within_arm": ~are_apart}
-    return {name: distances[:, pairs & (changes > _CHANGE)].min(axis=1) for name, pairs in kinds.items()}
+    return {name: distances[:, pairs & changing].min(axis=1) for name, pairs in kinds.items()}
 
 
 def measure(

@@ -120,7 +120,7 @@ def test_a_plugin_is_imported_and_named_for_other_processes(module, own_registry
         (["env.metric.correspondence=no_such_module:f"], "'no_such_module:f' cannot be imported: ModuleNotFoundError"),
         (["env.metric.correspondence=own"], "correspondence: expected one of"),
         (["env.observation.terms=[x]"], "observation.terms: expected one of distance_gradient, got 'x'"),
-        (["env.reward.terms={x: 1}"], "reward.terms: expected one of none, got 'x'"),
+        (["env.reward.terms={x: 1}"], "reward.terms: expected one of self_collision, got 'x'"),
         (["env.metric.link_distance=x"], "link_distance: expected one of none, got 'x'"),
         (["env.demonstrations.source=x"], "demonstrations.source: expected one of none, got 'x'"),
         (["env=no_such_env"], "unknown env 'no_such_env'; valid are bimanual, pair, panda3dof"),

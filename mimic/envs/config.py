@@ -13,7 +13,8 @@ from mimic.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
 AUTO = "auto"
-OBSERVATION_TERMS = ("distance_gradient",)  # built in, see mimic/envs/terms.py
+REWARD_TERMS, OBSERVATION_TERMS = ("self_collision",), ("distance_gradient",)  # built in, see mimic/envs/terms.py
+registry.reserve("reward_term", REWARD_TERMS)
 registry.reserve("observation_term", OBSERVATION_TERMS)
 _MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
@@ -72,8 +73,9 @@ class RewardConfig:
     """What is added to the reward, see `mimic.register`.
 
     Attributes:
-      terms: weights of registered reward terms, by name. A step that ends a runaway counts each term as minus the
-        weight's magnitude for all remaining steps; so terms should be in [-1, 1].
+      terms: weights of reward terms, by name: "self_collision", which is built in, or what `mimic.register` adds. A
+        step that ends a runaway counts each term as minus the weight's magnitude for all remaining steps; so terms
+        should be in [-1, 1].
     """
 
     terms: dict[str, float] = number(dict, at_least=-1e6, at_most=1e6, by_name=True)

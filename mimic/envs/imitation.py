@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mimic import compat, registry
 from mimic.arms.arm import Arm, build_arm, torque_scale
+from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
@@ -23,6 +25,7 @@ from mimic.envs.start_poses import home_poses, nearest_poses
 from mimic.envs.terms import Transition, observation_layout_of_terms, observation_terms, observed, reward_terms
 from mimic.metric.distance import LinkDistance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
+from mimic.retargeting.costs import changing_pairs
 
 # The limit penalty starts this margin inside a limit and is at its maximum a width further out; in rad for positions,
 # as a fraction of the velocity limit for speeds.
@@ -119,7 +122,18 @@ class ImitationEnv(Env):
     def _start_poses_of(self, demonstrations: Demonstrations) -> Float[np.ndarray, "demonstrations joints"]:
         if self.config.start == "home" or not demonstrations.count:
             return home_poses(self.learner, demonstrations.count)
-        return nearest_poses(self.expert, self.learner, demonstrations.qpos[:, 0], self.metric.arguments)
+        capsules = self.capsules if "self_collision" in self.config.reward.terms else None
+        return nearest_poses(self.expert, self.learner, demonstrations.qpos[:, 0], self.metric.arguments, capsules)
+
+    @functools.cached_property
+    def capsules(self) -> Capsules:
+        """Capsules around the links of the learner, fitted at the first access, see `fit_capsules`."""
+        return fit_capsules(self.config.learner, self.config.limits)
+
+    @functools.cached_property
+    def changing_pairs(self) -> Bool[np.ndarray, " pairs"]:
+        """Whether the joints change the distance of each of the capsules' pairs."""
+        return changing_pairs(self.learner, self.capsules)
 
     def reset(self, rng: Array) -> State:
         """Starts an episode: a random demonstration at its first step, the learner as the config's `start` says."""

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.compilation import on_host
 from mimic.retargeting.costs import Costs
@@ -15,6 +16,7 @@ START_POSES = ("home", "nearest")
 # Weight of the distance from the home pose, so that redundant joints start alike where many poses are equally near. It
 # adds 0.1 % to the mean distance of a Panda from a captured arm.
 _HOME = 0.01
+_SELF_COLLISION, CLEARANCE = 10.0, 0.05  # weight, and m
 _STARTS = 48  # random initial guesses: with 12 the poses are 0.4 % farther, and others from one window to the next
 _CHUNK = 256  # poses at a time: one function is compiled for any number of demonstrations
 
@@ -29,6 +31,7 @@ def nearest_poses(
     learner: Embodiment,
     qpos: Float[np.ndarray, "demonstrations expert_joints"],
     metric: dict[str, Any],
+    capsules: Capsules | None = None,
 ) -> Float[np.ndarray, "demonstrations joints"]:
     """The learner's poses nearest to poses of the expert [rad], see `imitate_pose`.
 
@@ -37,11 +40,13 @@ def nearest_poses(
       learner: n_hat joints.
       qpos: first poses of the demonstrations [rad].
       metric: correspondence, weights, rotation and reduction of the embodiment distance.
+      capsules: of the learner, to start without self-collision; None to ignore it.
     """
     count = len(qpos)
     padded = np.asarray(qpos, np.float32)[np.minimum(np.arange(-(-count // _CHUNK) * _CHUNK), count - 1)]
     chunks = padded.reshape(-1, _CHUNK, expert.num_joints)
-    options = {"starts": _STARTS, "costs": Costs(home=_HOME), **metric}
+    costs = Costs(home=_HOME, self_collision=_SELF_COLLISION if capsules else 0.0, clearance=CLEARANCE)
+    options = {"starts": _STARTS, "costs": costs, "capsules": capsules, **metric}
     with on_host():  # compiles several times faster, and runs once
         poses = [np.asarray(imitate_pose(expert, learner, jnp.asarray(chunk), **options).qpos) for chunk in chunks]
     return np.concatenate(poses)[:count]

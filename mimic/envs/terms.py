@@ -9,8 +9,10 @@ from jaxtyping import Array, Float
 
 from mimic import registry
 from mimic.envs.arm_state import ArmState
-from mimic.envs.config import OBSERVATION_TERMS
+from mimic.envs.config import OBSERVATION_TERMS, REWARD_TERMS
+from mimic.envs.start_poses import CLEARANCE
 from mimic.metric.kinematics import LinkStates, link_states
+from mimic.retargeting.costs import capsule_axes, intrusion, pair_distances
 
 Env = Any  # an `ImitationEnv`, which imports this module
 
@@ -59,10 +61,31 @@ class WeightedTerm(NamedTuple):
         return value
 
 
+def self_collision(env: Env, transition: Transition) -> Float[Array, ""]:
+    """-x / (1 + x) for the intrusion x of the learner's capsules into a clearance of 5 cm, see `Costs.self_collision`.
+
+    Without the pairs whose distance no joint changes. Links do not touch in the simulation: this is all that keeps them
+    apart.
+    """
+    capsules, pairs = env.capsules, env.changing_pairs
+    if not pairs.any():
+        return jnp.zeros(())
+    axes = capsule_axes(env.learner, capsules, transition.after.qpos)
+    x = intrusion(pair_distances(capsules, *axes)[pairs], CLEARANCE)
+    return -x / (1 + x)
+
+
+_BUILT_IN_REWARD_TERMS: dict[str, RewardTerm] = dict(zip(REWARD_TERMS, (self_collision,), strict=True))
+
+
 def reward_terms(weights: Mapping[str, float]) -> tuple[WeightedTerm, ...]:
     """The terms of `reward.terms`. Raises a ValueError for an unknown name."""
     return tuple(
-        WeightedTerm(name, float(weight), registry.find("reward_term", name, "reward.terms"))
+        WeightedTerm(
+            name,
+            float(weight),
+            _BUILT_IN_REWARD_TERMS.get(name) or registry.find("reward_term", name, "reward.terms"),
+        )
         for name, weight in weights.items()
     )
 
@@ -80,12 +103,17 @@ def distance_gradient(env: Env, state: ArmState) -> Float[Array, " 2*joints"]:
     return jnp.concatenate(jax.grad(distance, argnums=(0, 1))(state.qpos, state.qvel))
 
 
-_BUILT_IN: dict[str, ObservationTerm] = dict(zip(OBSERVATION_TERMS, (distance_gradient,), strict=True))
+_BUILT_IN_OBSERVATION_TERMS: dict[str, ObservationTerm] = dict(
+    zip(OBSERVATION_TERMS, (distance_gradient,), strict=True)
+)
 
 
 def observation_terms(names: Sequence[str]) -> tuple[tuple[str, ObservationTerm], ...]:
     """The terms of `observation.terms`. Raises a ValueError for an unknown name."""
-    found = (_BUILT_IN.get(name) or registry.find("observation_term", name, "observation.terms") for name in names)
+    found = (
+        _BUILT_IN_OBSERVATION_TERMS.get(name) or registry.find("observation_term", name, "observation.terms")
+        for name in names
+    )
     return tuple(zip(names, found, strict=True))
 
 

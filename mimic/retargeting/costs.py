@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.chain_match import matched_chains
@@ -21,6 +21,7 @@ from mimic.retargeting.pose_objective import PoseObjective, Target
 
 _NEAR_LIMIT = 0.1  # fraction of a joint's range at each end where `limits` counts
 _SMOOTHING = 1e-4  # m, of the distance of crossing segments, whose second derivative is infinite without
+_RANDOM_POSES, _CHANGE = 1000, 1e-3  # m, of a distance that joints change
 _SHORT = 1e-6  # m, axis of a capsule that is a sphere
 _FULL_TURN = 2 * np.pi - 1e-4  # rad; a joint with such a range has no limits, as for `continuous_joints`
 
@@ -101,11 +102,11 @@ def pose_cost(
         start, end = capsule_axes(learner, capsules, qpos)
         if costs.self_collision and capsules.pairs:
             distance = pair_distances(capsules, start, end)
-            total += costs.self_collision * _intrusion(distance, costs.clearance)
+            total += costs.self_collision * intrusion(distance, costs.clearance)
         if costs.floor:
             moves = np.flatnonzero(~np.array(capsules.near_base))
             height = jnp.minimum(start[moves, 2], end[moves, 2]) - jnp.asarray(capsules.radius[moves], qpos.dtype)
-            total += costs.floor * _intrusion(height - costs.floor_height, costs.clearance)
+            total += costs.floor * intrusion(height - costs.floor_height, costs.clearance)
     return total
 
 
@@ -179,6 +180,16 @@ def pair_distances(capsules: Capsules, start: Array, end: Array) -> Float[Array,
     return jax.vmap(segment_distance)(start[i], end[i], start[j], end[j]) - radii
 
 
+def changing_pairs(arm: Embodiment, capsules: Capsules) -> Bool[np.ndarray, " pairs"]:
+    """Whether the joints change the distance of each pair; two capsules of a Panda's wrist are always 2.0 cm apart."""
+    if not capsules.pairs:
+        return np.zeros(0, bool)
+    qpos = np.random.default_rng(0).uniform(-np.pi, np.pi, (_RANDOM_POSES, arm.num_joints))
+    with jax.ensure_compile_time_eval():
+        of_pose = jax.jit(jax.vmap(lambda q: pair_distances(capsules, *capsule_axes(arm, capsules, q))))
+        return np.ptp(np.asarray(of_pose(jnp.asarray(qpos, jnp.float32))), axis=0) > _CHANGE
+
+
 def segment_distance(
     a: Float[Array, "3"], b: Float[Array, "3"], c: Float[Array, "3"], d: Float[Array, "3"]
 ) -> Float[Array, ""]:
@@ -201,7 +212,8 @@ def segment_distance(
     return jnp.sqrt(jnp.sum(difference * difference) + _SMOOTHING**2)
 
 
-def _intrusion(distance: Array, clearance: float) -> Float[Array, ""]:
+def intrusion(distance: Float[Array, " pairs"], clearance: float) -> Float[Array, ""]:
+    """Sum of the squared fractions of the clearance that distances lack, see `Costs.self_collision`."""
     return jnp.sum(jnp.maximum(0, 1 - distance / clearance) ** 2)
 
 

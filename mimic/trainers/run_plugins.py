@@ -19,9 +19,9 @@ def used_plugins(config: TrainConfig) -> dict[str, str]:
 
 def _used(config: TrainConfig) -> Iterator[tuple[str, str]]:
     env = config.env
-    yield from (("reward_term", name) for name in env.reward.terms)
-    terms = env.observation.terms
-    yield from (("observation_term", name) for name in terms if registry.is_registered("observation_term", name))
+    terms = [("reward_term", name) for name in env.reward.terms]
+    terms += [("observation_term", name) for name in env.observation.terms]
+    yield from (term for term in terms if registry.is_registered(*term))
     single = {
         "environment": env.environment,
         "correspondence": env.metric.correspondence,

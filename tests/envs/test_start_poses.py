@@ -8,11 +8,12 @@ import pytest
 import mimic
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.envs.start_poses import nearest_poses
+from mimic.envs.start_poses import CLEARANCE, nearest_poses
 from mimic.envs.wrappers import fresh_episodes
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_frames import RolloutFrames
 from mimic.evaluation.searched_torques import _task
+from mimic.retargeting.costs import capsule_axes, pair_distances
 
 SETTINGS = {"demonstrations": {"count": 3, "held_out": 2}, "horizon": 6}
 
@@ -90,3 +91,17 @@ def test_home_is_the_default_and_other_names_are_rejected():
     np.testing.assert_array_equal(env.start_poses, np.tile(np.float32(env.learner.home), (3, 1)))
     with pytest.raises(ValueError, match="start: expected one of home, nearest"):
         mimic.env_config("planar4dof", start="first")
+
+
+def test_an_arm_that_is_charged_for_self_collision_starts_without():
+    env = mimic.make("panda7dof", physics="fused", reward={"terms": {"self_collision": 1.0}}, **SETTINGS)
+    qpos = np.zeros((2, 7))
+    qpos[:, 1], qpos[:, 3] = 2.8, [-0.5, -2.0]  # the upper arm is folded down to the base
+    arguments = env.expert, env.learner, qpos, env.metric.arguments
+
+    def smallest_distance(pose):
+        axes = capsule_axes(env.learner, env.capsules, jnp.asarray(pose))
+        return float(pair_distances(env.capsules, *axes)[env.changing_pairs].min())
+
+    assert max(map(smallest_distance, nearest_poses(*arguments))) < 0
+    assert min(map(smallest_distance, nearest_poses(*arguments, env.capsules))) > 0.8 * CLEARANCE

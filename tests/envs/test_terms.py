@@ -4,12 +4,14 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 import mimic
 from mimic.envs.imitation import layout_of, make_env
 from mimic.envs.wrappers import fresh_episodes
+from mimic.retargeting.costs import capsule_axes
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_plugins import used_plugins
 
@@ -64,13 +66,48 @@ def test_the_distance_gradient_is_that_of_finite_differences(name):
     env = mimic.make(name, physics="fused", observation={"terms": ["distance_gradient"]}, **SMALL)
     state = one_step(env, jnp.linspace(-0.5, 0.8, env.action_size)).pipeline_state
     observed = np.asarray(jax.jit(env.observe)(state)[-2 * env.action_size :])
-    distance = jax.jit(lambda motion: env.distance(*jnp.split(motion, 2), state.demonstration, state.step + 1))
+    n, next_step = env.action_size, state.step + 1
+    distance = jax.jit(lambda motion: env.distance(motion[:n], motion[n:], state.demonstration, next_step))
     motion, step = jnp.concatenate([state.qpos, state.qvel]), 1e-3  # float32
     differences = [
         (distance(motion + change) - distance(motion - change)) / (2 * step) for change in step * jnp.eye(len(motion))
     ]
     assert np.abs(observed[: env.action_size]).max() > 0.05
     np.testing.assert_allclose(observed, differences, atol=5e-4)
+
+
+def test_self_collision_is_charged_by_the_distances_of_mujoco():
+    """The intrusion of capsules into 5 cm, for a pose that folds the hand to the upper arm."""
+    plain = mimic.make("panda7dof", physics="fused", **SMALL)
+    env = mimic.make("panda7dof", physics="fused", reward={"terms": {"self_collision": 0.5}}, **SMALL)
+    action, folded = jnp.zeros(7), jnp.array([0.0, 0.6, 0.0, -2.95, 0.0, 0.5, 0.0])
+    rewards, arm = [], None
+    for each in (plain, env):
+        start = each.reset(jax.random.PRNGKey(0))
+        start = start.replace(pipeline_state=dataclasses.replace(start.pipeline_state, qpos=folded))
+        state = jax.jit(each.step)(start, action)
+        rewards.append(float(state.reward))
+        arm = state.pipeline_state
+    distances = capsule_distances_of_mujoco(env, np.asarray(arm.qpos))
+    intrusion = float((np.maximum(0, 1 - distances[env.changing_pairs] / 0.05) ** 2).sum())
+    expected = -intrusion / (1 + intrusion)
+    assert not env.changing_pairs[env.capsules.pairs.index((8, 10))] and -1 < expected < -0.1
+    assert state.metrics["reward/self_collision"] == pytest.approx(expected, abs=2e-3)  # smoothed by 0.1 mm, float32
+    assert rewards[1] - rewards[0] == pytest.approx(0.5 * expected, abs=1e-3)
+
+
+def capsule_distances_of_mujoco(env, qpos):
+    """Distances of the pairs of the learner's capsules, as geoms of a model of their own."""
+    axes = capsule_axes(env.learner, env.capsules, jnp.asarray(qpos))
+    spec = mujoco.MjSpec()
+    for start, end, radius in zip(*map(np.asarray, axes), env.capsules.radius, strict=True):
+        body = spec.worldbody.add_body()
+        end = np.where(np.linalg.norm(end - start) < 1e-6, start + [0, 0, 1e-6], end)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*start, *end], size=[radius, 0, 0])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return np.array([mujoco.mj_geomDistance(model, data, i, j, 1.0, None) for i, j in env.capsules.pairs])
 
 
 def test_the_distance_gradient_is_finite_where_arms_coincide():
