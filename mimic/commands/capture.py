@@ -136,7 +136,7 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
         command = (
             f"python -m mimic.train env={env.name} env.expert={model} env.demonstrations.path={out} "
             f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out} env.start=nearest "
-            "env.observation.terms=[distance_gradient]"
+            "'env.observation.terms=[distance_gradient]'"
         )
         console.print(f"train on it: {command}", soft_wrap=True, highlight=False, markup=False)
 

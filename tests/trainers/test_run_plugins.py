@@ -43,7 +43,7 @@ def test_a_missing_plugin_is_one_line(tmp_path, own_registry):
     with pytest.raises(ValueError, match=message):
         load_config(run_dir)
     (run_dir / PLUGINS).unlink()  # the config alone says it too
-    with pytest.raises(ValueError, match="reward.terms: expected one of none, got 'height'"):
+    with pytest.raises(ValueError, match="reward.terms: expected one of self_collision, got 'height'"):
         load_config(run_dir)
 
 
