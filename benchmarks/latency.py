@@ -2,15 +2,17 @@
 
     python -m benchmarks.latency [--out FILE] [--poses 2000] [--runs 5]
 
-The process is bound to one core of Linux. `jit` is a caller inside `jax.jit`, `call` is `imitate_pose` itself, which
-also looks up what it compiled. Quantiles are medians over runs; `lowest_p99_us` is of the run that other processes
-disturbed least. On a machine that is not idle, `chrt -f 1` before the command gives the process real-time priority.
+The process is bound to one core of Linux, and XLA computes in the caller's thread, as a control loop would have it.
+`jit` is a caller inside `jax.jit`, `call` is `imitate_pose` itself, which also looks up what it compiled. Quantiles
+are medians over runs; `lowest_p99_us` is of the run that other processes disturbed least. The last row is a loop of
+Python alone, which is as long each time: what its p99 is above its p50 is the machine's. On a machine that is not
+idle, `chrt -f 1` before the command gives the process real-time priority.
 """
 
 import functools
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -42,6 +44,16 @@ def latencies(imitate: Callable[..., Any], motion: np.ndarray, *, warm: bool) ->
     return np.array(times[len(times) // 10 :])
 
 
+def loop_seconds(repeats: int) -> np.ndarray:
+    """Seconds of a loop of Python that does the same each time."""
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        sum(range(7000))
+        times.append(time.perf_counter() - began)
+    return np.array(times)
+
+
 def run_way(way: str, start: str, poses: int, runs: int) -> Row:
     pair = mimic.panda(), mimic.panda(locked=(3, 6, 7))
     metric = MetricConfig().build(*pair).arguments
@@ -51,6 +63,11 @@ def run_way(way: str, start: str, poses: int, runs: int) -> Row:
     phases = np.linspace(0, 20, poses)[:, None] + np.arange(7)
     motion = np.sin(phases).astype(np.float32)
     times = np.array([latencies(imitate, motion, warm=start == "warm") for _ in range(runs)])
+    return row(start, way, times)
+
+
+def row(start: str, way: str, times: np.ndarray) -> Row:
+    """The quantiles of times [runs, poses]."""
     p50, p99 = 1e6 * np.quantile(times, [0.5, 0.99], axis=1)
     return {
         "start": start,
@@ -61,11 +78,18 @@ def run_way(way: str, start: str, poses: int, runs: int) -> Row:
     }
 
 
+def measure(poses: int, runs: int) -> Iterator[Row]:
+    for start in STARTS:
+        for way in ("jit", "call"):
+            yield run_way(way, start, poses, runs)
+    yield row("", "loop of Python", np.array([loop_seconds(poses) for _ in range(runs)]))
+
+
 def main() -> None:
     options = make_parser("latency", __doc__, poses=2000, runs=5).parse_args()
     bind_to_one_core()
-    rows = (run_way(way, start, options.poses, options.runs) for start in STARTS for way in ("jit", "call"))
-    collect(options, rows, "results", COLUMNS)
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    collect(options, measure(options.poses, options.runs), "results", COLUMNS)
 
 
 if __name__ == "__main__":
