@@ -170,6 +170,7 @@ def view_rate(clip: Path, options: argparse.Namespace) -> Row:
             address = re.search(r"http://(\S+)", process.stdout.readline())
             assert address is not None
             moved = asyncio.run(watch(f"ws://{address[1]}", options.seconds))
+            sender.kill()
             process.send_signal(signal.SIGINT)
             rest, exit_code = process.stdout.read(), process.wait(60)
         finally:

@@ -31,7 +31,7 @@ MAX_VALUES = {
     "joint position [rad or m]": (1e4, ("qpos0", "qpos_spring", "key_qpos")),
     "joint range [rad or m]": (1e4, ("jnt_range",)),
     "rotor inertia [kg m^2]": (1e6, ("dof_armature",)),
-    "damping [N m s/rad]": (1e6, ("dof_damping",)),
+    "damping [N m s/rad]": (1e12, ("dof_damping",)),  # Fetch's base is held by 1e11
     "stiffness [N m/rad]": (1e8, ("jnt_stiffness",)),
     "dry friction [N m]": (1e8, ("dof_frictionloss",)),
     "torque limit [N m]": (1e10, ("jnt_actfrcrange",)),

@@ -71,6 +71,7 @@ class Page:
         """Moves the arms to those of a frame; numbers, chart and maps stay."""
         with self.server.atomic():
             self._move(frame)
+        self.server.flush()  # viser's windows of 1/60 s would merge some of the frames that come as fast
 
     def show(self, frame: Frame, chart: str, note: str) -> None:
         """Shows a frame; all elements change together."""
