@@ -20,6 +20,7 @@ LAYERS = (
     ("runs",),
     ("retargeting",),
     ("envs",),
+    ("any_arm",),
     ("mocap",),
     ("evaluation",),
     ("trainers",),

@@ -19,7 +19,7 @@ from mimic.ranges import check_ranges, number, seed_number
 from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
 
-CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "searched")
+CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "searched")
 ARM_SIDES = ("left", "right")
 EXPORT_FORMATS = ("onnx", "jax")
 

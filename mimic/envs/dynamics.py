@@ -106,7 +106,7 @@ def segments(model: mujoco.MjModel) -> tuple[Segment, ...]:
         body = int(model.jnt_bodyid[joint])
         has_body = last_joint[body] == joint  # if a body has several joints, the others move no mass of their own
         poses.append(pose)
-        masses.append(_mass(model, data, body, frame, origin) if has_body else np.zeros((4, 4)))
+        masses.append(pseudo_inertia(model, data, body, frame, origin) if has_body else np.zeros((4, 4)))
     for joint in reversed(range(model.njnt)):  # see `Inertia`
         on_axis = np.zeros((4, 4))
         on_axis[2:, 2:] = masses[joint][2:, 2:]
@@ -185,7 +185,7 @@ def acceleration(
     for i, segment in enumerate(arm):
         matrix[i][i] = plus(matrix[i][i], times(segment.armature, inverse_mass))
         forces[i] = times(torque[i] - times(damping, segment.damping) * qvel[i], inverse_mass) - forces[i]
-    return _solve(matrix, forces)
+    return solve(matrix, forces)
 
 
 def inverse(
@@ -261,10 +261,10 @@ def bias_forces(arm: Sequence[Segment], rotations: Sequence[Rotation], qvel: Seq
         linear = rotate(to_child, add(linear, rotate(field, segment.offset)))
         spin, carried = scale(speed, _Z), rotate(to_child, omega)
         omega, alpha = add(carried, spin), add(rotate(to_child, alpha), cross(carried, spin))
-        field = _acceleration_field(omega, alpha)
+        field = acceleration_field(omega, alpha)
         motions.append((omega, alpha, linear, field))
         first, second = segment.inertia.first, segment.inertia.second
-        moment = add(_moment(field, second), cross(first, linear))
+        moment = add(moment_of_field(field, second), cross(first, linear))
         wrenches.append((rotate(field, first), moment))
     torques: list[Scalar] = [0.0] * len(arm)
     of_children = [(ZERO, ZERO) for _ in arm]
@@ -289,7 +289,7 @@ def _passed_on(
     return force if parent >= 0 else ZERO, moment
 
 
-def _acceleration_field(omega: Vector, alpha: Vector) -> Rotation:
+def acceleration_field(omega: Vector, alpha: Vector) -> Rotation:
     """The matrix of alpha x r + omega x (omega x r)."""
     x, y, z = omega
     xx, yy, zz = times(x, x), times(y, y), times(z, z)
@@ -302,7 +302,7 @@ def _acceleration_field(omega: Vector, alpha: Vector) -> Rotation:
     )
 
 
-def _moment(field: Rotation, second: Rotation) -> Vector:
+def moment_of_field(field: Rotation, second: Rotation) -> Vector:
     """The sum of m r x (field r)."""
 
     def minor(i: int, j: int) -> Scalar:
@@ -311,8 +311,16 @@ def _moment(field: Rotation, second: Rotation) -> Vector:
     return minor(1, 2), minor(2, 0), minor(0, 1)
 
 
-def _solve(matrix: list[list[Scalar]], values: list[Scalar]) -> list[Scalar]:
-    """X of M x = b by L D L^T; only the lower triangle of M is read."""
+def solve(
+    matrix: Sequence[Sequence[Scalar]], values: Sequence[Scalar], is_free: Sequence[Scalar] | None = None
+) -> list[Scalar]:
+    """X of M x = b by L D L^T; only the lower triangle of M is read.
+
+    Args:
+      matrix: M, symmetric and positive definite.
+      values: b.
+      is_free: 1 for the rows and columns of a smaller system, 0 for those to leave out; x is 0 there. All where None.
+    """
     size = len(values)
     lower: list[list[Scalar]] = [[0.0] * size for _ in range(size)]
     inverse: list[Scalar] = []
@@ -327,7 +335,7 @@ def _solve(matrix: list[list[Scalar]], values: list[Scalar]) -> list[Scalar]:
         pivot = matrix[i][i]
         for j in range(i):
             pivot = pivot - times(scaled[j], lower[i][j])
-        inverse.append(1.0 / pivot)
+        inverse.append(1.0 / pivot if is_free is None else is_free[i] / pivot)  # 0 removes a row and its column
     solution = list(values)
     for i in range(size):
         for j in range(i):
@@ -375,7 +383,9 @@ def _frame(axis: np.ndarray, previous: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(axis, x), axis], axis=1)
 
 
-def _mass(model: mujoco.MjModel, data: mujoco.MjData, body: int, frame: np.ndarray, origin: np.ndarray) -> np.ndarray:
+def pseudo_inertia(
+    model: mujoco.MjModel, data: mujoco.MjData, body: int, frame: np.ndarray, origin: np.ndarray
+) -> np.ndarray:
     """The sum of m p p^T over a body's points p = (x, y, z, 1) in a frame: second and first moments, and the mass."""
     inertia = model.body_inertia[body]
     result = np.zeros((4, 4))

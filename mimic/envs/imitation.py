@@ -157,6 +157,10 @@ class ImitationEnv(Env):
         zero = jnp.zeros((), jnp.int32)
         return ArmState(qpos, jnp.zeros_like(qpos), zero, demonstration, key_next, self._draw_load(key_load))
 
+    def at_step(self, state: ArmState, step: Int[Array, ""]) -> ArmState:
+        """A state of `start` at another step of its demonstration."""
+        return dataclasses.replace(state, step=step)
+
     def _draw_load(self, key: Array) -> Load | None:
         mass, damping = self.config.randomization.mass, self.config.randomization.damping
         if mass[0] == mass[1] and damping[0] == damping[1]:

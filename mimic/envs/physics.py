@@ -90,7 +90,7 @@ def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advan
             data = blank.replace(qpos=qpos, qvel=qvel, qfrc_applied=torque)
             return mjx.forward(loaded, data).qacc
 
-        return _runge_kutta(acceleration, qpos, qvel, timestep, substeps)
+        return runge_kutta(acceleration, qpos, qvel, timestep, substeps)
 
     return advance
 
@@ -107,7 +107,7 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
         def acceleration(qpos: Array, qvel: Array) -> Array:
             return jnp.stack(dynamics.acceleration(arm, list(qpos), list(qvel), list(torque), *load))
 
-        return _runge_kutta(acceleration, qpos, qvel, timestep, substeps)
+        return runge_kutta(acceleration, qpos, qvel, timestep, substeps)
 
     # For CPUs: a loop over a few arrays is twice as fast as a loop over an array for each joint.
     widths = len(arm), len(arm)
@@ -127,12 +127,12 @@ def _scalar_step(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: i
         def acceleration(qpos: Any, qvel: Any) -> tuple[Any, ...]:
             return tuple(dynamics.acceleration(arm, qpos, qvel, torque, *load))
 
-        return _runge_kutta(acceleration, tuple(qpos), tuple(qvel), timestep, substeps)
+        return runge_kutta(acceleration, tuple(qpos), tuple(qvel), timestep, substeps)
 
     return step
 
 
-def _runge_kutta(
+def runge_kutta(
     acceleration: Callable[[Any, Any], Any], qpos: Any, qvel: Any, timestep: float, substeps: int
 ) -> tuple[Any, Any]:
     """Runge-Kutta steps of arrays or tuples of arrays. A loop over the stages compiles the dynamics only once."""

@@ -1,7 +1,5 @@
 """Training wrappers: brax's own, with a new random demonstration for every episode."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
@@ -28,7 +26,7 @@ class FreshEpisodeWrapper(Wrapper):
         arm = arm_state(state)
         keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(arm.key, FIRST_STEP)
         steps = jax.vmap(lambda key: jax.random.randint(key, (), 0, self._imitation.config.horizon))(keys)
-        arm = dataclasses.replace(arm, step=steps)
+        arm = jax.vmap(self._imitation.at_step)(arm, steps)
         return state.replace(pipeline_state=arm, obs=jax.vmap(self._imitation.observe_start)(arm))
 
     def step(self, state: State, action: jax.Array) -> State:

@@ -1,4 +1,4 @@
-"""Controllers without learning: holding the start pose, and feedback control along the optimal poses."""
+"""Controllers without learning: holding the start pose, and feedback control along optimal poses."""
 
 from collections.abc import Callable
 
@@ -8,6 +8,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
+from mimic.any_arm.controller import nearest_pose_controller
 from mimic.arms.simulation_model import effective_inertia
 from mimic.envs import dynamics
 from mimic.envs.imitation import ImitationEnv, arm_state
@@ -26,21 +27,30 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, float]:
     - "pd": proportional-derivative feedback of each joint along the poses of `imitate_trajectory`, scaled by the
       joint's effective inertia in the home pose. The controller has no other model of the dynamics.
     - "computed_torque": the same feedback through the arm's exact inverse dynamics, with feed-forward.
+    - "nearest_pose": inverse dynamics to the pose nearest to the expert's at the next step, found in each step from the
+      arm's own pose. In contrast to "pd" and "computed_torque" it does not know the motion in advance, see
+      `nearest_pose_controller`.
 
-    Both feedback controllers are critically damped. Of several frequencies, the one with the smallest distance on the
+    "pd" and "computed_torque" are critically damped. Of several frequencies, the one with the smallest distance on the
     training demonstrations is used.
 
     Args:
       evaluator: evaluator of the environment and its demonstrations.
-      name: "hold", "pd" or "computed_torque".
+      name: "hold", "pd", "computed_torque" or "nearest_pose".
 
     Returns:
-      Rollouts of the controller, and its frequency [rad/s].
+      Rollouts of the controller, and its frequency [rad/s], 0 for one that has none.
+
+    Raises:
+      ValueError: an arm or a metric that "nearest_pose" does not support.
     """
     env = evaluator.env
     if name == "hold":
         zero = jnp.zeros(env.action_size)
         return jax.jit(lambda: evaluator.rollout(lambda state: zero))(), 0.0
+    if name == "nearest_pose":
+        controller = nearest_pose_controller(env)
+        return jax.jit(lambda: evaluator.rollout(controller))(), 0.0
     make_controller = _tracking(env, {"pd": _joint_law, "computed_torque": _inverse_dynamics_law}[name](env))
     run = jax.jit(lambda frequency: evaluator.rollout(make_controller(frequency)))
     candidates = [(run(frequency), frequency) for frequency in _FREQUENCIES]

@@ -105,13 +105,13 @@ def _overlaps(
     link_lengths = [arm.link_lengths if lengths == "chord" else _path_lengths(arm, numpy) for arm in arms]
     pairs = matched_chains(expert.chain_names, learner.chain_names, chains)
     if len(expert.chains) == len(learner.chains) == 1:
-        return *_overlaps_of_chains(link_lengths[0], link_lengths[1], numpy), numpy
+        return *overlaps_of_chains(link_lengths[0], link_lengths[1], numpy), numpy
     shape = expert.num_links, learner.num_links
     overlap, sums = numpy.zeros(shape), [numpy.zeros(size) for size in shape]
     for pair in pairs:
         places = [np.eye(arm.num_links)[:, np.array(arm.chains[i])] for arm, i in zip(arms, pair, strict=True)]
         of_chains = [length[np.array(arm.chains[i])] for arm, i, length in zip(arms, pair, link_lengths, strict=True)]
-        own_overlap, own_lengths = _overlaps_of_chains(of_chains[0], of_chains[1], numpy)
+        own_overlap, own_lengths = overlaps_of_chains(of_chains[0], of_chains[1], numpy)
         overlap = overlap + _placed(places[1], _placed(places[0], own_overlap, numpy).T, numpy).T
         sums = [
             total + _placed(place, own[:, None], numpy)[:, 0]
@@ -126,7 +126,7 @@ def _placed(places: np.ndarray, rows: Any, numpy: ModuleType) -> Any:
     return numpy.sum(places[:, :, None] * rows[None], axis=1)
 
 
-def _overlaps_of_chains(lengths_a: Any, lengths_b: Any, numpy: ModuleType) -> tuple[Any, Any]:
+def overlaps_of_chains(lengths_a: Any, lengths_b: Any, numpy: ModuleType) -> tuple[Any, Any]:
     """Overlap of each pair of links of two chains, both on [0, 1], and the links' lengths there."""
     (start_a, end_a), (start_b, end_b) = (_on_unit_interval(length, numpy) for length in (lengths_a, lengths_b))
     overlap = numpy.minimum(end_a[:, None], end_b[None, :]) - numpy.maximum(start_a[:, None], start_b[None, :])

@@ -1,7 +1,7 @@
 """Kinematic bound: the learner's joint states nearest to those of the expert, whatever the controller."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from mimic.retargeting.pose import pose_limits, shared_joints
 from mimic.retargeting.quasi_newton import Descent, bfgs
 
 _POSES = 256  # random poses whose distances are compared to choose the initial guesses
-_MIN_SPEED = 1e-2  # rad/s, of the unit of the optimised velocities
+MIN_SPEED = 1e-2  # rad/s, of the unit of the optimised velocities
 # Shift of each round of exchange, in steps: each step tries the motions of the steps before and after it by this shift.
 # Long shifts spread a minimum quickly, short ones track it.
 _SHIFTS = (1, 2, 4, 1, 8, 1, 2, 1, 1, 1, 1, 1)
@@ -143,62 +143,110 @@ def _motion_solver(
     expert: Embodiment, learner: Embodiment, metric: Metric, starts: int, iterations: int, seed: int
 ) -> Callable[[Array, Array], ClosestMotion]:
     """The function of the expert's motion that `closest_motion` compiles."""
+    lower, upper = np.asarray(learner.joint_range).T
 
     def solve(qpos: Array, qvel: Array) -> ClosestMotion:
-        times, rng = len(qpos), np.random.default_rng(seed)
         states = jax.vmap(lambda *motion: link_states(expert, *motion))(qpos, qvel)
-        speed = jnp.maximum(jnp.abs(qvel).max(axis=1), _MIN_SPEED)
-        shared_qpos, shared_qvel = (shared_joints(expert, learner, values) for values in (qpos, qvel))
-        guesses = _initial_poses(metric, learner, states, shared_qpos, max(starts, _MIN_DESCENTS // times), rng)
-        unit_qvel = jnp.broadcast_to((shared_qvel / speed[:, None])[:, None], guesses.shape)
-        points = jnp.concatenate([guesses, unit_qvel], axis=-1)
-        descend = _descents(metric, learner, states, speed)
-        best = _search(descend, points, iterations, rng)
-        best_qpos, best_qvel = jnp.split(best.point, 2, axis=-1)
-        return ClosestMotion(best_qpos, speed[:, None] * best_qvel, best.value)
+        speed = jnp.maximum(jnp.abs(qvel).max(axis=1), MIN_SPEED)
+        limits = pose_limits(learner, speed.dtype)
+        infinite = np.full_like(limits[1], np.inf)
+        space = SearchSpace(
+            lambda *motion: link_states(learner, *motion),
+            (lower, upper),
+            (np.concatenate([limits[0], -infinite]), np.concatenate([limits[1], infinite])),
+        )
+        guess = (shared_joints(expert, learner, values) for values in (qpos, qvel))
+        return search_motion(metric, space, states, speed, *guess, starts=starts, iterations=iterations, seed=seed)
 
     return solve
 
 
+class SearchSpace(NamedTuple):
+    """The motions of a learner among which the nearest are searched. Its numbers may be traced.
+
+    Attributes:
+      link_states: function of its angles and velocities, each [joints].
+      poses: minimum and maximum angles of random poses [rad], each [joints].
+      limits: minimum and maximum of the angles, then of the velocities, each [2 joints]; may be infinite. A coordinate
+        whose limits are equal stays there. `link_states` should not depend on it, or it disturbs the Hessians.
+    """
+
+    link_states: Callable[[Array, Array], LinkStates]
+    poses: tuple[Any, Any]
+    limits: tuple[Any, Any]
+
+
+def search_motion(
+    metric: Metric,
+    space: SearchSpace,
+    states: LinkStates,
+    speed: Float[Array, " time"],
+    qpos: Float[Array, "time joints"],
+    qvel: Float[Array, "time joints"],
+    *,
+    starts: int,
+    iterations: int,
+    seed: int,
+) -> ClosestMotion:
+    """The search that `closest_motion` describes, for any function of link states. It does not compile by itself.
+
+    Args:
+      metric: between the expert and the learner.
+      space: the learner's motions.
+      states: link states of the expert, each [T, links, 3].
+      speed: unit of the optimised velocities at each time [rad/s], at least `MIN_SPEED`.
+      qpos: one of the initial guesses of the angles [rad].
+      qvel: initial guess of the velocities [rad/s].
+      starts: see `closest_motion`.
+      iterations: see `closest_motion`.
+      seed: see `closest_motion`.
+    """
+    times, rng = len(qpos), np.random.default_rng(seed)
+    guesses = _initial_poses(metric, space, states, qpos, max(starts, _MIN_DESCENTS // times), rng)
+    unit_qvel = jnp.broadcast_to((qvel / speed[:, None])[:, None], guesses.shape)
+    points = jnp.concatenate([guesses, unit_qvel], axis=-1)
+    descend = _descents(metric, space, states, speed)
+    best = _search(descend, points, iterations, rng)
+    best_qpos, best_qvel = jnp.split(best.point, 2, axis=-1)
+    return ClosestMotion(best_qpos, speed[:, None] * best_qvel, best.value)
+
+
 def _initial_poses(
     metric: Metric,
-    learner: Embodiment,
+    space: SearchSpace,
     states: LinkStates,
-    shared_qpos: Float[Array, "time joints"],
+    guess: Float[Array, "time joints"],
     starts: int,
     rng: np.random.Generator,
 ) -> Float[Array, "time guesses joints"]:
-    """The shared angles, and the nearest of each of `starts` subsets of random poses; other subsets at each time."""
-    count, times = -(-_POSES // starts) * starts, len(shared_qpos)
-    lower, upper = np.asarray(learner.joint_range).T
-    poses = jnp.asarray(rng.uniform(lower, upper, (count, learner.num_joints)), shared_qpos.dtype)
-    pose_states = jax.vmap(lambda pose: link_states(learner, pose))(poses)
+    """The guess, and the nearest of each of `starts` subsets of random poses; other subsets at each time."""
+    count, (times, joints) = -(-_POSES // starts) * starts, guess.shape
+    lower, upper = space.poses
+    poses = jnp.asarray(lower + (upper - lower) * rng.random((count, joints)), guess.dtype)
+    pose_states = jax.vmap(lambda pose: space.link_states(pose, jnp.zeros_like(pose)))(poses)
     pose_distances = jax.vmap(lambda state: jax.vmap(lambda pose: metric(state, pose))(pose_states))(states)
     orders = np.stack([rng.permutation(count) for _ in range(min(_PERIOD, times))]).reshape(-1, starts, count // starts)
     subsets = jnp.asarray(orders)[np.arange(times) % _PERIOD]
     distances = jnp.take_along_axis(pose_distances[:, None], subsets, axis=2)
     nearest = jnp.take_along_axis(subsets, jnp.argmin(distances, axis=2)[..., None], axis=2)[..., 0]
-    return jnp.concatenate([shared_qpos[:, None], poses[nearest]], axis=1)
+    return jnp.concatenate([guess[:, None], poses[nearest]], axis=1)
 
 
 def _descents(
-    metric: Metric, learner: Embodiment, states: LinkStates, speed: Float[Array, " time"]
+    metric: Metric, space: SearchSpace, states: LinkStates, speed: Float[Array, " time"]
 ) -> Callable[[Array, Array, int], Descent]:
     """A function of points [T, candidates, 2 joints] and their inverse Hessians: the best descent at each time.
 
     A point is the learner's angles, then its velocities in units of the expert's speed.
     """
-    lower, upper = pose_limits(learner, speed.dtype)
-    infinite = np.full_like(upper, np.inf)
-    limits = np.concatenate([lower, -infinite]), np.concatenate([upper, infinite])
 
     def descend(points: Array, inverses: Array, iterations: int) -> Descent:
         def at_time(state: LinkStates, speed: Array, points: Array, inverses: Array) -> Descent:
             def objective(point: Array) -> Array:
                 qpos, unit_qvel = jnp.split(point, 2)
-                return metric(state, link_states(learner, qpos, speed * unit_qvel))
+                return metric(state, space.link_states(qpos, speed * unit_qvel))
 
-            descent = jax.vmap(lambda point, inverse: bfgs(objective, point, inverse, limits, iterations))
+            descent = jax.vmap(lambda point, inverse: bfgs(objective, point, inverse, space.limits, iterations))
             descents = descent(points, inverses)
             return jax.tree.map(lambda x: x[jnp.argmin(descents.value)], descents)
 

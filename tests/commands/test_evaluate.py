@@ -109,7 +109,10 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["controller=mpc"], "controller: expected one of policy, hold, pd, computed_torque, searched, got 'mpc'"),
+        (
+            ["controller=mpc"],
+            "controller: expected one of policy, hold, pd, computed_torque, nearest_pose, searched, got 'mpc'",
+        ),
         (["physics=bullet"], "physics: expected one of mjx, fused, got 'bullet'"),
         (["checkpoint=7"], "has no checkpoint 7; it has 0"),
         (["out=."], "exists; name a new folder"),

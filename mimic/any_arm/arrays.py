@@ -1,0 +1,275 @@
+"""An arm as arrays of fixed shape: one compiled function takes any arm, and each row of a batch may be another one.
+
+The frame of a joint has z along the joint's axis, and its origin is the point on the axis nearest to the origin of the
+frame before it. Its x-axis is normal to the next joint's axis. So the transform from a frame to the next one is
+
+    T = Rx(twist) Trans(a, b, 0) Rz(qpos + reference),
+
+which has as many numbers as Denavit and Hartenberg's. In contrast to theirs, they stay small if two axes are almost
+parallel.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from flax import struct
+from jaxtyping import Float, Int
+
+from mimic.arms.arm import Arm, finite_velocity_limit
+from mimic.arms.embodiment import Embodiment, snap_to_units
+from mimic.envs.dynamics import pseudo_inertia
+from mimic.metric.spatial import array_library
+
+MAX_JOINTS, MAX_LINKS = 8, 12
+_PARALLEL = 1e-12  # rad: axes at a smaller angle are parallel, as `snap_to_units` rounds their sine to 0
+
+
+@struct.dataclass
+class ArmArrays:
+    """A serial arm of up to 8 revolute joints and 12 links. Slots beyond its own joints and links are empty.
+
+    An empty slot of a joint is locked and has no mass; an empty slot of a link has length 0. A joint is locked by its
+    mask, `is_free`: it stays at its angle in `home`, and the shape of the arrays stays the same.
+
+    Attributes:
+      base_rotation: [3, 3] frame of the first joint at angle 0, in the base frame.
+      base_position: [3] its origin [m].
+      twist: [joints, 2] cosine and sine of the angle between a joint's axis and the axis before it.
+      offset: [joints, 2] a and b above [m].
+      reference: [joints] angle that is added to the joint's angle [rad].
+      first_moment: [joints, 2] x and y of the sum of m r over the points of the joint's body [kg m], as in `Inertia` of
+        mimic/envs/dynamics.py: the mass on the axis is part of the parent body.
+      second_moment: [joints, 5] xx, yy, xy, xz and yz of the sum of m r r^T [kg m^2].
+      armature: [joints] rotor inertia [kg m^2].
+      damping: [joints] viscous damping [N m s/rad].
+      is_free: [joints] 1 for a joint that moves, 0 for one that is locked.
+      home: [joints] pose at the start of an episode, and the angles of locked joints [rad].
+      joint_range: [joints, 2] minimum and maximum angle [rad].
+      velocity_limit: [joints] maximum speed [rad/s].
+      torque_limit: [joints] maximum torque [N m].
+      link_joint: [links] index of the joint that moves the link, -1 for a link fixed to the base.
+      link_position: [links, 3] origin of the link in the frame of that joint, or in the base frame [m].
+      link_direction: [links, 3] direction of the link in that frame.
+      link_length: [links] length [m].
+    """
+
+    base_rotation: Float[Any, "3 3"]
+    base_position: Float[Any, "3"]
+    twist: Float[Any, "joints 2"]
+    offset: Float[Any, "joints 2"]
+    reference: Float[Any, " joints"]
+    first_moment: Float[Any, "joints 2"]
+    second_moment: Float[Any, "joints 5"]
+    armature: Float[Any, " joints"]
+    damping: Float[Any, " joints"]
+    is_free: Float[Any, " joints"]
+    home: Float[Any, " joints"]
+    joint_range: Float[Any, "joints 2"]
+    velocity_limit: Float[Any, " joints"]
+    torque_limit: Float[Any, " joints"]
+    link_joint: Int[Any, " links"]
+    link_position: Float[Any, "links 3"]
+    link_direction: Float[Any, "links 3"]
+    link_length: Float[Any, " links"]
+
+    @property
+    def chain_length(self) -> Any:
+        """Sum of the link lengths [m]."""
+        return self.link_length.sum(axis=-1)
+
+    def astype(self, dtype: Any) -> "ArmArrays":
+        """The arm with floating numbers of another type."""
+        return jax.tree.map(lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x, self)
+
+
+def arm_arrays(arm: Arm, free: Sequence[bool] | np.ndarray | None = None) -> ArmArrays:
+    """The arrays of an arm, in double precision.
+
+    Args:
+      arm: a serial arm; joints that its config locks have no slot.
+      free: whether each joint moves; the others are locked at home. All move where None.
+
+    Raises:
+      ValueError: a tree, or more joints or links than there are slots.
+    """
+    embodiment, model = arm.embodiment, arm.model
+    joints, links = embodiment.num_joints, embodiment.num_links
+    if not embodiment.is_serial:
+        raise ValueError(f"{embodiment.name}: expected a serial arm, got a tree of {len(embodiment.chains)} chains")
+    if joints > MAX_JOINTS or links > MAX_LINKS:
+        raise ValueError(
+            f"{embodiment.name}: expected at most {MAX_JOINTS} joints and {MAX_LINKS} links, got {joints} and {links}"
+        )
+    rotations, origins = joint_frames(np.asarray(embodiment.joint_axis), np.asarray(embodiment.joint_anchor))
+    twist, offset, reference = placements(rotations, origins)
+    masses = without_mass_on_axes(_masses(model, embodiment, rotations, origins), rotations, origins)
+    is_free = np.ones(joints) if free is None else np.asarray(free, float)
+    link_joint = np.array(embodiment.link_joint)
+    axes_of_link = np.concatenate([np.eye(3)[None], rotations])[link_joint + 1]
+    origin_of_link = np.concatenate([np.zeros((1, 3)), origins])[link_joint + 1]
+    positions = np.einsum("lji,lj->li", axes_of_link, embodiment.link_position - origin_of_link)
+    directions = np.einsum("lji,lj->li", axes_of_link, embodiment.link_rotation[:, :, 0])
+    arrays = ArmArrays(
+        base_rotation=snap_to_units(rotations[0]),
+        base_position=snap_to_units(origins[0]),
+        twist=_padded(snap_to_units(twist), MAX_JOINTS),
+        offset=_padded(snap_to_units(offset), MAX_JOINTS),
+        reference=_padded(reference, MAX_JOINTS),
+        first_moment=_padded(masses[:, :2, 3], MAX_JOINTS),
+        second_moment=_padded(masses[:, (0, 1, 0, 0, 1), (0, 1, 1, 2, 2)], MAX_JOINTS),
+        armature=_padded(model.dof_armature, MAX_JOINTS),
+        damping=_padded(model.dof_damping, MAX_JOINTS),
+        is_free=_padded(is_free, MAX_JOINTS),
+        home=_padded(embodiment.home, MAX_JOINTS),
+        joint_range=_padded(embodiment.joint_range, MAX_JOINTS),
+        velocity_limit=_padded(finite_velocity_limit(embodiment), MAX_JOINTS),
+        torque_limit=_padded(embodiment.torque_limit, MAX_JOINTS),
+        link_joint=_padded(link_joint, MAX_LINKS).astype(np.int32),
+        link_position=_padded(snap_to_units(positions), MAX_LINKS),
+        link_direction=_padded(snap_to_units(directions), MAX_LINKS),
+        link_length=_padded(embodiment.link_lengths, MAX_LINKS),
+    )
+    return _with_empty_slots(arrays, joints, links)
+
+
+def stack_arms(arms: Sequence[ArmArrays]) -> ArmArrays:
+    """A batch of arms, along the first axis."""
+    return jax.tree.map(lambda *x: np.stack(x), *arms)
+
+
+def lock_joints(arm: ArmArrays, locked: Any) -> ArmArrays:
+    """The arm with more joints locked at home.
+
+    Args:
+      arm: the arm.
+      locked: [joints] 1 or True for the joints to lock.
+    """
+    return dataclasses.replace(arm, is_free=arm.is_free * (1 - locked))
+
+
+def _padded(values: Any, size: int) -> np.ndarray:
+    values = np.asarray(values, float)
+    return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]))])
+
+
+def _with_empty_slots(arrays: ArmArrays, joints: int, links: int) -> ArmArrays:
+    """Fills the slots beyond an arm's own joints and links with numbers that are harmless."""
+    arrays.twist[joints:] = 1.0, 0.0
+    arrays.armature[joints:] = 1.0
+    arrays.joint_range[joints:] = -np.pi, np.pi
+    arrays.velocity_limit[joints:] = np.pi
+    arrays.torque_limit[joints:] = 1.0
+    arrays.link_joint[links:] = -1
+    arrays.link_direction[links:] = 1.0, 0.0, 0.0
+    return arrays
+
+
+def joint_frames(
+    axes: Float[Any, "joints 3"], anchors: Float[Any, "joints 3"], min_angle: float = _PARALLEL
+) -> tuple[Float[Any, "joints 3 3"], Float[Any, "joints 3"]]:
+    """Rotations and origins of the joints' frames at angle 0; NumPy or JAX arrays.
+
+    Args:
+      axes: unit axes of the joints.
+      anchors: a point on each axis.
+      min_angle: axes at a smaller angle are parallel [rad].
+    """
+    numpy = array_library(axes)
+    origins = [anchors[0]]
+    for axis, anchor in zip(axes[1:], anchors[1:], strict=True):
+        origins.append(anchor + numpy.sum(axis * (origins[-1] - anchor)) * axis)
+    rotations = []
+    for i, axis in enumerate(axes):
+        is_last = i + 1 == len(axes)
+        candidates = [] if is_last else [numpy.cross(axis, axes[i + 1]), origins[i + 1] - origins[i]]
+        x = _first_normal(axis, numpy.stack([*candidates, *numpy.eye(3, dtype=axes.dtype)]), min_angle)
+        rotations.append(numpy.stack([x, numpy.cross(axis, x), axis], axis=1))
+    return numpy.stack(rotations), numpy.stack(origins)
+
+
+def _first_normal(axis: Any, candidates: Any, min_length: float) -> Any:
+    """The unit vector normal to an axis along the first of the candidates that is long enough."""
+    numpy = array_library(axis)
+    normals = candidates - numpy.sum(candidates * axis, axis=1, keepdims=True) * axis
+    lengths = numpy.sqrt(numpy.sum(normals * normals, axis=1))
+    first = numpy.argmax(lengths > min_length)
+    normal = normals[first] / lengths[first]
+    normal = normal - numpy.sum(normal * axis) * axis  # a short vector was not normal to rounding
+    return normal / numpy.sqrt(numpy.sum(normal * normal))
+
+
+def placements(rotations: Float[Any, "joints 3 3"], origins: Float[Any, "joints 3"]) -> tuple[Any, Any, Any]:
+    """Twist, offset and reference of each joint, see `ArmArrays`; those of the first are 0."""
+    numpy = array_library(rotations)
+    twists, offsets, references = [numpy.array([1.0, 0.0])], [numpy.zeros(2)], [numpy.zeros(())]
+    for i in range(1, len(rotations)):
+        x, y, z = (rotations[i - 1][:, k] for k in range(3))
+        axis, step = rotations[i][:, 2], origins[i] - origins[i - 1]
+        cosine, sine = numpy.sum(z * axis), -numpy.sum(y * axis)
+        twisted_y = cosine * y + sine * z
+        next_x = rotations[i][:, 0]
+        twists.append(numpy.stack([cosine, sine]))
+        offsets.append(numpy.stack([numpy.sum(x * step), numpy.sum(twisted_y * step)]))
+        references.append(numpy.arctan2(numpy.sum(twisted_y * next_x), numpy.sum(x * next_x)))
+    return numpy.stack(twists), numpy.stack(offsets), numpy.stack(references)
+
+
+def without_mass_on_axes(
+    masses: Float[Any, "joints 4 4"], rotations: Float[Any, "joints 3 3"], origins: Float[Any, "joints 3"]
+) -> Float[Any, "joints 4 4"]:
+    """Moments of mass in the frames of the joints, where the mass on each axis is part of the parent, see `Inertia`."""
+    numpy = array_library(masses)
+    on_axis = np.zeros((4, 4))
+    on_axis[2:, 2:] = 1.0
+    result, of_child = [], numpy.zeros((4, 4))
+    for i in reversed(range(len(masses))):
+        mass = masses[i] + of_child
+        result.append(mass * (1 - on_axis))
+        if i > 0:
+            step = rotations[i - 1].T @ (origins[i] - origins[i - 1])
+            upper = numpy.concatenate([rotations[i - 1].T @ rotations[i], step[:, None]], axis=1)
+            placement = numpy.concatenate([upper, numpy.array([[0.0, 0.0, 0.0, 1.0]])])
+            of_child = placement @ (mass * on_axis) @ placement.T
+    return numpy.stack(result[::-1])
+
+
+def _masses(
+    model: mujoco.MjModel,
+    embodiment: Embodiment,
+    rotations: Float[np.ndarray, "joints 3 3"],
+    origins: Float[np.ndarray, "joints 3"],
+) -> Float[np.ndarray, "joints 4 4"]:
+    """Moments of mass of the body of each joint in its frame."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.0
+    mujoco.mj_kinematics(model, data)
+    to_world = _rigid_transform(embodiment, data)
+    last_joint = {int(body): joint for joint, body in enumerate(model.jnt_bodyid)}
+    masses = np.zeros((len(rotations), 4, 4))
+    for joint, (rotation, origin) in enumerate(zip(rotations, origins, strict=True)):
+        body = int(model.jnt_bodyid[joint])
+        if last_joint[body] == joint:  # if a body has several joints, the others move no mass of their own
+            frame = to_world[:3, :3] @ rotation
+            masses[joint] = pseudo_inertia(model, data, body, frame, to_world[:3, :3] @ origin + to_world[:3, 3])
+    return masses
+
+
+def _rigid_transform(embodiment: Embodiment, data: mujoco.MjData) -> Float[np.ndarray, "4 4"]:
+    """Maps the embodiment's base frame into the world of the model, by the lines of the joints (Kabsch)."""
+    unit = float(embodiment.chain_length)
+    ours, theirs = (
+        np.concatenate([anchor, anchor + unit * axis])
+        for anchor, axis in ((embodiment.joint_anchor, embodiment.joint_axis), (data.xanchor, data.xaxis))
+    )
+    left, _, right = np.linalg.svd((ours - ours.mean(axis=0)).T @ (theirs - theirs.mean(axis=0)))
+    signs = np.array([1.0, 1.0, np.linalg.det(left @ right)])
+    transform = np.eye(4)
+    transform[:3, :3] = (left * signs @ right).T
+    transform[:3, 3] = theirs.mean(axis=0) - transform[:3, :3] @ ours.mean(axis=0)
+    residual = np.abs(ours @ transform[:3, :3].T + transform[:3, 3] - theirs).max()
+    assert residual < 1e-6 * unit, residual
+    return transform

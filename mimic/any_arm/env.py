@@ -1,0 +1,257 @@
+"""The imitation environment whose learner is another arm in each episode; one compiled function for all of them.
+
+An action does not set torques: the same torque means something else on every arm. It shifts target angles. The targets
+without it are those of the nearest pose, which Newton steps find from the arm's own pose, see `nearest_pose`. Inverse
+dynamics turns targets into torques within the arm's limits, see `tracking_torque`. So the zero action is already a
+controller of any arm, and a policy learns what it lacks: to leave local minima, and to look ahead.
+"""
+
+import copy
+import dataclasses
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import Env, State
+from flax import struct
+from jaxtyping import Array, Float
+
+from mimic import compat
+from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
+from mimic.any_arm.control import Targets, torque_scale, tracking_torque
+from mimic.any_arm.controller import NEWTON_STEPS
+from mimic.any_arm.kinematics import (
+    check_metric,
+    correspondence,
+    joint_states,
+    link_states,
+    link_states_in_frames,
+    make_metric,
+)
+from mimic.any_arm.nearest import nearest_pose
+from mimic.any_arm.physics import make_advance
+from mimic.any_arm.sampler import Sampler
+from mimic.arms.arm import build_arm
+from mimic.envs.arm_state import ArmState, arm_state
+from mimic.envs.config import EnvConfig
+from mimic.envs.demonstrations import Demonstrations
+from mimic.envs.physics import Load, PhysicsChoice
+from mimic.metric.distance import Metric
+from mimic.metric.kinematics import LinkStates
+
+_REACH = 1.0  # largest shift of a target by an action, as a fraction of the way at the velocity limit in a step
+_HOLD_SAMPLES = 5  # steps of a demonstration at which the distance of holding the home pose is computed
+_RUNAWAY = 3.0  # distance charged for each step after a runaway, as a multiple of that of holding the home pose
+_MIN_HOLD = 1e-3  # distance; below it, an arm that rests is already where the expert is
+_MAX_FEATURE = 10.0  # of the observation
+
+
+@struct.dataclass
+class AnyArmState(ArmState):
+    """The state of an episode, with its arm.
+
+    Attributes:
+      arm: the learner.
+      max_torque: [joints] maximum torque [N m], see `torque_scale`.
+      hold: mean distance of holding the home pose, the unit of the reward.
+      targets: the nearest pose to the expert at the next step, and its velocity; from `with_targets`.
+    """
+
+    arm: ArmArrays = None  # type: ignore[assignment] - fields after one with a default need one too
+    max_torque: Float[Array, " joints"] = None  # type: ignore[assignment]
+    hold: Float[Array, ""] = None  # type: ignore[assignment]
+    targets: Targets = None  # type: ignore[assignment]
+
+
+class AnyArmEnv(Env):
+    """Arms of a sampler that imitate the demonstrations of one expert; a brax environment.
+
+    Reward: minus the embodiment distance to the expert after the step, divided by the mean distance of holding the
+    home pose, so that all arms count alike. Action: for each joint slot a shift of the target angle in [-1, 1], in
+    units of the way at the velocity limit in one step. Observation: see `observe`.
+
+    Args:
+      config: expert, metric, demonstrations and time steps; its learner is not used.
+      sampler: draws the learner of an episode.
+      demonstrations: motions to imitate.
+
+    Attributes:
+      config: the config.
+      physics: which physics simulates the arms, and why.
+      sampler: draws the learner of an episode.
+      expert: the arm that is imitated.
+      demonstrations: motions to imitate.
+      expert_states: link states of the demonstrations, [demonstrations, time, expert links, 3] each.
+
+    Raises:
+      ValueError: a metric or expert that arrays do not cover, or demonstrations that do not fit.
+    """
+
+    def __init__(self, config: EnvConfig, sampler: Sampler, demonstrations: Demonstrations):
+        compat.mend_brax()
+        self.config, self.sampler = config, sampler
+        self._weights = check_metric(config.metric)
+        expert = build_arm(config.expert, config.limits, config.metric.links)
+        demonstrations.check_fits(expert.embodiment, config.control_dt, config.horizon)
+        self.expert = expert.embodiment
+        self._expert_arrays = jax.tree.map(jnp.asarray, arm_arrays(expert).astype(np.float32))
+        self.demonstrations = demonstrations
+        motions = (demonstrations.qpos, demonstrations.qvel)
+        padding = [(0, 0), (0, 0), (0, MAX_JOINTS - expert.embodiment.num_joints)]
+        padded = (np.pad(x, padding).astype(np.float32) for x in motions)
+        table = jax.jit(jax.vmap(jax.vmap(lambda *motion: link_states(self._expert_arrays, *motion))))(*padded)
+        self.expert_states: LinkStates = table
+        self.physics = PhysicsChoice("fused", "the arm is data of the compiled function")
+        self._advance = make_advance(config.control_dt / config.substeps, config.substeps)
+
+    def with_expert_states(self, states: LinkStates) -> "AnyArmEnv":
+        """The same environment with another array for `expert_states`, see `ImitationEnv.with_expert_states`."""
+        env = copy.copy(self)
+        env.expert_states = states
+        return env
+
+    def reset(self, rng: Array) -> State:
+        """Starts an episode: a random demonstration at its first step, a new arm in its home pose."""
+        return self.begin(self.start(rng))
+
+    def start(self, key: Array) -> AnyArmState:
+        """The first state of an episode of a new arm, on a random demonstration."""
+        key_demonstration, key_arm, key_next = jax.random.split(key, 3)
+        demonstration = jax.random.randint(key_demonstration, (), 0, self.demonstrations.count)
+        return self.start_of(self.sampler(key_arm), demonstration, key_next)
+
+    def start_of(self, arm: ArmArrays, demonstration: Array, key: Array) -> AnyArmState:
+        """The first state of an episode of a given arm on a demonstration."""
+        metric = self.metric_of(arm)
+        samples = jnp.linspace(1, self.config.horizon, _HOLD_SAMPLES).astype(jnp.int32)
+        at_home = link_states(arm, arm.home)
+        held = jax.vmap(lambda step: metric(self.expert_at(demonstration, step), at_home))(samples)
+        state = AnyArmState(
+            qpos=arm.home,
+            qvel=jnp.zeros(MAX_JOINTS),
+            step=jnp.zeros((), jnp.int32),
+            demonstration=jnp.asarray(demonstration, jnp.int32),
+            key=key,
+            arm=arm,
+            max_torque=torque_scale(arm, self.config.action_scale, self.config.control_dt),
+            hold=jnp.maximum(held.mean(), _MIN_HOLD),
+            targets=Targets(arm.home, jnp.zeros(MAX_JOINTS)),
+        )
+        return self.with_targets(state)
+
+    def with_targets(self, state: AnyArmState) -> AnyArmState:
+        """The state with its nearest pose at the next step, by Newton steps from its own pose."""
+        expert = self.expert_at(state.demonstration, state.step + 1)
+        guess = state.qpos + 0.5 * self.config.control_dt * state.qvel
+        matrix = correspondence(self._expert_arrays, state.arm)
+        targets = nearest_pose(state.arm, self._weights, matrix, expert, guess, NEWTON_STEPS)
+        return dataclasses.replace(state, targets=Targets(*targets))
+
+    def at_step(self, state: AnyArmState, step: Array) -> AnyArmState:
+        """A state of `start` at another step of its demonstration."""
+        return self.with_targets(dataclasses.replace(state, step=step))
+
+    def metric_of(self, arm: ArmArrays) -> Metric:
+        """The metric between the expert and an arm."""
+        return make_metric(self._weights, correspondence(self._expert_arrays, arm))
+
+    def begin(self, state: AnyArmState) -> State:
+        """The brax state of an episode that starts in a state."""
+        zero = jnp.zeros(())
+        return State(state, self.observe(state), zero, zero, {"distance": zero, "runaway": zero}, {})
+
+    def observe_start(self, state: AnyArmState) -> Float[Array, " observation"]:
+        """The observation of a state."""
+        return self.observe(state)
+
+    def step(self, state: State, action: Float[Array, " joints"]) -> State:
+        """Advances an episode by one control step of constant torque."""
+        before = any_arm_state(state)
+        torque = self.torque(before, action)
+        qpos, qvel = self._advance(before.arm, before.qpos, before.qvel, torque, Load())
+        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1)
+        expert = self.expert_at(after.demonstration, after.step)
+        runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
+        distance = self.metric_of(after.arm)(expert, link_states(after.arm, qpos, qvel))
+        distance = jnp.where(runaway, _RUNAWAY * after.hold, distance)
+        # A runaway is charged for all remaining steps, so that ending an episode early is never better.
+        steps = jnp.where(runaway, 1.0 + (self.config.horizon - after.step), 1.0)
+        done = (runaway | (after.step >= self.config.horizon)).astype(jnp.float32)
+        metrics = {**state.metrics, "distance": distance, "runaway": runaway.astype(jnp.float32)}
+        after = self.with_targets(after)
+        reward = -steps * distance / after.hold
+        return state.replace(pipeline_state=after, obs=self.observe(after), reward=reward, done=done, metrics=metrics)
+
+    def torque(self, state: AnyArmState, action: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        """The torque of an action [N m]."""
+        arm, dt = state.arm, self.config.control_dt
+        shift = _REACH * dt * arm.velocity_limit * jnp.clip(action, -1.0, 1.0) * arm.is_free
+        shifted = state.targets._replace(qpos=state.targets.qpos + shift)
+        return tracking_torque(arm, state.qpos, state.qvel, shifted, state.max_torque, dt)
+
+    def restart_done(self, states: State) -> State:
+        """Starts a new episode of a new arm for each arm of a batch whose episode is done."""
+        arms = any_arm_state(states)
+        new = jax.vmap(self.start)(arms.key)
+        done = states.done.astype(bool)
+
+        def where_done(new: Array, old: Array) -> Array:
+            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
+
+        arms = jax.tree.map(where_done, new, arms)
+        # Once for all: XLA removes the targets and observations of `step`, which nothing uses.
+        arms = jax.vmap(self.with_targets)(arms)
+        return states.replace(pipeline_state=arms, obs=jax.vmap(self.observe)(arms))
+
+    def expert_at(self, demonstration: Array, step: Array) -> LinkStates:
+        """The expert's link states at a step of a demonstration."""
+        last = self.demonstrations.horizon
+        return jax.tree.map(lambda table: table[demonstration, jnp.minimum(step, last)], self.expert_states)
+
+    def observe(self, state: AnyArmState) -> Float[Array, " observation"]:
+        """The observation: numbers of each joint, of each link, of the expert's links at the next step, and distances.
+
+        - Each joint: whether it is free; cosine and sine of its angle; its velocity, the way to the nearest pose and
+          the velocity there, by the velocity limit; its axis and origin in the base frame.
+        - Each link of the learner: position, direction and length. Each link of the expert: its state.
+        - The distance to the expert at the next step, now and in the nearest pose, by that of holding the home pose.
+
+        Lengths are in chain lengths. Empty slots are 0.
+        """
+        arm, targets = state.arm, state.targets
+        frames = joint_states(arm, state.qpos, state.qvel)
+        states = link_states_in_frames(arm, frames)
+        expert = self.expert_at(state.demonstration, state.step + 1)
+        speed, unit = arm.velocity_limit, 1 / arm.chain_length
+        way = (targets.qpos - state.qpos) / (speed * self.config.control_dt)
+        numbers = [jnp.cos(state.qpos), jnp.sin(state.qpos), state.qvel / speed, way, targets.qvel / speed]
+        own = arm.is_free[:, None]
+        joints = [own, *(own * x[:, None] for x in numbers), frames.rotation[1:, :, 2], unit * frames.origin[1:]]
+        has_link = (arm.link_length > 0)[:, None]
+        links = [has_link * x for x in (states.position, states.direction, unit * arm.link_length[:, None])]
+        expert_links = jax.tree.leaves(jax.tree.map(lambda x: x[: self.expert.num_links], expert))
+        metric, at_targets = self.metric_of(arm), link_states(arm, targets.qpos, targets.qvel)
+        distances = jnp.stack([metric(expert, x) for x in (states, at_targets)]) / state.hold
+        parts = [*joints, *links, *expert_links, distances]
+        return jnp.clip(jnp.concatenate([x.ravel() for x in parts]), -_MAX_FEATURE, _MAX_FEATURE)
+
+    @property
+    def observation_size(self) -> int:
+        """Length of an observation: 12 numbers for each joint, 7 for each link, 12 for each of the expert's, and 2."""
+        return 12 * MAX_JOINTS + 7 * MAX_LINKS + 12 * self.expert.num_links + 2
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action: one number for each joint slot."""
+        return MAX_JOINTS
+
+    @property
+    def backend(self) -> str:
+        """Name of the physics backend, for brax."""
+        return self.physics.name
+
+
+def any_arm_state(state: State) -> AnyArmState:
+    """The `AnyArmState` in a brax state, with its type."""
+    return cast(AnyArmState, arm_state(state))

@@ -1,0 +1,126 @@
+"""The pose of any arm that is nearest to the expert's links, by Newton steps from a given pose.
+
+The metric is a sum over pairs of links of a_tr |p - p_i| + a_rot (pi / 2) (1 - e . e_i). Its gradient and its Hessian
+by the joint angles follow from the axes of the joints in closed form. The Hessian is that of the quadratic function
+that touches the metric at the given pose and lies above it wherever the links move little: 1 / |p - p_i| becomes the
+curvature of a pair's translation, as in iteratively reweighted least squares.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mimic.any_arm.arrays import ArmArrays
+from mimic.any_arm.kinematics import joint_states, link_jacobians, link_states_in_frames
+from mimic.envs.dynamics import solve
+from mimic.metric.distance import DistanceWeights
+from mimic.metric.kinematics import LinkStates
+
+_MIN_DISTANCE = 0.02  # chain lengths; the curvature of a pair's translation is not above the inverse of it
+_DAMPING = 1e-3  # of the Hessian, relative to the mean of its diagonal
+
+
+class PoseQuadratic(NamedTuple):
+    """The metric near a pose of the learner, as a quadratic function of the joint angles.
+
+    Attributes:
+      gradient: [joints] of the metric's part of the pose [1/rad].
+      hessian: [joints, joints] [1/rad^2], positive definite.
+      rate: [joints] change of the gradient in time while the expert moves and the learner rests [1/(rad s)].
+    """
+
+    gradient: Float[Array, " joints"]
+    hessian: Float[Array, "joints joints"]
+    rate: Float[Array, " joints"]
+
+
+def pose_quadratic(
+    arm: ArmArrays,
+    weights: DistanceWeights,
+    matrix: Float[Array, "expert links"],
+    expert: LinkStates,
+    qpos: Float[Array, " joints"],
+) -> PoseQuadratic:
+    """The metric near a pose.
+
+    Args:
+      arm: the learner.
+      weights: of the metric, constants.
+      matrix: correspondence of the links.
+      expert: link states of the expert.
+      qpos: the learner's pose [rad].
+    """
+    frames = joint_states(arm, qpos)
+    states = link_states_in_frames(arm, frames)
+    jacobians = link_jacobians(arm, frames, states)
+    assert expert.direction is not None and expert.angular_velocity is not None
+    shares = matrix / matrix.size
+    step = states.position - expert.position[:, None]  # [expert, links, 3]
+    distance = jnp.maximum(jnp.sqrt(jnp.sum(step**2, axis=-1)), _MIN_DISTANCE)
+    curvature = weights.translation * shares / distance
+    pull = jnp.sum(curvature[..., None] * step, axis=0)
+    turn = 0.5 * jnp.pi * weights.rotation * shares[..., None]
+    target = jnp.sum(turn * expert.direction[:, None], axis=0)
+    gradient = jnp.sum(jacobians.position * pull - jacobians.direction * target, axis=(1, 2))
+    stiffness = jnp.sum(curvature, axis=0)[:, None], jnp.sum(turn, axis=0)
+    hessian = sum(
+        jnp.sum(jacobian[:, None] * jacobian * factor, axis=(2, 3))
+        for jacobian, factor in zip(jacobians, stiffness, strict=True)
+    )
+    # The expert's motion changes the gradient: its links' velocities, and those of their directions.
+    carried = jnp.sum(curvature[..., None] * expert.linear_velocity[:, None], axis=0)
+    turning = jnp.cross(expert.angular_velocity, expert.direction)
+    turned = jnp.sum(turn * turning[:, None], axis=0)
+    rate = -jnp.sum(jacobians.position * carried + jacobians.direction * turned, axis=(1, 2))
+    mean = jnp.trace(hessian) / jnp.maximum(arm.is_free.sum(), 1)
+    hessian = hessian + jnp.diag(_DAMPING * mean + 1e-6 + (1 - arm.is_free))
+    return PoseQuadratic(gradient, hessian, rate)
+
+
+def angle_limits(arm: ArmArrays) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
+    """Minimum and maximum angles [rad]; infinite for joints that can rotate by a full revolution."""
+    lower, upper = arm.joint_range[:, 0], arm.joint_range[:, 1]
+    is_continuous = upper - lower >= 2 * jnp.pi - 1e-4  # models round pi in their text
+    return jnp.where(is_continuous, -jnp.inf, lower), jnp.where(is_continuous, jnp.inf, upper)
+
+
+def solve_free(
+    matrix: Float[Array, "joints joints"], vector: Float[Array, " joints"], is_free: Float[Array, " joints"]
+) -> Float[Array, " joints"]:
+    """X of M x = b among the joints that move; 0 for those that do not."""
+    rows = [list(row) for row in matrix]
+    return jnp.stack(solve(rows, list(vector), list(is_free)))
+
+
+def nearest_pose(
+    arm: ArmArrays,
+    weights: DistanceWeights,
+    matrix: Float[Array, "expert links"],
+    expert: LinkStates,
+    qpos: Float[Array, " joints"],
+    steps: int,
+    max_step: Float[Array, " joints"] | float = 0.5,
+) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
+    """A local minimum near a pose, within the joints' ranges, and the velocity at which it moves with the expert.
+
+    Args:
+      arm: the learner.
+      weights: of the metric, constants.
+      matrix: correspondence of the links.
+      expert: link states of the expert.
+      qpos: pose to start from [rad].
+      steps: Newton steps.
+      max_step: largest change of a joint in a step [rad].
+    """
+    lower, upper = angle_limits(arm)
+
+    def newton(qpos: Array, _: None) -> tuple[Array, Array]:
+        near = pose_quadratic(arm, weights, matrix, expert, qpos)
+        step = solve_free(near.hessian, -near.gradient, arm.is_free)
+        velocity = solve_free(near.hessian, -near.rate, arm.is_free)
+        return jnp.clip(qpos + jnp.clip(step, -max_step, max_step), lower, upper), velocity
+
+    qpos, velocities = jax.lax.scan(newton, qpos, None, length=steps)
+    return qpos, velocities[-1]

@@ -1,0 +1,161 @@
+"""The environment of any arm, and the controller of one arm that it contains."""
+
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
+from mimic.any_arm.controller import nearest_pose_controller
+from mimic.any_arm.env import AnyArmEnv, any_arm_state
+from mimic.any_arm.sampler import lock_masks, lock_sampler, random_arm
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.envs.imitation import training_and_held_out
+from mimic.envs.wrappers import fresh_episodes
+from mimic.evaluation.evaluator import Evaluator
+from mimic.evaluation.tracking_controllers import run_controller
+
+HORIZON, COUNT, HELD_OUT = 20, 3, 2
+
+
+@pytest.fixture(scope="module")
+def config():
+    return mimic.env_config(
+        "panda4dof",
+        physics="fused",
+        horizon=HORIZON,
+        demonstrations={"count": COUNT, "held_out": HELD_OUT},
+    )
+
+
+@pytest.fixture(scope="module")
+def motions(config):
+    return training_and_held_out(config)
+
+
+@pytest.fixture(scope="module")
+def panda():
+    return arm_arrays(build_arm(ArmConfig()))
+
+
+@pytest.fixture(scope="module")
+def env(config, motions):
+    return AnyArmEnv(config, random_arm, motions[0])
+
+
+@pytest.fixture(scope="module")
+def four_joints(panda):
+    mask = np.isin(np.arange(MAX_JOINTS), (2, 5, 6)).astype(float)
+    return jax.tree.map(jnp.asarray, lock_joints(panda, mask).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def zero_actions(env, four_joints):
+    """Rollouts of the zero action on each demonstration: states over time."""
+
+    def run(demonstration):
+        start = env.begin(env.start_of(four_joints, demonstration, jax.random.PRNGKey(0)))
+
+        def step(state, _):
+            state = env.step(state, jnp.zeros(MAX_JOINTS))
+            return state, state
+
+        return jax.lax.scan(step, start, None, length=HORIZON)[1]
+
+    return jax.jit(jax.vmap(run))(jnp.arange(COUNT))
+
+
+@pytest.fixture(scope="module")
+def evaluator(config, motions):
+    return Evaluator(mimic.ImitationEnv(config, motions[0]), motions[1])
+
+
+@pytest.fixture(scope="module")
+def of_one_arm(evaluator):
+    return run_controller(evaluator, "nearest_pose")[0]
+
+
+def test_the_zero_action_is_the_controller_of_one_arm(zero_actions, of_one_arm):
+    """Two implementations of all: arrays with locked joints, and the compiled-in arm without them.
+
+    1e-3 rad: float32 in 20 steps of a controller that amplifies nothing.
+    """
+    qpos = np.asarray(any_arm_state(zero_actions).qpos)
+    np.testing.assert_allclose(qpos[:, :, [0, 1, 3, 4]], np.asarray(of_one_arm.qpos)[:COUNT], rtol=0, atol=1e-3)
+    assert not qpos[:, :, [2, 5, 6, 7]].any()
+    np.testing.assert_allclose(
+        zero_actions.metrics["distance"], np.asarray(of_one_arm.distance)[:COUNT], rtol=0, atol=1e-4
+    )
+
+
+def test_the_controller_is_near_the_kinematic_bound(evaluator, of_one_arm):
+    """Measured: 0.6 and 1.2 % in the first two seconds; in whole episodes of the default demonstrations less."""
+    gap = evaluator.summary(of_one_arm)["optimality_gap"]
+    assert -0.001 < gap["train"] < 0.02 and -0.001 < gap["held_out"] < 0.02
+
+
+def test_the_controller_rejects_what_arrays_do_not_cover():
+    metric = {"correspondence": "hard"}
+    small = {"demonstrations": {"count": 1, "held_out": 1}, "horizon": 5, "physics": "fused"}
+    with pytest.raises(ValueError, match="metric: expected the default one.*got correspondence=hard"):
+        nearest_pose_controller(mimic.make("panda4dof", metric=metric, **small))
+    tree = mimic.make("bimanual", **small)
+    with pytest.raises(ValueError, match="expected a serial arm, got a tree of 2 chains"):
+        nearest_pose_controller(tree)
+
+
+def test_rewards_are_distances_in_units_of_holding(zero_actions):
+    state = any_arm_state(zero_actions)
+    expected = -np.asarray(zero_actions.metrics["distance"]) / np.asarray(state.hold)
+    np.testing.assert_allclose(zero_actions.reward, expected, rtol=1e-6)
+    assert not np.asarray(zero_actions.done)[:, :-1].any() and np.asarray(zero_actions.done)[:, -1].all()
+
+
+def test_observations_have_their_size_and_are_bounded(env, zero_actions):
+    observation = np.asarray(zero_actions.obs)
+    assert observation.shape == (COUNT, HORIZON, env.observation_size)
+    assert np.isfinite(observation).all() and np.abs(observation).max() <= 10
+
+
+def test_a_runaway_ends_and_is_charged_for_all_remaining_steps(env, four_joints):
+    start = env.start_of(four_joints, 0, jax.random.PRNGKey(0))
+    state = env.begin(start.replace(qvel=jnp.full(MAX_JOINTS, 1e4) * four_joints.is_free))
+    after = jax.jit(env.step)(state, jnp.zeros(MAX_JOINTS))
+    assert after.done == 1 and after.metrics["runaway"] == 1
+    assert float(after.reward) == pytest.approx(-3 * HORIZON)
+
+
+def test_each_episode_has_a_new_arm(config, motions, panda):
+    """In a batch, from random steps on, as in training."""
+    masks = lock_masks(7, 1)
+    env = AnyArmEnv(config, lock_sampler(panda, masks), motions[0])
+    wrapped = fresh_episodes(cast(Any, env))
+    state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(1), 8))
+    step = jax.jit(wrapped.step)
+    drawn, steps = [np.asarray(any_arm_state(state).arm.is_free)], np.asarray(any_arm_state(state).step)
+    assert len(np.unique(steps)) > 3
+    for _ in range(HORIZON):
+        before, was_free = any_arm_state(state), drawn[-1]
+        state = step(state, jnp.zeros((8, MAX_JOINTS)))
+        drawn.append(np.asarray(any_arm_state(state).arm.is_free))
+        restarted = np.asarray(state.done) > 0
+        np.testing.assert_array_equal(restarted, np.asarray(before.step) + 1 == HORIZON)
+        np.testing.assert_array_equal(drawn[-1][~restarted], was_free[~restarted])
+        assert not np.asarray(any_arm_state(state).qpos)[restarted].any()
+    assert len(np.unique(np.concatenate(drawn), axis=0)) > 3
+    np.testing.assert_array_equal(stack_arms([panda]).is_free[0], panda.is_free)
+
+
+def test_actions_shift_the_targets(env, four_joints):
+    """By the way at the velocity limit in a step; locked joints stay."""
+    state = env.begin(env.start_of(four_joints, 0, jax.random.PRNGKey(0)))
+    step, unit = jax.jit(env.step), 0.3 * jnp.eye(MAX_JOINTS)
+    still = any_arm_state(step(state, jnp.zeros(MAX_JOINTS))).qpos
+    moved = np.stack([any_arm_state(step(state, action)).qpos - still for action in unit])
+    free = [0, 1, 3, 4]
+    for joint in free:
+        assert moved[joint, joint] > 0.02 and np.argmax(np.abs(moved[joint])) == joint
+    assert not np.delete(moved, free, axis=0).any()
