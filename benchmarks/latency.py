@@ -5,8 +5,7 @@
 The process is bound to one core of Linux, and XLA computes in the caller's thread, as a control loop would have it.
 `jit` is a caller inside `jax.jit`, `call` is `imitate_pose` itself, which also looks up what it compiled. Quantiles
 are medians over runs; `lowest_p99_us` is of the run that other processes disturbed least. The last row is a loop of
-Python alone, which is as long each time: what its p99 is above its p50 is the machine's. On a machine that is not
-idle, `chrt -f 1` before the command gives the process real-time priority.
+Python alone, which is as long each time: what its p99 is above its p50 is the machine's.
 """
 
 import functools

@@ -5,8 +5,8 @@ those of mimic/any_arm/arrays.py: a transform between two frames is two rotation
 mass.
 
 The compile time of a GPU kernel grows with the square of the number of operations of a basic block. The equations of
-mimic/envs/dynamics.py with the arm's numbers as inputs are one block: 47.5 s on an H200. Loops take 3.7 s and have 40 % of
-the speed, which is still far above what a training needs.
+mimic/envs/dynamics.py with the arm's numbers as inputs are one block: 47.5 s on an H200. Loops take 3.7 s and have 40 %
+of the speed, which is still far above what a training needs.
 """
 
 from collections.abc import Callable, Sequence

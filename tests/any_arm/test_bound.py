@@ -37,7 +37,7 @@ def arrays(locked, limits="none"):
 TRACES = []
 
 
-@jax.jit
+@jax.jit(compiler_options={"xla_backend_optimization_level": 1})  # which compiles faster
 def solve(arms, qpos, qvel):
     """The closest motions of a batch of arms to the Panda, and their distances computed from these motions."""
     expert = arrays(())
@@ -75,14 +75,15 @@ def test_the_bound_is_that_of_the_arm_compiled_in(batch, row):
     metric = MetricConfig().build(expert, learner).arguments
     expected = np.asarray(mimic.kinematic_bound(expert, learner, *demonstration(0), **metric))
     actual = batch[1].distance[row]
-    # Both are results of a search from other random poses, whose error is below 1e-3, see `mimic.closest_motion`.
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-3)
+    # Both are results of a search, from other random poses; both find the same poses here. What is left is how near the
+    # descents come to kinks of the velocities: 4e-6; without the refinement of the velocities, 1.4e-4.
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=5e-5)
     assert np.all(actual <= 1.01 * expected)
 
 
 def test_the_bound_of_an_arm_and_itself_is_zero(batch):
-    # The search starts at velocity 0, and ends within 0.02 rad/s of the kink of the metric, whose weight is 0.01 s/rad.
-    np.testing.assert_allclose(batch[1].distance[0], 0, atol=2e-4)
+    # A descent to a kink of the metric would end 1e-4 above it; the refinement of the velocities is exact to 1e-3 of a unit.
+    np.testing.assert_allclose(batch[1].distance[0], 0, atol=1e-5)
 
 
 def test_the_distance_is_that_of_the_returned_motion(batch):
