@@ -65,7 +65,7 @@ def batch():
     return arms, *solved(arms)
 
 
-@pytest.mark.parametrize("row", range(1, len(LEARNERS)))
+@pytest.mark.parametrize("row", [pytest.param(row, marks=[pytest.mark.slow] * (row != 2)) for row in range(1, 4)])
 def test_the_bound_is_that_of_the_arm_compiled_in(batch, row):
     locked, limits = LEARNERS[row]
     expert, learner = (

@@ -91,6 +91,7 @@ def test_the_zero_action_is_the_controller_of_one_arm(zero_actions, of_one_arm):
     )
 
 
+@pytest.mark.slow
 def test_the_controller_is_near_the_kinematic_bound(evaluator, of_one_arm):
     """Measured: 0.6 and 1.2 % in the first two seconds; in whole episodes of the default demonstrations less."""
     gap = evaluator.summary(of_one_arm)["optimality_gap"]
@@ -120,6 +121,7 @@ def test_observations_have_their_size_and_are_bounded(env, zero_actions):
     assert np.isfinite(observation).all() and np.abs(observation).max() <= 10
 
 
+@pytest.mark.slow
 def test_a_runaway_ends_and_is_charged_for_all_remaining_steps(env, four_joints):
     start = env.start_of(four_joints, 0, jax.random.PRNGKey(0))
     state = env.begin(start.replace(qvel=jnp.full(MAX_JOINTS, 1e4) * four_joints.is_free))
@@ -128,6 +130,7 @@ def test_a_runaway_ends_and_is_charged_for_all_remaining_steps(env, four_joints)
     assert float(after.reward) == pytest.approx(-3 * HORIZON)
 
 
+@pytest.mark.slow
 def test_each_episode_has_a_new_arm(config, motions, panda):
     """In a batch, from random steps on, as in training."""
     masks = lock_masks(7, 1)
@@ -149,6 +152,7 @@ def test_each_episode_has_a_new_arm(config, motions, panda):
     np.testing.assert_array_equal(stack_arms([panda]).is_free[0], panda.is_free)
 
 
+@pytest.mark.slow
 def test_actions_shift_the_targets(env, four_joints):
     """By the way at the velocity limit in a step; locked joints stay."""
     state = env.begin(env.start_of(four_joints, 0, jax.random.PRNGKey(0)))
