@@ -8,15 +8,13 @@ from jaxtyping import Array, Float
 from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays
 from mimic.any_arm.dynamics import inertia_matrix, torque_of_arm
 from mimic.any_arm.nearest import solve_free
+from mimic.arms.arm import SPEED_FACTOR
 
 # Weight of the velocity at the end of a step against the angle there, in units of the step. Without it the velocity
 # would alternate from step to step; 0.05 to 1 give optimality gaps of 0.14 to 0.17 % on panda4dof.
 _VELOCITY_WEIGHT = 0.15
 # The deceleration that is counted on, as a fraction of the velocity limit that is lost in a control step.
 _BRAKING = 0.3
-# The maximum torque accelerates a joint from rest to this multiple of its velocity limit in one step, as in
-# `mimic.arms.arm.torque_scale`.
-_SPEED_FACTOR = 2.0
 
 
 class Targets(NamedTuple):
@@ -40,7 +38,7 @@ def effective_inertia(arm: ArmArrays, qpos: Float[Array, " joints"]) -> Float[Ar
 
 def torque_scale(arm: ArmArrays, action_scale: float, control_dt: float) -> Float[Array, " joints"]:
     """Maximum torque of each joint [N m], see `mimic.arms.arm.torque_scale`; 0 for locked joints."""
-    torque = action_scale * _SPEED_FACTOR * arm.velocity_limit * effective_inertia(arm, arm.home) / control_dt
+    torque = action_scale * SPEED_FACTOR * arm.velocity_limit * effective_inertia(arm, arm.home) / control_dt
     return arm.is_free * jnp.minimum(torque, arm.torque_limit)
 
 
@@ -78,6 +76,9 @@ def tracking_torque(
       targets: see `Targets`; those beyond reach in one step are approached.
       max_torque: [joints] maximum torque [N m].
       control_dt: duration of the step [s].
+
+    Returns:
+      Torques, 0 for locked joints.
     """
     targets = reachable_targets(arm, qpos, targets, control_dt)
     dt, weight = control_dt, _VELOCITY_WEIGHT

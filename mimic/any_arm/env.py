@@ -217,7 +217,8 @@ class AnyArmEnv(Env):
         - Each link of the learner: position, direction and length. Each link of the expert: its state.
         - The distance to the expert at the next step, now and in the nearest pose, by that of holding the home pose.
 
-        Lengths are in chain lengths. Empty slots are 0.
+        Lengths are in chain lengths. Empty slots of links are 0; those of joints have the axis and origin of the last
+        joint, and 0 otherwise.
         """
         arm, targets = state.arm, state.targets
         frames = joint_states(arm, state.qpos, state.qvel)

@@ -118,7 +118,7 @@ def check_metric(config: MetricConfig) -> DistanceWeights:
     different = [f"{key}={getattr(config, key)}" for key, value in expected.items() if getattr(config, key) != value]
     if different or not isinstance(weights, DistanceWeights):
         raise ValueError(
-            "metric: expected the default one, with any constant weights, for an environment of any arm, got "
+            "metric: expected the default one, with any constant weights, for arms as arrays, got "
             + (", ".join(different) or f"adaptive={config.adaptive}, link_distance={config.link_distance!r}")
         )
     return weights

@@ -30,7 +30,7 @@ _PLANAR_RADIUS, _PLANAR_COLOUR = 0.035, [0.35, 0.55, 0.85, 1.0]  # of links, as 
 _PLANAR_JOINT, _PLANAR_HEIGHT, _PLANAR_DARK = 0.045, 0.045, [0.25, 0.27, 0.3, 1.0]  # of the housings of joints
 
 # The maximum torque accelerates a joint from rest to this multiple of its velocity limit in one step.
-_SPEED_FACTOR = 2.0
+SPEED_FACTOR = 2.0
 DEFAULT_VELOCITY_LIMIT = np.pi  # rad/s, assumed for joints without a velocity limit
 
 
@@ -211,7 +211,7 @@ def torque_scale(arm: Arm, action_scale: float, control_dt: float) -> Float[np.n
       control_dt: duration of a torque [s].
     """
     inertia = effective_inertia(arm.model, np.asarray(arm.embodiment.home))
-    torque = action_scale * _SPEED_FACTOR * finite_velocity_limit(arm.embodiment) * inertia / control_dt
+    torque = action_scale * SPEED_FACTOR * finite_velocity_limit(arm.embodiment) * inertia / control_dt
     return np.minimum(torque, arm.embodiment.torque_limit).astype(np.float32)
 
 
