@@ -1,4 +1,4 @@
-"""A controller of any arm without learning: at each step towards the pose nearest to the expert's next one."""
+"""Controllers of one arm that know its model: towards the pose nearest to the next of the expert, or a policy."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,9 +10,15 @@ from brax.envs.base import State
 from jaxtyping import Array, Float
 
 from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays
-from mimic.any_arm.control import Targets, tracking_torque
+from mimic.any_arm.control import (
+    changed_acceleration,
+    max_speed,
+    torque_of_acceleration,
+    tracking_acceleration,
+)
 from mimic.any_arm.kinematics import check_metric, correspondence
 from mimic.any_arm.nearest import nearest_pose
+from mimic.any_arm.observation import observe
 from mimic.arms.arm import build_arm
 from mimic.envs.arm_state import arm_state
 from mimic.envs.imitation import ImitationEnv
@@ -20,15 +26,18 @@ from mimic.envs.imitation import ImitationEnv
 NEWTON_STEPS = 3  # of the nearest pose; 1 gives a gap of 0.16 instead of 0.14 % on panda4dof, 8 gives 0.13 %
 
 
-def nearest_pose_controller(env: ImitationEnv) -> Callable[[State], Float[Array, " joints"]]:
+def nearest_pose_controller(
+    env: ImitationEnv, policy: Callable[[Float[Array, " observation"]], Float[Array, " joints"]] | None = None
+) -> Callable[[State], Float[Array, " joints"]]:
     """A function from a state of the environment to an action.
 
     It knows the learner's model and the expert's state at the next step, as a policy with `preview=1` observes it, and
-    nothing of the demonstration beyond. See `nearest_pose` and `tracking_torque`. It finds a local minimum of the
-    metric, the one that Newton steps from the arm's own pose lead to.
+    nothing of the demonstration beyond. See `nearest_pose` and `tracking_acceleration`. Without a policy it finds a
+    local minimum of the metric, the one that Newton steps from the arm's own pose lead to.
 
     Args:
-      env: the environment.
+      env: the environment of the arm.
+      policy: policy of any arm, trained on `AnyArmEnv`: from its observation to its action.
 
     Raises:
       ValueError: a tree, an arm with more joints or links than `ArmArrays` has, or another metric than the default one.
@@ -40,14 +49,20 @@ def nearest_pose_controller(env: ImitationEnv) -> Callable[[State], Float[Array,
     with jax.ensure_compile_time_eval():
         matrix = np.asarray(correspondence(expert_arm, arm))
     joints, dt = env.action_size, config.control_dt
+    speed = max_speed(arm, config.limits)
 
     def controller(state: State) -> Array:
         now = arm_state(state)
         qpos, qvel, max_torque = (_padded(x, MAX_JOINTS) for x in (now.qpos, now.qvel, env.torque_scale))
-        next_states = jax.tree.map(lambda x: _padded(x, MAX_LINKS), env.expert_at(now.demonstration, now.step + 1))
+        own_states = env.expert_at(now.demonstration, now.step + 1)
+        next_states = jax.tree.map(lambda x: _padded(x, MAX_LINKS), own_states)
         guess = qpos + 0.5 * dt * qvel
         targets = nearest_pose(arm, weights, jnp.asarray(matrix), next_states, guess, NEWTON_STEPS)
-        torque = tracking_torque(arm, qpos, qvel, Targets(*targets), max_torque, dt)
+        acceleration = tracking_acceleration(arm, qpos, qvel, targets, speed, dt)
+        if policy is not None:
+            action = policy(observe(arm, own_states, qpos, qvel, targets, max_torque, speed, dt))
+            acceleration = changed_acceleration(arm, acceleration, action, dt)
+        torque = torque_of_acceleration(arm, qpos, qvel, acceleration, max_torque, dt)
         return torque[:joints] / env.torque_scale
 
     return controller

@@ -1,9 +1,9 @@
 """The imitation environment whose learner is another arm in each episode; one compiled function for all of them.
 
-An action does not set torques: the same torque means something else on every arm. It shifts target angles. The targets
-without it are those of the nearest pose, which Newton steps find from the arm's own pose, see `nearest_pose`. Inverse
-dynamics turns targets into torques within the arm's limits, see `tracking_torque`. So the zero action is already a
-controller of any arm, and a policy learns what it lacks: to leave local minima, and to look ahead.
+An action does not set torques: the same torque means something else on every arm. It changes accelerations. Those
+without it lead to the nearest pose, which Newton steps find from the arm's own pose, see `nearest_pose`. Inverse
+dynamics turns accelerations into torques within the arm's limits, see `torque_of_acceleration`. So the zero action is
+already a controller of any arm, and a policy learns what it lacks: to leave local minima, and to look ahead.
 """
 
 import copy
@@ -18,18 +18,23 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from mimic import compat
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
-from mimic.any_arm.control import Targets, torque_scale, tracking_torque
+from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
+from mimic.any_arm.control import (
+    changed_acceleration,
+    max_speed,
+    torque_of_acceleration,
+    torque_scale,
+    tracking_acceleration,
+)
 from mimic.any_arm.controller import NEWTON_STEPS
 from mimic.any_arm.kinematics import (
     check_metric,
     correspondence,
-    joint_states,
     link_states,
-    link_states_in_frames,
     make_metric,
 )
-from mimic.any_arm.nearest import nearest_pose
+from mimic.any_arm.nearest import NearestPose, nearest_pose
+from mimic.any_arm.observation import observation_size, observe
 from mimic.any_arm.physics import make_advance
 from mimic.any_arm.sampler import Sampler
 from mimic.arms.arm import build_arm
@@ -40,11 +45,9 @@ from mimic.envs.physics import Load, PhysicsChoice
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import LinkStates
 
-_REACH = 1.0  # largest shift of a target by an action, as a fraction of the way at the velocity limit in a step
 _HOLD_SAMPLES = 5  # steps of a demonstration at which the distance of holding the home pose is computed
 _RUNAWAY = 3.0  # distance charged for each step after a runaway, as a multiple of that of holding the home pose
 _MIN_HOLD = 1e-3  # distance; below it, an arm that rests is already where the expert is
-_MAX_FEATURE = 10.0  # of the observation
 
 
 @struct.dataclass
@@ -61,15 +64,15 @@ class AnyArmState(ArmState):
     arm: ArmArrays = None  # type: ignore[assignment] - fields after one with a default need one too
     max_torque: Float[Array, " joints"] = None  # type: ignore[assignment]
     hold: Float[Array, ""] = None  # type: ignore[assignment]
-    targets: Targets = None  # type: ignore[assignment]
+    targets: NearestPose = None  # type: ignore[assignment]
 
 
 class AnyArmEnv(Env):
     """Arms of a sampler that imitate the demonstrations of one expert; a brax environment.
 
     Reward: minus the embodiment distance to the expert after the step, divided by the mean distance of holding the
-    home pose, so that all arms count alike. Action: for each joint slot a shift of the target angle in [-1, 1], in
-    units of the way at the velocity limit in one step. Observation: see `observe`.
+    home pose, so that all arms count alike. Action: for each joint slot a change of its acceleration in [-1, 1], see
+    `changed_acceleration`. Observation: see `mimic.any_arm.observation.observe`.
 
     Args:
       config: expert, metric, demonstrations and time steps; its learner is not used.
@@ -136,7 +139,7 @@ class AnyArmEnv(Env):
             arm=arm,
             max_torque=torque_scale(arm, self.config.action_scale, self.config.control_dt),
             hold=jnp.maximum(held.mean(), _MIN_HOLD),
-            targets=Targets(arm.home, jnp.zeros(MAX_JOINTS)),
+            targets=NearestPose(arm.home, jnp.zeros(MAX_JOINTS), jnp.ones(MAX_JOINTS)),
         )
         return self.with_targets(state)
 
@@ -146,7 +149,7 @@ class AnyArmEnv(Env):
         guess = state.qpos + 0.5 * self.config.control_dt * state.qvel
         matrix = correspondence(self._expert_arrays, state.arm)
         targets = nearest_pose(state.arm, self._weights, matrix, expert, guess, NEWTON_STEPS)
-        return dataclasses.replace(state, targets=Targets(*targets))
+        return dataclasses.replace(state, targets=targets)
 
     def at_step(self, state: AnyArmState, step: Array) -> AnyArmState:
         """A state of `start` at another step of its demonstration."""
@@ -185,10 +188,12 @@ class AnyArmEnv(Env):
 
     def torque(self, state: AnyArmState, action: Float[Array, " joints"]) -> Float[Array, " joints"]:
         """The torque of an action [N m]."""
-        arm, dt = state.arm, self.config.control_dt
-        shift = _REACH * dt * arm.velocity_limit * jnp.clip(action, -1.0, 1.0) * arm.is_free
-        shifted = state.targets._replace(qpos=state.targets.qpos + shift)
-        return tracking_torque(arm, state.qpos, state.qvel, shifted, state.max_torque, dt)
+        arm, dt, motion = state.arm, self.config.control_dt, (state.qpos, state.qvel)
+        speed = max_speed(arm, self.config.limits)
+        acceleration = changed_acceleration(
+            arm, tracking_acceleration(arm, *motion, state.targets, speed, dt), action, dt
+        )
+        return torque_of_acceleration(arm, *motion, acceleration, state.max_torque, dt)
 
     def restart_done(self, states: State) -> State:
         """Starts a new episode of a new arm for each arm of a batch whose episode is done."""
@@ -210,37 +215,17 @@ class AnyArmEnv(Env):
         return jax.tree.map(lambda table: table[demonstration, jnp.minimum(step, last)], self.expert_states)
 
     def observe(self, state: AnyArmState) -> Float[Array, " observation"]:
-        """The observation: numbers of each joint, of each link, of the expert's links at the next step, and distances.
-
-        - Each joint: whether it is free; cosine and sine of its angle; its velocity, the way to the nearest pose and
-          the velocity there, by the velocity limit; its axis and origin in the base frame.
-        - Each link of the learner: position, direction and length. Each link of the expert: its state.
-        - The distance to the expert at the next step, now and in the nearest pose, by that of holding the home pose.
-
-        Lengths are in chain lengths. Empty slots of links are 0; those of joints have the axis and origin of the last
-        joint, and 0 otherwise.
-        """
-        arm, targets = state.arm, state.targets
-        frames = joint_states(arm, state.qpos, state.qvel)
-        states = link_states_in_frames(arm, frames)
+        """The observation, see `mimic.any_arm.observation.observe`."""
         expert = self.expert_at(state.demonstration, state.step + 1)
-        speed, unit = arm.velocity_limit, 1 / arm.chain_length
-        way = (targets.qpos - state.qpos) / (speed * self.config.control_dt)
-        numbers = [jnp.cos(state.qpos), jnp.sin(state.qpos), state.qvel / speed, way, targets.qvel / speed]
-        own = arm.is_free[:, None]
-        joints = [own, *(own * x[:, None] for x in numbers), frames.rotation[1:, :, 2], unit * frames.origin[1:]]
-        has_link = (arm.link_length > 0)[:, None]
-        links = [has_link * x for x in (states.position, states.direction, unit * arm.link_length[:, None])]
-        expert_links = jax.tree.leaves(jax.tree.map(lambda x: x[: self.expert.num_links], expert))
-        metric, at_targets = self.metric_of(arm), link_states(arm, targets.qpos, targets.qvel)
-        distances = jnp.stack([metric(expert, x) for x in (states, at_targets)]) / state.hold
-        parts = [*joints, *links, *expert_links, distances]
-        return jnp.clip(jnp.concatenate([x.ravel() for x in parts]), -_MAX_FEATURE, _MAX_FEATURE)
+        expert = jax.tree.map(lambda x: x[: self.expert.num_links], expert)
+        speed = max_speed(state.arm, self.config.limits)
+        inputs = state.qpos, state.qvel, state.targets, state.max_torque, speed
+        return observe(state.arm, expert, *inputs, self.config.control_dt)
 
     @property
     def observation_size(self) -> int:
-        """Length of an observation: 12 numbers for each joint, 7 for each link, 12 for each of the expert's, and 2."""
-        return 12 * MAX_JOINTS + 7 * MAX_LINKS + 12 * self.expert.num_links + 2
+        """Length of an observation."""
+        return observation_size(self.expert.num_links)
 
     @property
     def action_size(self) -> int:

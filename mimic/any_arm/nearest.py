@@ -36,6 +36,20 @@ class PoseQuadratic(NamedTuple):
     rate: Float[Array, " joints"]
 
 
+class NearestPose(NamedTuple):
+    """A local minimum of the metric over the poses of an arm.
+
+    Attributes:
+      qpos: [joints] the pose [rad].
+      qvel: [joints] velocity at which it moves with the expert [rad/s].
+      curvature: [joints] second derivative of the metric by each joint's angle [1/rad^2]; 1 for locked joints.
+    """
+
+    qpos: Float[Array, " joints"]
+    qvel: Float[Array, " joints"]
+    curvature: Float[Array, " joints"]
+
+
 def pose_quadratic(
     arm: ArmArrays,
     weights: DistanceWeights,
@@ -102,8 +116,8 @@ def nearest_pose(
     qpos: Float[Array, " joints"],
     steps: int,
     max_step: Float[Array, " joints"] | float = 0.5,
-) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """A local minimum near a pose, within the joints' ranges, and the velocity at which it moves with the expert.
+) -> NearestPose:
+    """A local minimum near a pose, within the joints' ranges.
 
     Args:
       arm: the learner.
@@ -116,11 +130,12 @@ def nearest_pose(
     """
     lower, upper = angle_limits(arm)
 
-    def newton(qpos: Array, _: None) -> tuple[Array, Array]:
+    def newton(qpos: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         near = pose_quadratic(arm, weights, matrix, expert, qpos)
         step = solve_free(near.hessian, -near.gradient, arm.is_free)
         velocity = solve_free(near.hessian, -near.rate, arm.is_free)
-        return jnp.clip(qpos + jnp.clip(step, -max_step, max_step), lower, upper), velocity
+        after = jnp.clip(qpos + jnp.clip(step, -max_step, max_step), lower, upper)
+        return after, (velocity, jnp.diagonal(near.hessian))
 
-    qpos, velocities = jax.lax.scan(newton, qpos, None, length=steps)
-    return qpos, velocities[-1]
+    qpos, of_steps = jax.lax.scan(newton, qpos, None, length=steps)
+    return NearestPose(qpos, *(x[-1] for x in of_steps))

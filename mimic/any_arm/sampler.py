@@ -35,6 +35,10 @@ _HOUSING = 0.2, 3.0  # kg, mass at the end of a link: the next joint's motor, or
 _ARMATURE = 0.05, 0.5  # kg m^2
 _DAMPING = 0.3, 5.0  # N m s/rad
 _SPEED = 1.5, 3.5  # rad/s
+# Factors of the perturbed arms, log-uniform.
+_SIZE, _MASS = (0.7, 1.4), (0.5, 2.0)
+_DRIVES = (0.5, 2.0), (0.5, 2.0), (0.7, 1.4)  # armature, damping, velocity limit
+_LOCKED = 0.3  # probability that a joint is locked
 _TORQUE_LIMIT = 1e3  # N m: the limit of the environment is below it
 
 
@@ -80,6 +84,52 @@ def limited_sampler(sampler: Sampler, count: int) -> Sampler:
     return lambda key: sampler(jax.random.fold_in(jax.random.PRNGKey(0), jax.random.randint(key, (), 0, count)))
 
 
+def perturbed_sampler(arms: Sequence[ArmArrays]) -> Sampler:
+    """One of several arms, with another size, other masses and drives, and some times with a joint locked at home.
+
+    Lengths have a common factor, and masses have one too, so that every body keeps a positive density. Armature,
+    damping and velocity limit of each joint have factors of their own. The base is rotated about the vertical.
+    """
+    table = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(each, jnp.float32) for each in x]), *arms)
+    table = table.replace(link_joint=table.link_joint.astype(jnp.int32))
+
+    def draw(key: Array) -> ArmArrays:
+        key_arm, key_size, key_drives, key_lock = jax.random.split(key, 4)
+        arm = jax.tree.map(lambda x: x[jax.random.randint(key_arm, (), 0, len(arms))], table)
+        of_arm = jax.random.uniform(key_size, (3,))
+        length, mass = (_log_uniform(bounds, x) for bounds, x in zip((_SIZE, _MASS), of_arm[:2], strict=True))
+        of_joints = jax.random.uniform(key_drives, (3, MAX_JOINTS))
+        armature, damping, speed = (_log_uniform(bounds, x) for bounds, x in zip(_DRIVES, of_joints, strict=True))
+        rotation = _rotation_about_z(2 * jnp.pi * of_arm[2])
+        number_lock, number_joint = jax.random.uniform(key_lock, (2,))
+        locked = jnp.floor(number_joint * arm.is_free.sum()) == jnp.cumsum(arm.is_free) - 1
+        base_links = (arm.link_joint < 0)[:, None]  # those are given in the base frame
+
+        def rotated(vectors: Array) -> Array:
+            return jnp.where(base_links, jnp.sum(rotation * vectors[:, None], axis=-1), vectors)
+
+        perturbed = arm.replace(
+            base_rotation=jnp.sum(rotation[:, :, None] * arm.base_rotation[None], axis=1),
+            base_position=length * jnp.sum(rotation * arm.base_position, axis=-1),
+            offset=length * arm.offset,
+            first_moment=mass * length * arm.first_moment,
+            second_moment=mass * length**2 * arm.second_moment,
+            armature=jnp.where(arm.is_free > 0, armature * arm.armature, arm.armature),
+            damping=damping * arm.damping,
+            velocity_limit=speed * arm.velocity_limit,
+            link_position=length * rotated(arm.link_position),
+            link_direction=rotated(arm.link_direction),
+            link_length=length * arm.link_length,
+        )
+        return lock_joints(perturbed, arm.is_free * locked * (number_lock < _LOCKED))
+
+    return draw
+
+
+def _log_uniform(bounds: tuple[float, float], number: Array) -> Array:
+    return jnp.exp(np.log(bounds[0]) + np.log(bounds[1] / bounds[0]) * number)
+
+
 # Above 40 lines because each line is one fact of the distribution. Matrix products are not rounded to TF32.
 @jax.default_matmul_precision("highest")
 def random_arm(key: Array) -> ArmArrays:
@@ -96,9 +146,6 @@ def random_arm(key: Array) -> ArmArrays:
 
     def uniform(bounds: tuple[float, float], number: Array) -> Array:
         return bounds[0] + (bounds[1] - bounds[0]) * number
-
-    def log_uniform(bounds: tuple[float, float], number: Array) -> Array:
-        return jnp.exp(uniform((float(np.log(bounds[0])), float(np.log(bounds[1]))), number))
 
     of_arm = numbers[0]
     count = _MIN_JOINTS + jnp.floor((MAX_JOINTS + 1 - _MIN_JOINTS) * of_arm[0])
@@ -117,8 +164,8 @@ def random_arm(key: Array) -> ArmArrays:
     radius, density = uniform(_RADIUS, of_arm[4]), uniform(_DENSITY, of_arm[5])
     housings = jnp.sort(uniform(_HOUSING, numbers[1]))[::-1]  # motors are smaller towards the tip
     armature, damping, speed = (
-        log_uniform(_ARMATURE, numbers[2]),
-        log_uniform(_DAMPING, numbers[3]),
+        _log_uniform(_ARMATURE, numbers[2]),
+        _log_uniform(_DAMPING, numbers[3]),
         uniform(_SPEED, numbers[4]),
     )
     masses = jax.vmap(_rod_with_sphere, (0, None, None, 0))(steps, radius, density, housings)

@@ -102,12 +102,59 @@ class ObservationConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class ArmsConfig:
+    """What the learner of each episode is drawn from. If all weights are 0, it is always the environment's learner.
+
+    Attributes:
+      locked: weight of the environment's learner with joints locked at home, none of them included.
+      most_locked: largest number of joints that are locked.
+      unseen: sets of locked joints that training leaves out, as in "2" or "1+4"; the report shows them apart.
+      perturbed: weight of `models`, each drawn with another size, other masses, rotors, damping and velocity limits.
+      models: arms to draw perturbed ones from: names or files, see `ArmConfig.model`.
+      random: weight of random arms, see `random_arm` in mimic/any_arm/sampler.py.
+      distinct: number of distinct arms in a training; 0 draws a new arm for each episode.
+      evaluated: arms that the report shows too, as names or files. They should not be in `models`.
+      armature, damping: minimum of each joint of `models` and `evaluated`, see `ArmConfig`; the default is the Panda's.
+    """
+
+    locked: float = number(0.0, at_least=0.0, at_most=1e6)
+    most_locked: int = number(2, at_least=0, at_most=7)
+    unseen: list[str] = dataclasses.field(default_factory=list)
+    perturbed: float = number(0.0, at_least=0.0, at_most=1e6)
+    models: list[str] = dataclasses.field(default_factory=list)
+    random: float = number(0.0, at_least=0.0, at_most=1e6)
+    distinct: int = number(0, at_least=0, at_most=2**31 - 1)
+    evaluated: list[str] = dataclasses.field(default_factory=list)
+    armature: float = number(0.1, at_least=0.0, at_most=1e4)
+    damping: float = number(1.0, at_least=0.0, at_most=1e4)
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "arms.")
+        for text in self.unseen:
+            if not all(number.isdecimal() and int(number) > 0 for number in text.split("+")):
+                raise ValueError(f"arms.unseen: expected numbers of joints from 1, as in 2 or 1+4, got {text!r:.80}")
+        if bool(self.models) != (self.perturbed > 0):
+            raise ValueError("arms: expected models and a weight perturbed above 0, or neither of them")
+
+    @property
+    def are_drawn(self) -> bool:
+        """Whether the learner is another arm in each episode."""
+        return self.locked + self.perturbed + self.random > 0
+
+    @property
+    def unseen_sets(self) -> list[tuple[int, ...]]:
+        """The numbers of the locked joints, from 1, of each set in `unseen`."""
+        return [tuple(sorted(int(number) for number in text.split("+"))) for text in self.unseen]
+
+
+@dataclasses.dataclass(frozen=True)
 class EnvConfig:
     """An imitation environment.
 
     Attributes:
       name: name of the preset.
       expert, learner: the arms.
+      arms: what the learner of each episode is drawn from, where it is not always the same.
       limits: "none" (start in the zero pose, paper) or "hardware" (start in the ready pose, the manufacturer's joint
         ranges).
       metric: embodiment distance of the reward.
@@ -133,6 +180,7 @@ class EnvConfig:
     name: str = ""
     expert: ArmConfig = dataclasses.field(default_factory=ArmConfig)
     learner: ArmConfig = dataclasses.field(default_factory=ArmConfig)
+    arms: ArmsConfig = dataclasses.field(default_factory=ArmsConfig)
     limits: str = "none"
     metric: MetricConfig = dataclasses.field(default_factory=MetricConfig)
     demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)

@@ -9,7 +9,7 @@ import pytest
 
 from mimic.any_arm import control
 from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints
-from mimic.any_arm.control import Targets
+from mimic.any_arm.nearest import NearestPose
 from mimic.any_arm.physics import make_advance
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arm import torque_scale as scale_of_one_arm
@@ -18,6 +18,15 @@ from mimic.envs.physics import Load
 DT = 0.1
 UNLIMITED: Any = np.full(MAX_JOINTS, 1e9)
 LOCKED = np.array([0, 0, 1, 0, 0, 1, 1, 0])
+
+
+def targets_at(qpos, qvel):
+    return NearestPose(qpos, qvel, jnp.ones(MAX_JOINTS))
+
+
+def tracking_torque(arm, qpos, qvel, targets, max_torque):
+    acceleration = control.tracking_acceleration(arm, qpos, qvel, targets, arm.velocity_limit, DT)
+    return control.torque_of_acceleration(arm, qpos, qvel, acceleration, max_torque, DT)
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +50,8 @@ def test_targets_of_a_constant_acceleration_are_reached(x64, panda, mask):
     rng = np.random.default_rng(0)
     qpos, qvel, qacc = (jnp.asarray(x * arm.is_free) for x in rng.uniform(-1, 1, (3, MAX_JOINTS)))
     qvel, qacc = 0.3 * qvel, 3.0 * qacc
-    targets = Targets(qpos + DT * qvel + 0.5 * DT**2 * qacc, qvel + DT * qacc)
-    torque = control.tracking_torque(arm, qpos, qvel, targets, UNLIMITED, DT)
+    targets = targets_at(qpos + DT * qvel + 0.5 * DT**2 * qacc, qvel + DT * qacc)
+    torque = tracking_torque(arm, qpos, qvel, targets, UNLIMITED)
     end = make_advance(DT / 10, 10)(arm, qpos, qvel, torque, Load())
     np.testing.assert_allclose(end[0], targets.qpos, rtol=0, atol=2e-3)
     np.testing.assert_allclose(end[1], targets.qvel, rtol=0, atol=4e-2)
@@ -50,10 +59,10 @@ def test_targets_of_a_constant_acceleration_are_reached(x64, panda, mask):
 
 def test_torques_above_the_maximum_keep_their_direction(x64, panda):
     qpos = jnp.zeros(MAX_JOINTS)
-    targets = Targets(qpos + 1.0 * panda.is_free, qpos)
-    free = control.tracking_torque(panda, qpos, qpos, targets, UNLIMITED, DT)
+    targets = targets_at(qpos + 1.0 * panda.is_free, qpos)
+    free = tracking_torque(panda, qpos, qpos, targets, UNLIMITED)
     maximum = control.torque_scale(panda, 0.2, DT)
-    limited = control.tracking_torque(panda, qpos, qpos, targets, maximum, DT)
+    limited = tracking_torque(panda, qpos, qpos, targets, maximum)
     ratio = np.asarray(limited / maximum)[:7]
     assert np.abs(ratio).max() == pytest.approx(1.0)
     np.testing.assert_allclose(limited / free[0] * free[0] / limited[0], free / free[0], rtol=1e-12)
@@ -62,12 +71,12 @@ def test_torques_above_the_maximum_keep_their_direction(x64, panda):
 def test_far_targets_are_approached_at_the_velocity_limit_and_braked_before(x64, panda):
     """The angle never overshoots a target at rest by more than a step's rounding of the braking distance."""
     arm = lock_joints(panda, np.array([1, 0, 1, 1, 1, 1, 1, 0]))
-    target = Targets(jnp.full(MAX_JOINTS, 1.5) * arm.is_free, jnp.zeros(MAX_JOINTS))
+    target = targets_at(jnp.full(MAX_JOINTS, 1.5) * arm.is_free, jnp.zeros(MAX_JOINTS))
     advance = jax.jit(make_advance(DT / 10, 10))
     qpos = qvel = jnp.zeros(MAX_JOINTS)
     angles, speeds = [], []
     for _ in range(25):
-        torque = control.tracking_torque(arm, qpos, qvel, target, control.torque_scale(arm, 1.0, DT), DT)
+        torque = tracking_torque(arm, qpos, qvel, target, control.torque_scale(arm, 1.0, DT))
         qpos, qvel = advance(arm, qpos, qvel, torque, Load())
         angles.append(float(qpos[1]))
         speeds.append(float(qvel[1]))

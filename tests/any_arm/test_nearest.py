@@ -43,7 +43,7 @@ def test_steps_lead_to_an_equal_arm_and_its_velocity(x64, panda):
     qpos, qvel = motion(2)
     expert, matrix = link_states(panda, qpos, qvel), correspondence(panda, panda)
     start = qpos + 0.2 * motion(3)[0]
-    found, velocity = nearest_pose(panda, WEIGHTS, matrix, expert, start, 60)
+    found, velocity, _ = nearest_pose(panda, WEIGHTS, matrix, expert, start, 60)
     np.testing.assert_allclose(found[:6], qpos[:6], rtol=0, atol=1e-5)
     np.testing.assert_allclose(velocity[:6], qvel[:6], rtol=0, atol=0.05)
     np.testing.assert_allclose(found[6], qpos[6], rtol=0, atol=0.1)  # it moves only the last link, by a few cm
@@ -55,7 +55,7 @@ def test_steps_reduce_the_distance_and_leave_locked_joints(x64, panda):
     pose, distances = jnp.zeros(MAX_JOINTS), []
     for _ in range(8):
         distances.append(float(metric(expert, link_states(learner, pose))))
-        pose, velocity = nearest_pose(learner, WEIGHTS, matrix, expert, pose, 1)
+        pose, velocity, _ = nearest_pose(learner, WEIGHTS, matrix, expert, pose, 1)
         assert not np.asarray(pose)[LOCKED > 0].any() and not np.asarray(velocity)[LOCKED > 0].any()
     assert np.all(np.diff(distances) < 0)
 
@@ -67,5 +67,5 @@ def test_poses_stay_within_ranges(x64, panda):
     lower, upper = angle_limits(learner)
     assert lower[1] == -0.1 and upper[1] == 0.2 and np.isinf(lower[0])  # the others rotate by a full revolution
     expert, matrix = link_states(panda, qpos, qvel), correspondence(panda, panda)
-    found, _ = nearest_pose(learner, WEIGHTS, matrix, expert, jnp.zeros(MAX_JOINTS), 10)
+    found, *_ = nearest_pose(learner, WEIGHTS, matrix, expert, jnp.zeros(MAX_JOINTS), 10)
     assert float(found[1]) in (-0.1, 0.2)

@@ -1,0 +1,110 @@
+"""The arms of an environment whose learner is drawn for each episode: its sampler, and the arms of its report."""
+
+import jax
+import numpy as np
+
+from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints
+from mimic.any_arm.sampler import (
+    Sampler,
+    limited_sampler,
+    lock_masks,
+    lock_sampler,
+    mixed_sampler,
+    perturbed_sampler,
+    random_arm,
+)
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.envs.config import EnvConfig
+
+SEEN, UNSEEN = "seen", "unseen"
+_RANDOM_ARMS = 16  # in a report
+_RANDOM_SEED = 2**20  # of the random arms of a report; training draws from other keys
+
+
+def arm_sampler(config: EnvConfig) -> Sampler:
+    """Draws the learner of an episode of training.
+
+    Raises:
+      ValueError: an arm that cannot be loaded or has too many joints, or a set of joints that the learner lacks.
+    """
+    arms = config.arms
+    parts: list[tuple[float, Sampler]] = []
+    if arms.locked:
+        base = _arrays(config, config.learner)
+        parts.append((arms.locked, lock_sampler(base, _masks(config, base))))
+    if arms.perturbed:
+        parts.append(
+            (arms.perturbed, perturbed_sampler([_arrays(config, _model(config, name)) for name in arms.models]))
+        )
+    if arms.random:
+        parts.append((arms.random, random_arm))
+    if not parts:
+        raise ValueError("arms: expected a weight above 0 of locked, perturbed or random arms, got none")
+    total = sum(weight for weight, _ in parts)
+    samplers = [sampler for _, sampler in parts]
+    sampler = samplers[0] if len(parts) == 1 else mixed_sampler(samplers, [weight / total for weight, _ in parts])
+    return limited_sampler(sampler, arms.distinct) if arms.distinct else sampler
+
+
+def report_arms(config: EnvConfig) -> dict[str, dict[str, ArmArrays]]:
+    """The arms of the report by name, those that training has seen and those that it has not.
+
+    Seen are the locked variants of the learner, and the models as they are. Unseen are the sets `unseen`, the models
+    `evaluated`, and, where training draws random arms, others of these.
+    """
+    arms = config.arms
+    result: dict[str, dict[str, ArmArrays]] = {SEEN: {}, UNSEEN: {}}
+    if arms.locked:
+        base = _arrays(config, config.learner)
+        for mask in _masks(config, base):
+            result[SEEN][_name_of_locks(mask)] = lock_joints(base, mask)
+        for locked in arms.unseen_sets:
+            mask = np.isin(np.arange(1, MAX_JOINTS + 1), locked)
+            result[UNSEEN][_name_of_locks(mask)] = lock_joints(base, mask)
+    for split, names in ((SEEN, arms.models), (UNSEEN, arms.evaluated)):
+        for name in names:
+            model = _model(config, name)
+            result[split][arm_name(model)] = _arrays(config, model)
+    if arms.random:
+        drawn = jax.device_get(
+            jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(_RANDOM_SEED), _RANDOM_ARMS))
+        )
+        for i in range(_RANDOM_ARMS):
+            result[UNSEEN][f"random {i}"] = jax.tree.map(lambda x, i=i: x[i], drawn)
+    return result
+
+
+def arm_name(model: ArmConfig) -> str:
+    """A short name of an arm of a file, for tables."""
+    path = model.model.replace("\\", "/").rstrip("/").split("/")
+    stem = path[-1].rsplit(".", 1)[0]
+    return path[-2] if stem in ("robot", "scene") and len(path) > 1 else stem
+
+
+def _model(config: EnvConfig, name: str) -> ArmConfig:
+    return ArmConfig(model=name, armature=config.arms.armature, damping=config.arms.damping)
+
+
+def _arrays(config: EnvConfig, arm: ArmConfig) -> ArmArrays:
+    return arm_arrays(build_arm(arm, config.limits, config.metric.links))
+
+
+def _masks(config: EnvConfig, base: ArmArrays) -> np.ndarray:
+    """The sets of locked joints that training draws from: none, and up to `most_locked`, without the unseen ones."""
+    joints = int(np.sum(base.is_free))
+    if config.arms.most_locked >= joints:
+        raise ValueError(
+            f"arms.most_locked: expected less than the learner's {joints} joints, got {config.arms.most_locked}"
+        )
+    for locked in config.arms.unseen_sets:
+        if locked[-1] > joints:
+            raise ValueError(f"arms.unseen: the learner has {joints} joints, got joint {locked[-1]}")
+    none = np.zeros((1, MAX_JOINTS))
+    if not config.arms.most_locked:
+        return none
+    return np.concatenate([none, lock_masks(joints, config.arms.most_locked, config.arms.unseen_sets)])
+
+
+def _name_of_locks(mask: np.ndarray) -> str:
+    numbers = np.flatnonzero(mask) + 1
+    return f"locked {'+'.join(map(str, numbers))}" if len(numbers) else "whole"

@@ -1,0 +1,82 @@
+"""What a policy of any arm observes: numbers of each joint, and numbers of the whole arm and of its expert.
+
+Nothing of it depends on the number of the arm's joints or links, nor on what the expert will do after the next step.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
+from mimic.any_arm.control import tracking_acceleration
+from mimic.any_arm.dynamics import inertia_matrix, torque_of_arm
+from mimic.any_arm.kinematics import joint_states, link_states_in_frames
+from mimic.any_arm.nearest import NearestPose, angle_limits
+from mimic.metric.kinematics import LinkStates
+
+JOINT_FEATURES = 17  # numbers of each joint; the first says whether it is free
+_LINK_FEATURES, _EXPERT_FEATURES = 7, 12
+_MAX_FEATURE = 10.0
+
+
+def observation_size(expert_links: int) -> int:
+    """Length of an observation: that of `observe`."""
+    return JOINT_FEATURES * MAX_JOINTS + _LINK_FEATURES * MAX_LINKS + _EXPERT_FEATURES * expert_links
+
+
+def observe(
+    arm: ArmArrays,
+    expert: LinkStates,
+    qpos: Float[Array, " joints"],
+    qvel: Float[Array, " joints"],
+    targets: NearestPose,
+    max_torque: Float[Array, " joints"],
+    speed: Float[Array, " joints"],
+    control_dt: float,
+) -> Float[Array, " observation"]:
+    """The observation of an arm, in units of the arm's own velocity limits, torques and chain length.
+
+    - Each joint, `JOINT_FEATURES` numbers, 0 for a locked one apart from its axis and origin: whether it is free; the
+      way to the nearest pose, the velocity, and the velocity of the nearest pose, by the velocity limit; the
+      acceleration and the torque of the controller; the acceleration that its maximum torque gives; the curvature of
+      the metric; the distances to its limits; its axis and origin in the base frame.
+    - Each link: position, direction and length. Each link of the expert at the next step: its state.
+
+    Args:
+      arm: the learner.
+      expert: link states of the expert at the next step, of its own links alone.
+      qpos: the learner's angles [rad].
+      qvel: its velocities [rad/s].
+      targets: the pose nearest to the expert at the next step.
+      max_torque: [joints] maximum torque [N m].
+      speed: [joints] maximum speed of the controller [rad/s].
+      control_dt: duration of a control step [s].
+    """
+    frames = joint_states(arm, qpos, qvel)
+    states = link_states_in_frames(arm, frames)
+    dt, limit, unit = control_dt, arm.velocity_limit, 1 / arm.chain_length
+    own, step = arm.is_free, control_dt * limit
+    acceleration = tracking_acceleration(arm, qpos, qvel, targets, speed, dt)
+    torque = torque_of_arm(arm, qpos, qvel, acceleration)
+    inertia = jnp.diagonal(inertia_matrix(arm, qpos))
+    lower, upper = angle_limits(arm)
+    numbers = [
+        own,
+        (targets.qpos - qpos) / step,
+        qvel / limit,
+        targets.qvel / limit,
+        acceleration * dt / limit,
+        torque / jnp.maximum(max_torque, 1e-6),
+        max_torque * dt / (inertia * limit),
+        targets.curvature * step**2,
+        jnp.minimum((qpos - lower) / jnp.pi, 2.0),
+        jnp.minimum((upper - qpos) / jnp.pi, 2.0),
+        jnp.log(jnp.maximum(inertia, 1e-6)),
+    ]
+    of_joints = jnp.stack([own * x for x in numbers], axis=1)
+    joints = jnp.concatenate([of_joints, frames.rotation[1:, :, 2], unit * frames.origin[1:]], axis=1)
+    has_link = (arm.link_length > 0)[:, None]
+    links = [has_link * x for x in (states.position, states.direction, unit * arm.link_length[:, None])]
+    assert expert.direction is not None and expert.angular_velocity is not None
+    of_expert = [expert.position, expert.direction, expert.linear_velocity, expert.angular_velocity]
+    parts = [joints, jnp.concatenate(links, axis=1), jnp.concatenate(of_expert, axis=1)]
+    return jnp.clip(jnp.concatenate([x.ravel() for x in parts]), -_MAX_FEATURE, _MAX_FEATURE)
