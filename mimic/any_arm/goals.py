@@ -26,9 +26,11 @@ _NEW = 2  # random poses that join in each step
 _POSES = 5  # folded into an episode's key: others are the noise and the start of the episode
 _SAME = 0.05  # rad, maximum over the joints: minima at a smaller difference are the same
 _SPEED = 2.0  # on the way to another minimum, in velocity limits
-_HORIZON = 40.0  # control steps, of an estimate
+_HORIZON = 60.0  # control steps, of an estimate
 _ON_THE_WAY = (0.0, 0.33, 0.67, 1.0)  # fractions of the way where the metric is evaluated
-MIN_ADVANTAGE = 0.1  # of another minimum, for a change to it
+# Of another minimum, for a change to it. With 0.1 and a horizon of 40, real arms change too often: a mean gap of 5.7
+# instead of 4.4 %; without changes that of locked Pandas is 2.8 instead of 1.3 %.
+MIN_ADVANTAGE = 0.2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

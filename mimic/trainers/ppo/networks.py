@@ -19,7 +19,7 @@ from mimic.trainers.networks import Transformer
 
 # Standard deviations of an untrained policy, whose mean is the zero action: the controller is good from the start, and
 # noise of the usual size would hide it.
-_JOINT_STD, _PREFERENCE_STD = 0.1, 0.3
+_JOINT_STD, _PREFERENCE_STD = 0.05, 0.03
 
 
 def make_networks(config: PPOSettings, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
