@@ -34,7 +34,10 @@ from tests.helpers.repository import REPOSITORY
             "each from 0.001 to 100, got [0.5, 0.0]",
         ),
         (["env.learner.model=missing.xml"], "missing.xml"),
-        (["trainer=pose_mapper", "trainer.preset=huge"], "expected one of paper, large, got 'huge'"),
+        (
+            ["trainer=pose_mapper", "trainer.preset=huge"],
+            "expected one of auto, paper, large, any_arm, any_arm_cpu, got 'huge'",
+        ),
         (["trainer=pose_mapper", "trainer.batch_size=1000"], "expected a divisor of samples = 65536, got 1000"),
         (["trainer=pose_mapper", "trainer.heads=0"], "trainer.heads: expected a whole number from 1 to 1,000, got 0"),
         (["trainer=pose_mapper", "trainer.inputs=pixels"], "expected one of angles, link_states"),

@@ -162,7 +162,8 @@ class PoseMapperTrainer(Trainer):
         # Starts to compile these in parallel with the training's functions, the slowest first.
         _ = self._optimisation, self._evaluation
         return training.train(
-            self._model,
+            training.mapper_objective(self._model),
+            self.settings,
             lambda: (self._poses["train"], self._poses["validation"]),
             run_dir,
             seed=self._seed,

@@ -1,0 +1,55 @@
+"""Plots with one column for each arm, of what is trained for many arms."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.ticker  # noqa: E402
+import numpy as np  # noqa: E402
+
+_TITLES = {"train": "arms seen in training", "held_out": "other arms"}
+_FLOOR = 0.01  # per cent: smaller values are drawn here
+_INCHES, _MIN_INCHES = 0.17, 3.0  # width of a column and of a part
+
+
+def plot_mapper_arms(
+    table: Mapping[str, Mapping[str, Mapping[str, float]]], out: Path, heads: int, *, title: str
+) -> None:
+    """Plots how far each arm is above the optimum: by the mapper, its proposals, and Newton steps without a network.
+
+    Args:
+      table: {split: {arm: {metric: value}}}, see `AnyArmMapperTrainer`.
+      out: file of the plot.
+      heads: number of poses that the mapper proposes.
+      title: of the plot.
+    """
+    series = {  # label, marker, colour
+        "quality_from_home": ("Newton steps from home", "v", "tab:green"),
+        "quality_random_guesses": (f"the same from {heads} random guesses", "^", "tab:orange"),
+        "quality_proposed": ("mapper without Newton steps", "o", "lightsteelblue"),
+        "quality": ("mapper", "o", "tab:blue"),
+    }
+    parts = {split: arms for split, arms in table.items() if arms}
+    widths = [max(_INCHES * len(arms), _MIN_INCHES) for arms in parts.values()]
+    figure, all_axes = plt.subplots(
+        1, len(parts), figsize=(sum(widths) + 1, 4.5), sharey=True, layout="constrained", squeeze=False,
+        width_ratios=widths,
+    )  # fmt: skip
+    for axes, (split, arms) in zip(all_axes[0], parts.items(), strict=True):
+        names = sorted(arms, key=lambda name, arms=arms: arms[name]["quality"])
+        for key, (label, marker, colour) in series.items():
+            percent = np.maximum([100 * arms[name][key] for name in names], _FLOOR)
+            axes.plot(range(len(names)), percent, marker, color=colour, label=label, markersize=5)
+        axes.set(title=_TITLES.get(split, split), yscale="log", xlim=(-0.7, len(names) - 0.3))
+        axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+        axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+        axes.grid(alpha=0.3)
+    all_axes[0, 0].set(ylabel="above the optimum [%]\n(0 best, 100 a random pose)")
+    figure.suptitle(title)
+    handles, labels = all_axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles[::-1], labels[::-1], loc="outside lower center", ncols=len(series), fontsize=8)
+    figure.savefig(out, dpi=150)
+    plt.close(figure)
