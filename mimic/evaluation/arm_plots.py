@@ -28,9 +28,9 @@ def plot_mapper_arms(
     """
     series = {  # label, marker, colour
         "quality_from_home": ("Newton steps from home", "v", "tab:green"),
-        "quality_random_guesses": (f"the same from {heads} random guesses", "^", "tab:orange"),
-        "quality_proposed": ("mapper without Newton steps", "o", "lightsteelblue"),
-        "quality": ("mapper", "o", "tab:blue"),
+        "quality_random_guesses": (f"Newton steps from {heads} random guesses", "^", "tab:orange"),
+        "quality_proposed": ("mapper, without Newton steps", "o", "lightsteelblue"),
+        "quality": ("mapper, with Newton steps", "o", "tab:blue"),
     }
     parts = {split: arms for split, arms in table.items() if arms}
     widths = [max(_INCHES * len(arms), _MIN_INCHES) for arms in parts.values()]
