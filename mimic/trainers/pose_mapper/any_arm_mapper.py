@@ -16,7 +16,7 @@ from mimic.any_arm.kinematics import link_states
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.envs import env_config, environments
-from mimic.envs.config import EnvConfig
+from mimic.envs.config import ArmsConfig, EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig
@@ -196,6 +196,11 @@ def load_mapper(
     if not env.arms.are_drawn:
         return PoseMapper.load(run_dir, checkpoint)
     return AnyArmMapper.load(run_dir, checkpoint).to(learner or env.learner)
+
+
+def one_learner(env: EnvConfig) -> EnvConfig:
+    """The environment with its own learner, which is one of those that it may draw."""
+    return dataclasses.replace(env, arms=ArmsConfig())
 
 
 def padded_poses(qpos: Float[Array, "*batch joints"]) -> Float[Array, "*batch 8"]:

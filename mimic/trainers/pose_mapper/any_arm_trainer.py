@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from mimic.any_arm.arrays import ArmArrays, stack_arms
 from mimic.any_arm.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.compilation import Background, compiling
 from mimic.runs.checkpoints import Checkpoint
+from mimic.runs.files import write_atomically
 from mimic.runs.signals import Signals
 from mimic.trainers.config import AnyArmMapperSettings, PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training
@@ -52,6 +54,7 @@ class AnyArmMapperTrainer(Trainer):
     """
 
     unit = "training_poses"
+    columns = ("seen arms", "unseen arms")
 
     def __init__(self, config: TrainConfig, run_dir: Path | None = None):
         del run_dir
@@ -137,19 +140,22 @@ class AnyArmMapperTrainer(Trainer):
         return jax.device_get(self._evaluation()(params, *self._inputs))
 
     def _by_split(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Values of the arms by split; without splits that have no arms."""
-        counts = {split: len(arms) for split, arms in self._arms.items()}
-        parts = np.split(values, np.cumsum(list(counts.values()))[:-1])
-        return {split: part for split, part in zip(counts, parts, strict=True) if len(part)}
+        """Values of the arms by split."""
+        seen = len(self._arms["train"])
+        return {"train": values[:seen], "held_out": values[seen:]}
 
     def _means(self, values: np.ndarray) -> dict[str, float]:
-        return {split: float(part.mean()) for split, part in self._by_split(values).items()}
+        """Means by split; NaN for a split without arms."""
+        return {split: float(part.mean()) if part.size else np.nan for split, part in self._by_split(values).items()}
 
     def metrics(self, outcome: Mapped) -> Metrics:
         """Means over the arms of a split, and the arm with the largest quality; see `table_of_arms`."""
         table = table_of_arms(self._reference, outcome)
-        largest = {split: float(part.max()) for split, part in self._by_split(table["quality"]).items()}
-        return {**{name: self._means(column) for name, column in table.items()}, "quality_largest": largest}
+        largest = {split: part.max(initial=-np.inf) for split, part in self._by_split(table["quality"]).items()}
+        return {
+            **{name: self._means(column) for name, column in table.items()},
+            "quality_largest": {split: float(x) if np.isfinite(x) else np.nan for split, x in largest.items()},
+        }
 
     def details(self, outcome: Mapped, controller: str = "mapper") -> Metrics:
         """Similarity of the mapper, the optimum and random initial guesses; and the table of the arms."""
@@ -171,24 +177,24 @@ class AnyArmMapperTrainer(Trainer):
         }
         return {"similarity": by_split, "arms": self._table(outcome)}
 
-    def _table(self, outcome: Mapped) -> dict[str, dict[str, dict[str, float]]]:
-        """Metrics of each arm, as {split: {arm: {metric: value}}}."""
-        columns = {name: self._by_split(column) for name, column in table_of_arms(self._reference, outcome).items()}
+    def _table(self, outcome: Mapped) -> dict[str, dict[str, Any]]:
+        """The metrics of each arm by its name, with whether it was seen in training and its number of joints."""
+        columns = table_of_arms(self._reference, outcome)
+        names = [(split == "train", name, arm) for split, arms in self._arms.items() for name, arm in arms.items()]
         return {
-            split: {
-                arm: {
-                    "free_joints": int(arrays.is_free.sum()),
-                    **{name: float(column[split][i]) for name, column in columns.items()},
-                }
-                for i, (arm, arrays) in enumerate(arms.items())
+            name: {
+                "seen": seen,
+                "joints": int(arm.is_free.sum()),
+                **{key: float(column[i]) for key, column in columns.items()},
             }
-            for split, arms in self._arms.items()
+            for i, (seen, name, arm) in enumerate(names)
         }
 
     def status(self, metrics: Metrics) -> str:
         """Distance and quality."""
-        texts = [f"{_SPLITS[split]} {value:.2%}" for split, value in metrics["quality"].items()]
-        return f"distance {metrics['mean_distance']['train']:.4f}  above the optimum: {', '.join(texts)}"
+        quality, distance = metrics["quality"], metrics["mean_distance"]["train"]
+        unseen = _cell(quality["held_out"], ", unseen {:.2%}")
+        return f"distance {distance:.4f}  above the optimum {quality['train']:.2%}{unseen}"
 
     def good_enough(self, metrics: Metrics) -> bool:
         """Whether the target quality is reached on the arms seen in training; the others decide nothing."""
@@ -207,22 +213,23 @@ class AnyArmMapperTrainer(Trainer):
             ("  optimal poses", "optimal_distance", "{:.4f}"),
             ("  random poses", "random_distance", "{:.4f}"),
         )
-        counts = [f"{len(self._arms[split])} {name}" for split, name in _SPLITS.items()]
+        counts = [str(len(self._arms[split])) for split in _SPLITS]
         cells = [
-            (label, _cell(metrics[key], "train", form), _cell(metrics[key], "held_out", form))
+            (label, _cell(metrics[key]["train"], form), _cell(metrics[key]["held_out"], form))
             for label, key, form in rows
         ]
-        return [("arms", counts[0], counts[1]), *cells]
+        return [("number of arms", counts[0], counts[1]), *cells]
 
     def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
         """Writes the table of the arms, its plot, and in a run directory a plot of the training."""
         del controller
-        from mimic.evaluation import arm_plots, plots  # imports matplotlib, which takes a second
+        from mimic.evaluation import mapper_arms_plot, plots  # imports matplotlib, which takes a second
 
         table = self._table(outcome)
         _write_table(folder / "arms.csv", table)
-        arm_plots.plot_mapper_arms(table, folder / "arms.png", self.settings.heads, title=self._name)
-        plots.plot_training(folder, "quality", "above the optimum [%]", of="arms", title=self._name)
+        mapper_arms_plot.plot_mapper_arms(table, folder / "arms.png", self.settings.heads, title=self._name)
+        labels = {"train": "arms seen in training", "held_out": "unseen arms"}
+        plots.plot_training(folder, "quality", "above the optimum [%]", labels=labels, title=self._name)
 
 
 def _arms_by_split(
@@ -240,14 +247,19 @@ def _key(purpose: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(1), purpose)
 
 
-def _cell(values: Mapping[str, float], split: str, form: str) -> str:
-    return form.format(values[split]) if split in values else ""
+def _cell(value: float | None, form: str) -> str:
+    """A number as text; nothing for one that is not finite, which a report replaces by None."""
+    return "" if value is None or not np.isfinite(value) else form.format(value)
 
 
-def _write_table(file: Path, table: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
+def _write_table(file: Path, table: Mapping[str, Mapping[str, Any]]) -> None:
     """Writes one row for each arm."""
-    rows = [{"split": _SPLITS[split], "arm": arm, **row} for split, arms in table.items() for arm, row in arms.items()]
-    with file.open("w", newline="") as opened:
-        writer = csv.DictWriter(opened, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    rows = [
+        {"arms": SEEN if row["seen"] else UNSEEN, "arm": name, **{key: row[key] for key in row if key != "seen"}}
+        for name, row in table.items()
+    ]
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, rows[0])
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(file, text.getvalue())

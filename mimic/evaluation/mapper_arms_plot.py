@@ -1,7 +1,8 @@
-"""Plots with one column for each arm, of what is trained for many arms."""
+"""A plot of the arms of a pose mapper to any arm: how far each is above the optimum."""
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -10,18 +11,16 @@ import matplotlib.pyplot as plt  # noqa: E402
 import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 
-_TITLES = {"train": "arms seen in training", "held_out": "other arms"}
+_TITLES = {True: "arms seen in training", False: "unseen arms"}
 _FLOOR = 0.01  # per cent: smaller values are drawn here
 _INCHES, _MIN_INCHES = 0.17, 3.0  # width of a column and of a part
 
 
-def plot_mapper_arms(
-    table: Mapping[str, Mapping[str, Mapping[str, float]]], out: Path, heads: int, *, title: str
-) -> None:
+def plot_mapper_arms(table: Mapping[str, Mapping[str, Any]], out: Path, heads: int, *, title: str) -> None:
     """Plots how far each arm is above the optimum: by the mapper, its proposals, and Newton steps without a network.
 
     Args:
-      table: {split: {arm: {metric: value}}}, see `AnyArmMapperTrainer`.
+      table: metrics of each arm by its name, and whether it was `seen` in training, see `AnyArmMapperTrainer`.
       out: file of the plot.
       heads: number of poses that the mapper proposes.
       title: of the plot.
@@ -32,18 +31,19 @@ def plot_mapper_arms(
         "quality_proposed": ("mapper, without Newton steps", "o", "lightsteelblue"),
         "quality": ("mapper, with Newton steps", "o", "tab:blue"),
     }
-    parts = {split: arms for split, arms in table.items() if arms}
-    widths = [max(_INCHES * len(arms), _MIN_INCHES) for arms in parts.values()]
+    by_quality = sorted(table, key=lambda name: table[name]["quality"])
+    groups = {seen: [name for name in by_quality if table[name]["seen"] == seen] for seen in (True, False)}
+    parts = {seen: names for seen, names in groups.items() if names}
+    widths = [max(_INCHES * len(names), _MIN_INCHES) for names in parts.values()]
     figure, all_axes = plt.subplots(
         1, len(parts), figsize=(sum(widths) + 1, 4.5), sharey=True, layout="constrained", squeeze=False,
         width_ratios=widths,
     )  # fmt: skip
-    for axes, (split, arms) in zip(all_axes[0], parts.items(), strict=True):
-        names = sorted(arms, key=lambda name, arms=arms: arms[name]["quality"])
+    for axes, (seen, names) in zip(all_axes[0], parts.items(), strict=True):
         for key, (label, marker, colour) in series.items():
-            percent = np.maximum([100 * arms[name][key] for name in names], _FLOOR)
+            percent = np.maximum([100 * table[name][key] for name in names], _FLOOR)
             axes.plot(range(len(names)), percent, marker, color=colour, label=label, markersize=5)
-        axes.set(title=_TITLES.get(split, split), yscale="log", xlim=(-0.7, len(names) - 0.3))
+        axes.set(title=_TITLES[seen], yscale="log", xlim=(-0.7, len(names) - 0.3))
         axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
         axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
         axes.grid(alpha=0.3)
