@@ -139,11 +139,11 @@ def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path):
     mimic.export_run(tmp_path / "run", json_file, learner="panda")
     mimic.export_run(tmp_path / "run", npz_file, learner="panda4dof")
     arms = {
-        "panda": (json.loads(json_file.read_text())["learner"], 7),
-        "panda4dof": (np.load(npz_file)["learner"], 4),
-        "random": (description(jax.device_get(random_arm(jax.random.PRNGKey(1)))), 8),
+        "panda": json.loads(json_file.read_text())["learner"],
+        "panda4dof": np.load(npz_file)["learner"],
+        "random": description(jax.device_get(random_arm(jax.random.PRNGKey(1)))),
     }
-    for name, (vector, joints) in arms.items():
+    for (name, vector), joints in zip(arms.items(), (7, 4, 7), strict=True):
         batch = np.tile(np.asarray(vector, np.float32), (len(poses), 1))
         (outputs,) = session.run(["learner_qpos"], {"expert_qpos": poses, "learner": batch})
         expected = np.asarray(mapper(poses, jax.device_get(described_arm(jnp.asarray(batch[0])))))
@@ -154,7 +154,7 @@ def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path):
             np.testing.assert_allclose(expected[:, :joints], mapper(poses, name), atol=1e-3)
     metadata = session.get_modelmeta().custom_metadata_map
     layout = json.loads(metadata["learner_layout"])
-    assert layout[-1]["stop"] == len(arms["panda"][0]) and json.loads(metadata["expert_joints"])[0] == "joint1"
+    assert layout[-1]["stop"] == len(arms["panda"]) and json.loads(metadata["expert_joints"])[0] == "joint1"
     assert json.loads(json_file.read_text())["joints"] == [f"joint{i}" for i in range(1, 8)]
 
 
