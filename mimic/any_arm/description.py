@@ -66,6 +66,12 @@ def described_arm(vector: Float[Array, " numbers"]) -> ArmArrays:
 def save_description(file: Path, arm: ArmArrays, name: str, joints: tuple[str, ...]) -> None:
     """Writes the vector of an arm, its layout and the names of its joints to a .json or .npz file.
 
+    Args:
+      file: the file.
+      arm: the arm.
+      name: of the arm.
+      joints: name of the joint in each slot, locked ones included.
+
     Raises:
       ValueError: another suffix.
     """

@@ -67,7 +67,7 @@ def export_run(
 
     A pose mapper to any arm has a second input, `learner` [batch, 180]: the description of an arm, which this function
     writes too. With the metadata's `learner_layout` it can also be made without mimic, see `ArmArrays` in
-    mimic/any_arm/arrays.py. Its output has 8 joints; those that the arm does not have stay at 0.
+    mimic/any_arm/arrays.py. Its output has 8 angles, those of locked joints included, and 0 where the arm has no joint.
 
     Args:
       run: run directory.
@@ -180,11 +180,11 @@ def _description_writer(config: ExportConfig) -> Callable[[], None] | None:
             f"{config.out!r}; export the network, which takes any arm, without learner="
         )
     mapper = AnyArmMapper.load(run_dir, config.checkpoint)
-    arm = mapper.build(config.learner)
-    arrays = mapper.arrays(arm)
+    described = mapper.describe(config.learner)
+    name, arrays, slots = described.arm.embodiment.name, described.arrays, described.slots
 
     def run() -> None:
-        save_description(out, arrays, arm.embodiment.name, arm.embodiment.joint_names)
+        save_description(out, arrays, name, slots)
         Console().print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
@@ -266,7 +266,7 @@ def _any_arm_mapper(mapper: AnyArmMapper, trained: TrainConfig, steps: int) -> E
             "expert_qpos": "rad, in the order of expert_joints",
             "learner": "description of an arm, see learner_layout; mimic.export with learner=ARM writes it",
         },
-        "outputs": {"learner_qpos": "rad, from base to tip; 0 in the slots of joints that the arm does not have"},
+        "outputs": {"learner_qpos": "rad, from base to tip, with those of locked joints; 0 where the arm has no joint"},
         "expert_range": _range(mapper.expert),
         "learner_layout": description_layout(),
     }

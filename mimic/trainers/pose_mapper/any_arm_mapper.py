@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
 from mimic.any_arm.kinematics import link_states
@@ -25,6 +25,29 @@ from mimic.trainers.pose_mapper.model import PoseMapper, check_poses
 from mimic.trainers.run_config import load_config
 
 Learner = ArmArrays | Arm | ArmConfig | str | os.PathLike[str]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DescribedArm:
+    """An arm and the arrays that the network takes.
+
+    Attributes:
+      arm: with its locked joints.
+      arrays: in single precision.
+      joints: slot of each of the arm's joints in the arrays.
+      slots: name of the joint in each of the first slots, locked ones included.
+    """
+
+    arm: Arm
+    arrays: ArmArrays
+    joints: Int[np.ndarray, " learner_joints"]
+    slots: tuple[str, ...]
+
+    @classmethod
+    def without_locks(cls, arm: Arm) -> "DescribedArm":
+        """An arm whose locked joints have no slot."""
+        names = arm.embodiment.joint_names
+        return cls(arm, arm_arrays(arm).astype(np.float32), np.arange(len(names)), names)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,10 +115,14 @@ class AnyArmMapper:
             cannot be loaded, is a tree, or has too many joints or links.
         """
         poses = check_poses(self.expert, qpos)
-        arrays, joints = self._described(learner)
+        if isinstance(learner, ArmArrays):
+            arrays, joints = self.arrays(learner), np.arange(MAX_JOINTS)
+        else:
+            described = self.describe(learner)
+            arrays, joints = described.arrays, described.joints
         flat = padded_poses(poses.reshape(-1, self.expert.num_joints))
         learner_poses = self._map(self.params, flat, arrays)
-        return learner_poses.reshape(*poses.shape[:-1], MAX_JOINTS)[..., :joints]
+        return learner_poses.reshape(*poses.shape[:-1], MAX_JOINTS)[..., joints]
 
     def arrays(self, learner: Learner) -> ArmArrays:
         """The description of a learner that the network takes, in single precision.
@@ -103,34 +130,38 @@ class AnyArmMapper:
         Raises:
           ValueError: see `__call__`.
         """
-        return self._described(learner)[0]
+        if not isinstance(learner, ArmArrays):
+            return self.describe(learner).arrays
+        expected = (MAX_JOINTS,), (MAX_LINKS,)
+        got = jnp.shape(learner.home), jnp.shape(learner.link_length)
+        if got != expected:
+            raise ValueError(
+                f"learner: expected arrays of one arm, home {list(expected[0])} and link_length {list(expected[1])}, "
+                f"got {list(got[0])} and {list(got[1])}; use jax.vmap for many arms"
+            )
+        return jax.tree.map(_single, learner)
 
-    def _described(self, learner: Learner) -> tuple[ArmArrays, int]:
-        """Arrays of a learner, and its number of joints."""
-        if isinstance(learner, ArmArrays):
-            expected = (MAX_JOINTS,), (MAX_LINKS,)
-            got = jnp.shape(learner.home), jnp.shape(learner.link_length)
-            if got != expected:
-                raise ValueError(
-                    f"learner: expected arrays of one arm, home {list(expected[0])} and link_length "
-                    f"{list(expected[1])}, got {list(got[0])} and {list(got[1])}; use jax.vmap for many arms"
-                )
-            return jax.tree.map(_single, learner), MAX_JOINTS
-        arm = self.build(learner)
-        return arm_arrays(arm).astype(np.float32), arm.embodiment.num_joints
-
-    def build(self, learner: Arm | ArmConfig | str | os.PathLike[str]) -> Arm:
-        """The arm of a config, name or file, with the limits and links of the run.
+    def describe(self, learner: Arm | ArmConfig | str | os.PathLike[str]) -> "DescribedArm":
+        """An arm and its arrays. Joints that a config locks are locked by the mask, as in training.
 
         Raises:
-          ValueError: it cannot be loaded.
+          ValueError: see `__call__`.
         """
+        limits, links = self.env.limits, self.env.metric.links
         if isinstance(learner, Arm):
-            return learner
+            return DescribedArm.without_locks(learner)
         if not isinstance(learner, ArmConfig):
             name = os.fspath(learner)
             learner = env_config(name).learner if name in environments() else ArmConfig(model=name)
-        return build_arm(learner, self.env.limits, self.env.metric.links)
+        arm = build_arm(learner, limits, links)
+        whole = build_arm(dataclasses.replace(learner, locked=None), limits, links) if arm.locked else arm
+        if max(whole.embodiment.num_joints - MAX_JOINTS, whole.embodiment.num_links - MAX_LINKS) > 0:
+            return DescribedArm.without_locks(arm)  # it may have few enough without those that are locked
+        names = whole.embodiment.joint_names
+        is_free = np.array([name not in arm.locked for name in names])
+        arrays = arm_arrays(whole, is_free)
+        arrays.home[: len(names)][~is_free] = [arm.locked[name] for name in names if name in arm.locked]
+        return DescribedArm(arm, arrays.astype(np.float32), np.flatnonzero(is_free), names)
 
     def to(self, learner: Arm | ArmConfig | str | os.PathLike[str]) -> PoseMapper:
         """The mapper to one learner, for everything that takes a `PoseMapper`.
@@ -138,10 +169,8 @@ class AnyArmMapper:
         Raises:
           ValueError: see `__call__`.
         """
-        arm = self.build(learner)
-        arrays = arm_arrays(arm).astype(np.float32)
         return PoseMapper(
-            OneLearnerModel(self.model, arrays, self.expert, arm.embodiment, self.env.metric), self.params
+            OneLearnerModel(self.model, self.describe(learner), self.expert, self.env.metric), self.params
         )
 
 
@@ -151,32 +180,36 @@ class OneLearnerModel:
 
     Attributes:
       mapper: the mapper to any arm.
-      arrays: of the learner.
+      described: the learner.
       expert: embodiment with n joints.
-      learner: embodiment with n_hat joints.
       metric: config of the metric.
     """
 
     mapper: AnyArmMapperModel
-    arrays: ArmArrays
+    described: DescribedArm
     expert: Embodiment
-    learner: Embodiment
     metric: MetricConfig
+
+    @property
+    def learner(self) -> Embodiment:
+        """Embodiment with n_hat joints."""
+        return self.described.arm.embodiment
 
     def candidates(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, "heads learner_joints"]:
         """The poses of the heads after the Newton steps [rad]."""
         expert = link_states(self.mapper.expert, padded_poses(qpos))
-        return self.mapper.refined(params, expert, self.arrays)[0][:, : self.learner.num_joints]
+        return self.mapper.refined(params, expert, self.described.arrays)[0][:, self.described.joints]
 
     def distance(self, qpos: Float[Array, " joints"], learner_qpos: Float[Array, " learner_joints"]) -> Array:
         """Embodiment distance between a pose of the expert and a pose of the learner."""
         expert = link_states(self.mapper.expert, padded_poses(qpos))
-        return self.mapper.distance(expert, self.arrays, padded_poses(learner_qpos))
+        arrays, joints = self.described.arrays, self.described.joints
+        return self.mapper.distance(expert, arrays, jnp.asarray(arrays.home).at[joints].set(learner_qpos))
 
     def __call__(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
         """The nearest of the poses of the heads."""
         expert = link_states(self.mapper.expert, padded_poses(qpos))
-        return self.mapper(params, expert, self.arrays)[: self.learner.num_joints]
+        return self.mapper(params, expert, self.described.arrays)[self.described.joints]
 
 
 def load_mapper(
