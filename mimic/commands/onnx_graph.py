@@ -6,7 +6,7 @@ operations that the exported functions use are supported.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,27 +14,20 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from mimic.commands.onnx_operations import (
+    BINARY,
+    REDUCTIONS,
+    UNARY,
+    Tensor,
+    Value,
+    einsum_equation,
+    ints,
+    live_equations,
+    read_value,
+)
+
 OPSET, IR_VERSION = 18, 8  # of 2022: reductions take axes as inputs; supported by all runtimes since then
-_UNARY = {
-    "abs": "Abs", "cos": "Cos", "exp": "Exp", "log": "Log", "logistic": "Sigmoid", "neg": "Neg", "not": "Not",
-    "round": "Round", "sign": "Sign", "sin": "Sin", "sqrt": "Sqrt", "tanh": "Tanh",
-}  # fmt: skip
-_BINARY = {
-    "add": "Add", "add_any": "Add", "and": "And", "div": "Div", "eq": "Equal", "ge": "GreaterOrEqual", "gt": "Greater",
-    "le": "LessOrEqual", "lt": "Less", "max": "Max", "min": "Min", "mul": "Mul", "or": "Or", "pow": "Pow", "sub": "Sub",
-}  # fmt: skip
-_REDUCTIONS = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax", "reduce_min": "ReduceMin"}
 _TINY = np.float32(1e-30)  # replaces a divisor of 0: the quotient has the same arc tangent
-
-
-class Tensor(NamedTuple):
-    """A value of the graph: its name, and its shape without the batch axis."""
-
-    name: str
-    shape: tuple[int, ...]
-
-
-Value = Tensor | np.ndarray  # arrays are constant over the batch
 
 
 def to_onnx(
@@ -91,10 +84,10 @@ class _Graph:
     ) -> list[Value]:
         """Adds a traced function and returns its results, or the first `outputs` of them."""
         values: dict[Any, Value] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
-        for equation in _live_equations(jaxpr, outputs):
-            results = self._apply(equation, [_read(values, variable) for variable in equation.invars])
+        for equation in live_equations(jaxpr, outputs):
+            results = self._apply(equation, [read_value(values, variable) for variable in equation.invars])
             values.update(zip(equation.outvars, results, strict=False))  # a loop returns only what it carries
-        return [_read(values, variable) for variable in jaxpr.outvars[:outputs]]
+        return [read_value(values, variable) for variable in jaxpr.outvars[:outputs]]
 
     def _apply(self, equation: Any, inputs: list[Value]) -> list[Value]:
         primitive, params = equation.primitive, equation.params
@@ -130,12 +123,12 @@ class _Graph:
 
     def _single_output(self, name: str, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         """Adds an operation with one output, and returns its name."""
-        if name in _UNARY:
-            return self.node(_UNARY[name], *inputs)
-        if name in _BINARY:
-            return self.node(_BINARY[name], *(self._aligned(value, shape) for value in inputs))
-        if name in _REDUCTIONS:
-            return self.node(_REDUCTIONS[name], inputs[0], _ints([axis + 1 for axis in params["axes"]]), keepdims=0)
+        if name in UNARY:
+            return self.node(UNARY[name], *inputs)
+        if name in BINARY:
+            return self.node(BINARY[name], *(self._aligned(value, shape) for value in inputs))
+        if name in REDUCTIONS:
+            return self.node(REDUCTIONS[name], inputs[0], ints([axis + 1 for axis in params["axes"]]), keepdims=0)
         if name in ("reshape", "squeeze", "expand_dims"):
             return self._reshape(inputs[0], shape)
         if name not in _RULES:
@@ -165,7 +158,7 @@ class _Graph:
         if isinstance(value, Tensor):
             return value.name
         batch = self.node("Shape", self._input, end=1)
-        return self.node("Expand", value[None], self.node("Concat", batch, _ints([1] * value.ndim), axis=0))
+        return self.node("Expand", value[None], self.node("Concat", batch, ints([1] * value.ndim), axis=0))
 
     def _aligned(self, value: Value, shape: tuple[int, ...]) -> Value | str:
         """A number of each sample with the axes of a result; JAX broadcasts numbers, and ONNX aligns the last axes."""
@@ -173,13 +166,13 @@ class _Graph:
         return self._reshape(value, [1] * len(shape)) if is_number else value
 
     def _reshape(self, value: Value | str, shape: Sequence[int]) -> str:
-        return self.node("Reshape", value, _ints([-1, *shape]))
+        return self.node("Reshape", value, ints([-1, *shape]))
 
     def _split(self, value: Value, shapes: list[tuple[int, ...]], axis: int) -> list[Value]:
         parts, start = [], 0
         for shape in shapes:
-            bounds = _ints([start]), _ints([start + shape[axis]])
-            parts.append(Tensor(self.node("Slice", value, *bounds, _ints([axis + 1])), shape))
+            bounds = ints([start]), ints([start + shape[axis]])
+            parts.append(Tensor(self.node("Slice", value, *bounds, ints([axis + 1])), shape))
             start += shape[axis]
         return parts
 
@@ -218,13 +211,13 @@ class _Graph:
         for axis, size in zip(dimensions, inputs[0].shape, strict=True):
             aligned[axis] = size
         reshaped = self._reshape(inputs[0], aligned)
-        return reshaped if tuple(aligned) == shape else self.node("Expand", reshaped, _ints([1, *shape]))
+        return reshaped if tuple(aligned) == shape else self.node("Expand", reshaped, ints([1, *shape]))
 
     def _slice(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         strides = params["strides"] or [1] * len(shape)
         axes = range(1, len(shape) + 1)
         ranges = params["start_indices"], params["limit_indices"], axes, strides
-        return self.node("Slice", inputs[0], *map(_ints, ranges))
+        return self.node("Slice", inputs[0], *map(ints, ranges))
 
     def _concatenate(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         return self.node("Concat", *map(self.batched, inputs), axis=params["dimension"] + 1)
@@ -244,7 +237,7 @@ class _Graph:
         dimensions = (tuple(map(tuple, contracted)), tuple(map(tuple, batch)))
         if dimensions == vector_times_matrix and isinstance(right, np.ndarray) and len(left.shape) == 1:
             return self.node("MatMul", left, right)
-        return self.node("Einsum", left, right, equation=_einsum_equation(left, right, contracted, batch))
+        return self.node("Einsum", left, right, equation=einsum_equation(left, right, contracted, batch))
 
     def _cumsum(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         return self.node("CumSum", inputs[0], np.asarray(params["axis"] + 1), reverse=int(params["reverse"]))
@@ -254,7 +247,7 @@ class _Graph:
         low, high, inner = zip(*params["padding_config"], strict=True)
         if any(inner) or min(*low, *high) < 0:
             raise NotImplementedError(f"onnx: expected padding outside only, got {params['padding_config']}")
-        return self.node("Pad", values, _ints([0, *low, 0, *high]), filling)
+        return self.node("Pad", values, ints([0, *low, 0, *high]), filling)
 
     def _gather(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         """Entries along one axis, by a vector of indices."""
@@ -268,7 +261,7 @@ class _Graph:
         aligned = [1] * len(shape)
         aligned[axis] = shape[axis]
         positions = self._reshape(self.node("Cast", self.batched(indices), to=TensorProto.INT64), aligned)
-        everywhere = self.node("Expand", positions, _ints([1, *shape]))
+        everywhere = self.node("Expand", positions, ints([1, *shape]))
         return self.node("GatherElements", self.batched(values), everywhere, axis=axis + 1)
 
     def _argmin(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
@@ -307,40 +300,4 @@ _RULES: dict[str, Callable[[_Graph, list[Value], tuple[int, ...], Mapping[str, A
 
 
 def _supported() -> list[str]:
-    return sorted([*_UNARY, *_BINARY, *_REDUCTIONS, *_RULES, "expand_dims", "reshape", "scan", "split", "squeeze"])
-
-
-def _einsum_equation(left: Value, right: Value, contracted: Any, batch: Any) -> str:
-    """The equation of a general product, such as zab,zcb->zac; z is the batch axis, which constants do not have."""
-    letters = iter("abcdefghijklmnopqrstuvwxy")
-    of_left = [next(letters) for _ in left.shape]
-    of_right = [next(letters) for _ in right.shape]
-    for pairs in (contracted, batch):
-        for i, j in zip(*pairs, strict=True):
-            of_right[j] = of_left[i]
-    shared = [of_left[i] for i in batch[0]]
-    summed = {of_left[i] for i in contracted[0]}
-    free = [letter for letter in (*of_left, *of_right) if letter not in summed and letter not in shared]
-    terms = ("z" * isinstance(x, Tensor) + "".join(own) for x, own in ((left, of_left), (right, of_right)))
-    return f"{','.join(terms)}->z{''.join((*shared, *free))}"
-
-
-def _live_equations(jaxpr: Any, outputs: int | None = None) -> list[Any]:
-    """The equations that the first `outputs` results, or all of them, depend on.
-
-    They are without the standard deviation of PPO's network, for example.
-    """
-    live_variables, live = {variable for variable in jaxpr.outvars[:outputs] if not hasattr(variable, "val")}, []
-    for equation in reversed(jaxpr.eqns):
-        if live_variables.intersection(equation.outvars):
-            live.append(equation)
-            live_variables.update(variable for variable in equation.invars if not hasattr(variable, "val"))
-    return live[::-1]
-
-
-def _read(values: Mapping[Any, Value], variable: Any) -> Value:
-    return np.asarray(variable.val) if hasattr(variable, "val") else values[variable]
-
-
-def _ints(values: Sequence[int]) -> np.ndarray:
-    return np.asarray(list(values), np.int64)
+    return sorted([*UNARY, *BINARY, *REDUCTIONS, *_RULES, "expand_dims", "reshape", "scan", "split", "squeeze"])

@@ -94,7 +94,9 @@ def test_a_resumed_run_is_that_of_one_without_an_interruption(trained, tmp_path)
     constant = {"final_learning_rate": 1.0}  # a decay depends on the number of epochs
     train(run_dir, **constant, epochs=1)
     config = TrainConfig(resume=str(run_dir), compilation_cache="")
-    assert session.prepare_training(config, 0.0, [f"resume={run_dir}", "trainer.epochs=2"])() == 0
+    # The second makes the command line accept the third.
+    overrides = [f"resume={run_dir}", "trainer=pose_mapper", "trainer.epochs=2"]
+    assert session.prepare_training(config, 0.0, overrides)() == 0
     train(tmp_path / "whole", **constant)
     resumed, whole = (AnyArmMapper.load(path) for path in (run_dir, tmp_path / "whole"))
     jax.tree.map(np.testing.assert_array_equal, resumed.params, whole.params)
