@@ -25,6 +25,7 @@ from mimic.trainers.config import AnyArmMapperSettings, PoseMapperConfig, TrainC
 from mimic.trainers.pose_mapper.any_arm_evaluation import METHODS, Mapped, Reference, best_poses, table_of_arms
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, load_mapper
 from mimic.trainers.pose_mapper.any_arm_model import make_any_arm_model
+from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
 from mimic.trainers.pose_mapper.any_arm_training import any_arm_objective, random_pose
 
 TINY: dict[str, Any] = {
@@ -86,6 +87,21 @@ def test_evaluate_repeats_the_report(trained, tmp_path):
     for key in ("quality", "optimal_distance", "similarity", "arms"):
         assert again[key] == report[key]
     assert (out / "arms.csv").read_text() == (run_dir / "arms.csv").read_text()
+
+
+def test_splits_without_arms_are_left_out(tmp_path):
+    """All arms are seen in training; and if the config names none that are, the report draws some."""
+    trainer = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 1.0, "most_locked": 1, "unseen": []}))
+    distances = np.linspace(0.1, 0.2, 16).reshape(8, 2)
+    mapped = Mapped(distances, np.zeros((8, 2, MAX_JOINTS)), distances)
+    vars(trainer)["_reference"] = Reference(
+        distances / 2, mapped.qpos, distances, mapped.qpos, distances, distances + 1
+    )
+    metrics = trainer.metrics(mapped)
+    assert set(metrics["quality"]) == {"train"} and "unseen" not in trainer.status(metrics)
+    assert trainer.rows(metrics)[0] == ("number of arms", "8", "0") and trainer.rows(metrics)[1][2] == ""
+    drawn = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 0.0, "unseen": [], "random": 1.0}))
+    assert len(drawn._arms["train"]) == 16 and len(drawn._arms["held_out"]) == 16
 
 
 @pytest.mark.slow

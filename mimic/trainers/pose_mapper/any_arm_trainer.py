@@ -140,22 +140,19 @@ class AnyArmMapperTrainer(Trainer):
         return jax.device_get(self._evaluation()(params, *self._inputs))
 
     def _by_split(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Values of the arms by split."""
+        """Values of the arms by split; without a split that has no arms."""
         seen = len(self._arms["train"])
-        return {"train": values[:seen], "held_out": values[seen:]}
+        parts = {"train": values[:seen], "held_out": values[seen:]}
+        return {split: part for split, part in parts.items() if part.size}
 
     def _means(self, values: np.ndarray) -> dict[str, float]:
-        """Means by split; NaN for a split without arms."""
-        return {split: float(part.mean()) if part.size else np.nan for split, part in self._by_split(values).items()}
+        return {split: float(part.mean()) for split, part in self._by_split(values).items()}
 
     def metrics(self, outcome: Mapped) -> Metrics:
         """Means over the arms of a split, and the arm with the largest quality; see `table_of_arms`."""
         table = table_of_arms(self._reference, outcome)
-        largest = {split: part.max(initial=-np.inf) for split, part in self._by_split(table["quality"]).items()}
-        return {
-            **{name: self._means(column) for name, column in table.items()},
-            "quality_largest": {split: float(x) if np.isfinite(x) else np.nan for split, x in largest.items()},
-        }
+        largest = {split: float(part.max()) for split, part in self._by_split(table["quality"]).items()}
+        return {**{name: self._means(column) for name, column in table.items()}, "quality_largest": largest}
 
     def details(self, outcome: Mapped, controller: str = "mapper") -> Metrics:
         """Similarity of the mapper, the optimum and random initial guesses; and the table of the arms."""
@@ -193,7 +190,7 @@ class AnyArmMapperTrainer(Trainer):
     def status(self, metrics: Metrics) -> str:
         """Distance and quality."""
         quality, distance = metrics["quality"], metrics["mean_distance"]["train"]
-        unseen = _cell(quality["held_out"], ", unseen {:.2%}")
+        unseen = _cell(quality, "held_out", ", unseen {:.2%}")
         return f"distance {distance:.4f}  above the optimum {quality['train']:.2%}{unseen}"
 
     def good_enough(self, metrics: Metrics) -> bool:
@@ -215,7 +212,7 @@ class AnyArmMapperTrainer(Trainer):
         )
         counts = [str(len(self._arms[split])) for split in _SPLITS]
         cells = [
-            (label, _cell(metrics[key]["train"], form), _cell(metrics[key]["held_out"], form))
+            (label, _cell(metrics[key], "train", form), _cell(metrics[key], "held_out", form))
             for label, key, form in rows
         ]
         return [("number of arms", counts[0], counts[1]), *cells]
@@ -247,9 +244,9 @@ def _key(purpose: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(1), purpose)
 
 
-def _cell(value: float | None, form: str) -> str:
-    """A number as text; nothing for one that is not finite, which a report replaces by None."""
-    return "" if value is None or not np.isfinite(value) else form.format(value)
+def _cell(values: Mapping[str, float], split: str, form: str) -> str:
+    """The value of a split as text; nothing where the split has no arms."""
+    return form.format(values[split]) if split in values else ""
 
 
 def _write_table(file: Path, table: Mapping[str, Mapping[str, Any]]) -> None:
