@@ -50,6 +50,6 @@ def plot_mapper_arms(table: Mapping[str, Mapping[str, Any]], out: Path, heads: i
     all_axes[0, 0].set(ylabel="above the optimum [%]\n(0 best, 100 a random pose)")
     figure.suptitle(title)
     handles, labels = all_axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles[::-1], labels[::-1], loc="outside lower center", ncols=len(series), fontsize=8)
+    figure.legend(handles[::-1], labels[::-1], loc="outside lower center", ncols=2, fontsize=8)
     figure.savefig(out, dpi=150)
     plt.close(figure)
