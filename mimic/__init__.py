@@ -61,12 +61,14 @@ if TYPE_CHECKING:
     from mimic.commands.fit import Run, fit
     from mimic.envs.imitation import ImitationEnv
     from mimic.pretrained.network import Pretrained, load
+    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.trainers.pose_mapper.model import PoseMapper
 
 __version__ = VERSION
 
 __all__ = [
     "PAPER_WEIGHTS",
+    "AnyArmMapper",
     "ArmConfig",
     "ArmScene",
     "Capsules",
@@ -136,6 +138,10 @@ def __getattr__(name: str) -> Any:
         from mimic.trainers.pose_mapper.model import PoseMapper
 
         return PoseMapper
+    if name == "AnyArmMapper":
+        from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
+
+        return AnyArmMapper
     if name in ("Pretrained", "load"):  # imports the trainers' configs
         from mimic.pretrained import network
 

@@ -17,7 +17,10 @@ from tests.helpers.repository import REPOSITORY
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["env=panda5dof"], "unknown env 'panda5dof'; valid are bimanual, pair, panda3dof, panda4dof, panda7dof"),
+        (
+            ["env=panda5dof"],
+            "unknown env 'panda5dof'; valid are any_arm, bimanual, pair, panda3dof, panda4dof, panda7dof",
+        ),
         (["trainer=sac"], "unknown trainer 'sac'; valid are "),
         (["env.previw=1"], "unknown key 'env.previw'; valid are"),
         (["seed=one"], "could not be converted to Integer"),
@@ -34,7 +37,10 @@ from tests.helpers.repository import REPOSITORY
             "each from 0.001 to 100, got [0.5, 0.0]",
         ),
         (["env.learner.model=missing.xml"], "missing.xml"),
-        (["trainer=pose_mapper", "trainer.preset=huge"], "expected one of paper, large, got 'huge'"),
+        (
+            ["trainer=pose_mapper", "trainer.preset=huge"],
+            "expected one of auto, paper, large, any_arm, any_arm_cpu, got 'huge'",
+        ),
         (["trainer=pose_mapper", "trainer.batch_size=1000"], "expected a divisor of samples = 65536, got 1000"),
         (["trainer=pose_mapper", "trainer.heads=0"], "trainer.heads: expected a whole number from 1 to 1,000, got 0"),
         (["trainer=pose_mapper", "trainer.inputs=pixels"], "expected one of angles, link_states"),

@@ -11,7 +11,14 @@ import pytest
 
 from mimic.commands import config as commands
 from mimic.ranges import Range, all_ranges, check_ranges, number, ranges
-from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings, PPOConfig, PPOSettings, TrainConfig
+from mimic.trainers.config import (
+    AnyArmMapperSettings,
+    PoseMapperConfig,
+    PoseMapperSettings,
+    PPOConfig,
+    PPOSettings,
+    TrainConfig,
+)
 
 CONFIGS = (
     TrainConfig,
@@ -19,6 +26,7 @@ CONFIGS = (
     PPOSettings,
     PoseMapperConfig,
     PoseMapperSettings,
+    AnyArmMapperSettings,
     *(value for name, value in vars(commands).items() if name.endswith("Config") and dataclasses.is_dataclass(value)),
 )
 

@@ -23,7 +23,7 @@ from mimic.metric.similarity import centre_line_table, similarity
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_ppo_trainer
-from mimic.trainers.pose_mapper.model import PoseMapper
+from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper, one_learner
 from mimic.trainers.run_config import load_config, policy_run
 
 FRAMES_PER_SECOND = 30
@@ -126,8 +126,8 @@ def _mapper_clip(config: RenderConfig) -> ClipPlan:
     """A demonstration of the expert, and the pose of the pose mapper at each frame."""
     _check_unused(config, "a run of trainer=pose_mapper", "split", "learner", "limits")
     run_dir = Path(config.run).expanduser()
-    env = load_config(run_dir).env
-    mapper = PoseMapper.load(run_dir, config.checkpoint)
+    env = one_learner(load_config(run_dir).env)
+    mapper = load_mapper(run_dir, config.checkpoint)
     if config.demonstrations:
         _check_unused(config, "demonstrations=FILE", "seed")
         demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())

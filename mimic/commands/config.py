@@ -139,7 +139,8 @@ class ExportConfig:
       run: run directory.
       out: exported file; must not exist.
       format: "onnx" or "jax".
-      learner: name of the environment that the run's arms must equal. Default "": not checked.
+      learner: name of the environment that the run's arms must equal; for a pose mapper to any arm, an arm whose
+        description is written to `out` instead. Default "": not checked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
     """
 

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
+from mimic.any_arm.description import SIZE, SUFFIXES, described_arm, description_layout, save_description
+from mimic.any_arm.kinematics import link_states
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import EXPORT_FORMATS, ExportConfig
 from mimic.config import check_choice, new_file
@@ -22,6 +24,7 @@ from mimic.envs.imitation import layout_of, observation_layout, torque_scale
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_atomically
 from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, padded_poses
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.trainer import run_environment
@@ -36,17 +39,15 @@ class ExportedFunction:
     """A function to export.
 
     Attributes:
-      function: maps one float32 vector to the named output vectors.
+      function: maps one float32 vector for each input to the named output vectors.
       kind: "policy" or "pose_mapper".
-      input_name: name of the input.
-      input_size: length of the input.
+      inputs: length of each input by its name.
       metadata: meaning and units of inputs and outputs.
     """
 
-    function: Callable[[jax.Array], dict[str, jax.Array]]
+    function: Callable[..., dict[str, jax.Array]]
     kind: str
-    input_name: str
-    input_size: int
+    inputs: dict[str, int]
     metadata: dict[str, Any]
 
 
@@ -64,11 +65,17 @@ def export_run(
     to `torque` [N m]. A pose mapper maps `expert_qpos` [batch, joints] to `learner_qpos` [batch, learner_joints], both
     in rad. The file includes the normalisation of inputs and the scaling of outputs.
 
+    A pose mapper to any arm has a second input, `learner` [batch, 180]: the description of an arm, which this function
+    writes too. With the metadata's `learner_layout` it can also be made without mimic, see `ArmArrays` in
+    mimic/any_arm/arrays.py. Its output has 8 angles, those of locked joints included, and 0 where the arm has no joint.
+
     Args:
       run: run directory.
       out: exported file; must not exist.
       format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json".
-      learner: name of the environment that the run's arms must equal. Default "": not checked.
+      learner: name of the environment that the run's arms must equal. Default "": not checked. For a pose mapper to any
+        arm, an arm (see `AnyArmMapper`) whose description is written to `out`, a .json or .npz file, instead of the
+        network.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
 
     Returns:
@@ -79,7 +86,10 @@ def export_run(
         format is unknown, or a package that it needs is not installed.
     """
     config = ExportConfig(os.fspath(run), os.fspath(out), format, learner, checkpoint)
-    _write(_exported_function(config), _file(config), format)
+    if describe := _description_writer(config):
+        describe()
+    else:
+        _write(_exported_function(config), _file(config), format)
     return Path(out).expanduser()
 
 
@@ -89,6 +99,8 @@ def prepare_export(config: ExportConfig) -> Callable[[], None]:
     Raises:
       ValueError: see `export_run`.
     """
+    if describe := _description_writer(config):
+        return describe
     out = _file(config)
     exported = _exported_function(config)
 
@@ -96,8 +108,9 @@ def prepare_export(config: ExportConfig) -> Callable[[], None]:
         _write(exported, out, config.format)
         console = Console()
         title = f"{exported.kind.replace('_', ' ')} of {exported.metadata['env']}"
+        inputs = ", ".join(f"{name} [batch, {size}]" for name, size in exported.inputs.items())
         outputs = ", ".join(exported.metadata["outputs"])
-        console.print(f"{title}: {exported.input_name} [batch, {exported.input_size}] -> {outputs}", markup=False)
+        console.print(f"{title}: {inputs} -> {outputs}", markup=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
@@ -131,6 +144,8 @@ def _exported_function(config: ExportConfig) -> ExportedFunction:
     run_dir = Path(config.run).expanduser()
     trained = load_config(run_dir)
     steps = check_checkpoint(run_dir, config.checkpoint)
+    if _is_of_any_arm(trained):
+        return _any_arm_mapper(AnyArmMapper.load(run_dir, steps), trained, steps)
     expert, learner = trained.env.build_arms().embodiments
     if config.learner:
         _check_arms(config.learner, expert, learner)
@@ -147,6 +162,32 @@ def _exported_function(config: ExportConfig) -> ExportedFunction:
     if trained.trainer.name == "ppo":
         return _policy(trained, run_dir, steps, common)
     return _mapper(PoseMapper.load(run_dir, steps), common)
+
+
+def _is_of_any_arm(trained: TrainConfig) -> bool:
+    return trained.trainer.name == "pose_mapper" and trained.env.arms.are_drawn
+
+
+def _description_writer(config: ExportConfig) -> Callable[[], None] | None:
+    """Writes the description of the arm `learner` for a mapper to any arm; None for another export."""
+    run_dir = Path(config.run).expanduser()
+    if not config.learner or not config.run or not _is_of_any_arm(load_config(run_dir)):
+        return None
+    out = new_file("out", config.out)
+    if out.suffix not in SUFFIXES:
+        raise ValueError(
+            f"out: expected a file {' or '.join(SUFFIXES)} for the description of learner={config.learner}, got "
+            f"{config.out!r}; export the network, which takes any arm, without learner="
+        )
+    mapper = AnyArmMapper.load(run_dir, config.checkpoint)
+    described = mapper.describe(config.learner)
+    name, arrays, slots = described.arm.embodiment.name, described.arrays, described.slots
+
+    def run() -> None:
+        save_description(out, arrays, name, slots)
+        Console().print(f"results: {out}", soft_wrap=True, highlight=False)
+
+    return run
 
 
 def _check_arms(name: str, expert: Embodiment, learner: Embodiment) -> None:
@@ -188,7 +229,7 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str
         "torque_scale": [float(torque) for torque in scale],
         "control_dt": trained.env.control_dt,
     }
-    return ExportedFunction(function, "policy", "observation", size, metadata)
+    return ExportedFunction(function, "policy", {"observation": size}, metadata)
 
 
 def _mapper(mapper: PoseMapper, common: Mapping[str, Any]) -> ExportedFunction:
@@ -204,7 +245,33 @@ def _mapper(mapper: PoseMapper, common: Mapping[str, Any]) -> ExportedFunction:
         "expert_range": _range(mapper.expert),
         "learner_range": _range(mapper.learner),
     }
-    return ExportedFunction(function, "pose_mapper", "expert_qpos", mapper.expert.num_joints, metadata)
+    return ExportedFunction(function, "pose_mapper", {"expert_qpos": mapper.expert.num_joints}, metadata)
+
+
+def _any_arm_mapper(mapper: AnyArmMapper, trained: TrainConfig, steps: int) -> ExportedFunction:
+    params = jax.device_get(mapper.params)
+
+    def function(expert_qpos: jax.Array, learner: jax.Array) -> dict[str, jax.Array]:
+        states = link_states(mapper.model.expert, padded_poses(expert_qpos))
+        return {"learner_qpos": mapper.model(params, states, described_arm(learner))}
+
+    metadata = {
+        "mimic_version": VERSION,
+        "env": trained.env.name,
+        "trainer": trained.trainer.name,
+        "checkpoint": steps,
+        "expert": mapper.expert.name,
+        "expert_joints": list(mapper.expert.joint_names),
+        "inputs": {
+            "expert_qpos": "rad, in the order of expert_joints",
+            "learner": "description of an arm, see learner_layout; mimic.export with learner=ARM writes it",
+        },
+        "outputs": {"learner_qpos": "rad, from base to tip, with those of locked joints; 0 where the arm has no joint"},
+        "expert_range": _range(mapper.expert),
+        "learner_layout": description_layout(),
+    }
+    inputs = {"expert_qpos": mapper.expert.num_joints, "learner": SIZE}
+    return ExportedFunction(function, "pose_mapper", inputs, metadata)
 
 
 def _range(arm: Embodiment) -> Sequence[Sequence[float]]:
@@ -227,8 +294,7 @@ def _onnx_bytes(exported: ExportedFunction) -> bytes:
     model = to_onnx(
         exported.function,
         name=exported.kind,
-        input_name=exported.input_name,
-        input_size=exported.input_size,
+        inputs=exported.inputs,
         metadata=texts,
     )
     return model.SerializeToString()
@@ -238,6 +304,6 @@ def _jax_bytes(exported: ExportedFunction) -> bytes:
     from jax import export  # jax.export must be imported explicitly
 
     (batch,) = export.symbolic_shape("batch")
-    shape = jax.ShapeDtypeStruct((batch, exported.input_size), jnp.float32)
-    serializable = export.export(jax.jit(jax.vmap(exported.function)), platforms=_JAX_PLATFORMS)(shape)
+    shapes = [jax.ShapeDtypeStruct((batch, size), jnp.float32) for size in exported.inputs.values()]
+    serializable = export.export(jax.jit(jax.vmap(exported.function)), platforms=_JAX_PLATFORMS)(*shapes)
     return bytes(serializable.serialize())

@@ -63,8 +63,8 @@ def _value(node: DictConfig, key: str) -> str:
     presets = _PRESETS.get(config_class, {}) if isinstance(config_class, type) else {}
     if value is None and any(key in preset for preset in presets.values()):
         if node["preset"] in presets:
-            return _yaml(presets[node["preset"]][key])
-        values = {name: _yaml(preset[key]) for name, preset in presets.items()}
+            return _yaml(presets[node["preset"]].get(key))
+        values = {name: _yaml(preset[key]) for name, preset in presets.items() if key in preset}
         if len(set(values.values())) > 1:
             return ", ".join(f"{value} ({name})" for name, value in values.items())
         return next(iter(values.values()))

@@ -6,7 +6,7 @@ operations that the exported functions use are supported.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,58 +14,51 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from mimic.commands.onnx_operations import (
+    BINARY,
+    REDUCTIONS,
+    UNARY,
+    Tensor,
+    Value,
+    einsum_equation,
+    ints,
+    live_equations,
+    read_value,
+)
+
 OPSET, IR_VERSION = 18, 8  # of 2022: reductions take axes as inputs; supported by all runtimes since then
-_UNARY = {
-    "abs": "Abs", "cos": "Cos", "exp": "Exp", "log": "Log", "logistic": "Sigmoid", "neg": "Neg", "not": "Not",
-    "round": "Round", "sign": "Sign", "sin": "Sin", "sqrt": "Sqrt", "tanh": "Tanh",
-}  # fmt: skip
-_BINARY = {
-    "add": "Add", "add_any": "Add", "and": "And", "div": "Div", "eq": "Equal", "ge": "GreaterOrEqual", "gt": "Greater",
-    "le": "LessOrEqual", "lt": "Less", "max": "Max", "min": "Min", "mul": "Mul", "or": "Or", "pow": "Pow", "sub": "Sub",
-}  # fmt: skip
-_REDUCTIONS = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax", "reduce_min": "ReduceMin"}
 _TINY = np.float32(1e-30)  # replaces a divisor of 0: the quotient has the same arc tangent
 
 
-class Tensor(NamedTuple):
-    """A value of the graph: its name, and its shape without the batch axis."""
-
-    name: str
-    shape: tuple[int, ...]
-
-
-Value = Tensor | np.ndarray  # arrays are constant over the batch
-
-
 def to_onnx(
-    function: Callable[[jax.Array], Mapping[str, jax.Array]],
+    function: Callable[..., Mapping[str, jax.Array]],
     *,
     name: str,
-    input_name: str,
-    input_size: int,
+    inputs: Mapping[str, int],
     metadata: Mapping[str, str],
 ) -> onnx.ModelProto:
-    """Converts a function of one float32 vector to an ONNX model with any batch size.
+    """Converts a function of float32 vectors to an ONNX model with any batch size.
 
     Args:
-      function: maps a vector to the named output vectors.
+      function: maps a vector for each input to the named output vectors.
       name: name of the graph.
-      input_name: name of the input [batch, input_size].
-      input_size: length of the vector.
+      inputs: length of the vector of each input [batch, length], which all have the same batch size.
       metadata: `metadata_props` of the model.
 
     Raises:
       NotImplementedError: the function uses an unsupported operation.
     """
-    traced, shapes = jax.make_jaxpr(function, return_shape=True)(jnp.zeros(input_size, jnp.float32))
-    graph = _Graph(input_name)
-    results = graph.run(traced.jaxpr, list(map(np.asarray, traced.consts)), [Tensor(input_name, (input_size,))])
+    vectors = [jnp.zeros(size, jnp.float32) for size in inputs.values()]
+    traced, shapes = jax.make_jaxpr(function, return_shape=True)(*vectors)
+    graph = _Graph(next(iter(inputs)))
+    arguments = [Tensor(key, (size,)) for key, size in inputs.items()]
+    results = graph.run(traced.jaxpr, list(map(np.asarray, traced.consts)), arguments)
     outputs = []
     for result, output_name in zip(results, sorted(shapes), strict=True):  # JAX sorts the keys of a dict
         graph.nodes.append(helper.make_node("Identity", [graph.batched(result)], [output_name]))
         outputs.append(_value_info(output_name, shapes[output_name].shape[0]))
-    inputs = [_value_info(input_name, input_size)]
-    proto = helper.make_graph(graph.nodes, name, inputs, outputs, list(graph.constants.values()))
+    input_infos = [_value_info(*item) for item in inputs.items()]
+    proto = helper.make_graph(graph.nodes, name, input_infos, outputs, list(graph.constants.values()))
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(proto, opset_imports=opset, ir_version=IR_VERSION, producer_name="mimic")
     helper.set_model_props(model, dict(metadata))
@@ -86,16 +79,25 @@ class _Graph:
         self._input = input_name
         self._names = 0
 
-    def run(self, jaxpr: Any, consts: Sequence[Value], arguments: Sequence[Value]) -> list[Value]:
-        """Adds a traced function and returns its results."""
+    def run(
+        self, jaxpr: Any, consts: Sequence[Value], arguments: Sequence[Value], outputs: int | None = None
+    ) -> list[Value]:
+        """Adds a traced function and returns its results, or the first `outputs` of them."""
         values: dict[Any, Value] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
-        for equation in _live_equations(jaxpr):
-            results = self._apply(equation, [_read(values, variable) for variable in equation.invars])
-            values.update(zip(equation.outvars, results, strict=True))
-        return [_read(values, variable) for variable in jaxpr.outvars]
+        for equation in live_equations(jaxpr, outputs):
+            results = self._apply(equation, [read_value(values, variable) for variable in equation.invars])
+            values.update(zip(equation.outvars, results, strict=False))  # a loop returns only what it carries
+        return [read_value(values, variable) for variable in jaxpr.outvars[:outputs]]
 
     def _apply(self, equation: Any, inputs: list[Value]) -> list[Value]:
         primitive, params = equation.primitive, equation.params
+        if primitive.name == "platform_index":  # of a function with another form on TPUs
+            return [np.asarray(0)]
+        if primitive.name == "cond" and params.get("branches_platforms"):
+            default = params["branches"][params["branches_platforms"].index(None)]
+            return self.run(default.jaxpr, default.consts, inputs[1:])
+        if primitive.name == "scan":
+            return self._unrolled(inputs, params)
         if not any(isinstance(value, Tensor) for value in inputs):  # constant over the batch: folded
             results = primitive.bind(*inputs, **params)
             return list(map(np.asarray, results if primitive.multiple_results else [results]))
@@ -109,14 +111,24 @@ class _Graph:
             return inputs
         return [Tensor(self._single_output(name, inputs, shapes[0], params), shapes[0])]
 
+    def _unrolled(self, inputs: list[Value], params: Mapping[str, Any]) -> list[Value]:
+        """A loop over a constant number of steps, without values for each step; what it carries at the end."""
+        consts, carried = inputs[: params["num_consts"]], inputs[params["num_consts"] :]
+        if len(carried) != params["num_carry"]:
+            raise NotImplementedError("onnx: expected a loop without inputs for each step")
+        for _ in range(params["length"]):
+            body = params["jaxpr"]
+            carried = self.run(body.jaxpr, list(map(np.asarray, body.consts)), [*consts, *carried], len(carried))
+        return carried
+
     def _single_output(self, name: str, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         """Adds an operation with one output, and returns its name."""
-        if name in _UNARY:
-            return self.node(_UNARY[name], *inputs)
-        if name in _BINARY:
-            return self.node(_BINARY[name], *inputs)
-        if name in _REDUCTIONS:
-            return self.node(_REDUCTIONS[name], inputs[0], _ints([axis + 1 for axis in params["axes"]]), keepdims=0)
+        if name in UNARY:
+            return self.node(UNARY[name], *inputs)
+        if name in BINARY:
+            return self.node(BINARY[name], *(self._aligned(value, shape) for value in inputs))
+        if name in REDUCTIONS:
+            return self.node(REDUCTIONS[name], inputs[0], ints([axis + 1 for axis in params["axes"]]), keepdims=0)
         if name in ("reshape", "squeeze", "expand_dims"):
             return self._reshape(inputs[0], shape)
         if name not in _RULES:
@@ -146,16 +158,21 @@ class _Graph:
         if isinstance(value, Tensor):
             return value.name
         batch = self.node("Shape", self._input, end=1)
-        return self.node("Expand", value[None], self.node("Concat", batch, _ints([1] * value.ndim), axis=0))
+        return self.node("Expand", value[None], self.node("Concat", batch, ints([1] * value.ndim), axis=0))
+
+    def _aligned(self, value: Value, shape: tuple[int, ...]) -> Value | str:
+        """A number of each sample with the axes of a result; JAX broadcasts numbers, and ONNX aligns the last axes."""
+        is_number = isinstance(value, Tensor) and not value.shape and shape
+        return self._reshape(value, [1] * len(shape)) if is_number else value
 
     def _reshape(self, value: Value | str, shape: Sequence[int]) -> str:
-        return self.node("Reshape", value, _ints([-1, *shape]))
+        return self.node("Reshape", value, ints([-1, *shape]))
 
     def _split(self, value: Value, shapes: list[tuple[int, ...]], axis: int) -> list[Value]:
         parts, start = [], 0
         for shape in shapes:
-            bounds = _ints([start]), _ints([start + shape[axis]])
-            parts.append(Tensor(self.node("Slice", value, *bounds, _ints([axis + 1])), shape))
+            bounds = ints([start]), ints([start + shape[axis]])
+            parts.append(Tensor(self.node("Slice", value, *bounds, ints([axis + 1])), shape))
             start += shape[axis]
         return parts
 
@@ -183,7 +200,7 @@ class _Graph:
 
     def _select(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         condition, if_false, if_true = inputs
-        return self.node("Where", condition, if_true, if_false)
+        return self.node("Where", self._aligned(condition, shape), if_true, if_false)
 
     def _convert(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         return self.node("Cast", inputs[0], to=helper.np_dtype_to_tensor_dtype(np.dtype(params["new_dtype"])))
@@ -194,13 +211,13 @@ class _Graph:
         for axis, size in zip(dimensions, inputs[0].shape, strict=True):
             aligned[axis] = size
         reshaped = self._reshape(inputs[0], aligned)
-        return reshaped if tuple(aligned) == shape else self.node("Expand", reshaped, _ints([1, *shape]))
+        return reshaped if tuple(aligned) == shape else self.node("Expand", reshaped, ints([1, *shape]))
 
     def _slice(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         strides = params["strides"] or [1] * len(shape)
         axes = range(1, len(shape) + 1)
         ranges = params["start_indices"], params["limit_indices"], axes, strides
-        return self.node("Slice", inputs[0], *map(_ints, ranges))
+        return self.node("Slice", inputs[0], *map(ints, ranges))
 
     def _concatenate(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         return self.node("Concat", *map(self.batched, inputs), axis=params["dimension"] + 1)
@@ -218,9 +235,34 @@ class _Graph:
         left, right = inputs
         vector_times_matrix = (((0,), (0,)), ((), ()))
         dimensions = (tuple(map(tuple, contracted)), tuple(map(tuple, batch)))
-        if dimensions != vector_times_matrix or not isinstance(right, np.ndarray) or len(left.shape) != 1:
-            raise NotImplementedError(f"onnx: expected a vector times a constant matrix, got {dimensions}")
-        return self.node("MatMul", left, right)
+        if dimensions == vector_times_matrix and isinstance(right, np.ndarray) and len(left.shape) == 1:
+            return self.node("MatMul", left, right)
+        return self.node("Einsum", left, right, equation=einsum_equation(left, right, contracted, batch))
+
+    def _cumsum(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
+        return self.node("CumSum", inputs[0], np.asarray(params["axis"] + 1), reverse=int(params["reverse"]))
+
+    def _pad(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
+        values, filling = inputs
+        low, high, inner = zip(*params["padding_config"], strict=True)
+        if any(inner) or min(*low, *high) < 0:
+            raise NotImplementedError(f"onnx: expected padding outside only, got {params['padding_config']}")
+        return self.node("Pad", values, ints([0, *low, 0, *high]), filling)
+
+    def _gather(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
+        """Entries along one axis, by a vector of indices."""
+        values, indices = inputs
+        numbers = params["dimension_numbers"]
+        (axis,) = map(int, numbers.start_index_map)
+        kept = tuple(i for i in range(len(shape)) if i != axis)
+        is_along_axis = tuple(map(int, numbers.offset_dims)) == kept and len(values.shape) == len(shape)
+        if not is_along_axis or tuple(map(int, numbers.collapsed_slice_dims)) != (axis,) or len(indices.shape) != 2:
+            raise NotImplementedError(f"onnx: expected entries along one axis, got {numbers}")
+        aligned = [1] * len(shape)
+        aligned[axis] = shape[axis]
+        positions = self._reshape(self.node("Cast", self.batched(indices), to=TensorProto.INT64), aligned)
+        everywhere = self.node("Expand", positions, ints([1, *shape]))
+        return self.node("GatherElements", self.batched(values), everywhere, axis=axis + 1)
 
     def _argmin(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         (axis,) = params["axes"]
@@ -241,10 +283,13 @@ _RULES: dict[str, Callable[[_Graph, list[Value], tuple[int, ...], Mapping[str, A
     "broadcast_in_dim": _Graph._broadcast,
     "concatenate": _Graph._concatenate,
     "convert_element_type": _Graph._convert,
+    "cumsum": _Graph._cumsum,
     "dot_general": _Graph._dot,
     "dynamic_slice": _Graph._take,
+    "gather": _Graph._gather,
     "integer_pow": _Graph._integer_pow,
     "ne": _Graph._not_equal,
+    "pad": _Graph._pad,
     "rsqrt": _Graph._rsqrt,
     "select_n": _Graph._select,
     "slice": _Graph._slice,
@@ -255,22 +300,4 @@ _RULES: dict[str, Callable[[_Graph, list[Value], tuple[int, ...], Mapping[str, A
 
 
 def _supported() -> list[str]:
-    return sorted([*_UNARY, *_BINARY, *_REDUCTIONS, *_RULES, "expand_dims", "reshape", "split", "squeeze"])
-
-
-def _live_equations(jaxpr: Any) -> list[Any]:
-    """The equations that the results depend on, without the standard deviation of PPO's network, for example."""
-    live_variables, live = {variable for variable in jaxpr.outvars if not hasattr(variable, "val")}, []
-    for equation in reversed(jaxpr.eqns):
-        if live_variables.intersection(equation.outvars):
-            live.append(equation)
-            live_variables.update(variable for variable in equation.invars if not hasattr(variable, "val"))
-    return live[::-1]
-
-
-def _read(values: Mapping[Any, Value], variable: Any) -> Value:
-    return np.asarray(variable.val) if hasattr(variable, "val") else values[variable]
-
-
-def _ints(values: Sequence[int]) -> np.ndarray:
-    return np.asarray(list(values), np.int64)
+    return sorted([*UNARY, *BINARY, *REDUCTIONS, *_RULES, "expand_dims", "reshape", "scan", "split", "squeeze"])

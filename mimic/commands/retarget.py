@@ -25,6 +25,7 @@ from mimic.metric.config import MetricConfig
 from mimic.retargeting.costs import Costs
 from mimic.retargeting.motions import largest_jump, optimal_motions
 from mimic.retargeting.pose import continuous_joints, wrap_angles
+from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper
 from mimic.trainers.pose_mapper.model import PoseMapper
 
 
@@ -164,7 +165,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
     _check(demonstrations, expert)
     capsules = fit_capsules(env.learner, env.limits) if config.costs.of_capsules else None
-    mapper = PoseMapper.load(Path(config.mapper).expanduser()) if config.mapper else None
+    mapper = load_mapper(Path(config.mapper).expanduser(), learner=env.learner) if config.mapper else None
     if mapper:
         mapper.check_fits(expert, learner)
 

@@ -101,7 +101,8 @@ def _resumed_config(run_dir: Path, requested: TrainConfig, overrides: Sequence[s
     """The config of a run directory, with the overrides of the command line that a resumed run accepts."""
     config = load_config(run_dir)
     process_keys = ("resume=", "compilation_cache=", "distributed.", "logger=")  # taken from `requested`
-    changes = [override for override in overrides if not override.startswith(process_keys)]
+    own = f"trainer={config.trainer.name}"  # chooses the keys that the command line accepts
+    changes = [override for override in overrides if override != own and not override.startswith(process_keys)]
     logger = {"logger": requested.logger} if any(override.startswith("logger=") for override in overrides) else {}
     fixed = ("trainer.preset=", "trainer.name=")
     rejected = [change for change in changes if not change.startswith("trainer.") or change.startswith(fixed)]

@@ -68,10 +68,10 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         return _prepare_playback(config)
     mapper, env = None, config.resolve_env()
     if config.mapper:
-        from mimic.trainers.pose_mapper.model import PoseMapper
+        from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper, one_learner
 
-        mapper = PoseMapper.load(Path(config.mapper).expanduser(), config.checkpoint)
-        env = load_config(Path(config.mapper).expanduser()).env
+        mapper = load_mapper(Path(config.mapper).expanduser(), config.checkpoint)
+        env = one_learner(load_config(Path(config.mapper).expanduser()).env)
     # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if config.source:

@@ -248,8 +248,10 @@ MAPPER_PRESETS: dict[str, dict[str, Any]] = {
         "epochs": 2000,
         "learning_rate": 1e-3,
         "final_learning_rate": 1.0,
+        "weight_decay": 0.0,
         "patience": 10,
         "evaluations": 100,
+        "held_out_poses": 10_000,
     },
     # The best by measurement, both on a GPU and on two cores.
     "large": {
@@ -264,10 +266,50 @@ MAPPER_PRESETS: dict[str, dict[str, Any]] = {
         "epochs": 30,
         "learning_rate": 2e-3,
         "final_learning_rate": 1e-3,
+        "weight_decay": 0.0,
         "patience": 0,
         "evaluations": 10,
+        "held_out_poses": 10_000,
+    },
+    # A learner that is drawn for each training pose, on one GPU: 24 million arms and poses.
+    "any_arm": {
+        "width": 128,
+        "layers": 3,
+        "heads": 8,
+        "refinements": 4,
+        "samples": 262_144,
+        "batch_size": 2048,
+        "fresh": True,
+        "epochs": 92,
+        "learning_rate": 1e-3,
+        "final_learning_rate": 1e-3,
+        "weight_decay": 1e-4,
+        "patience": 0,
+        "evaluations": 8,
+        "held_out_poses": 256,
+    },
+    # The same on two cores, in about 15 minutes: some 4000 arms and poses in a second.
+    "any_arm_cpu": {
+        "width": 64,
+        "layers": 2,
+        "heads": 8,
+        "refinements": 4,
+        "samples": 65_536,
+        "batch_size": 512,
+        "fresh": True,
+        "epochs": 48,
+        "learning_rate": 2e-3,
+        "final_learning_rate": 1e-3,
+        "weight_decay": 1e-4,
+        "patience": 0,
+        "evaluations": 8,
+        "held_out_poses": 32,
     },
 }
+_ONE_LEARNER_PRESETS, _ANY_ARM_PRESETS = ("paper", "large"), ("any_arm", "any_arm_cpu")
+# Fields that apply only to the network of one learner, and only to that of any arm.
+_OF_ONE_LEARNER, _OF_ANY_ARM = ("inputs", "outputs", "hidden_layers", "activation"), ("width", "layers", "refinements")
+ATTENTION_HEADS = 4  # of each layer of the network of any arm
 MAPPER_INPUTS, MAPPER_OUTPUTS, ACTIVATIONS = ("angles", "link_states"), ("tanh", "circle"), ("leaky_relu", "gelu")
 
 
@@ -275,15 +317,23 @@ MAPPER_INPUTS, MAPPER_OUTPUTS, ACTIVATIONS = ("angles", "link_states"), ("tanh",
 class PoseMapperConfig(TrainerConfig):
     """The neural pose mapper. A field that is None takes its value from the preset.
 
+    If the environment draws its learner (`env.arms`), one network maps to all of these arms: see
+    `mimic.trainers.pose_mapper.any_arm_model`. It has `width`, `layers` and `refinements`, and neither `inputs`,
+    `outputs`, `hidden_layers`, `activation` nor `dropout`. A training pose is then a pose of the expert and an arm.
+
     Attributes:
       name: "pose_mapper".
-      preset: "large", or "paper".
+      preset: "large" or "paper" for one learner, "any_arm" or "any_arm_cpu" where the learner is drawn, or "auto":
+        "large", or of the latter two that of JAX's backend.
       inputs: "angles" of the expert (paper), or its "link_states": positions and directions.
       outputs: "tanh", scaled to the joint's range (paper), or "circle": a point on the unit circle for joints whose
         range is a full rotation.
       heads: number of poses that the network proposes; the nearest one is the output.
       hidden_layers: widths of the hidden layers.
       activation: "leaky_relu" (paper) or "gelu".
+      width: of a token of the network of any arm; a multiple of 4.
+      layers: transformer layers of the network of any arm.
+      refinements: Newton steps from each pose that the network of any arm proposes; training has none.
       samples: poses in an epoch.
       batch_size: poses in a minibatch; must divide samples.
       fresh: whether each epoch draws new random poses; otherwise all epochs have the same poses, shuffled.
@@ -294,25 +344,29 @@ class PoseMapperConfig(TrainerConfig):
       dropout: fraction of the hidden units of each layer that is dropped for a training pose, in [0, 1). The paper
         mentions it against overfitting and does not use it; the presets do not either.
       weight_decay: AdamW's: each update subtracts the fraction learning_rate * weight_decay of every weight; biases do
-        not decay. The presets do not use it.
+        not decay. The presets for one learner do not use it.
       patience: training ends after this many evaluations without a smaller distance on the validation poses; 0 disables
         it.
-      target_quality: training ends early when the quality on the validation poses is at most this; 0 disables it.
+      target_quality: training ends early when the quality on the validation poses, or on the arms seen in training, is
+        at most this; 0 disables it.
       evaluations: number of evaluations and checkpoints.
       validation_poses: number of poses that early stopping is decided on.
-      held_out_poses: number of poses that the report is computed on.
+      held_out_poses: number of poses that the report is computed on, the same for each arm.
     """
 
     length_key: ClassVar[str] = "epochs"
 
     name: str = "pose_mapper"
-    preset: str = "large"
+    preset: str = "auto"
     inputs: str | None = None
     outputs: str | None = None
     # Sizes: `check_training_memory` rejects products that do not fit.
     heads: int | None = number(None, at_least=1, at_most=1000)
     hidden_layers: list[int] | None = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     activation: str | None = None
+    width: int | None = number(None, at_least=4, at_most=2**14)
+    layers: int | None = number(None, at_least=1, at_most=100)
+    refinements: int | None = number(None, at_least=0, at_most=1000)
     samples: int | None = number(None, at_least=1, at_most=10**9)
     batch_size: int | None = number(None, at_least=1, at_most=10**9)
     fresh: bool | None = None
@@ -321,32 +375,67 @@ class PoseMapperConfig(TrainerConfig):
     learning_rate: float | None = number(None, above=0.0, at_most=1.0)
     final_learning_rate: float | None = number(None, at_least=0.0, at_most=1.0)
     dropout: float = number(0.0, at_least=0.0, below=1.0)
-    weight_decay: float = number(0.0, at_least=0.0, at_most=1000.0)  # an update subtracts its product with the rate
+    weight_decay: float | None = number(None, at_least=0.0, at_most=1000.0)  # times the rate in an update
     patience: int | None = number(None, at_least=0, at_most=1_000_000)
     target_quality: float = number(0.0, at_least=0.0, at_most=100.0)
     evaluations: int | None = number(None, at_least=1, at_most=1_000_000)
     validation_poses: int = number(1024, at_least=1, at_most=10_000_000)
-    held_out_poses: int = number(10_000, at_least=1, at_most=10_000_000)
+    held_out_poses: int | None = number(None, at_least=1, at_most=10_000_000)
 
     def __post_init__(self) -> None:
-        check_choice("trainer.preset", self.preset, tuple(MAPPER_PRESETS))
+        check_choice("trainer.preset", self.preset, ("auto", *MAPPER_PRESETS))
         check_choice("trainer.name", self.name, ("pose_mapper",))
         check_ranges(self, "trainer.")
 
     def resolve(self) -> "PoseMapperSettings":
-        """Returns the settings: every field has a value.
+        """Returns the settings of a mapper to one learner: every field has a value.
 
         Raises:
-          ValueError: numbers out of range, or a batch size that does not divide the samples.
+          ValueError: numbers out of range, a batch size that does not divide the samples, or a setting of a mapper to
+            any arm.
         """
-        settings = PoseMapperSettings(**_filled_in(self, MAPPER_PRESETS[self.preset]))
+        name = "large" if self.preset == "auto" else self.preset
+        self._check_applies(name, _ONE_LEARNER_PRESETS, _OF_ANY_ARM, "to one learner")
+        settings = PoseMapperSettings(**{**_filled_in(self, MAPPER_PRESETS[name]), "preset": name})
         settings.check()
         return settings
+
+    def resolve_any_arm(self, backend: str = "cpu") -> "AnyArmMapperSettings":
+        """Returns the settings of a mapper to any arm: every field that applies has a value.
+
+        Args:
+          backend: JAX's backend; it chooses the preset where that is "auto".
+
+        Raises:
+          ValueError: numbers out of range, a batch size that does not divide the samples, or a setting of a mapper to
+            one learner.
+        """
+        name = self.preset if self.preset != "auto" else "any_arm_cpu" if backend == "cpu" else "any_arm"
+        self._check_applies(name, _ANY_ARM_PRESETS, _OF_ONE_LEARNER, "to any arm (env.arms)")
+        if self.dropout:
+            raise ValueError(f"trainer.dropout: expected 0 for a mapper to any arm (env.arms), got {self.dropout}")
+        settings = AnyArmMapperSettings(**{**_filled_in(self, MAPPER_PRESETS[name]), "preset": name})
+        settings.check()
+        return settings
+
+    def _check_applies(self, preset: str, valid: tuple[str, ...], others: tuple[str, ...], kind: str) -> None:
+        """Raises a ValueError for a preset or a field of the other kind of mapper."""
+        if preset not in valid:
+            raise ValueError(f"trainer.preset: expected {' or '.join(valid)} for a mapper {kind}, got {preset}")
+        for field in others:
+            if getattr(self, field) is not None:
+                raise ValueError(f"trainer.{field}: expected none for a mapper {kind}, got {getattr(self, field)}")
+
+    def _check_batch_size(self) -> None:
+        if self.samples % self.batch_size:  # type: ignore[operator] - called by classes whose fields have values
+            raise ValueError(
+                f"trainer.batch_size: expected a divisor of samples = {self.samples}, got {self.batch_size}"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
 class PoseMapperSettings(PoseMapperConfig):
-    """A pose mapper's config where every field has a value."""
+    """A pose mapper's config where every field has a value, but for those of a mapper to any arm."""
 
     inputs: str = MISSING
     outputs: str = MISSING
@@ -359,18 +448,17 @@ class PoseMapperSettings(PoseMapperConfig):
     epochs: int = MISSING
     learning_rate: float = MISSING
     final_learning_rate: float = MISSING
+    weight_decay: float = MISSING
     patience: int = MISSING
     evaluations: int = MISSING
+    held_out_poses: int = MISSING
 
     def check(self) -> None:
         """Raises a ValueError for an unknown choice, or a batch size that does not divide the samples."""
         check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
         check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
         check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
-        if self.samples % self.batch_size:
-            raise ValueError(
-                f"trainer.batch_size: expected a divisor of samples = {self.samples}, got {self.batch_size}"
-            )
+        self._check_batch_size()
 
     @property
     def total_steps(self) -> int:
@@ -378,6 +466,38 @@ class PoseMapperSettings(PoseMapperConfig):
         return self.samples * self.epochs
 
 
+@dataclasses.dataclass(frozen=True)
+class AnyArmMapperSettings(PoseMapperConfig):
+    """The config of a mapper to any arm where every field has a value, but for those of a mapper to one learner."""
+
+    heads: int = MISSING
+    width: int = MISSING
+    layers: int = MISSING
+    refinements: int = MISSING
+    samples: int = MISSING
+    batch_size: int = MISSING
+    fresh: bool = MISSING
+    epochs: int = MISSING
+    learning_rate: float = MISSING
+    final_learning_rate: float = MISSING
+    weight_decay: float = MISSING
+    patience: int = MISSING
+    evaluations: int = MISSING
+    held_out_poses: int = MISSING
+
+    def check(self) -> None:
+        """Raises a ValueError for a width that attention cannot divide, or a batch size that no epoch can."""
+        if self.width % ATTENTION_HEADS:
+            raise ValueError(f"trainer.width: expected a multiple of {ATTENTION_HEADS}, got {self.width}")
+        self._check_batch_size()
+
+    @property
+    def total_steps(self) -> int:
+        """Training poses, each with an arm, counted in every epoch."""
+        return self.samples * self.epochs
+
+
+MapperSettings = PoseMapperSettings | AnyArmMapperSettings
 BUILT_IN_TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig, "pose_mapper": PoseMapperConfig}
 registry.reserve("trainer", tuple(BUILT_IN_TRAINERS))
 

@@ -41,6 +41,10 @@ def make_ppo_trainer(config: TrainConfig, run_dir: Path | None, unseen: Demonstr
 
 
 def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
+    if config.env.arms.are_drawn:
+        from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
+
+        return AnyArmMapperTrainer(config, run_dir)
     from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 
     return PoseMapperTrainer(config, run_dir)

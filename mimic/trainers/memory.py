@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import jax
 
+from mimic.any_arm.arrays import MAX_LINKS
 from mimic.arms.embodiment import Embodiment
 from mimic.memory import check_memory, device_memory, host_memory
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
@@ -24,6 +25,8 @@ def check_training_memory(config: TrainConfig) -> None:
     if isinstance(config.trainer, PPOConfig):
         _check("host", _demonstration_bytes(config, expert), host_memory())
         _check("device", _ppo_bytes(config, config.trainer, expert, learner), device_memory())
+    elif isinstance(config.trainer, PoseMapperConfig) and config.env.arms.are_drawn:
+        _check("device", _any_arm_mapper_bytes(config.trainer), device_memory())
     elif isinstance(config.trainer, PoseMapperConfig):
         _check("device", _mapper_bytes(config.trainer, expert, learner), device_memory())
 
@@ -65,6 +68,16 @@ def _mapper_bytes(trainer: PoseMapperConfig, expert: Embodiment, learner: Embodi
         "trainer.hidden_layers, trainer.heads": _network_bytes(widths),
         "trainer.samples, trainer.validation_poses, trainer.held_out_poses": poses * expert.num_joints * _FLOAT32,
         "trainer.batch_size, trainer.hidden_layers": float(settings.batch_size) * sum(widths) * _FLOAT32,
+    }
+
+
+def _any_arm_mapper_bytes(trainer: PoseMapperConfig) -> dict[str, float]:
+    """Network; hidden units of a minibatch, of which each token of a link has those of all layers."""
+    settings = trainer.resolve_any_arm(jax.default_backend())
+    units = float(settings.width) * settings.layers
+    return {
+        "trainer.width, trainer.layers": 8 * units * settings.width * _COPIES * _FLOAT32,  # attention 4, then 2 and 2
+        "trainer.batch_size, trainer.width, trainer.layers": settings.batch_size * MAX_LINKS * units * _FLOAT32,
     }
 
 

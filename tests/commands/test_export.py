@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.any_arm.description import described_arm, description, description_layout
+from mimic.any_arm.sampler import random_arm
 from mimic.metric.config import MetricConfig
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
+from mimic.trainers.pose_mapper.any_arm_model import make_any_arm_model
 from mimic.trainers.pose_mapper.model import PoseMapper, make_model
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import initial_params
@@ -115,6 +119,72 @@ def test_an_onnx_pose_mapper_equals_the_mapper(tmp_path, name, preset, metric):
     assert len(np.unique(np.round(outputs, 3), axis=0)) > 100
 
 
+def any_arm_run(run_dir):
+    """A run whose mapper to any arm has random weights."""
+    env = mimic.env_config("any_arm")
+    config = PoseMapperConfig(width=16, layers=1, heads=2, refinements=2).resolve_any_arm()
+    params = make_any_arm_model(env, config).init(jax.random.key(3))
+    run_dir.mkdir()
+    save_config(run_dir, TrainConfig(env, config))
+    save_checkpoint(run_dir, 5, params)
+    return AnyArmMapper.load(run_dir)
+
+
+def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path):
+    """One file for arms of 7 and 4 joints and for a random one, with the descriptions that the command writes."""
+    mapper = any_arm_run(tmp_path / "run")
+    session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "mapper.onnx"))
+    poses = random_poses(mapper.expert, 50)
+    json_file, npz_file = tmp_path / "panda.json", tmp_path / "panda4dof.npz"
+    mimic.export_run(tmp_path / "run", json_file, learner="panda")
+    mimic.export_run(tmp_path / "run", npz_file, learner="panda4dof")
+    arms = {
+        "panda": json.loads(json_file.read_text())["learner"],
+        "panda4dof": np.load(npz_file)["learner"],
+        "random": description(jax.device_get(random_arm(jax.random.PRNGKey(1)))),
+    }
+    for (name, vector), joints in zip(arms.items(), (7, 4, 7), strict=True):
+        batch = np.tile(np.asarray(vector, np.float32), (len(poses), 1))
+        (outputs,) = session.run(["learner_qpos"], {"expert_qpos": poses, "learner": batch})
+        expected = np.asarray(mapper(poses, jax.device_get(described_arm(jnp.asarray(batch[0])))))
+        off = np.abs(np.angle(np.exp(1j * (outputs - expected)))).max(axis=1)
+        assert np.mean(off < 1e-3) >= 0.95, name  # Newton steps magnify rounding errors
+        assert np.sum(np.ptp(expected, axis=0) > 0.1) == np.sum(np.ptp(outputs, axis=0) > 1e-6) == joints
+        if name != "random":
+            joints_of_arm = mapper.describe(name).joints
+            np.testing.assert_allclose(expected[:, joints_of_arm], mapper(poses, name), atol=1e-3)
+    metadata = session.get_modelmeta().custom_metadata_map
+    layout = json.loads(metadata["learner_layout"])
+    assert layout[-1]["stop"] == len(arms["panda"]) and json.loads(metadata["expert_joints"])[0] == "joint1"
+    assert json.loads(json_file.read_text())["joints"] == [f"joint{i}" for i in range(1, 8)]
+
+
+def test_a_description_is_the_arm(tmp_path):
+    mapper = any_arm_run(tmp_path / "run")
+    arm = mapper.arrays("panda4dof")
+    again = described_arm(jnp.asarray(description(arm)))
+    for part in description_layout():
+        np.testing.assert_array_equal(getattr(again, part["name"]), getattr(arm, part["name"]))
+
+
+def test_a_description_needs_a_file_for_it(rejected, tmp_path):
+    any_arm_run(tmp_path / "run")
+    message = rejected("export", f"run={tmp_path / 'run'}", f"out={tmp_path / 'new.onnx'}", "learner=panda")
+    assert "out: expected a file .json or .npz for the description of learner=panda" in message
+
+
+def test_jax_reads_a_mapper_to_any_arm(tmp_path):
+    pytest.importorskip("flatbuffers")
+    from jax import export
+
+    mapper = any_arm_run(tmp_path / "run")
+    path = mimic.export_run(tmp_path / "run", tmp_path / "mapper.jax", format="jax")
+    poses, arm = random_poses(mapper.expert, 9), mapper.arrays("panda")
+    function = export.deserialize(bytearray(path.read_bytes()))
+    outputs = function.call(poses, np.tile(description(arm), (9, 1)))["learner_qpos"]
+    np.testing.assert_allclose(outputs, mapper(poses, arm), atol=1e-3)
+
+
 def test_jax_reads_its_own_format(tmp_path):
     pytest.importorskip("flatbuffers")
     from jax import export
@@ -144,7 +214,10 @@ def test_bad_input_is_rejected(rejected, tmp_path):
             ["out=new.onnx", run, "learner=panda3dof"],
             "but the run's is panda-joint3-joint6-joint7 with joints",
         ),
-        (["out=new.onnx", run, "learner=panda9dof"], "unknown environment 'panda9dof'; valid are bimanual, pair"),
+        (
+            ["out=new.onnx", run, "learner=panda9dof"],
+            "unknown environment 'panda9dof'; valid are any_arm, bimanual, pair",
+        ),
     ]
     for arguments, message in cases:
         assert message in rejected("export", *arguments)

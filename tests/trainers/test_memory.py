@@ -1,6 +1,7 @@
 """Trainings that cannot fit into the memory are rejected before anything is built."""
 
 import dataclasses
+from typing import Any
 
 import pytest
 
@@ -65,3 +66,14 @@ def test_the_memory_of_this_machine_is_known():
 
 def test_unknown_memory_is_accepted():
     check_memory("trainer.num_envs", 1e30, None, "device")
+
+
+@pytest.mark.usefixtures("small")
+def test_large_mappers_to_any_arm_are_rejected():
+    cases: list[tuple[dict[str, Any], str]] = [
+        ({"width": 2**13, "layers": 3}, "trainer.width, trainer.layers: expected to fit"),
+        ({"samples": 2**20, "batch_size": 2**20}, "trainer.batch_size, trainer.width, trainer.layers: expected"),
+    ]
+    for settings, message in cases:
+        with pytest.raises(ValueError, match=message):
+            check_training_memory(TrainConfig(env_config("any_arm"), PoseMapperConfig(**settings)))

@@ -164,7 +164,7 @@ def test_weights_decay_and_biases_do_not():
     settings = {**SMALL, "learning_rate": 1e-2, "final_learning_rate": 1.0, "weight_decay": 0.5}
     model = make_model(env_config("planar4dof"), PoseMapperConfig(**settings).resolve())
     params = jax.tree.map(jnp.ones_like, model.init(jax.random.key(0)))
-    optimiser = training._optimiser(model)
+    optimiser = training._optimiser(model.config)
     change, _ = optimiser.update(jax.tree.map(jnp.zeros_like, params), optimiser.init(params), params)
     for path, value in jax.tree_util.tree_leaves_with_path(change):
         expected = -1e-2 * 0.5 if "kernel" in jax.tree_util.keystr(path) else 0.0

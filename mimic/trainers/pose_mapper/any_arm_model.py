@@ -10,11 +10,21 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays
-from mimic.any_arm.kinematics import correspondence, joint_states, link_states, link_states_in_frames, make_metric
+from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
+from mimic.any_arm.kinematics import (
+    check_metric,
+    correspondence,
+    joint_states,
+    link_states,
+    link_states_in_frames,
+    make_metric,
+)
 from mimic.any_arm.nearest import angle_limits, nearest_pose
+from mimic.arms.arm import build_arm
+from mimic.envs.config import EnvConfig
 from mimic.metric.distance import DistanceWeights
 from mimic.metric.kinematics import LinkStates
+from mimic.trainers.config import AnyArmMapperSettings
 from mimic.trainers.networks import Transformer
 
 Params = Any
@@ -93,6 +103,10 @@ class AnyArmMapperModel:
         metric = make_metric(self.weights, correspondence(self.expert, learner))
         return metric(expert, link_states(learner, qpos))
 
+    def distances(self, expert: LinkStates, learner: ArmArrays, poses: Float[Array, "n joints"]) -> Float[Array, " n"]:
+        """Embodiment distances between the expert's pose and some of a learner's."""
+        return jax.vmap(lambda qpos: self.distance(expert, learner, qpos))(poses)
+
     def refined(
         self, params: Params, expert: LinkStates, learner: ArmArrays
     ) -> tuple[Float[Array, "heads joints"], Float[Array, " heads"]]:
@@ -105,7 +119,7 @@ class AnyArmMapperModel:
         poses = self.candidates(params, expert, learner)
         if self.refinements:
             poses = jax.vmap(refine)(poses)
-        return poses, jax.vmap(lambda qpos: self.distance(expert, learner, qpos))(poses)
+        return poses, self.distances(expert, learner, poses)
 
     def __call__(self, params: Params, expert: LinkStates, learner: ArmArrays) -> Float[Array, " joints"]:
         """The nearest of the proposed poses."""
@@ -130,6 +144,17 @@ class AnyArmMapperModel:
         features = [expert.position, expert.direction, _arcs(self.expert)]
         of_expert = jnp.concatenate([x for x in features if x is not None], axis=1)[: self._expert_links]
         return joints, links, of_expert, learner.is_free, has_link
+
+
+def make_any_arm_model(env: EnvConfig, settings: AnyArmMapperSettings) -> AnyArmMapperModel:
+    """The untrained mapper of an environment's expert and metric.
+
+    Raises:
+      ValueError: an expert that cannot be loaded or has no arrays, or a metric other than of constant weights.
+    """
+    expert = arm_arrays(build_arm(env.expert, env.limits, env.metric.links)).astype(np.float32)
+    sizes = settings.width, settings.layers, settings.heads, settings.refinements
+    return AnyArmMapperModel(expert, check_metric(env.metric), *sizes)
 
 
 def _arcs(arm: ArmArrays) -> Float[Array, "links 2"]:

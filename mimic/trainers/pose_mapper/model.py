@@ -5,7 +5,7 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -81,7 +81,7 @@ class MapperModel:
             matrix = metric.correspondence
             return metric if callable(matrix) else dataclasses.replace(metric, correspondence=np.asarray(matrix))
 
-    @functools.cached_property
+    @property
     def distance(self) -> PoseDistance:
         """Embodiment distance between a pose of the expert and a pose of the learner."""
         metric = self.built_metric
@@ -133,6 +133,38 @@ class MapperModel:
         return (2 * qpos - lower - upper) / (upper - lower)
 
 
+class PoseModel(Protocol):
+    """A mapper to one learner without its parameters: what a `PoseMapper` needs of `MapperModel`."""
+
+    @property
+    def expert(self) -> Embodiment:
+        """Embodiment with n joints."""
+        ...
+
+    @property
+    def learner(self) -> Embodiment:
+        """Embodiment with n_hat joints."""
+        ...
+
+    @property
+    def metric(self) -> MetricConfig:
+        """Config of the metric."""
+        ...
+
+    @property
+    def distance(self) -> PoseDistance:
+        """Embodiment distance between a pose of the expert and a pose of the learner."""
+        ...
+
+    def candidates(self, params: Params, qpos: Array) -> Array:
+        """The poses that the heads propose [rad]."""
+        ...
+
+    def __call__(self, params: Params, qpos: Array) -> Array:
+        """The nearest of these poses [rad]."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class PoseMapper:
     """A trained mapper: call it with one pose of the expert or a batch of poses. Safe under `jax.jit` and `jax.vmap`.
@@ -142,7 +174,7 @@ class PoseMapper:
       params: parameters of the network.
     """
 
-    model: MapperModel
+    model: PoseModel
     params: Params
 
     @classmethod
@@ -154,12 +186,17 @@ class PoseMapper:
           checkpoint: number of training poses of the checkpoint; the last checkpoint where None.
 
         Raises:
-          ValueError: no run directory, a run of another trainer, or no such checkpoint.
+          ValueError: no run directory, a run of another trainer or of any arm, or no such checkpoint.
         """
         config = load_config(Path(run_dir))
         if not isinstance(config.trainer, PoseMapperConfig):
             raise ValueError(
                 f"{os.fspath(run_dir)!r}: expected a run of trainer=pose_mapper, got one of {config.trainer.name}"
+            )
+        if config.env.arms.are_drawn:
+            raise ValueError(
+                f"{os.fspath(run_dir)!r}: expected a run with one learner, got env={config.env.name}; load it with "
+                "mimic.AnyArmMapper.load(RUN_DIR).to(LEARNER)"
             )
         model = make_model(config.env, config.trainer.resolve())
         template = jax.eval_shape(model.init, jax.random.key(0))

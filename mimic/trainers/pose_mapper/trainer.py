@@ -162,7 +162,8 @@ class PoseMapperTrainer(Trainer):
         # Starts to compile these in parallel with the training's functions, the slowest first.
         _ = self._optimisation, self._evaluation
         return training.train(
-            self._model,
+            training.mapper_objective(self._model),
+            self.settings,
             lambda: (self._poses["train"], self._poses["validation"]),
             run_dir,
             seed=self._seed,
@@ -262,7 +263,8 @@ class PoseMapperTrainer(Trainer):
         del outcome, controller
         from mimic.evaluation import plots  # imports matplotlib, which takes a second
 
-        plots.plot_training(folder, "quality", "above the optimum [%]", of="poses", title=self._name)
+        labels = plots.labels_of("poses")
+        plots.plot_training(folder, "quality", "above the optimum [%]", labels=labels, title=self._name)
 
 
 def _key(purpose: int) -> jax.Array:

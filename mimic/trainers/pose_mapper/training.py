@@ -1,5 +1,7 @@
 """Training of a pose mapper: the embodiment distance is the loss, and there are no labels (paper, eq. 23)."""
 
+import dataclasses
+import functools
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +18,7 @@ from mimic.compilation import Background, compiling
 from mimic.runs.checkpoints import STATE_UNUSED, Checkpoint, checkpoint_steps, save_checkpoint, thin_checkpoints
 from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
+from mimic.trainers.config import MapperSettings
 from mimic.trainers.pose_mapper.model import MapperModel, Params
 from mimic.trainers.schedules import schedules_from
 from mimic.trainers.trainer import OnEvaluation
@@ -25,6 +28,26 @@ _WARM_UP = 0.02  # fraction of the updates over which the learning rate rises
 _ALL_HEADS = 0.1
 
 Poses = Float[Array, "poses joints"]
+Samples = Any  # a pytree of arrays [samples, ...]: what a loss is computed of
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Objective:
+    """What a training minimises, as pure functions.
+
+    Attributes:
+      init: random key -> parameters.
+      draw: (random key, count) -> samples.
+      distances: (parameters, samples, random key of the dropout or None) -> distances [samples, heads].
+    """
+
+    init: Callable[[Array], Params]
+    draw: Callable[[Array, int], Samples]
+    distances: Callable[[Params, Samples, Array | None], Float[Array, "samples heads"]]
+
+    def samples_shape(self, count: int) -> Any:
+        """Shapes of `count` samples."""
+        return jax.eval_shape(lambda: self.draw(jax.random.key(0), count))
 
 
 class _Functions(NamedTuple):
@@ -33,7 +56,7 @@ class _Functions(NamedTuple):
     Attributes:
       start: (seed, parameters to start from or None, updates done with them) -> (parameters, optimiser state).
       train: a training epoch, see `_training_epoch`.
-      validate: (parameters, poses) -> mean distance of the nearest head.
+      validate: (parameters, samples) -> mean distance of the nearest head.
     """
 
     start: Background[Callable[..., Any]]
@@ -51,8 +74,9 @@ class _Best(NamedTuple):
 
 # Above 40 lines because of its docstring.
 def train(
-    model: MapperModel,
-    poses: Callable[[], tuple[Poses, Poses]],
+    objective: Objective,
+    config: MapperSettings,
+    samples: Callable[[], tuple[Samples, Samples]],
     run_dir: Path,
     *,
     seed: int,
@@ -60,33 +84,33 @@ def train(
     signals: Signals,
     restored: Checkpoint | None = None,
 ) -> tuple[int, Params]:
-    """Trains a mapper. If the distance on the validation poses rises, the result has the best parameters before.
+    """Trains a mapper. If the distance on the validation samples rises, the result has the best parameters before.
 
     Args:
-      model: the mapper.
-      poses: returns training poses, for epochs without fresh ones, and validation poses; called after the functions
-        of the training have started to compile.
+      objective: what is minimised.
+      config: settings of the training.
+      samples: returns those of training, for epochs without fresh ones, and those of validation; called after the
+        functions of the training have started to compile.
       run_dir: folder of the checkpoints.
-      seed: random seed of the network, the order and the fresh poses.
+      seed: random seed of the network, the order and the fresh samples.
       on_evaluation: called after each checkpoint; training ends when it returns True.
       signals: signals of the process; after one, training ends at the next checkpoint.
       restored: the checkpoint to continue from. With the training's state the result is that of a training that was not
         interrupted; without it, the moments of the optimiser start anew.
 
     Returns:
-      Training poses so far and parameters of the result.
+      Training samples so far and parameters of the result.
 
     Raises:
       Interrupted: a signal was received; a checkpoint has been written.
       Diverged: a number is not finite.
       OSError: a checkpoint cannot be written.
     """
-    config = model.config
     steps, initial, leaves, metrics = restored or Checkpoint(0, None, None, {})
     interval = max(config.epochs // config.evaluations, 1)  # epochs between two evaluations
-    functions = _compile(model, interval, seed, initial)
+    functions = _compile(objective, config, interval, seed, initial)
     state = functions.start()(seed, initial, steps // config.batch_size)
-    training, validation = poses()
+    training, validation = samples()
     best = _Best(float(functions.validate()(state[0], validation)), steps, state[0])
     saved = _unflatten((state, tuple(best)), leaves)
     if saved is None and steps:
@@ -127,19 +151,22 @@ def _unflatten(template: Any, leaves: Sequence[np.ndarray] | None) -> Any:
     return jax.tree.unflatten(structure, leaves)
 
 
-def _compile(model: MapperModel, interval: int, seed: int, initial: Params | None) -> _Functions:
-    optimiser = _optimiser(model)
+def _compile(
+    objective: Objective, config: MapperSettings, interval: int, seed: int, initial: Params | None
+) -> _Functions:
+    optimiser = _optimiser(config)
 
     def start(seed: int, initial: Params | None, done_updates: int) -> Any:
-        params = model.init(_keys(seed)[0]) if initial is None else initial
+        params = objective.init(_keys(seed)[0]) if initial is None else initial
         return params, schedules_from(optimiser.init(params), done_updates)
 
-    def validation_distance(params: Params, poses: Poses) -> Array:
-        return _distances(model, params, poses).min(axis=1).mean()
+    def validation_distance(params: Params, samples: Samples) -> Array:
+        return objective.distances(params, samples, None).min(axis=1).mean()
 
     state = jax.eval_shape(start, seed, initial, 0)
-    training, validation = poses_shape(model, model.config.samples), poses_shape(model, model.config.validation_poses)
-    train = compiling(_training_epoch(model, optimiser, interval), state, seed, 0, training)  # first: it takes longest
+    training, validation = map(objective.samples_shape, (config.samples, config.validation_poses))
+    run = _training_epoch(objective, config, optimiser, interval)
+    train = compiling(run, state, seed, 0, training)  # first: it takes longest
     return _Functions(
         start=compiling(start, seed, initial, 0),
         train=train,
@@ -147,9 +174,8 @@ def _compile(model: MapperModel, interval: int, seed: int, initial: Params | Non
     )
 
 
-def _optimiser(model: MapperModel) -> optax.GradientTransformation:
+def _optimiser(config: MapperSettings) -> optax.GradientTransformation:
     """AdamW with a constant rate, or with a warm-up and a cosine decay. Biases do not decay."""
-    config = model.config
     updates_per_epoch = config.samples // config.batch_size
     updates, rate = config.epochs * updates_per_epoch, config.learning_rate
     warm_up, final = max(round(_WARM_UP * updates), 1), rate * config.final_learning_rate
@@ -165,38 +191,35 @@ def _is_matrix(params: Params) -> Any:
 
 
 def _training_epoch(
-    model: MapperModel, optimiser: optax.GradientTransformation, epochs: int
-) -> Callable[[Any, Any, Any, Poses], tuple[Any, Array]]:
+    objective: Objective, config: MapperSettings, optimiser: optax.GradientTransformation, epochs: int
+) -> Callable[[Any, Any, Any, Samples], tuple[Any, Array]]:
     """A function that trains for some epochs.
 
-    It maps the state (parameters, optimiser state), the seed, the number of epochs so far and the training poses to the
-    new state and the mean loss.
+    It maps the state (parameters, optimiser state), the seed, the number of epochs so far and the training samples to
+    the new state and the mean loss.
     """
-    config = model.config
-    samples, batch_size = config.samples, config.batch_size
+    count, batch_size = config.samples, config.batch_size
 
-    def loss(params: Params, poses: Poses, dropout_key: Array | None) -> Array:
-        distances = _distances(model, params, poses, dropout_key)
+    def loss(params: Params, samples: Samples, dropout_key: Array | None) -> Array:
+        distances = objective.distances(params, samples, dropout_key)
         nearest = distances.min(axis=1).mean()
         return (1 - _ALL_HEADS) * nearest + _ALL_HEADS * distances.mean()
 
-    def update(carry: Any, batch: tuple[Poses, Array]) -> tuple[Any, Array]:
+    def update(carry: Any, batch: tuple[Samples, Array]) -> tuple[Any, Array]:
         params, state = carry
-        poses, key = batch
-        value, gradient = jax.value_and_grad(loss)(params, poses, key if config.dropout else None)
+        samples, key = batch
+        value, gradient = jax.value_and_grad(loss)(params, samples, key if config.dropout else None)
         change, state = optimiser.update(gradient, state, params)
         return (optax.apply_updates(params, change), state), value
 
-    def run(carry: Any, seed: Any, done: Any, training: Poses) -> tuple[Any, Array]:
+    def run(carry: Any, seed: Any, done: Any, training: Samples) -> tuple[Any, Array]:
         _, key_epochs, key_dropout = _keys(seed)
 
         def epoch(carry: Any, number: Array) -> tuple[Any, Array]:
             key = jax.random.fold_in(key_epochs, number)
-            poses = (
-                random_poses(model, key, samples) if config.fresh else training[jax.random.permutation(key, samples)]
-            )
-            batches = poses.reshape(-1, batch_size, poses.shape[-1])
-            keys = jax.random.split(jax.random.fold_in(key_dropout, number), len(batches))
+            samples = objective.draw(key, count) if config.fresh else _shuffled(key, training, count)
+            batches = jax.tree.map(lambda x: x.reshape(-1, batch_size, *x.shape[1:]), samples)
+            keys = jax.random.split(jax.random.fold_in(key_dropout, number), count // batch_size)
             carry, losses = jax.lax.scan(update, carry, (batches, keys))
             return carry, losses.mean()
 
@@ -206,9 +229,19 @@ def _training_epoch(
     return run
 
 
+def _shuffled(key: Array, samples: Samples, count: int) -> Samples:
+    order = jax.random.permutation(key, count)
+    return jax.tree.map(lambda x: x[order], samples)
+
+
 def _keys(seed: Any) -> Array:
     """Random keys of the network, of the epochs, and of dropout."""
     return jax.random.split(jax.random.key(seed), 3)
+
+
+def mapper_objective(model: MapperModel) -> Objective:
+    """The mean distance of a mapper to one learner, over poses of the expert."""
+    return Objective(model.init, functools.partial(random_poses, model), functools.partial(_distances, model))
 
 
 def random_poses(model: MapperModel, key: Array, count: int) -> Poses:

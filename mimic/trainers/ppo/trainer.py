@@ -238,7 +238,8 @@ class PPOTrainer(Trainer):
         plots.plot_similarity(
             self.evaluator.similarity_summary(outcome, controller), folder / "similarity.png", title=self._name
         )
-        plots.plot_training(folder, "optimality_gap", "optimality gap [%]", of="demonstrations", title=self._name)
+        labels = plots.labels_of("demonstrations")
+        plots.plot_training(folder, "optimality_gap", "optimality gap [%]", labels=labels, title=self._name)
 
 
 def _text(form: str, value: float) -> str:

@@ -1,0 +1,42 @@
+"""Training of a pose mapper to any arm: each sample is another learner and another pose of the expert."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mimic.any_arm.arrays import ArmArrays
+from mimic.any_arm.kinematics import link_states
+from mimic.any_arm.sampler import Sampler
+from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, Params
+from mimic.trainers.pose_mapper.training import Objective
+
+
+def any_arm_objective(model: AnyArmMapperModel, sampler: Sampler) -> Objective:
+    """The mean distance of the poses that a mapper proposes, before the Newton steps.
+
+    A sample is a random key: arm and pose are drawn within the loss, so that an epoch needs no memory for its arms.
+
+    Args:
+      model: the mapper.
+      sampler: draws the learners.
+    """
+
+    def distances(params: Params, keys: Array, dropout_key: Array | None) -> Float[Array, "samples heads"]:
+        del dropout_key  # the network has none
+
+        def of_sample(key: Array) -> Float[Array, " heads"]:
+            key_arm, key_pose = jax.random.split(key)
+            learner = sampler(key_arm)
+            expert = link_states(model.expert, random_pose(model.expert, key_pose))
+            return model.distances(expert, learner, model.candidates(params, expert, learner))
+
+        return jax.vmap(of_sample)(keys)
+
+    return Objective(model.init, jax.random.split, distances)
+
+
+def random_pose(arm: ArmArrays, key: Array) -> Float[Array, " joints"]:
+    """A pose [rad], uniform within the joints' ranges; locked joints are at home."""
+    lower, upper = jnp.asarray(arm.joint_range, jnp.float32).T
+    qpos = jax.random.uniform(key, lower.shape, jnp.float32, minval=lower, maxval=upper)
+    return jnp.where(jnp.asarray(arm.is_free) > 0, qpos, jnp.asarray(arm.home, jnp.float32))
