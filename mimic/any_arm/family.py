@@ -14,7 +14,7 @@ from mimic.any_arm.sampler import (
     random_arm,
 )
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.envs.config import EnvConfig
+from mimic.envs.config import EnvConfig, ObservationConfig, RandomizationConfig, RewardConfig
 
 SEEN, UNSEEN = "seen", "unseen"
 _RANDOM_ARMS = 16  # in a report
@@ -44,6 +44,26 @@ def arm_sampler(config: EnvConfig) -> Sampler:
     samplers = [sampler for _, sampler in parts]
     sampler = samplers[0] if len(parts) == 1 else mixed_sampler(samplers, [weight / total for weight, _ in parts])
     return limited_sampler(sampler, arms.distinct) if arms.distinct else sampler
+
+
+def check_family(config: EnvConfig) -> None:
+    """Raises a ValueError for settings of one arm that an environment of many arms does not have."""
+    supported = {
+        "physics": ("auto", "fused"),
+        "start": ("home",),
+        "preview": (1,),
+        "randomization": (RandomizationConfig(),),
+        "reward": (RewardConfig(),),
+        "observation": (ObservationConfig(),),
+        "environment": ("",),
+    }
+    for key, values in supported.items():
+        if getattr(config, key) not in values:
+            expected = " or ".join(map(str, values))
+            raise ValueError(
+                f"{key}: expected {expected or 'none'} where the learner is drawn for each episode, got "
+                f"{getattr(config, key)}"
+            )
 
 
 def report_arms(config: EnvConfig) -> dict[str, dict[str, ArmArrays]]:

@@ -156,7 +156,9 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def similarity_table(similarity: Mapping[str, Mapping[str, Mapping[str, float]]]) -> Table:
+def similarity_table(
+    similarity: Mapping[str, Mapping[str, Mapping[str, float]]], split_names: Mapping[str, str] = SPLIT_NAMES
+) -> Table:
     """Similarity of expert and learner for each controller: means of the measures, with a section for each split."""
     title = "similarity (not optimised by any trainer); 0 is identical"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
@@ -166,7 +168,7 @@ def similarity_table(similarity: Mapping[str, Mapping[str, Mapping[str, float]]]
     splits = next(iter(next(iter(similarity.values())).values()))
     for split in splits:
         if len(splits) > 1:
-            table.add_row(f"[italic]{SPLIT_NAMES.get(split, split)}[/italic]")
+            table.add_row(f"[italic]{split_names.get(split, split)}[/italic]")
         for name, measures in similarity.items():
             cells = (_similarity_cell(key, measures[key][split]) for key in SIMILARITY_HEADERS)
             table.add_row(SIMILARITY_NAMES.get(name, name.replace("_", " ")), *cells)
@@ -179,11 +181,11 @@ def _similarity_cell(key: str, value: float) -> str:
 
 
 def report_table(report: Mapping[str, Any], trainer: Trainer) -> Table:
-    """The metrics of a report, on training and held-out data."""
+    """The metrics of a report by split, in the trainer's columns."""
     table = Table(title=f"{report['env']}  {report['trainer']}  seed {report['seed']}", title_justify="left")
     table.add_column("")
-    table.add_column("training", justify="right")
-    table.add_column("held out", justify="right")
+    for header in trainer.columns:
+        table.add_column(header, justify="right")
     for row in trainer.rows(dict(report)):
         table.add_row(*row)
     table.add_section()

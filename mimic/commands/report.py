@@ -6,6 +6,7 @@ from typing import Any
 from rich.console import Console
 
 from mimic.commands.progress import report_table, similarity_table
+from mimic.evaluation.labels import SPLITS
 from mimic.runs.provenance import hardware, versions
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
@@ -17,7 +18,7 @@ def show_report(console: Console, report: Mapping[str, Any], trainer: Trainer) -
     """Prints the tables of a report."""
     console.print(report_table(report, trainer))
     if "similarity" in report:
-        console.print(similarity_table(report["similarity"]))
+        console.print(similarity_table(report["similarity"], dict(zip(SPLITS, trainer.columns, strict=True))))
 
 
 def make_report(

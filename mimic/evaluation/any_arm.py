@@ -21,7 +21,7 @@ from mimic.any_arm.family import SEEN, UNSEEN
 from mimic.any_arm.kinematics import link_states
 from mimic.any_arm.similarity import motion_similarity
 from mimic.arms.arm import build_arm
-from mimic.compilation import Background
+from mimic.compilation import Background, on_host
 from mimic.evaluation.evaluator import Controller
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.kinematics import LinkStates
@@ -142,9 +142,8 @@ class ArmsEvaluator:
 
     def _compute_references(self, controller: ArmRollouts) -> ArmReferences:
         """The references; one arm after the other, so that the search takes the memory of one."""
-        env, steps = self.env, jnp.arange(1, self.env.config.horizon + 1)
-        count = env.demonstrations.count
-        states = jax.vmap(lambda index: jax.vmap(lambda step: env.expert_at(index, step))(steps))(jnp.arange(count))
+        env = self.env
+        expert_states = jax.tree.map(lambda x: np.asarray(x)[:, 1 : env.config.horizon + 1], env.expert_states)
 
         def of_arm(inputs: tuple[ArmArrays, Array]) -> ArmReferences:
             arm, guesses = inputs
@@ -155,10 +154,11 @@ class ArmsEvaluator:
                 hold = jax.vmap(lambda state: metric(state, at_home))(expert)
                 return ArmReferences(closest.distance, hold, closest.qpos)
 
-            return jax.vmap(of_demonstration)(states, guesses)
+            return jax.vmap(of_demonstration)(expert_states, guesses)
 
-        search = jax.jit(lambda *inputs: jax.lax.map(of_arm, inputs))
-        return jax.tree.map(np.asarray, search(self.arms, jnp.asarray(controller.qpos)))
+        inputs = jax.tree.map(np.asarray, (self.arms, controller.qpos))
+        with on_host():  # as the bound of one arm: there it compiles several times faster, and it runs once
+            return jax.tree.map(np.asarray, jax.jit(lambda *inputs: jax.lax.map(of_arm, inputs))(*inputs))
 
     def table(self, outcome: ArmsOutcome) -> ArmTable:
         """One row for each arm: joints, gaps, distances and the fraction of steps above a velocity limit.

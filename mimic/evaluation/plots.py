@@ -23,8 +23,8 @@ _COLOURS = {"train": "tab:blue", "held_out": "tab:orange"}
 _LABELS = {split: name.replace(" ", "-") for split, name in SPLIT_NAMES.items()}  # adjectives: held-out demonstrations
 
 
-def plot_training(folder: Path, metric: str, label: str, *, of: str, title: str) -> None:
-    """Plots a metric in percent over the steps, on training and held-out data; nothing if the folder has no run."""
+def plot_training(folder: Path, metric: str, label: str, *, labels: Mapping[str, str], title: str) -> None:
+    """Plots a metric in percent over the steps, with a label for each split; nothing if the folder has no run."""
     log = folder / METRICS
     if not log.is_file():
         return
@@ -34,13 +34,18 @@ def plot_training(folder: Path, metric: str, label: str, *, of: str, title: str)
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
     for split, colour in _COLOURS.items():
         percent = [100 * float(row[f"quality/{metric}.{split}"]) for row in rows]
-        axes.plot(steps, percent, "o-", markersize=3, color=colour, label=f"{_LABELS[split]} {of}")
+        axes.plot(steps, percent, "o-", markersize=3, color=colour, label=labels[split])
     axes.set(xlabel="steps", ylabel=label, title=title, yscale="log")
     axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     axes.yaxis.set_minor_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     axes.grid(alpha=0.3, which="both")
     axes.legend()
     _save(figure, folder / "training.png")
+
+
+def labels_of(data: str) -> dict[str, str]:
+    """A label for each split of data, such as demonstrations."""
+    return {split: f"{label} {data}" for split, label in _LABELS.items()}
 
 
 def plot_quality(evaluator: "Evaluator", rollouts: "Rollouts", out: Path, *, controller: str, title: str) -> None:

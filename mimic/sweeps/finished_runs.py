@@ -237,7 +237,7 @@ def _complete_lines(path: Path) -> list[str]:
 
 def _numbers(report: Mapping[str, Any]) -> dict[str, float]:
     """The numbers of a report by dotted keys; null, which replaces values that are not finite, is left out."""
-    flat = flatten({key: report[key] for key in report if key not in ("worst_demonstrations", "seed")})
+    flat = flatten({key: report[key] for key in report if key not in ("worst_demonstrations", "arms", "seed")})
     return {key: x for key, x in flat.items() if _is_number(x) and not key.startswith("hardware")}
 
 

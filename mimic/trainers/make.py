@@ -11,6 +11,7 @@ from mimic.trainers.memory import check_training_memory
 from mimic.trainers.trainer import Trainer
 
 if TYPE_CHECKING:
+    from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
     from mimic.trainers.ppo.trainer import PPOTrainer
 
 
@@ -24,8 +25,10 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
     Raises:
       ValueError: a config that cannot be trained, or not in the memory that there is.
     """
-    check_training_memory(config)
     name = config.trainer.name
+    if name != "ppo":
+        config.env.check_one_learner()
+    check_training_memory(config)
     if name in _MAKERS:
         return _MAKERS[name](config, run_dir)
     compat.import_mjx()  # first, and quietly: the trainer may import brax
@@ -33,11 +36,27 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
 
 
 def make_ppo_trainer(config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None) -> "PPOTrainer":
-    """The trainer of a config with trainer=ppo; see `PPOTrainer`."""
+    """The trainer of a config with trainer=ppo and one learner; see `PPOTrainer`."""
     compat.import_mjx()
     from mimic.trainers.ppo.trainer import PPOTrainer  # brax and MJX, which take seconds to import
 
+    config.env.check_one_learner()
     return PPOTrainer(config, run_dir, unseen)
+
+
+def make_any_arm_trainer(
+    config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None
+) -> "AnyArmPPOTrainer":
+    """The trainer of a config with trainer=ppo whose learner is drawn for each episode; see `AnyArmPPOTrainer`."""
+    compat.import_mjx()
+    from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
+
+    return AnyArmPPOTrainer(config, run_dir, unseen)
+
+
+def _make_ppo_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
+    make = make_any_arm_trainer if config.env.arms.are_drawn else make_ppo_trainer
+    return make(config, run_dir)
 
 
 def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
@@ -47,6 +66,6 @@ def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trai
 
 
 _MAKERS: dict[str, Callable[[TrainConfig, Path | None], Trainer]] = {
-    "ppo": make_ppo_trainer,
+    "ppo": _make_ppo_trainer,
     "pose_mapper": _make_pose_mapper_trainer,
 }

@@ -28,6 +28,7 @@ class Trainer(abc.ABC):
       simulation: one line for people: the physics and why; empty where nothing is simulated.
       total_steps: training steps of the whole run.
       unit: name of a training step, as its key in the report.
+      columns: headers of the final table for the splits "train" and "held_out".
     """
 
     settings: TrainerConfig
@@ -36,6 +37,7 @@ class Trainer(abc.ABC):
     simulation: str = ""
     total_steps: int
     unit: str
+    columns: tuple[str, str] = ("training", "held out")
 
     @abc.abstractmethod
     def save_inputs(self, run_dir: Path) -> None:

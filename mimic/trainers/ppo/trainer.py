@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -26,6 +26,18 @@ from mimic.trainers.ppo.programs import Replay
 from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
 
 
+class PolicyOfManyArms(NamedTuple):
+    """A policy that was trained on many arms, to evaluate on one.
+
+    Attributes:
+      params_template: makes the parameters, or their shapes, with the structure of a checkpoint.
+      controller: from the environment of the arm and parameters to the controller of that arm.
+    """
+
+    params_template: Callable[[], Params]
+    controller: Callable[[ImitationEnv, Params], Controller]
+
+
 class PPOTrainer(Trainer):
     """Trains a policy on the training demonstrations, and evaluates it on these and on held-out ones.
 
@@ -33,6 +45,7 @@ class PPOTrainer(Trainer):
       config: the run's config.
       run_dir: directory of an existing run, whose demonstrations are used.
       unseen: demonstrations to evaluate on instead of the held-out ones.
+      shared: the policy, where it was trained on many arms; it can be evaluated, and not trained.
 
     Attributes:
       evaluator: evaluates controllers on the run's demonstrations.
@@ -43,9 +56,15 @@ class PPOTrainer(Trainer):
 
     unit = "env_steps"
 
-    def __init__(self, config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None):
+    def __init__(
+        self,
+        config: TrainConfig,
+        run_dir: Path | None,
+        unseen: Demonstrations | None = None,
+        shared: PolicyOfManyArms | None = None,
+    ):
         assert isinstance(config.trainer, PPOConfig)
-        self._name, self._seed = config.env.name, config.seed
+        self._name, self._seed, self._shared = config.env.name, config.seed, shared
         self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count())
         self.total_steps = self.settings.total_steps
         env, held_out = run_environment(config.env, run_dir)
@@ -72,10 +91,14 @@ class PPOTrainer(Trainer):
 
     def params_template(self) -> Params:
         """Observation statistics and the parameters of policy and value network."""
+        if self._shared is not None:
+            return self._shared.params_template()
         return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
 
     def controller(self, params: Params) -> Controller:
         """The deterministic policy of these parameters."""
+        if self._shared is not None:
+            return self._shared.controller(self.evaluator.env, params)
         return ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)(params)
 
     def policy(self, params: Params) -> Callable[[Any], Any]:
@@ -238,7 +261,8 @@ class PPOTrainer(Trainer):
         plots.plot_similarity(
             self.evaluator.similarity_summary(outcome, controller), folder / "similarity.png", title=self._name
         )
-        plots.plot_training(folder, "optimality_gap", "optimality gap [%]", of="demonstrations", title=self._name)
+        labels = plots.labels_of("demonstrations")
+        plots.plot_training(folder, "optimality_gap", "optimality gap [%]", labels=labels, title=self._name)
 
 
 def _text(form: str, value: float) -> str:
