@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @overload
-def make(name: Literal["any_arm", "panda_family"], **overrides: Any) -> "AnyArmEnv": ...  # pyright: ignore[reportOverlappingOverload]
+def make(name: Literal["any_arm", "panda_family"], **overrides: Any) -> "AnyArmEnv": ...
 
 
 @overload

@@ -215,7 +215,8 @@ class ArmsEvaluator:
             return {name: value.mean() for name, value in values.items()}
 
         of_arm = jax.vmap(of_one, in_axes=(None, 0, 0))
-        return jax.jit(lambda qpos: jax.vmap(of_arm, in_axes=(0, None, 0))(self.arms, self._expert_qpos, qpos))
+        expert_qpos = jnp.asarray(self._expert_qpos)
+        return jax.jit(lambda qpos: jax.vmap(of_arm, in_axes=(0, None, 0))(self.arms, expert_qpos, qpos))
 
     def similarity_summary(self, outcome: ArmsOutcome, name: str) -> dict[str, dict[str, dict[str, float]]]:
         """Means by split of each measure of similarity, as `Evaluator.similarity_summary`.

@@ -14,6 +14,7 @@ import numpy as np  # noqa: E402
 _TITLES = {True: "seen in training", False: "not seen in training"}
 _COLOURS = {True: "tab:blue", False: "tab:orange"}
 _LINEAR = 0.1  # %: gaps below it are on a linear axis, as a rollout at the bound has the gap 0
+_TICKS = [*(-10.0, -1.0, 0.0), *(digit * 10.0**power for power in range(-1, 4) for digit in (1, 2, 5))]  # %
 _ROW, _MARGIN = 0.17, 1.7  # inches
 
 
@@ -50,7 +51,10 @@ def plot_arms(arms: Mapping[str, Mapping[str, Any]], out: Path, *, controller: s
         axes.set(ylim=(len(rows) - 0.4, -0.6), title=f"{_TITLES[seen]}: {len(rows)}")
         axes.grid(alpha=0.3, axis="x", which="both")
     last = all_axes[-1, 0]
-    last.set_xscale("symlog", linthresh=_LINEAR)
+    last.set_xscale("symlog", linthresh=_LINEAR, linscale=0.5)
+    values = [100 * arm[key] for rows in groups.values() for _, arm in rows for key in ("gap", "controller_gap")]
+    last.set_xlim(1.3 * min(0, *values) - 0.01, 1.3 * max(_LINEAR, *values))
+    last.xaxis.set_major_locator(matplotlib.ticker.FixedLocator(_TICKS))
     last.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
     last.set_xlabel("optimality gap [%]: 0 is the kinematic bound, 100 is holding the start pose")
     figure.suptitle(f"{title}: {controller}, each arm (and its joints)")

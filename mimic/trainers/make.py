@@ -12,7 +12,7 @@ from mimic.trainers.trainer import Trainer
 
 if TYPE_CHECKING:
     from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
-    from mimic.trainers.ppo.trainer import PPOTrainer
+    from mimic.trainers.ppo.trainer import PolicyOfManyArms, PPOTrainer
 
 
 def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
@@ -35,13 +35,18 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
     return registry.find("trainer", name, "trainer.name")(config, run_dir)
 
 
-def make_ppo_trainer(config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None) -> "PPOTrainer":
+def make_ppo_trainer(
+    config: TrainConfig,
+    run_dir: Path | None,
+    unseen: Demonstrations | None = None,
+    shared: "PolicyOfManyArms | None" = None,
+) -> "PPOTrainer":
     """The trainer of a config with trainer=ppo and one learner; see `PPOTrainer`."""
     compat.import_mjx()
     from mimic.trainers.ppo.trainer import PPOTrainer  # brax and MJX, which take seconds to import
 
     config.env.check_one_learner()
-    return PPOTrainer(config, run_dir, unseen)
+    return PPOTrainer(config, run_dir, unseen, shared)
 
 
 def make_any_arm_trainer(

@@ -262,7 +262,8 @@ class PoseMapperTrainer(Trainer):
         del outcome, controller
         from mimic.evaluation import plots  # imports matplotlib, which takes a second
 
-        plots.plot_training(folder, "quality", "above the optimum [%]", labels=plots.labels_of("poses"), title=self._name)
+        labels = plots.labels_of("poses")
+        plots.plot_training(folder, "quality", "above the optimum [%]", labels=labels, title=self._name)
 
 
 def _key(purpose: int) -> jax.Array:

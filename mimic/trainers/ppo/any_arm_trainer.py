@@ -1,6 +1,5 @@
 """`trainer=ppo` where the learner is another arm in each episode: trains one policy for all of them."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,8 +16,7 @@ from mimic.any_arm.env import AnyArmEnv
 from mimic.any_arm.family import SEEN, UNSEEN, report_arms
 from mimic.any_arm.making import make_family_env
 from mimic.compilation import Background, compiling
-from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
+from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS, ArmRollouts, ArmsEvaluator, ArmsOutcome
 from mimic.evaluation.config import SearchConfig
@@ -31,9 +29,8 @@ from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, PPOSettings, TrainConfig
 from mimic.trainers.ppo import training as ppo
 from mimic.trainers.ppo.programs import Replay
+from mimic.trainers.ppo.trainer import PolicyOfManyArms, with_crossovers, with_saved_demonstrations
 from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
-
-CONTROLLERS = ("policy", "nearest_pose")
 
 
 class AnyArmPPOTrainer(Trainer):
@@ -61,7 +58,8 @@ class AnyArmPPOTrainer(Trainer):
         self.total_steps = self.settings.total_steps
         training, held_out = training_and_held_out(with_saved_demonstrations(config.env, run_dir))
         self._demonstrations = concatenate(training, held_out)
-        self._env = make_family_env(config.env, _with_crossovers(training, config, self.settings))
+        mixed = with_crossovers(training, self.settings.crossovers, config.env.demonstrations.seed)
+        self._env = make_family_env(config.env, mixed)
         if unseen is not None:
             unseen.check_fits(self._env.expert, config.env.control_dt, config.env.horizon)
             check_effort(unseen, self._env.expert)
@@ -93,9 +91,14 @@ class AnyArmPPOTrainer(Trainer):
         """The deterministic policy: observation -> action in [-1, 1]."""
         return jax.jit(self._policy(params))
 
-    def controller_of(self, env: ImitationEnv, params: Params) -> Controller:
-        """The controller of one arm that the policy of these parameters is, see `nearest_pose_controller`."""
-        return nearest_pose_controller(env, self._policy(params))
+    def shared_policy(self) -> PolicyOfManyArms:
+        """The policy, to evaluate it on one arm by `PPOTrainer`."""
+
+        def controller(env: ImitationEnv, params: Params) -> Controller:
+            with jax.ensure_compile_time_eval():  # all but the parameters is constant where JAX traces them
+                return nearest_pose_controller(env, self._policy(params))
+
+        return PolicyOfManyArms(self.params_template, controller)
 
     def _policy(self, params: Params) -> Callable[[Array], Array]:
         controller = ppo.make_controller(self.settings, *self._sizes)(params)
@@ -164,14 +167,10 @@ class AnyArmPPOTrainer(Trainer):
     def run_controller(
         self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate
     ) -> tuple[ArmsOutcome, dict[str, Any]]:
-        """The policy, or "nearest_pose": the controller without learning.
-
-        Raises:
-          ValueError: another controller, which exists for one arm only.
-        """
-        check_controller(name)
+        """The policy, or "nearest_pose": the controller without learning; the others need an environment of one arm."""
         if name == "policy":
             return self.evaluate(params), {}
+        assert name == "nearest_pose", name
         return ArmsOutcome(self._controller_rollouts(), self._controller_rollouts()), {"trainer": name}
 
     def metrics(self, outcome: ArmsOutcome) -> Metrics:
@@ -213,13 +212,12 @@ class AnyArmPPOTrainer(Trainer):
             (label, _text(form, metrics[key]["train"]), _text(form, metrics[key]["held_out"]))
             for label, key, form in by_split
         ]
-        split_arms = [[row for row in metrics["arms"].values() if row["seen"] == seen] for seen in (True, False)]
-        worst = (_worst(metrics["arms"], seen=seen) for seen in (True, False))
-        rows.insert(3, ("    which is", *worst))
-        rows.append(("arms", *(str(len(arms)) for arms in split_arms)))
-        without = [sum(math.isnan(arm["gap"]) for arm in arms) for arms in split_arms]
+        seen, unseen = ({n: arm for n, arm in metrics["arms"].items() if arm["seen"] == seen} for seen in (True, False))
+        rows.insert(3, ("    which is", _worst(seen), _worst(unseen)))
+        rows.append(("arms", str(len(seen)), str(len(unseen))))
+        without = [sum(math.isnan(arm["gap"]) for arm in arms.values()) for arms in (seen, unseen)]
         if any(without):
-            rows.append((f"  without gap (span below {MIN_SPAN:.0%})", *map(str, without)))
+            rows.append((f"  without gap (span below {MIN_SPAN:.0%})", str(without[0]), str(without[1])))
         return rows
 
     def save_outcome(self, folder: Path, outcome: ArmsOutcome, controller: str = "policy") -> None:
@@ -234,34 +232,9 @@ class AnyArmPPOTrainer(Trainer):
         plots.plot_training(folder, "optimality_gap", "optimality gap [%]", labels=labels, title=self._name)
 
 
-def check_controller(name: str) -> None:
-    """Raises a ValueError for a controller that many arms do not have."""
-    if name not in CONTROLLERS:
-        raise ValueError(
-            f"controller: expected {' or '.join(CONTROLLERS)} for a run of many arms, got {name}; name one of its arms "
-            "with learner=NAME"
-        )
-
-
-def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvConfig:
-    """The environment with the demonstrations of an existing run, if there is one."""
-    if run_dir is None:
-        return config
-    saved = dataclasses.replace(config.demonstrations, path=str(run_dir / DEMONSTRATIONS))
-    return dataclasses.replace(config, demonstrations=saved)
-
-
-def _with_crossovers(training: Demonstrations, config: TrainConfig, settings: PPOSettings) -> Demonstrations:
-    """The training demonstrations with additional ones, see `crossovers`."""
-    if settings.crossovers == 0 or training.count == 1:  # a single demonstration cannot be mixed
-        return training
-    mixed = crossovers(training, settings.crossovers, config.env.demonstrations.seed)
-    return concatenate(training, mixed)
-
-
-def _worst(arms: Mapping[str, Mapping[str, Any]], *, seen: bool) -> str:
+def _worst(arms: Mapping[str, Mapping[str, Any]]) -> str:
     """The name of the arm with the largest gap."""
-    gaps = {name: arm["gap"] for name, arm in arms.items() if arm["seen"] == seen and not math.isnan(arm["gap"])}
+    gaps = {name: arm["gap"] for name, arm in arms.items() if not math.isnan(arm["gap"])}
     return max(gaps, key=lambda name: gaps[name]) if gaps else "none"
 
 

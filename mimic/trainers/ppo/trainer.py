@@ -73,7 +73,8 @@ class PPOTrainer(Trainer):
             check_effort(unseen, env.expert)
             held_out = unseen.of_length(env.demonstrations.horizon)
         self.evaluator = Evaluator(env, held_out)
-        self._env = _with_crossovers(env, self.settings.crossovers, config.env.demonstrations.seed)
+        mixed = with_crossovers(env.demonstrations, self.settings.crossovers, config.env.demonstrations.seed)
+        self._env = env if mixed is env.demonstrations else env.with_demonstrations(mixed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
         self.env_config = dataclasses.replace(config.env, physics=env.physics.name)
         self.headline = (
@@ -271,17 +272,21 @@ def _text(form: str, value: float) -> str:
 
 def run_environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
     """The environment with its training demonstrations, and the held-out ones; an existing run has its own."""
-    if run_dir is not None:
-        path = str(run_dir / DEMONSTRATIONS)
-        stored = dataclasses.replace(config.demonstrations, path=path)
-        config = dataclasses.replace(config, demonstrations=stored)
+    config = with_saved_demonstrations(config, run_dir)
     training, held_out = training_and_held_out(config)
     return make_env(config, training), held_out
 
 
-def _with_crossovers(env: ImitationEnv, count: int, seed: int) -> ImitationEnv:
-    """The environment with additional training demonstrations."""
-    recorded = env.demonstrations
+def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvConfig:
+    """The environment with the demonstrations of an existing run, if there is one."""
+    if run_dir is None:
+        return config
+    saved = dataclasses.replace(config.demonstrations, path=str(run_dir / DEMONSTRATIONS))
+    return dataclasses.replace(config, demonstrations=saved)
+
+
+def with_crossovers(recorded: Demonstrations, count: int, seed: int) -> Demonstrations:
+    """Training demonstrations with additional ones, see `crossovers`."""
     if count == 0 or recorded.count == 1:  # a single demonstration cannot be mixed
-        return env
-    return env.with_demonstrations(concatenate(recorded, crossovers(recorded, count, seed)))
+        return recorded
+    return concatenate(recorded, crossovers(recorded, count, seed))
