@@ -1,10 +1,12 @@
 """Torques of any arm that bring its joints to target angles at the end of a control step, within its limits."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays
-from mimic.any_arm.dynamics import inertia_matrix, torque_of_arm
+from mimic.any_arm.dynamics import inertia_and_bias, inertia_matrix
 from mimic.any_arm.nearest import NearestPose, solve_free
 from mimic.arms.arm import SPEED_FACTOR
 
@@ -82,39 +84,59 @@ def tracking_acceleration(
     return arm.is_free * (0.5 * angle_error + weight * dt * velocity_error) / (dt**2 * (0.25 + weight))
 
 
-def changed_acceleration(
-    arm: ArmArrays, acceleration: Float[Array, " joints"], action: Float[Array, " joints"], control_dt: float
-) -> Float[Array, " joints"]:
-    """An acceleration [rad/s^2] with the change that an action of a policy in [-1, 1] makes."""
-    return acceleration + arm.is_free * _MAX_CHANGE * arm.velocity_limit / control_dt * jnp.clip(action, -1.0, 1.0)
+class Plan(NamedTuple):
+    """What the controller does in a step, and the dynamics at its middle, which turn a change of it into torques.
+
+    Attributes:
+      acceleration: [joints] of the joints, constant [rad/s^2].
+      inertia: [joints, joints] joint-space inertia [kg m^2].
+      bias: [joints] torques of zero acceleration [N m].
+    """
+
+    acceleration: Float[Array, " joints"]
+    inertia: Float[Array, "joints joints"]
+    bias: Float[Array, " joints"]
+
+    def torque(self, acceleration: Float[Array, " joints"]) -> Float[Array, " joints"]:
+        """The torques of another acceleration [N m]; those of locked joints have no meaning."""
+        return jnp.sum(self.inertia * acceleration, axis=1) + self.bias
 
 
-def torque_of_acceleration(
+def make_plan(
     arm: ArmArrays,
     qpos: Float[Array, " joints"],
     qvel: Float[Array, " joints"],
-    acceleration: Float[Array, " joints"],
+    targets: NearestPose,
+    speed: Float[Array, " joints"],
+    control_dt: float,
+) -> Plan:
+    """The plan of a step towards targets, see `tracking_acceleration`."""
+    dt = control_dt
+    acceleration = tracking_acceleration(arm, qpos, qvel, targets, speed, dt)
+    middle = qpos + 0.5 * dt * qvel + 0.125 * dt**2 * acceleration, qvel + 0.5 * dt * acceleration
+    return Plan(acceleration, *inertia_and_bias(arm, *middle))
+
+
+def planned_torque(
+    arm: ArmArrays,
+    plan: Plan,
+    action: Float[Array, " joints"],
     max_torque: Float[Array, " joints"],
     control_dt: float,
 ) -> Float[Array, " joints"]:
-    """The constant torque [N m] of an acceleration over a step, by inverse dynamics at its middle, within limits.
+    """The constant torque [N m] of a plan, within limits; 0 for locked joints.
 
     If a torque is above its maximum, all are reduced by the same factor, so that their direction stays: if each were
-    cut by itself, light arms would be thrown about by the others.
+    cut by itself, the light joints would be thrown about by the others.
 
     Args:
       arm: the arm.
-      qpos: joint angles [rad].
-      qvel: joint velocities [rad/s].
-      acceleration: of the joints [rad/s^2].
+      plan: of the step.
+      action: change of the acceleration by a policy, in [-1, 1]: 1 is two velocity limits in a control step.
       max_torque: [joints] maximum torque [N m].
       control_dt: duration of the step [s].
-
-    Returns:
-      Torques, 0 for locked joints.
     """
-    dt = control_dt
-    middle = qpos + 0.5 * dt * qvel + 0.125 * dt**2 * acceleration, qvel + 0.5 * dt * acceleration
-    torque = torque_of_arm(arm, *middle, acceleration)
+    change = _MAX_CHANGE * arm.velocity_limit / control_dt * jnp.clip(action, -1.0, 1.0)
+    torque = arm.is_free * plan.torque(arm.is_free * (plan.acceleration + change))
     excess = jnp.max(jnp.abs(torque) / jnp.maximum(max_torque, 1e-6) * arm.is_free)
     return torque / jnp.maximum(excess, 1.0)

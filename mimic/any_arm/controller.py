@@ -10,12 +10,7 @@ from brax.envs.base import State
 from jaxtyping import Array, Float
 
 from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays
-from mimic.any_arm.control import (
-    changed_acceleration,
-    max_speed,
-    torque_of_acceleration,
-    tracking_acceleration,
-)
+from mimic.any_arm.control import make_plan, max_speed, planned_torque
 from mimic.any_arm.kinematics import check_metric, correspondence
 from mimic.any_arm.nearest import nearest_pose
 from mimic.any_arm.observation import observe
@@ -58,11 +53,12 @@ def nearest_pose_controller(
         next_states = jax.tree.map(lambda x: _padded(x, MAX_LINKS), own_states)
         guess = qpos + 0.5 * dt * qvel
         targets = nearest_pose(arm, weights, jnp.asarray(matrix), next_states, guess, NEWTON_STEPS)
-        acceleration = tracking_acceleration(arm, qpos, qvel, targets, speed, dt)
-        if policy is not None:
-            action = policy(observe(arm, own_states, qpos, qvel, targets, max_torque, speed, dt))
-            acceleration = changed_acceleration(arm, acceleration, action, dt)
-        torque = torque_of_acceleration(arm, qpos, qvel, acceleration, max_torque, dt)
+        plan = make_plan(arm, qpos, qvel, targets, speed, dt)
+        if policy is None:
+            action = jnp.zeros(MAX_JOINTS)
+        else:
+            action = policy(observe(arm, own_states, qpos, qvel, targets, max_torque, plan, dt))
+        torque = planned_torque(arm, plan, action, max_torque, dt)
         return torque[:joints] / env.torque_scale
 
     return controller

@@ -55,25 +55,23 @@ def joint_of(numbers: Any) -> JointNumbers:
     return JointNumbers((x[0], x[1]), (x[2], x[3]), x[4], first, second, x[12], x[13], x[14])
 
 
-def inverse(
-    joints: Sequence[JointNumbers], qpos: Sequence[Scalar], qvel: Sequence[Scalar], qacc: Sequence[Scalar]
-) -> list[Scalar]:
-    """Inverse dynamics: joint torques [N m] for joint accelerations [rad/s^2], which are 0 for locked joints."""
-    turns = _turns(joints, qpos)
-    matrix = mass_matrix(joints, turns)
-    torque = bias_forces(joints, turns, qvel)
-    for i, joint in enumerate(joints):
-        torque[i] = torque[i] + joint.armature * qacc[i] + joint.damping * qvel[i]
-        for j in range(len(joints)):
-            torque[i] = torque[i] + matrix[max(i, j)][min(i, j)] * qacc[j]
-        torque[i] = torque[i] * joint.is_free
-    return torque
-
-
 def inertia_matrix(arm: ArmArrays, qpos: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
     """Joint-space inertia with the armature [kg m^2]; locked joints have the rows of the identity."""
     joints = unpacked(joint_numbers(arm))
-    lower = mass_matrix(joints, _turns(joints, list(qpos)))
+    return _full_inertia(arm, mass_matrix(joints, _turns(joints, list(qpos))))
+
+
+def inertia_and_bias(
+    arm: ArmArrays, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]
+) -> tuple[Float[Array, "joints joints"], Float[Array, " joints"]]:
+    """`inertia_matrix`, and the joint torques [N m] for zero acceleration: Coriolis and centrifugal forces, damping."""
+    joints = unpacked(joint_numbers(arm))
+    turns = _turns(joints, list(qpos))
+    bias = jnp.stack(bias_forces(joints, turns, list(qvel)))
+    return _full_inertia(arm, mass_matrix(joints, turns)), arm.is_free * (bias + arm.damping * qvel)
+
+
+def _full_inertia(arm: ArmArrays, lower: Sequence[Sequence[Scalar]]) -> Float[Array, "joints joints"]:
     rows = [jnp.stack([lower[max(i, j)][min(i, j)] for j in range(MAX_JOINTS)]) for i in range(MAX_JOINTS)]
     both_free = arm.is_free[:, None] * arm.is_free
     return both_free * jnp.stack(rows) + jnp.diag(arm.is_free * arm.armature + (1 - arm.is_free))
@@ -244,5 +242,6 @@ def torque_of_arm(
     qvel: Float[Array, " joints"],
     qacc: Float[Array, " joints"],
 ) -> Float[Array, " joints"]:
-    """Joint torques [N m] for joint accelerations, see `inverse`."""
-    return jnp.stack(inverse(unpacked(joint_numbers(arm)), list(qpos), list(qvel), list(qacc)))
+    """Inverse dynamics: joint torques [N m] for joint accelerations [rad/s^2]; 0 for locked joints."""
+    inertia, bias = inertia_and_bias(arm, qpos, qvel)
+    return arm.is_free * jnp.sum(inertia * (arm.is_free * qacc), axis=1) + bias

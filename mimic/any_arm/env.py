@@ -2,7 +2,7 @@
 
 An action does not set torques: the same torque means something else on every arm. It changes accelerations. Those
 without it lead to the nearest pose, which Newton steps find from the arm's own pose, see `nearest_pose`. Inverse
-dynamics turns accelerations into torques within the arm's limits, see `torque_of_acceleration`. So the zero action is
+dynamics turns accelerations into torques within the arm's limits, see `planned_torque`. So the zero action is
 already a controller of any arm, and a policy learns what it lacks: to leave local minima, and to look ahead.
 """
 
@@ -19,13 +19,7 @@ from jaxtyping import Array, Float
 
 from mimic import compat
 from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
-from mimic.any_arm.control import (
-    changed_acceleration,
-    max_speed,
-    torque_of_acceleration,
-    torque_scale,
-    tracking_acceleration,
-)
+from mimic.any_arm.control import Plan, make_plan, max_speed, planned_torque, torque_scale
 from mimic.any_arm.controller import NEWTON_STEPS
 from mimic.any_arm.kinematics import (
     check_metric,
@@ -58,13 +52,15 @@ class AnyArmState(ArmState):
       arm: the learner.
       max_torque: [joints] maximum torque [N m], see `torque_scale`.
       hold: mean distance of holding the home pose, the unit of the reward.
-      targets: the nearest pose to the expert at the next step, and its velocity; from `with_targets`.
+      targets: the nearest pose to the expert at the next step, and its velocity; from `with_plan`.
+      plan: what the controller does in the next step; from `with_plan`.
     """
 
     arm: ArmArrays = None  # type: ignore[assignment] - fields after one with a default need one too
     max_torque: Float[Array, " joints"] = None  # type: ignore[assignment]
     hold: Float[Array, ""] = None  # type: ignore[assignment]
     targets: NearestPose = None  # type: ignore[assignment]
+    plan: Plan = None  # type: ignore[assignment]
 
 
 class AnyArmEnv(Env):
@@ -72,7 +68,7 @@ class AnyArmEnv(Env):
 
     Reward: minus the embodiment distance to the expert after the step, divided by the mean distance of holding the
     home pose, so that all arms count alike. Action: for each joint slot a change of its acceleration in [-1, 1], see
-    `changed_acceleration`. Observation: see `mimic.any_arm.observation.observe`.
+    `planned_torque`. Observation: see `mimic.any_arm.observation.observe`.
 
     Args:
       config: expert, metric, demonstrations and time steps; its learner is not used.
@@ -126,34 +122,37 @@ class AnyArmEnv(Env):
 
     def start_of(self, arm: ArmArrays, demonstration: Array, key: Array) -> AnyArmState:
         """The first state of an episode of a given arm on a demonstration."""
-        metric = self.metric_of(arm)
+        metric, zeros = self.metric_of(arm), jnp.zeros(MAX_JOINTS)
         samples = jnp.linspace(1, self.config.horizon, _HOLD_SAMPLES).astype(jnp.int32)
         at_home = link_states(arm, arm.home)
         held = jax.vmap(lambda step: metric(self.expert_at(demonstration, step), at_home))(samples)
         state = AnyArmState(
             qpos=arm.home,
-            qvel=jnp.zeros(MAX_JOINTS),
+            qvel=zeros,
             step=jnp.zeros((), jnp.int32),
             demonstration=jnp.asarray(demonstration, jnp.int32),
             key=key,
             arm=arm,
             max_torque=torque_scale(arm, self.config.action_scale, self.config.control_dt),
             hold=jnp.maximum(held.mean(), _MIN_HOLD),
-            targets=NearestPose(arm.home, jnp.zeros(MAX_JOINTS), jnp.ones(MAX_JOINTS)),
+            targets=NearestPose(arm.home, zeros, zeros),
+            plan=Plan(zeros, jnp.zeros((MAX_JOINTS, MAX_JOINTS)), zeros),
         )
-        return self.with_targets(state)
+        return self.with_plan(state)
 
-    def with_targets(self, state: AnyArmState) -> AnyArmState:
-        """The state with its nearest pose at the next step, by Newton steps from its own pose."""
+    def with_plan(self, state: AnyArmState) -> AnyArmState:
+        """The state with its nearest pose at the next step, by Newton steps from its own pose, and the way there."""
         expert = self.expert_at(state.demonstration, state.step + 1)
         guess = state.qpos + 0.5 * self.config.control_dt * state.qvel
         matrix = correspondence(self._expert_arrays, state.arm)
         targets = nearest_pose(state.arm, self._weights, matrix, expert, guess, NEWTON_STEPS)
-        return dataclasses.replace(state, targets=targets)
+        speed = max_speed(state.arm, self.config.limits)
+        plan = make_plan(state.arm, state.qpos, state.qvel, targets, speed, self.config.control_dt)
+        return dataclasses.replace(state, targets=targets, plan=plan)
 
     def at_step(self, state: AnyArmState, step: Array) -> AnyArmState:
         """A state of `start` at another step of its demonstration."""
-        return self.with_targets(dataclasses.replace(state, step=step))
+        return self.with_plan(dataclasses.replace(state, step=step))
 
     def metric_of(self, arm: ArmArrays) -> Metric:
         """The metric between the expert and an arm."""
@@ -182,18 +181,13 @@ class AnyArmEnv(Env):
         steps = jnp.where(runaway, 1.0 + (self.config.horizon - after.step), 1.0)
         done = (runaway | (after.step >= self.config.horizon)).astype(jnp.float32)
         metrics = {**state.metrics, "distance": distance, "runaway": runaway.astype(jnp.float32)}
-        after = self.with_targets(after)
+        after = self.with_plan(after)
         reward = -steps * distance / after.hold
         return state.replace(pipeline_state=after, obs=self.observe(after), reward=reward, done=done, metrics=metrics)
 
     def torque(self, state: AnyArmState, action: Float[Array, " joints"]) -> Float[Array, " joints"]:
         """The torque of an action [N m]."""
-        arm, dt, motion = state.arm, self.config.control_dt, (state.qpos, state.qvel)
-        speed = max_speed(arm, self.config.limits)
-        acceleration = changed_acceleration(
-            arm, tracking_acceleration(arm, *motion, state.targets, speed, dt), action, dt
-        )
-        return torque_of_acceleration(arm, *motion, acceleration, state.max_torque, dt)
+        return planned_torque(state.arm, state.plan, action, state.max_torque, self.config.control_dt)
 
     def restart_done(self, states: State) -> State:
         """Starts a new episode of a new arm for each arm of a batch whose episode is done."""
@@ -206,7 +200,7 @@ class AnyArmEnv(Env):
 
         arms = jax.tree.map(where_done, new, arms)
         # Once for all: XLA removes the targets and observations of `step`, which nothing uses.
-        arms = jax.vmap(self.with_targets)(arms)
+        arms = jax.vmap(self.with_plan)(arms)
         return states.replace(pipeline_state=arms, obs=jax.vmap(self.observe)(arms))
 
     def expert_at(self, demonstration: Array, step: Array) -> LinkStates:
@@ -218,8 +212,7 @@ class AnyArmEnv(Env):
         """The observation, see `mimic.any_arm.observation.observe`."""
         expert = self.expert_at(state.demonstration, state.step + 1)
         expert = jax.tree.map(lambda x: x[: self.expert.num_links], expert)
-        speed = max_speed(state.arm, self.config.limits)
-        inputs = state.qpos, state.qvel, state.targets, state.max_torque, speed
+        inputs = state.qpos, state.qvel, state.targets, state.max_torque, state.plan
         return observe(state.arm, expert, *inputs, self.config.control_dt)
 
     @property

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
-from mimic.any_arm.control import tracking_acceleration
-from mimic.any_arm.dynamics import inertia_matrix, torque_of_arm
+from mimic.any_arm.control import Plan
 from mimic.any_arm.kinematics import joint_states, link_states_in_frames
 from mimic.any_arm.nearest import NearestPose, angle_limits
 from mimic.metric.kinematics import LinkStates
@@ -30,7 +29,7 @@ def observe(
     qvel: Float[Array, " joints"],
     targets: NearestPose,
     max_torque: Float[Array, " joints"],
-    speed: Float[Array, " joints"],
+    plan: Plan,
     control_dt: float,
 ) -> Float[Array, " observation"]:
     """The observation of an arm, in units of the arm's own velocity limits, torques and chain length.
@@ -48,24 +47,22 @@ def observe(
       qvel: its velocities [rad/s].
       targets: the pose nearest to the expert at the next step.
       max_torque: [joints] maximum torque [N m].
-      speed: [joints] maximum speed of the controller [rad/s].
+      plan: the controller's plan of the step.
       control_dt: duration of a control step [s].
     """
     frames = joint_states(arm, qpos, qvel)
     states = link_states_in_frames(arm, frames)
     dt, limit, unit = control_dt, arm.velocity_limit, 1 / arm.chain_length
     own, step = arm.is_free, control_dt * limit
-    acceleration = tracking_acceleration(arm, qpos, qvel, targets, speed, dt)
-    torque = torque_of_arm(arm, qpos, qvel, acceleration)
-    inertia = jnp.diagonal(inertia_matrix(arm, qpos))
+    inertia = jnp.diagonal(plan.inertia)
     lower, upper = angle_limits(arm)
     numbers = [
         own,
         (targets.qpos - qpos) / step,
         qvel / limit,
         targets.qvel / limit,
-        acceleration * dt / limit,
-        torque / jnp.maximum(max_torque, 1e-6),
+        plan.acceleration * dt / limit,
+        plan.torque(plan.acceleration) / jnp.maximum(max_torque, 1e-6),
         max_torque * dt / (inertia * limit),
         targets.curvature * step**2,
         jnp.minimum((qpos - lower) / jnp.pi, 2.0),

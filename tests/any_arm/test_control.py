@@ -25,8 +25,8 @@ def targets_at(qpos, qvel):
 
 
 def tracking_torque(arm, qpos, qvel, targets, max_torque):
-    acceleration = control.tracking_acceleration(arm, qpos, qvel, targets, arm.velocity_limit, DT)
-    return control.torque_of_acceleration(arm, qpos, qvel, acceleration, max_torque, DT)
+    plan = control.make_plan(arm, qpos, qvel, targets, arm.velocity_limit, DT)
+    return control.planned_torque(arm, plan, jnp.zeros(MAX_JOINTS), max_torque, DT)
 
 
 @pytest.fixture(scope="module")
