@@ -1,5 +1,8 @@
 """The arms of an environment whose learner is drawn for each episode: its sampler, and the arms of its report."""
 
+import dataclasses
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -58,11 +61,12 @@ def check_family(config: EnvConfig) -> None:
         "environment": ("",),
     }
     for key, values in supported.items():
-        if getattr(config, key) not in values:
-            expected = " or ".join(map(str, values))
+        value = getattr(config, key)
+        if value not in values:
+            is_plain = isinstance(values[0], int | str) and values[0]
+            expected = " or ".join(map(str, values)) if is_plain else "the default"
             raise ValueError(
-                f"{key}: expected {expected or 'none'} where the learner is drawn for each episode, got "
-                f"{getattr(config, key)}"
+                f"{key}: expected {expected} where the learner is drawn for each episode, got {_changes(value)}"
             )
 
 
@@ -99,6 +103,17 @@ def arm_name(model: ArmConfig) -> str:
     path = model.model.replace("\\", "/").rstrip("/").split("/")
     stem = path[-1].rsplit(".", 1)[0]
     return path[-2] if stem in ("robot", "scene") and len(path) > 1 else stem
+
+
+def _changes(value: Any) -> str:
+    """A setting, or the fields of a config that differ from their defaults."""
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return str(value)
+    default = type(value)()
+    names = (field.name for field in dataclasses.fields(value))
+    return ", ".join(
+        f"{name}={getattr(value, name)}" for name in names if getattr(value, name) != getattr(default, name)
+    )
 
 
 def _model(config: EnvConfig, name: str) -> ArmConfig:

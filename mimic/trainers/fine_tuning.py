@@ -7,6 +7,7 @@ from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
+from mimic import compat
 from mimic.any_arm.family import arm_name
 from mimic.arms.arm import ArmConfig
 from mimic.config import to_dict, typed
@@ -64,10 +65,18 @@ def with_one_learner(env: EnvConfig, model: str, locked: Sequence[int | str]) ->
       env: the environment of a run of many arms.
       model: the learner, see `ArmConfig.model`.
       locked: its locked joints, by number or name.
+
+    Raises:
+      ValueError: there is no such arm, or a policy of many arms cannot move it.
     """
+    compat.import_mjx()
+    from mimic.any_arm.controller import arrays_with_mask  # imports brax
+
     learner = dataclasses.replace(arm_of(env, model), locked=list(locked) or None)
     label = "-".join([env.name, arm_name(learner), *(["locked", *map(str, locked)] if locked else [])])
-    return dataclasses.replace(env, name=label, arms=ArmsConfig(), learner=learner, physics="auto")
+    config = dataclasses.replace(env, name=label, arms=ArmsConfig(), learner=learner, physics="auto")
+    arrays_with_mask(config)
+    return config
 
 
 def arm_of(env: EnvConfig, model: str) -> ArmConfig:

@@ -26,8 +26,6 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
       ValueError: a config that cannot be trained, or not in the memory that there is.
     """
     name = config.trainer.name
-    if name != "ppo":
-        config.env.check_one_learner()
     check_training_memory(config)
     if name in _MAKERS:
         return _MAKERS[name](config, run_dir)
@@ -67,6 +65,7 @@ def _make_ppo_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
 def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
     from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 
+    config.env.check_one_learner()
     return PoseMapperTrainer(config, run_dir)
 
 
