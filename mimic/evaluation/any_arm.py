@@ -21,7 +21,7 @@ from mimic.any_arm.family import SEEN, UNSEEN
 from mimic.any_arm.kinematics import link_states
 from mimic.any_arm.similarity import motion_similarity
 from mimic.arms.arm import build_arm
-from mimic.compilation import Background, on_host
+from mimic.compilation import Background, compiled_quickly, on_host
 from mimic.evaluation.evaluator import Controller
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.kinematics import LinkStates
@@ -158,7 +158,8 @@ class ArmsEvaluator:
 
         inputs = jax.tree.map(np.asarray, (self.arms, controller.qpos))
         with on_host():  # as the bound of one arm: there it compiles several times faster, and it runs once
-            return jax.tree.map(np.asarray, jax.jit(lambda *inputs: jax.lax.map(of_arm, inputs))(*inputs))
+            search = compiled_quickly(lambda *inputs: jax.lax.map(of_arm, inputs), *inputs)
+            return jax.tree.map(np.asarray, search(*inputs))
 
     def table(self, outcome: ArmsOutcome) -> ArmTable:
         """One row for each arm: joints, gaps, distances and the fraction of steps above a velocity limit.
@@ -183,7 +184,7 @@ class ArmsEvaluator:
         }
 
     def summary(self, outcome: ArmsOutcome) -> dict[str, dict[str, float]]:
-        """The metrics by split: means over arms, and the median and the largest gap; NaN for a split without arms."""
+        """The metrics by split, if it has arms: means over them, and their median and largest gap."""
         table = self.table(outcome)
         totals: dict[str, tuple[str, Callable[[np.ndarray], Any]]] = {
             "optimality_gap": ("gap", np.mean),
@@ -192,8 +193,9 @@ class ArmsEvaluator:
             "controller_gap": ("controller_gap", np.mean),
             **{key: (key, np.mean) for key in ("mean_distance", "lower_bound", "hold_distance", "speed_violations")},
         }
+        parts = {split: part for split, part in self.parts.items() if self.names[part]}
         return {
-            key: {split: _total(table[column][part], total) for split, part in self.parts.items()}
+            key: {split: _total(table[column][part], total) for split, part in parts.items()}
             for key, (column, total) in totals.items()
         }
 

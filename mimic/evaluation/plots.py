@@ -33,7 +33,10 @@ def plot_training(folder: Path, metric: str, label: str, *, labels: Mapping[str,
     steps = [int(row["step"]) for row in rows]
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
     for split, colour in _COLOURS.items():
-        percent = [100 * float(row[f"quality/{metric}.{split}"]) for row in rows]
+        column = f"quality/{metric}.{split}"
+        if column not in rows[0]:  # many arms, none of which is in this split
+            continue
+        percent = [100 * float(row[column]) for row in rows]
         axes.plot(steps, percent, "o-", markersize=3, color=colour, label=labels[split])
     axes.set(xlabel="steps", ylabel=label, title=title, yscale="log")
     axes.yaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))

@@ -26,7 +26,7 @@ def run_dir(tmp_path_factory):
         (["physics=mjx"], "physics: expected auto or fused where the learner is drawn for each episode, got mjx"),
         (["locked=[2]"], "locked: expected with learner=NAME, as in learner=panda locked=[2,4], got [2]"),
         (["learner=panda", "locked=[8]"], "locked: "),
-        (["learner=panda_pair"], "panda_pair: expected at most 8 joints and 12 links, got 14 and 16"),
+        (["learner=panda_pair"], "panda_pair: expected a serial arm, got a tree of 2 chains"),
         (["learner=no_such_arm"], "model: expected panda, planar, panda_pair, an MJCF or URDF file, or the name"),
     ],
 )

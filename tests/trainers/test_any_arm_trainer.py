@@ -145,7 +145,7 @@ def test_it_goes_on_with_one_arm(finished, tmp_path):
     more = command("train", f"init={run_dir}", "learner=panda", "trainer.num_timesteps=80", f"run_dir={tuned}")
     assert more.returncode == 0, more.stderr[-2000:]
     report = json.loads((tuned / "report.json").read_text())
-    assert list(report["arms"]) == ["whole"] and report["optimality_gap"]["held_out"] is None
+    assert list(report["arms"]) == ["whole"] and report["optimality_gap"].keys() == {"train"}
     config = load_config(tuned)
     assert config.learner == "panda" and config.env.arms.most_locked == 0
     resumed = command("train", f"resume={tuned}", "trainer.num_timesteps=160")

@@ -50,5 +50,5 @@ def test_an_environment_of_one_learner():
     env = with_one_learner(family(), "panda", [2, 4])
     assert not env.arms.are_drawn and env.physics == "auto" and env.learner.locked == [2, 4]
     assert env.build_arms().learner.embodiment.num_joints == 5
-    with pytest.raises(ValueError, match="expected at most 8 joints and 12 links"):
-        with_one_learner(family(limits="none"), "panda_pair", [])
+    with pytest.raises(ValueError, match="panda_pair: expected a serial arm, got a tree of 2 chains"):
+        with_one_learner(family(), "panda_pair", [])

@@ -179,13 +179,13 @@ class AnyArmPPOTrainer(Trainer):
 
     def status(self, metrics: Metrics) -> str:
         """Mean gaps on seen and unseen arms, and those of the controller without learning."""
-        seen, unseen = (_text("{:.2%}", metrics["optimality_gap"][split]) for split in SPLITS)
-        own = "/".join(_text("{:.2%}", metrics["controller_gap"][split]) for split in SPLITS)
+        seen, unseen = _texts("{:.2%}", metrics["optimality_gap"])
+        own = "/".join(_texts("{:.2%}", metrics["controller_gap"]))
         return f"gap {seen}, unseen arms {unseen}  without learning {own}"
 
     def good_enough(self, metrics: Metrics) -> bool:
         """Whether the target gap is reached, as the mean over the arms seen in training."""
-        return metrics["optimality_gap"]["train"] <= self.settings.target_gap
+        return metrics["optimality_gap"].get("train", math.inf) <= self.settings.target_gap
 
     def details(self, outcome: ArmsOutcome, controller: str = "policy") -> Metrics:
         """Physics, similarity of the motions compared with the baselines, and a row for each arm."""
@@ -208,10 +208,7 @@ class AnyArmPPOTrainer(Trainer):
             ("  holding start pose (1)", "hold_distance", "{:.4f}"),
             ("steps above velocity limit", "speed_violations", "{:.2%}"),
         )
-        rows: list[Row] = [
-            (label, _text(form, metrics[key]["train"]), _text(form, metrics[key]["held_out"]))
-            for label, key, form in by_split
-        ]
+        rows: list[Row] = [(label, *_texts(form, metrics[key])) for label, key, form in by_split]
         seen, unseen = ({n: arm for n, arm in metrics["arms"].items() if arm["seen"] == seen} for seen in (True, False))
         rows.insert(3, ("    which is", _worst(seen), _worst(unseen)))
         rows.append(("arms", str(len(seen)), str(len(unseen))))
@@ -238,5 +235,8 @@ def _worst(arms: Mapping[str, Mapping[str, Any]]) -> str:
     return max(gaps, key=lambda name: gaps[name]) if gaps else "none"
 
 
-def _text(form: str, value: float) -> str:
-    return form.format(value) if math.isfinite(value) else "none"
+def _texts(form: str, by_split: Mapping[str, float]) -> tuple[str, str]:
+    """The values of both splits as texts; "none" for one without arms or without a gap that means something."""
+    values = (by_split.get(split, math.nan) for split in SPLITS)
+    seen, unseen = (form.format(value) if math.isfinite(value) else "none" for value in values)
+    return seen, unseen
