@@ -24,6 +24,7 @@ def test_the_learner_is_the_only_arm(run_dir):
     assert (arms.locked, arms.most_locked, arms.random, arms.perturbed, arms.unseen) == (1, 0, 0, 0, [])
     assert config.env.name == "panda_family-panda" and config.env.learner.model == "panda"
     assert config.env.learner.armature == 0.1 and config.env.horizon == HORIZON
+    assert isinstance(config.trainer, PPOConfig)
     assert config.trainer.num_timesteps == 1000 and config.trainer.hidden_layers == [8]
     assert (config.seed, config.run_dir, config.init, config.learner) == (3, "runs/new", str(run_dir), "panda")
 
