@@ -83,10 +83,11 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
     if config.torque_noise is not None:
         changes["torque_noise"] = config.torque_noise
     if trained.trainer.name != "ppo":
-        if changes or config.physics or config.demonstrations or config.controller != "policy":
+        others = config.physics, config.demonstrations, config.learner
+        if changes or any(others) or config.controller != "policy":
             raise ValueError(
-                "controller, demonstrations, physics, mass, damping and torque_noise: expected a run of trainer=ppo, "
-                f"got one of {trained.trainer.name}"
+                "controller, learner, demonstrations, physics, mass, damping and torque_noise: expected a run of "
+                f"trainer=ppo, got one of {trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)
     if config.controller == "searched" and trained.env.metric.link_distance:

@@ -1,6 +1,6 @@
 """A plot of the gap of each arm, for a policy of many arms."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,14 +42,7 @@ def plot_arms(arms: Mapping[str, Mapping[str, Any]], out: Path, *, controller: s
         height_ratios=counts,
     )
     for axes, (seen, rows) in zip(all_axes[:, 0], groups.items(), strict=True):
-        place = np.arange(len(rows))
-        gap, own = (100 * np.array([arm[key] for _, arm in rows]) for key in ("gap", "controller_gap"))
-        axes.hlines(place, np.minimum(gap, own), np.maximum(gap, own), color="lightgrey", lw=1.5, zorder=0)
-        axes.plot(own, place, "o", color="grey", mfc="white", markersize=4.5, label="controller without learning")
-        axes.plot(gap, place, "o", color=_COLOURS[seen], markersize=4.5, label=f"{controller}, {_TITLES[seen]}")
-        axes.set_yticks(place, [f"{name} ({arm['joints']})" for name, arm in rows], fontsize=7)
-        axes.set(ylim=(len(rows) - 0.4, -0.6), title=f"{_TITLES[seen]}: {len(rows)}")
-        axes.grid(alpha=0.3, axis="x", which="both")
+        _plot_group(axes, rows, controller, seen)
     last = all_axes[-1, 0]
     last.set_xscale("symlog", linthresh=_LINEAR, linscale=0.5)
     values = [100 * arm[key] for rows in groups.values() for _, arm in rows for key in ("gap", "controller_gap")]
@@ -64,6 +57,18 @@ def plot_arms(arms: Mapping[str, Mapping[str, Any]], out: Path, *, controller: s
     figure.legend(labelled.values(), labelled.keys(), loc="outside lower center", ncols=3, fontsize="small")
     figure.savefig(out, dpi=150)
     plt.close(figure)
+
+
+def _plot_group(axes: Any, rows: Sequence[tuple[str, Mapping[str, Any]]], controller: str, seen: bool) -> None:
+    """Plots the arms that were seen, or not, one below the other."""
+    place = np.arange(len(rows))
+    gap, own = (100 * np.array([arm[key] for _, arm in rows]) for key in ("gap", "controller_gap"))
+    axes.hlines(place, np.minimum(gap, own), np.maximum(gap, own), color="lightgrey", lw=1.5, zorder=0)
+    axes.plot(own, place, "o", color="grey", mfc="white", markersize=4.5, label="controller without learning")
+    axes.plot(gap, place, "o", color=_COLOURS[seen], markersize=4.5, label=f"{controller}, {_TITLES[seen]}")
+    axes.set_yticks(place, [f"{name} ({arm['joints']})" for name, arm in rows], fontsize=7)
+    axes.set(ylim=(len(rows) - 0.4, -0.6), title=f"{_TITLES[seen]}: {len(rows)}")
+    axes.grid(alpha=0.3, axis="x", which="both")
 
 
 def _sorted(arms: Mapping[str, Mapping[str, Any]], seen: bool) -> list[tuple[str, Mapping[str, Any]]]:
