@@ -44,12 +44,12 @@ def nearest_pose_controller(
     expert = build_arm(config.expert, config.limits, config.metric.links)
     weights = check_metric(config.metric)
     arrays = arm_arrays(env.arm) if policy is None else arrays_with_mask(config)
-    expert_arm, arm = (_constants(x) for x in (arm_arrays(expert), arrays))
-    places = np.flatnonzero(arrays.is_free)  # of the environment's joints
     with jax.ensure_compile_time_eval():
+        expert_arm, arm = (_constants(x) for x in (arm_arrays(expert), arrays))
         matrix = np.asarray(correspondence(expert_arm, arm))
+        speed = max_speed(arm, config.limits)
+    places = np.flatnonzero(arrays.is_free)  # of the environment's joints
     dt = config.control_dt
-    speed = max_speed(arm, config.limits)
 
     def controller(state: State) -> Array:
         now = arm_state(state)

@@ -184,6 +184,7 @@ def test_a_policy_moves_one_arm_as_it_moves_it_among_many(env, evaluator, four_j
         return jax.lax.scan(step, start, None, length=HORIZON)[1]
 
     of_many = jax.jit(jax.vmap(run))(jnp.arange(COUNT))
-    alone = jax.jit(lambda: evaluator.rollout(nearest_pose_controller(evaluator.env, policy)))()
+    controller = nearest_pose_controller(evaluator.env, policy)
+    alone = jax.jit(lambda: evaluator.rollout(controller))()
     assert np.abs(np.asarray(of_many)).max() > 0.1
     np.testing.assert_allclose(of_many[:, :, [0, 1, 3, 4]], np.asarray(alone.qpos)[:COUNT], rtol=0, atol=1e-3)

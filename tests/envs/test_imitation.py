@@ -184,5 +184,5 @@ def test_bad_overrides_are_rejected(overrides, message):
 
 
 def test_an_unknown_environment_lists_the_valid_ones():
-    with pytest.raises(ValueError, match="panda3dof, panda4dof, panda7dof, planar4dof"):
+    with pytest.raises(ValueError, match="panda3dof, panda4dof, panda7dof, panda_family, planar4dof"):
         mimic.make("panda5dof")

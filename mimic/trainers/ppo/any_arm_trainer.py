@@ -95,8 +95,7 @@ class AnyArmPPOTrainer(Trainer):
         """The policy, to evaluate it on one arm by `PPOTrainer`."""
 
         def controller(env: ImitationEnv, params: Params) -> Controller:
-            with jax.ensure_compile_time_eval():  # all but the parameters is constant where JAX traces them
-                return nearest_pose_controller(env, self._policy(params))
+            return nearest_pose_controller(env, self._policy(params))
 
         return PolicyOfManyArms(self.params_template, controller)
 
