@@ -17,7 +17,10 @@ from tests.helpers.repository import REPOSITORY
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["env=panda5dof"], "unknown env 'panda5dof'; valid are bimanual, pair, panda3dof, panda4dof, panda7dof"),
+        (
+            ["env=panda5dof"],
+            "unknown env 'panda5dof'; valid are any_arm, bimanual, pair, panda3dof, panda4dof, panda7dof",
+        ),
         (["trainer=sac"], "unknown trainer 'sac'; valid are "),
         (["env.previw=1"], "unknown key 'env.previw'; valid are"),
         (["seed=one"], "could not be converted to Integer"),

@@ -144,7 +144,10 @@ def test_bad_input_is_rejected(rejected, tmp_path):
             ["out=new.onnx", run, "learner=panda3dof"],
             "but the run's is panda-joint3-joint6-joint7 with joints",
         ),
-        (["out=new.onnx", run, "learner=panda9dof"], "unknown environment 'panda9dof'; valid are bimanual, pair"),
+        (
+            ["out=new.onnx", run, "learner=panda9dof"],
+            "unknown environment 'panda9dof'; valid are any_arm, bimanual, pair",
+        ),
     ]
     for arguments, message in cases:
         assert message in rejected("export", *arguments)
