@@ -81,7 +81,7 @@ def suggestion(name: str, valid: Iterable[str]) -> str:
 
 
 def _suggested_key(key: str, parent: DictConfig) -> str:
-    """The suggestion for an unknown key: one of its name anywhere in the config, else a close one of the same parent."""
+    """The suggestion for an unknown key: one of its name anywhere in the config, else a close one beside it."""
     head, _, last = key.rpartition(".")
     siblings = [f"{head}.{name}" if head else str(name) for name in parent if name != "hydra"]
     elsewhere = dict(_keys(parent._get_root()))
