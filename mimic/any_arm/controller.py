@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,30 +12,39 @@ from jaxtyping import Array, Float
 
 from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
 from mimic.any_arm.control import make_plan, max_speed, planned_torque
+from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals
 from mimic.any_arm.kinematics import check_metric, correspondence
-from mimic.any_arm.nearest import nearest_pose
 from mimic.any_arm.observation import observe
 from mimic.arms.arm import build_arm
 from mimic.envs.arm_state import arm_state
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import ImitationEnv
 
-NEWTON_STEPS = 3  # of the nearest pose; 1 gives a gap of 0.16 instead of 0.14 % on panda4dof, 8 gives 0.13 %
+Policy = Callable[[Float[Array, " observation"]], Float[Array, " joints"]]
 
 
-def nearest_pose_controller(
-    env: ImitationEnv, policy: Callable[[Float[Array, " observation"]], Float[Array, " joints"]] | None = None
-) -> Callable[[State], Float[Array, " joints"]]:
-    """A function from a state of the environment to an action.
+class ControllerWithMemory(NamedTuple):
+    """A controller that keeps something from step to step.
+
+    Attributes:
+      start: its memory at the start of an episode, from the state there.
+      act: (state, memory) -> (action, memory).
+    """
+
+    start: Callable[[State], Any]
+    act: Callable[[State, Any], tuple[Float[Array, " joints"], Any]]
+
+
+def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> ControllerWithMemory:
+    """The controller of `AnyArmEnv` for the environment of one arm.
 
     It knows the learner's model and the expert's state at the next step, as a policy with `preview=1` observes it, and
-    nothing of the demonstration beyond. See `nearest_pose` and `tracking_acceleration`. Without a policy it finds a
-    local minimum of the metric, the one that Newton steps from the arm's own pose lead to.
+    nothing of the demonstration beyond. See `next_goals` and `make_plan`.
 
     Args:
       env: the environment of the arm.
-      policy: policy of any arm, trained on `AnyArmEnv`: from its observation to its action. Joints that the config
-        locks then keep their places, see `arrays_with_mask`, so that the policy observes what it did in training.
+      policy: policy of any arm, trained on `AnyArmEnv`: from its observation to its action; the zero action where None.
+        With a policy, joints that the config locks keep their places, as in training, see `arrays_with_mask`.
 
     Raises:
       ValueError: a tree, an arm with more joints or links than `ArmArrays` has, or another metric than the default one.
@@ -51,23 +60,26 @@ def nearest_pose_controller(
     places = np.flatnonzero(arrays.is_free)  # of the environment's joints
     dt = config.control_dt
 
-    def controller(state: State) -> Array:
+    def start(state: State) -> Goals:
+        return first_goals(arm.home.at[places].set(arm_state(state).qpos))
+
+    def act(state: State, goals: Goals) -> tuple[Array, Goals]:
         now = arm_state(state)
         qpos = arm.home.at[places].set(now.qpos)
         qvel, max_torque = (jnp.zeros(MAX_JOINTS).at[places].set(x) for x in (now.qvel, env.torque_scale))
         own_states = env.expert_at(now.demonstration, now.step + 1)
         next_states = jax.tree.map(lambda x: _padded(x, MAX_LINKS), own_states)
-        guess = qpos + 0.5 * dt * qvel
-        targets = nearest_pose(arm, weights, jnp.asarray(matrix), next_states, guess, NEWTON_STEPS)
-        plan = make_plan(arm, qpos, qvel, targets, speed, dt)
+        problem = Problem(arm, weights, jnp.asarray(matrix), next_states, dt)
+        goals = next_goals(problem, goals, qpos, now.key, now.step)
+        plan = make_plan(arm, qpos, qvel, goals.goal, speed, dt)
         if policy is None:
-            action = jnp.zeros(MAX_JOINTS)
+            action = jnp.zeros(MAX_JOINTS + 1)
         else:
-            action = policy(observe(arm, own_states, qpos, qvel, targets, max_torque, plan, dt))
-        torque = planned_torque(arm, plan, action, max_torque, dt)
-        return torque[places] / env.torque_scale
+            action = policy(observe(arm, own_states, qpos, qvel, goals, max_torque, plan, dt))
+        torque = planned_torque(arm, plan, action[:MAX_JOINTS], max_torque, dt)
+        return torque[places] / env.torque_scale, chosen_goal(goals, action[MAX_JOINTS])
 
-    return controller
+    return ControllerWithMemory(start, act)
 
 
 def arrays_with_mask(config: EnvConfig) -> ArmArrays:

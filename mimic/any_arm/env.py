@@ -20,14 +20,13 @@ from jaxtyping import Array, Float
 from mimic import compat
 from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.any_arm.control import Plan, make_plan, max_speed, planned_torque, torque_scale
-from mimic.any_arm.controller import NEWTON_STEPS
+from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals
 from mimic.any_arm.kinematics import (
     check_metric,
     correspondence,
     link_states,
     make_metric,
 )
-from mimic.any_arm.nearest import NearestPose, nearest_pose
 from mimic.any_arm.observation import observation_size, observe
 from mimic.any_arm.physics import make_advance
 from mimic.any_arm.sampler import Sampler
@@ -52,14 +51,14 @@ class AnyArmState(ArmState):
       arm: the learner.
       max_torque: [joints] maximum torque [N m], see `torque_scale`.
       hold: mean distance of holding the home pose, the unit of the reward.
-      targets: the nearest pose to the expert at the next step, and its velocity; from `with_plan`.
+      goals: the local minima that the controller follows; from `with_plan`.
       plan: what the controller does in the next step; from `with_plan`.
     """
 
     arm: ArmArrays = None  # type: ignore[assignment] - fields after one with a default need one too
     max_torque: Float[Array, " joints"] = None  # type: ignore[assignment]
     hold: Float[Array, ""] = None  # type: ignore[assignment]
-    targets: NearestPose = None  # type: ignore[assignment]
+    goals: Goals = None  # type: ignore[assignment]
     plan: Plan = None  # type: ignore[assignment]
 
 
@@ -135,20 +134,20 @@ class AnyArmEnv(Env):
             arm=arm,
             max_torque=torque_scale(arm, self.config.action_scale, self.config.control_dt),
             hold=jnp.maximum(held.mean(), _MIN_HOLD),
-            targets=NearestPose(arm.home, zeros, zeros),
+            goals=first_goals(arm.home),
             plan=Plan(zeros, jnp.zeros((MAX_JOINTS, MAX_JOINTS)), zeros),
         )
         return self.with_plan(state)
 
     def with_plan(self, state: AnyArmState) -> AnyArmState:
-        """The state with its nearest pose at the next step, by Newton steps from its own pose, and the way there."""
+        """The state with its goals at the next step, and the plan to move to the first of them."""
         expert = self.expert_at(state.demonstration, state.step + 1)
-        guess = state.qpos + 0.5 * self.config.control_dt * state.qvel
-        matrix = correspondence(self._expert_arrays, state.arm)
-        targets = nearest_pose(state.arm, self._weights, matrix, expert, guess, NEWTON_STEPS)
+        matrix, dt = correspondence(self._expert_arrays, state.arm), self.config.control_dt
+        problem = Problem(state.arm, self._weights, matrix, expert, dt)
+        goals = next_goals(problem, state.goals, state.qpos, state.key, state.step)
         speed = max_speed(state.arm, self.config.limits)
-        plan = make_plan(state.arm, state.qpos, state.qvel, targets, speed, self.config.control_dt)
-        return dataclasses.replace(state, targets=targets, plan=plan)
+        plan = make_plan(state.arm, state.qpos, state.qvel, goals.goal, speed, dt)
+        return dataclasses.replace(state, goals=goals, plan=plan)
 
     def at_step(self, state: AnyArmState, step: Array) -> AnyArmState:
         """A state of `start` at another step of its demonstration."""
@@ -172,7 +171,8 @@ class AnyArmEnv(Env):
         before = any_arm_state(state)
         torque = self.torque(before, action)
         qpos, qvel = self._advance(before.arm, before.qpos, before.qvel, torque, Load())
-        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1)
+        goals = chosen_goal(before.goals, action[MAX_JOINTS])
+        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1, goals=goals)
         expert = self.expert_at(after.demonstration, after.step)
         runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
         distance = self.metric_of(after.arm)(expert, link_states(after.arm, qpos, qvel))
@@ -187,7 +187,7 @@ class AnyArmEnv(Env):
 
     def torque(self, state: AnyArmState, action: Float[Array, " joints"]) -> Float[Array, " joints"]:
         """The torque of an action [N m]."""
-        return planned_torque(state.arm, state.plan, action, state.max_torque, self.config.control_dt)
+        return planned_torque(state.arm, state.plan, action[:MAX_JOINTS], state.max_torque, self.config.control_dt)
 
     def restart_done(self, states: State) -> State:
         """Starts a new episode of a new arm for each arm of a batch whose episode is done."""
@@ -212,7 +212,7 @@ class AnyArmEnv(Env):
         """The observation, see `mimic.any_arm.observation.observe`."""
         expert = self.expert_at(state.demonstration, state.step + 1)
         expert = jax.tree.map(lambda x: x[: self.expert.num_links], expert)
-        inputs = state.qpos, state.qvel, state.targets, state.max_torque, state.plan
+        inputs = state.qpos, state.qvel, state.goals, state.max_torque, state.plan
         return observe(state.arm, expert, *inputs, self.config.control_dt)
 
     @property
@@ -222,8 +222,8 @@ class AnyArmEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """Length of an action: one number for each joint slot."""
-        return MAX_JOINTS
+        """Length of an action: one number for each joint slot, and the preference for another goal."""
+        return MAX_JOINTS + 1
 
     @property
     def backend(self) -> str:

@@ -1,6 +1,6 @@
 """What a policy of any arm observes: numbers of each joint, and numbers of the whole arm and of its expert.
 
-Nothing of it depends on the number of the arm's joints or links, nor on what the expert will do after the next step.
+Its length depends on neither the arm's joints nor its links. Nothing of it is known of the expert after the next step.
 """
 
 import jax.numpy as jnp
@@ -8,18 +8,19 @@ from jaxtyping import Array, Float
 
 from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.any_arm.control import Plan
+from mimic.any_arm.goals import Goals
 from mimic.any_arm.kinematics import joint_states, link_states_in_frames
-from mimic.any_arm.nearest import NearestPose, angle_limits
+from mimic.any_arm.nearest import angle_limits
 from mimic.metric.kinematics import LinkStates
 
-JOINT_FEATURES = 17  # numbers of each joint; the first says whether it is free
+JOINT_FEATURES = 18  # numbers of each joint; the first says whether it is free
 _LINK_FEATURES, _EXPERT_FEATURES = 7, 12
 _MAX_FEATURE = 10.0
 
 
 def observation_size(expert_links: int) -> int:
     """Length of an observation: that of `observe`."""
-    return JOINT_FEATURES * MAX_JOINTS + _LINK_FEATURES * MAX_LINKS + _EXPERT_FEATURES * expert_links
+    return 1 + JOINT_FEATURES * MAX_JOINTS + _LINK_FEATURES * MAX_LINKS + _EXPERT_FEATURES * expert_links
 
 
 def observe(
@@ -27,7 +28,7 @@ def observe(
     expert: LinkStates,
     qpos: Float[Array, " joints"],
     qvel: Float[Array, " joints"],
-    targets: NearestPose,
+    goals: Goals,
     max_torque: Float[Array, " joints"],
     plan: Plan,
     control_dt: float,
@@ -35,9 +36,10 @@ def observe(
     """The observation of an arm, in units of the arm's own velocity limits, torques and chain length.
 
     - Each joint, `JOINT_FEATURES` numbers, 0 for a locked one apart from its axis and origin: whether it is free; the
-      way to the nearest pose, the velocity, and the velocity of the nearest pose, by the velocity limit; the
-      acceleration and the torque of the controller; the acceleration that its maximum torque gives; the curvature of
-      the metric; the distances to its limits; its axis and origin in the base frame.
+      ways to the goal and to the best of the other minima, the velocity, and the velocity of the goal, by the velocity
+      limit; the acceleration and the torque of the controller; the acceleration that its maximum torque gives; the
+      curvature of the metric; the distances to its limits; its inertia; its axis and origin in the base frame.
+    - The advantage of the best of the other minima over the goal.
     - Each link: position, direction and length. Each link of the expert at the next step: its state.
 
     Args:
@@ -45,7 +47,7 @@ def observe(
       expert: link states of the expert at the next step, of its own links alone.
       qpos: the learner's angles [rad].
       qvel: its velocities [rad/s].
-      targets: the pose nearest to the expert at the next step.
+      goals: local minima of the metric at the next step.
       max_torque: [joints] maximum torque [N m].
       plan: the controller's plan of the step.
       control_dt: duration of a control step [s].
@@ -58,13 +60,14 @@ def observe(
     lower, upper = angle_limits(arm)
     numbers = [
         own,
-        (targets.qpos - qpos) / step,
+        (goals.goal.qpos - qpos) / step,
+        (goals.best.qpos - qpos) / step,
         qvel / limit,
-        targets.qvel / limit,
+        goals.goal.qvel / limit,
         plan.acceleration * dt / limit,
         plan.torque(plan.acceleration) / jnp.maximum(max_torque, 1e-6),
         max_torque * dt / (inertia * limit),
-        targets.curvature * step**2,
+        goals.goal.curvature * step**2,
         jnp.minimum((qpos - lower) / jnp.pi, 2.0),
         jnp.minimum((upper - qpos) / jnp.pi, 2.0),
         jnp.log(jnp.maximum(inertia, 1e-6)),
@@ -75,5 +78,5 @@ def observe(
     links = [has_link * x for x in (states.position, states.direction, unit * arm.link_length[:, None])]
     assert expert.direction is not None and expert.angular_velocity is not None
     of_expert = [expert.position, expert.direction, expert.linear_velocity, expert.angular_velocity]
-    parts = [joints, jnp.concatenate(links, axis=1), jnp.concatenate(of_expert, axis=1)]
+    parts = [joints, goals.advantage[None], jnp.concatenate(links, axis=1), jnp.concatenate(of_expert, axis=1)]
     return jnp.clip(jnp.concatenate([x.ravel() for x in parts]), -_MAX_FEATURE, _MAX_FEATURE)

@@ -15,6 +15,7 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
+from mimic.any_arm.controller import ControllerWithMemory
 from mimic.compilation import Background, on_host
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
@@ -93,23 +94,29 @@ class Evaluator:
         demonstrations = self.env.demonstrations
         return Evaluator(self.env.with_demonstrations(demonstrations.select([])), demonstrations.select([index]))
 
-    def rollout(self, controller: Controller) -> Rollouts:
+    def rollout(self, controller: Controller | ControllerWithMemory) -> Rollouts:
         """Runs a controller on every demonstration. Call it under `jax.jit`."""
         env = self.env
+        if not isinstance(controller, ControllerWithMemory):
+            function = controller
+            controller = ControllerWithMemory(lambda state: (), lambda state, memory: (function(state), memory))
 
-        def begin(demonstration: Array) -> State:
+        def begin(demonstration: Array) -> tuple[State, Any]:
             key = jax.random.fold_in(jax.random.PRNGKey(0), demonstration)
-            return env.begin(env.start(key, demonstration))
+            state = env.begin(env.start(key, demonstration))
+            return state, controller.start(state)
 
-        def step(state: State) -> tuple[State, Rollouts]:
-            action = jnp.clip(controller(state), -1.0, 1.0)
-            state = env.step(state, action)
+        def step(carry: tuple[State, Any]) -> tuple[tuple[State, Any], Rollouts]:
+            action, memory = controller.act(*carry)
+            action = jnp.clip(action, -1.0, 1.0)
+            state = env.step(carry[0], action)
             after: Any = state.pipeline_state
-            return state, Rollouts(after.qpos, after.qvel, action * env.torque_scale, state.metrics["distance"])
+            rollouts = Rollouts(after.qpos, after.qvel, action * env.torque_scale, state.metrics["distance"])
+            return (state, memory), rollouts
 
         # `vmap` is inside the loop: around the loop, JAX would trace a step twice, without and with the batch.
         start = jax.vmap(begin)(jnp.arange(env.demonstrations.count))
-        _, over_time = jax.lax.scan(lambda state, _: jax.vmap(step)(state), start, None, length=env.config.horizon)
+        _, over_time = jax.lax.scan(lambda carry, _: jax.vmap(step)(carry), start, None, length=env.config.horizon)
         return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), over_time)
 
     @property

@@ -11,6 +11,7 @@ from mimic.envs.config import EnvConfig
 from mimic.ranges import check_ranges, number, seed_number
 from mimic.trainers.distributed.process_group import DistributedConfig
 
+NETWORKS = ("mlp", "joints")
 LOGGERS = ("local", "wandb", "mlflow")
 
 PRESETS: dict[str, dict[str, Any]] = {
@@ -104,6 +105,7 @@ class PPOConfig(TrainerConfig):
       clipping_epsilon: the policy ratio is clipped to 1 +- this.
       max_grad_norm: gradients are clipped to this norm, see `updated` in mimic/trainers/ppo/updates.py.
       reward_scaling: factor on the reward inside PPO.
+      network: "mlp"; or "joints", a policy with a token for each joint, for environments with a drawn arm.
       hidden_layers: widths of the hidden layers of the policy and value networks.
       crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
         `crossovers` in mimic/envs/demonstrations.py.
@@ -138,6 +140,7 @@ class PPOConfig(TrainerConfig):
     clipping_epsilon: float = number(0.2, above=0.0, at_most=10.0)
     max_grad_norm: float = number(1.0, above=0.0, at_most=1e6)
     reward_scaling: float = number(10.0, above=0.0, at_most=1e6)  # its square is in the loss
+    network: str = "mlp"
     hidden_layers: list[int] | None = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     crossovers: int | None = number(None, at_least=0, at_most=100_000)
     timed_critic: bool = True
@@ -147,6 +150,7 @@ class PPOConfig(TrainerConfig):
     def __post_init__(self) -> None:
         check_choice("trainer.preset", self.preset, ("auto", *PRESETS))
         check_choice("trainer.name", self.name, ("ppo",))
+        check_choice("trainer.network", self.network, NETWORKS)
         check_ranges(self, "trainer.")
 
     def resolve(self, backend: str = "cpu", devices: int = 1) -> "PPOSettings":

@@ -16,7 +16,7 @@ from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, run_schema
 
 _OWN = ("seed", "run_dir", "init", "learner", "logger", "compilation_cache", "distributed")  # of the new run
-_FIXED = ("trainer.name=", "trainer.preset=", "trainer.hidden_layers=", "trainer.timed_critic=")
+_FIXED = ("trainer.name=", "trainer.preset=", "trainer.network=", "trainer.hidden_layers=", "trainer.timed_critic=")
 
 
 def fine_tuned(requested: TrainConfig, overrides: Sequence[str]) -> TrainConfig:

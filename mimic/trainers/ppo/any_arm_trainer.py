@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from brax.envs.base import State
 from jaxtyping import Array
 
-from mimic.any_arm.controller import nearest_pose_controller
+from mimic.any_arm.controller import ControllerWithMemory, nearest_pose_controller
 from mimic.any_arm.env import AnyArmEnv
 from mimic.any_arm.family import SEEN, UNSEEN, report_arms
 from mimic.any_arm.making import make_family_env
@@ -20,7 +20,6 @@ from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS, ArmRollouts, ArmsEvaluator, ArmsOutcome
 from mimic.evaluation.config import SearchConfig
-from mimic.evaluation.evaluator import Controller
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.rollout_metrics import MIN_SPAN
 from mimic.runs.checkpoints import Checkpoint
@@ -94,7 +93,7 @@ class AnyArmPPOTrainer(Trainer):
     def shared_policy(self) -> PolicyOfManyArms:
         """The policy, to evaluate it on one arm by `PPOTrainer`."""
 
-        def controller(env: ImitationEnv, params: Params) -> Controller:
+        def controller(env: ImitationEnv, params: Params) -> ControllerWithMemory:
             return nearest_pose_controller(env, self._policy(params))
 
         return PolicyOfManyArms(self.params_template, controller)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from mimic.any_arm.controller import ControllerWithMemory
 from mimic.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
@@ -35,7 +36,7 @@ class PolicyOfManyArms(NamedTuple):
     """
 
     params_template: Callable[[], Params]
-    controller: Callable[[ImitationEnv, Params], Controller]
+    controller: Callable[[ImitationEnv, Params], ControllerWithMemory]
 
 
 class PPOTrainer(Trainer):
@@ -96,7 +97,7 @@ class PPOTrainer(Trainer):
             return self._shared.params_template()
         return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
 
-    def controller(self, params: Params) -> Controller:
+    def controller(self, params: Params) -> Controller | ControllerWithMemory:
         """The deterministic policy of these parameters."""
         if self._shared is not None:
             return self._shared.controller(self.evaluator.env, params)

@@ -1,18 +1,13 @@
 """PPO on an imitation environment: networks, training epochs, checkpoints."""
 
-import dataclasses
-import functools
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import optax
-from brax.training.acme import running_statistics
 from brax.training.agents.ppo import networks as ppo_networks
-from jaxtyping import Array
 
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.evaluator import Controller
@@ -21,6 +16,7 @@ from mimic.runs.divergence import Diverged, check_finite
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo.divergence import Epoch, record_divergence
+from mimic.trainers.ppo.networks import make_networks
 from mimic.trainers.ppo.programs import (
     Metrics,
     Params,
@@ -33,24 +29,6 @@ from mimic.trainers.ppo.programs import (
     saved_leaves,
 )
 from mimic.trainers.trainer import OnEvaluation
-
-
-def make_networks(config: PPOSettings, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
-    """The policy and value network of the trainer's settings."""
-    hidden = tuple(config.hidden_layers or ())
-    layers = {"policy_hidden_layer_sizes": hidden, "value_hidden_layer_sizes": hidden}
-    make = functools.partial(ppo_networks.make_ppo_networks, action_size=action_size, **layers)
-    networks = make(observation_size, preprocess_observations_fn=running_statistics.normalize)
-    if not config.timed_critic:
-        return networks
-    timed = make(observation_size + 1, preprocess_observations_fn=_normalize_all_but_last)
-    return dataclasses.replace(networks, value_network=timed.value_network)
-
-
-def _normalize_all_but_last(observation: Array, statistics: running_statistics.RunningStatisticsState) -> Array:
-    """The observation with normalised entries, except the last one: the elapsed fraction of the episode."""
-    normalized = running_statistics.normalize(observation[..., :-1], statistics)
-    return jnp.concatenate([normalized, observation[..., -1:]], axis=-1)
 
 
 def params_template(config: PPOSettings, observation_size: int, action_size: int) -> Params:

@@ -1,0 +1,99 @@
+"""The networks of PPO: brax's, and a policy for any arm with a token for each joint."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from brax.training import networks as brax_networks
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo import networks as ppo_networks
+from flax import linen as nn
+from jaxtyping import Array, Float
+
+from mimic.any_arm.arrays import MAX_JOINTS
+from mimic.any_arm.observation import JOINT_FEATURES
+from mimic.trainers.config import PPOSettings
+from mimic.trainers.networks import Transformer
+
+# Standard deviations of an untrained policy, whose mean is the zero action: the controller is good from the start, and
+# noise of the usual size would hide it.
+_JOINT_STD, _PREFERENCE_STD = 0.1, 0.3
+
+
+def make_networks(config: PPOSettings, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
+    """The policy and value network of the trainer's settings."""
+    hidden = tuple(config.hidden_layers or ())
+    layers = {"policy_hidden_layer_sizes": hidden, "value_hidden_layer_sizes": hidden}
+    make = functools.partial(ppo_networks.make_ppo_networks, action_size=action_size, **layers)
+    networks = make(observation_size, preprocess_observations_fn=running_statistics.normalize)
+    if config.timed_critic:
+        timed = make(observation_size + 1, preprocess_observations_fn=_normalize_all_but_last)
+        networks = dataclasses.replace(networks, value_network=timed.value_network)
+    if config.network == "joints":
+        networks = dataclasses.replace(networks, policy_network=_joint_policy(observation_size))
+    return networks
+
+
+def _normalize_all_but_last(observation: Array, statistics: running_statistics.RunningStatisticsState) -> Array:
+    """The observation with normalised entries, except the last one: the elapsed fraction of the episode."""
+    normalized = running_statistics.normalize(observation[..., :-1], statistics)
+    return jnp.concatenate([normalized, observation[..., -1:]], axis=-1)
+
+
+def _joint_policy(observation_size: int) -> brax_networks.FeedForwardNetwork:
+    """The policy of any arm as brax's type of network."""
+    module = JointPolicy()
+
+    def init(key: Array) -> Any:
+        return module.init(key, jnp.zeros(observation_size), jnp.ones(MAX_JOINTS))
+
+    def apply(statistics: Any, params: Any, observation: Array) -> Any:
+        is_free = observation[..., : JOINT_FEATURES * MAX_JOINTS : JOINT_FEATURES]
+        return module.apply(params, running_statistics.normalize(observation, statistics), is_free)
+
+    return brax_networks.FeedForwardNetwork(init=init, apply=apply)
+
+
+class JointPolicy(nn.Module):
+    """A policy of any arm: a token for each joint, with the same weights for all of them but for its place.
+
+    Attributes:
+      width: of a token.
+      layers: of the transformer.
+      summary: width of the layer between the numbers of the whole arm and the tokens.
+    """
+
+    width: int = 64
+    layers: int = 2
+    summary: int = 128
+
+    @nn.compact
+    def __call__(
+        self, observation: Float[Array, "*batch observation"], is_free: Float[Array, "*batch joints"]
+    ) -> Float[Array, "*batch parameters"]:
+        """Parameters of brax's normal distribution: means, then deviations before its softplus.
+
+        Args:
+          observation: of `mimic.any_arm.observation.observe`, normalised.
+          is_free: 1 for a joint that moves, 0 for a locked one.
+        """
+        split = JOINT_FEATURES * MAX_JOINTS
+        of_joints = observation[..., :split].reshape(*observation.shape[:-1], MAX_JOINTS, JOINT_FEATURES)
+        whole = nn.Dense(self.width)(nn.silu(nn.Dense(self.summary)(observation[..., split:])))
+        place = self.param("place", nn.initializers.normal(0.02), (MAX_JOINTS, self.width))
+        tokens = nn.Dense(self.width)(of_joints) + place + whole[..., None, :]
+        tokens = Transformer(self.width, self.layers)(tokens, is_free > 0)
+        joints = _action_parameters(tokens, _JOINT_STD, "joints")
+        weight = is_free[..., None] / jnp.maximum(is_free.sum(axis=-1)[..., None, None], 1)
+        preference = _action_parameters((weight * tokens).sum(axis=-2), _PREFERENCE_STD, "preference")
+        actions = jnp.concatenate([joints, preference[..., None, :]], axis=-2)
+        return jnp.concatenate([actions[..., 0], actions[..., 1]], axis=-1)
+
+
+def _action_parameters(inputs: Array, std: float, name: str) -> Array:
+    """Mean 0 and this deviation of an action, whatever the inputs are, before training; [..., 2]."""
+    bias = jnp.array([0.0, np.log(np.expm1(std))])
+    layer = nn.Dense(2, kernel_init=nn.initializers.zeros, bias_init=lambda *_: bias, name=name)
+    return layer(inputs)
