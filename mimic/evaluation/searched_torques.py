@@ -1,6 +1,7 @@
 """Estimates the best achievable rollouts: optimises the torques of each demonstration, knowing the whole motion."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp

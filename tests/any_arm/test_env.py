@@ -175,7 +175,9 @@ def test_a_policy_moves_one_arm_as_it_moves_it_among_many(env, evaluator, four_j
         return jnp.tanh(weights @ observation)
 
     def run(demonstration):
-        start = env.begin(env.start_of(four_joints, demonstration, jax.random.PRNGKey(0)))
+        key = jax.random.fold_in(jax.random.PRNGKey(0), demonstration)  # of random poses, as in `Evaluator.rollout`
+        key = evaluator.env.start(key, demonstration).key
+        start = env.begin(env.start_of(four_joints, demonstration, key))
 
         def step(state, _):
             state = env.step(state, policy(state.obs))
