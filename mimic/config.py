@@ -81,12 +81,12 @@ def suggestion(name: str, valid: Iterable[str]) -> str:
 
 
 def _suggested_key(key: str, parent: DictConfig) -> str:
-    """The suggestion for an unknown key: a key of the same parent, else one anywhere in the config."""
+    """The suggestion for an unknown key: one of its name anywhere in the config, else a close one beside it."""
     head, _, last = key.rpartition(".")
     siblings = [f"{head}.{name}" if head else str(name) for name in parent if name != "hydra"]
     elsewhere = dict(_keys(parent._get_root()))
     same_name = next((full for full, name in elsewhere.items() if name == last), "")
-    return suggestion(key, siblings) or (f"; did you mean {same_name}?" if same_name else "")
+    return f"; did you mean {same_name}?" if same_name else suggestion(key, siblings)
 
 
 def _keys(node: Any, prefix: str = "") -> Iterator[tuple[str, str]]:

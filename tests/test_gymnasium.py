@@ -48,6 +48,14 @@ def test_all_environments_are_registered():
     assert isinstance(env.unwrapped, VectorEnv) and env.num_envs == 2
 
 
+@pytest.mark.parametrize("name", ["any_arm", "panda_family"])
+def test_environments_of_many_arms_are_rejected(name):
+    with pytest.raises(ValueError, match=f"env: expected an environment of one learner, got '{name}', which draws"):
+        gymnasium.make(f"mimic/{name}-v0")
+    with pytest.raises(ValueError, match="env: expected an environment of one learner"):
+        VectorEnv(name, num_envs=2)
+
+
 def test_it_equals_the_brax_environment(imitation):
     env = Env(imitation)
     obs, _ = env.reset(seed=3, options={"demonstration": 2})

@@ -123,7 +123,7 @@ def test_a_plugin_is_imported_and_named_for_other_processes(module, own_registry
         (["env.reward.terms={x: 1}"], "reward.terms: expected one of self_collision, got 'x'"),
         (["env.metric.link_distance=x"], "link_distance: expected one of none, got 'x'"),
         (["env.demonstrations.source=x"], "demonstrations.source: expected one of none, got 'x'"),
-        (["env=no_such_env"], "unknown env 'no_such_env'; valid are bimanual, pair, panda3dof"),
+        (["env=no_such_env"], "unknown env 'no_such_env'; valid are any_arm, bimanual, pair, panda3dof"),
         (["trainer=no_such_trainer"], "unknown trainer 'no_such_trainer'; valid are pose_mapper, ppo"),
     ],
 )

@@ -1,5 +1,6 @@
 """Controllers of one arm that know its model: towards the pose nearest to the next of the expert, or a policy."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,13 +10,14 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays
+from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
 from mimic.any_arm.control import make_plan, max_speed, planned_torque
 from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals
 from mimic.any_arm.kinematics import check_metric, correspondence
 from mimic.any_arm.observation import observe
 from mimic.arms.arm import build_arm
 from mimic.envs.arm_state import arm_state
+from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import ImitationEnv
 
 Policy = Callable[[Float[Array, " observation"]], Float[Array, " joints"]]
@@ -42,6 +44,7 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
     Args:
       env: the environment of the arm.
       policy: policy of any arm, trained on `AnyArmEnv`: from its observation to its action; the zero action where None.
+        With a policy, joints that the config locks keep their places, as in training, see `arrays_with_mask`.
 
     Raises:
       ValueError: a tree, an arm with more joints or links than `ArmArrays` has, or another metric than the default one.
@@ -49,18 +52,21 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
     config = env.config
     expert = build_arm(config.expert, config.limits, config.metric.links)
     weights = check_metric(config.metric)
-    expert_arm, arm = (_constants(arm_arrays(x)) for x in (expert, env.arm))
+    arrays = arm_arrays(env.arm) if policy is None else arrays_with_mask(config)
     with jax.ensure_compile_time_eval():
+        expert_arm, arm = (_constants(x) for x in (arm_arrays(expert), arrays))
         matrix = np.asarray(correspondence(expert_arm, arm))
-    joints, dt = env.action_size, config.control_dt
-    speed = max_speed(arm, config.limits)
+        speed = max_speed(arm, config.limits)
+    places = np.flatnonzero(arrays.is_free)  # of the environment's joints
+    dt = config.control_dt
 
     def start(state: State) -> Goals:
-        return first_goals(_padded(arm_state(state).qpos, MAX_JOINTS))
+        return first_goals(arm.home.at[places].set(arm_state(state).qpos))
 
     def act(state: State, goals: Goals) -> tuple[Array, Goals]:
         now = arm_state(state)
-        qpos, qvel, max_torque = (_padded(x, MAX_JOINTS) for x in (now.qpos, now.qvel, env.torque_scale))
+        qpos = arm.home.at[places].set(now.qpos)
+        qvel, max_torque = (jnp.zeros(MAX_JOINTS).at[places].set(x) for x in (now.qvel, env.torque_scale))
         own_states = env.expert_at(now.demonstration, now.step + 1)
         next_states = jax.tree.map(lambda x: _padded(x, MAX_LINKS), own_states)
         problem = Problem(arm, weights, jnp.asarray(matrix), next_states, dt)
@@ -71,9 +77,21 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
         else:
             action = policy(observe(arm, own_states, qpos, qvel, goals, max_torque, plan, dt))
         torque = planned_torque(arm, plan, action[:MAX_JOINTS], max_torque, dt)
-        return torque[:joints] / env.torque_scale, chosen_goal(goals, action[MAX_JOINTS])
+        return torque[places] / env.torque_scale, chosen_goal(goals, action[MAX_JOINTS])
 
     return ControllerWithMemory(start, act)
+
+
+def arrays_with_mask(config: EnvConfig) -> ArmArrays:
+    """The learner as arrays where locked joints have places of their own, as `lock_joints` makes it.
+
+    Raises:
+      ValueError: a tree, or an arm with more joints, locked ones included, or links than `ArmArrays` has.
+    """
+    limits, links = config.limits, config.metric.links
+    whole = build_arm(dataclasses.replace(config.learner, locked=None), limits, links)
+    locked = build_arm(config.learner, limits, links).locked
+    return arm_arrays(whole, free=[name not in locked for name in whole.embodiment.joint_names])
 
 
 def _constants(arm: Any) -> Any:

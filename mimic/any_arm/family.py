@@ -1,5 +1,8 @@
 """The arms of an environment whose learner is drawn for each episode: its sampler, and the arms of its report."""
 
+import dataclasses
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -14,7 +17,7 @@ from mimic.any_arm.sampler import (
     random_arm,
 )
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.envs.config import EnvConfig
+from mimic.envs.config import EnvConfig, ObservationConfig, RandomizationConfig, RewardConfig
 
 SEEN, UNSEEN = "seen", "unseen"
 _RANDOM_ARMS = 16  # in a report
@@ -44,6 +47,27 @@ def arm_sampler(config: EnvConfig) -> Sampler:
     samplers = [sampler for _, sampler in parts]
     sampler = samplers[0] if len(parts) == 1 else mixed_sampler(samplers, [weight / total for weight, _ in parts])
     return limited_sampler(sampler, arms.distinct) if arms.distinct else sampler
+
+
+def check_family(config: EnvConfig) -> None:
+    """Raises a ValueError for settings of one arm that an environment of many arms does not have."""
+    supported = {
+        "physics": ("auto", "fused"),
+        "start": ("home",),
+        "preview": (1,),
+        "randomization": (RandomizationConfig(),),
+        "reward": (RewardConfig(),),
+        "observation": (ObservationConfig(),),
+        "environment": ("",),
+    }
+    for key, values in supported.items():
+        value = getattr(config, key)
+        if value not in values:
+            is_plain = isinstance(values[0], int | str) and values[0]
+            expected = " or ".join(map(str, values)) if is_plain else "the default"
+            raise ValueError(
+                f"{key}: expected {expected} where the learner is drawn for each episode, got {_changes(value)}"
+            )
 
 
 def report_arms(config: EnvConfig) -> dict[str, dict[str, ArmArrays]]:
@@ -79,6 +103,17 @@ def arm_name(model: ArmConfig) -> str:
     path = model.model.replace("\\", "/").rstrip("/").split("/")
     stem = path[-1].rsplit(".", 1)[0]
     return path[-2] if stem in ("robot", "scene") and len(path) > 1 else stem
+
+
+def _changes(value: Any) -> str:
+    """A setting, or the fields of a config that differ from their defaults."""
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return str(value)
+    default = type(value)()
+    names = (field.name for field in dataclasses.fields(value))
+    return ", ".join(
+        f"{name}={getattr(value, name)}" for name in names if getattr(value, name) != getattr(default, name)
+    )
 
 
 def _model(config: EnvConfig, name: str) -> ArmConfig:

@@ -43,6 +43,8 @@ class EvaluateConfig:
       checkpoint: environment steps of the checkpoint. Default None: the last checkpoint.
       controller: "policy"; a baseline controller (see `run_controller`); or "searched" (see `search_torques`).
       search: number of updates and of initial guesses for "searched".
+      learner: of a run of many arms: name or file of the one arm to evaluate on. Default "": all arms of the report.
+      locked: numbers or names of the joints of `learner` that are locked.
       demonstrations: file of demonstrations that replace the held-out ones.
       physics: see `EnvConfig`. Default "": that of the run.
       mass, damping, torque_noise: deviation of the arm from its model, see `RandomizationConfig`. Default None: as in
@@ -55,6 +57,8 @@ class EvaluateConfig:
     checkpoint: int | None = _steps()
     controller: str = "policy"
     search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
+    learner: str = ""
+    locked: list[Any] = dataclasses.field(default_factory=list)
     demonstrations: str = ""
     physics: str = ""
     mass: float | None = _factor()
@@ -66,6 +70,8 @@ class EvaluateConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
         check_choice("controller", self.controller, CONTROLLERS)
+        if self.locked and not self.learner:
+            raise ValueError(f"locked: expected with learner=NAME, as in learner=panda locked=[2,4], got {self.locked}")
         if self.physics:
             check_choice("physics", self.physics, PHYSICS)
 
@@ -370,6 +376,8 @@ class ViewConfig:
           ValueError: an arm does not exist.
         """
         arms = {role: _arm(role, name) for role in ("expert", "learner") if (name := getattr(self, role))}
+        if not arms:
+            self.env.check_one_learner()
         return dataclasses.replace(self.env, **arms)
 
 

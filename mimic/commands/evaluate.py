@@ -12,14 +12,18 @@ from mimic.commands.progress import SearchProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
 from mimic.config import new_folder
+from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.make import make_ppo_trainer, make_trainer
+from mimic.trainers.fine_tuning import with_one_learner
+from mimic.trainers.make import make_any_arm_trainer, make_ppo_trainer, make_trainer
 from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.trainer import Trainer
+
+CONTROLLERS_OF_MANY = ("policy", "nearest_pose")
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
@@ -79,10 +83,11 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
     if config.torque_noise is not None:
         changes["torque_noise"] = config.torque_noise
     if trained.trainer.name != "ppo":
-        if changes or config.physics or config.demonstrations or config.controller != "policy":
+        others = config.physics, config.demonstrations, config.learner
+        if changes or any(others) or config.controller != "policy":
             raise ValueError(
-                "controller, demonstrations, physics, mass, damping and torque_noise: expected a run of trainer=ppo, "
-                f"got one of {trained.trainer.name}"
+                "controller, learner, demonstrations, physics, mass, damping and torque_noise: expected a run of "
+                f"trainer=ppo, got one of {trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)
     if config.controller == "searched" and trained.env.metric.link_distance:
@@ -90,15 +95,32 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
             "controller=searched: expected a metric of weighted parts, got a run with "
             f"metric.link_distance={trained.env.metric.link_distance}"
         )
+    _check_arms(trained.env, config)
+    base = with_one_learner(trained.env, config.learner, config.locked) if config.learner else trained.env
     env = dataclasses.replace(
-        trained.env,
-        physics=config.physics or trained.env.physics,
-        randomization=dataclasses.replace(trained.env.randomization, **changes),
+        base,
+        physics=config.physics or base.physics,
+        randomization=dataclasses.replace(base.randomization, **changes),
     )
-    trained = dataclasses.replace(trained, env=env)
+    evaluated = dataclasses.replace(trained, env=env)
     unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
-    trainer = make_ppo_trainer(trained, run_dir, unseen)
-    return dataclasses.replace(trained, env=trainer.env_config), trainer
+    if env.arms.are_drawn:
+        trainer = make_any_arm_trainer(evaluated, run_dir, unseen)
+    else:
+        shared = make_any_arm_trainer(trained, run_dir).shared_policy() if config.learner else None
+        trainer = make_ppo_trainer(evaluated, run_dir, unseen, shared)
+    return dataclasses.replace(evaluated, env=trainer.env_config), trainer
+
+
+def _check_arms(env: EnvConfig, config: EvaluateConfig) -> None:
+    """Rejects what a run of one learner, or the report of many arms, does not have."""
+    if config.learner and not env.arms.are_drawn:
+        raise ValueError(f"learner: expected a run of many arms, got one of env={env.name}, whose learner is evaluated")
+    if env.arms.are_drawn and not config.learner and config.controller not in CONTROLLERS_OF_MANY:
+        raise ValueError(
+            f"controller: expected {' or '.join(CONTROLLERS_OF_MANY)} for all arms of a run of many, got "
+            f"{config.controller}; choose one arm with learner=NAME"
+        )
 
 
 def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
@@ -106,6 +128,7 @@ def _conditions(trained: TrainConfig, config: EvaluateConfig) -> dict[str, Any]:
     env = trained.env
     return {
         "run": config.run,
+        **({"learner": config.learner, "locked": config.locked} if config.learner else {}),
         "demonstrations": config.demonstrations,
         "physics": env.physics,
         **dataclasses.asdict(env.randomization),

@@ -12,6 +12,8 @@ import numpy as np
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
+from mimic.any_arm.env import AnyArmEnv
+from mimic.any_arm.making import make_family_env
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_report
 from mimic.commands.report import show_report
@@ -81,12 +83,12 @@ class Run:
 
         return {path.stem: Image.open(path) for path in sorted(self.run_dir.glob("*.png"))}
 
-    def make_env(self) -> ImitationEnv:
-        """The environment of the run, with its training demonstrations."""
+    def make_env(self) -> ImitationEnv | AnyArmEnv:
+        """The environment of the run, with its training demonstrations; an `AnyArmEnv` for a run of many arms."""
         env, path = self.config.env, self.run_dir / DEMONSTRATIONS
         if path.is_file():
             env = dataclasses.replace(env, demonstrations=dataclasses.replace(env.demonstrations, path=str(path)))
-        return make_env(env)
+        return make_family_env(env) if env.arms.are_drawn else make_env(env)
 
     def evaluate(self, *, quiet: bool = False, **options: Any) -> dict[str, Any]:
         """Evaluates the run, as `python -m mimic.evaluate` does.
@@ -151,7 +153,7 @@ def fit(
     return Run(path)
 
 
-def _env_config(env: str | EnvConfig | ImitationEnv, overrides: Mapping[str, Any]) -> EnvConfig:
+def _env_config(env: str | EnvConfig | ImitationEnv | AnyArmEnv, overrides: Mapping[str, Any]) -> EnvConfig:
     if isinstance(env, str):
         return env_config(env, **overrides)
     if overrides:
@@ -160,6 +162,11 @@ def _env_config(env: str | EnvConfig | ImitationEnv, overrides: Mapping[str, Any
         )
     if isinstance(env, EnvConfig):
         return env
+    if isinstance(env, AnyArmEnv):
+        raise ValueError(
+            "env: expected the name or the config of an environment of many arms, as in 'panda_family', got an "
+            "AnyArmEnv, whose sampler a config need not describe"
+        )
     if type(env) is not ImitationEnv and not env.config.environment:
         raise ValueError(
             f"env: expected the name of {type(env).__name__}: a run makes its environment from its config; "

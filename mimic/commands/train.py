@@ -37,6 +37,7 @@ from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.distributed.process_group import ProcessGroup
+from mimic.trainers.fine_tuning import fine_tuned
 from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, run_schema, save_config
 from mimic.trainers.run_correspondence import save_correspondence
@@ -81,6 +82,8 @@ def prepare_training(
         use_kept_choices(resumed_dir)
         config = _resumed_config(resumed_dir, config, overrides)
         check_writable("resume", resumed_dir)
+    elif config.learner:
+        config = fine_tuned(config, overrides)
     if group and config.trainer.name != "ppo":
         raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
     is_first = group is None or group.first

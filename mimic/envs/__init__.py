@@ -85,7 +85,7 @@ def _metric_preset(name: str) -> DictConfig:
 
 
 def make(name: str, **overrides: Any) -> "ImitationEnv":
-    """Makes an environment with its training demonstrations.
+    """Makes an environment of one learner with its training demonstrations; `mimic.make` makes those of many too.
 
     Args:
       name: one of `environments()`.
@@ -94,10 +94,12 @@ def make(name: str, **overrides: Any) -> "ImitationEnv":
     Raises:
       ValueError: an unknown name or field, a value of the wrong type or out of range, demonstrations that do not fit.
     """
+    config = env_config(name, **overrides)
+    config.check_one_learner()
     compat.import_mjx()
     from mimic.envs.imitation import make_env  # imports brax and MJX, which takes seconds
 
-    return make_env(env_config(name, **overrides))
+    return make_env(config)
 
 
 __all__ = ["EnvConfig", "env_config", "environments", "make"]

@@ -223,6 +223,15 @@ class EnvConfig:
         """Both arms, with the links that the metric compares.
 
         Raises:
-          ValueError: an arm that cannot be loaded.
+          ValueError: an arm that cannot be loaded, or a learner that is drawn for each episode.
         """
+        self.check_one_learner()
         return ArmPair(*(build_arm(arm, self.limits, self.metric.links) for arm in (self.expert, self.learner)))
+
+    def check_one_learner(self) -> None:
+        """Raises a ValueError where the learner is another arm in each episode."""
+        if self.arms.are_drawn:
+            raise ValueError(
+                f"env: expected an environment of one learner, got {self.name!r}, which draws another learner for each "
+                "episode; python -m mimic.evaluate run=DIR learner=NAME evaluates a policy of it on one learner"
+            )

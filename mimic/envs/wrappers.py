@@ -1,11 +1,26 @@
 """Training wrappers: brax's own, with a new random demonstration for every episode."""
 
+from typing import Any, Protocol, runtime_checkable
+
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
+from mimic.envs.arm_state import ArmState
+from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import FIRST_STEP, ImitationEnv, arm_state
+
+
+@runtime_checkable
+class RestartableEnv(Protocol):
+    """An environment whose episodes start anew within a batch: `ImitationEnv`, and `AnyArmEnv` of many arms."""
+
+    config: EnvConfig
+
+    def at_step(self, state: Any, step: Any) -> ArmState: ...  # noqa: D102
+    def observe_start(self, state: Any) -> jax.Array: ...  # noqa: D102
+    def restart_done(self, states: State) -> State: ...  # noqa: D102
 
 
 class FreshEpisodeWrapper(Wrapper):
@@ -16,7 +31,7 @@ class FreshEpisodeWrapper(Wrapper):
     synchronous, each batch would contain only one part of the motion.
     """
 
-    def __init__(self, env: Wrapper, imitation: ImitationEnv):
+    def __init__(self, env: Wrapper, imitation: RestartableEnv):
         super().__init__(env)
         self._imitation = imitation
 
@@ -51,12 +66,12 @@ def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, ran
     which PPO would treat as a truncation, never comes first.
 
     Raises:
-      TypeError: another environment than `ImitationEnv`.
+      TypeError: another environment than those of mimic.
       ValueError: a `randomization_fn`; see `RandomizationConfig` for randomization.
     """
     imitation = env.unwrapped
-    if not isinstance(imitation, ImitationEnv):
-        raise TypeError(f"expected an ImitationEnv, got {type(imitation).__name__}")
+    if not isinstance(imitation, RestartableEnv):
+        raise TypeError(f"expected an ImitationEnv or AnyArmEnv, got {type(imitation).__name__}")
     if randomization_fn is not None:
         raise ValueError("randomization_fn is not supported")
     wrapped = EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat)

@@ -18,6 +18,7 @@ SIMILARITY_NAMES = {  # display names that differ from their keys
     "hand_ik": "IK of the scaled hand",
     "align_segments": "aligning segments",
     "hold_home": "holding start pose",
+    "controller": "without learning",
 }
 
 

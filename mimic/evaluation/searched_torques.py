@@ -1,6 +1,7 @@
 """Estimates the best achievable rollouts: optimises the torques of each demonstration, knowing the whole motion."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
+from mimic.any_arm.controller import ControllerWithMemory
 from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.envs.physics import Load
 from mimic.evaluation.config import SearchConfig
@@ -25,7 +27,10 @@ NOISY_POLICY = "noisy_policy"
 
 
 def search_torques(
-    evaluator: Evaluator, policy: Controller, config: SearchConfig, on_update: Callable[[int, str], None]
+    evaluator: Evaluator,
+    policy: Controller | ControllerWithMemory,
+    config: SearchConfig,
+    on_update: Callable[[int, str], None],
 ) -> tuple[Rollouts, dict[str, dict[str, dict[str, float]]]]:
     """Optimises torques for each demonstration, by descent from several starts.
 
@@ -62,7 +67,9 @@ def search_torques(
     return best_rollouts, _gaps_by_start(evaluator, starts, solutions)
 
 
-def _starts(evaluator: Evaluator, policy: Controller, config: SearchConfig) -> dict[str, Rollouts]:
+def _starts(
+    evaluator: Evaluator, policy: Controller | ControllerWithMemory, config: SearchConfig
+) -> dict[str, Rollouts]:
     """Rollouts of `config.starts` starts, by name."""
     names = ["policy", "computed_torque", "pd", "hold"]
     names += [f"{NOISY_POLICY}_{i}" for i in range(1, config.starts - len(names) + 1)]
@@ -78,15 +85,25 @@ def _starts(evaluator: Evaluator, policy: Controller, config: SearchConfig) -> d
     return {name: make(name) for name in names[: config.starts]}
 
 
-def _with_noise(env: ImitationEnv, policy: Controller, key: Array) -> Controller:
+def _with_noise(
+    env: ImitationEnv, policy: Controller | ControllerWithMemory, key: Array
+) -> Controller | ControllerWithMemory:
     shape = env.demonstrations.count, env.config.horizon, env.action_size
     noise = jnp.repeat(_NOISE * jax.random.normal(key, shape), _NOISE_STEPS, axis=1)
 
-    def controller(state: State) -> Array:
+    def noise_at(state: State) -> Array:
         arm = arm_state(state)
-        return policy(state) + noise[arm.demonstration, arm.step]
+        return noise[arm.demonstration, arm.step]
 
-    return controller
+    if not isinstance(policy, ControllerWithMemory):
+        return lambda state: policy(state) + noise_at(state)
+    with_memory = policy
+
+    def act(state: State, memory: Any) -> tuple[Array, Any]:
+        action, memory = with_memory.act(state, memory)
+        return action + noise_at(state), memory
+
+    return with_memory._replace(act=act)
 
 
 def _replay(action: Float[Array, "demonstrations time joints"]) -> Controller:

@@ -11,7 +11,8 @@ from mimic.trainers.memory import check_training_memory
 from mimic.trainers.trainer import Trainer
 
 if TYPE_CHECKING:
-    from mimic.trainers.ppo.trainer import PPOTrainer
+    from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
+    from mimic.trainers.ppo.trainer import PolicyOfManyArms, PPOTrainer
 
 
 def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
@@ -24,20 +25,41 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
     Raises:
       ValueError: a config that cannot be trained, or not in the memory that there is.
     """
-    check_training_memory(config)
     name = config.trainer.name
+    check_training_memory(config)
     if name in _MAKERS:
         return _MAKERS[name](config, run_dir)
     compat.import_mjx()  # first, and quietly: the trainer may import brax
     return registry.find("trainer", name, "trainer.name")(config, run_dir)
 
 
-def make_ppo_trainer(config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None) -> "PPOTrainer":
-    """The trainer of a config with trainer=ppo; see `PPOTrainer`."""
+def make_ppo_trainer(
+    config: TrainConfig,
+    run_dir: Path | None,
+    unseen: Demonstrations | None = None,
+    shared: "PolicyOfManyArms | None" = None,
+) -> "PPOTrainer":
+    """The trainer of a config with trainer=ppo and one learner; see `PPOTrainer`."""
     compat.import_mjx()
     from mimic.trainers.ppo.trainer import PPOTrainer  # brax and MJX, which take seconds to import
 
-    return PPOTrainer(config, run_dir, unseen)
+    config.env.check_one_learner()
+    return PPOTrainer(config, run_dir, unseen, shared)
+
+
+def make_any_arm_trainer(
+    config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None
+) -> "AnyArmPPOTrainer":
+    """The trainer of a config with trainer=ppo whose learner is drawn for each episode; see `AnyArmPPOTrainer`."""
+    compat.import_mjx()
+    from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
+
+    return AnyArmPPOTrainer(config, run_dir, unseen)
+
+
+def _make_ppo_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
+    make = make_any_arm_trainer if config.env.arms.are_drawn else make_ppo_trainer
+    return make(config, run_dir)
 
 
 def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
@@ -47,10 +69,11 @@ def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trai
         return AnyArmMapperTrainer(config, run_dir)
     from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 
+    config.env.check_one_learner()
     return PoseMapperTrainer(config, run_dir)
 
 
 _MAKERS: dict[str, Callable[[TrainConfig, Path | None], Trainer]] = {
-    "ppo": make_ppo_trainer,
+    "ppo": _make_ppo_trainer,
     "pose_mapper": _make_pose_mapper_trainer,
 }

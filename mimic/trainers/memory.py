@@ -1,5 +1,6 @@
 """Lower bounds on the memory that a training needs, compared with what there is before anything is compiled."""
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 
@@ -7,6 +8,7 @@ import jax
 
 from mimic.any_arm.arrays import MAX_LINKS
 from mimic.arms.embodiment import Embodiment
+from mimic.envs.config import ArmsConfig
 from mimic.memory import check_memory, device_memory, host_memory
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 
@@ -21,7 +23,9 @@ def check_training_memory(config: TrainConfig) -> None:
     Raises:
       ValueError: also where the settings or the arms are invalid.
     """
-    expert, learner = config.env.build_arms().embodiments
+    # Where the learner is drawn, the whole one counts: the observation of any arm is at least as long.
+    env = dataclasses.replace(config.env, arms=ArmsConfig())
+    expert, learner = env.build_arms().embodiments
     if isinstance(config.trainer, PPOConfig):
         _check("host", _demonstration_bytes(config, expert), host_memory())
         _check("device", _ppo_bytes(config, config.trainer, expert, learner), device_memory())

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mimic.any_arm.family import arm_name
 from mimic.arms.arm import ArmConfig
 from mimic.arms.model_copy import copied_files
 from mimic.arms.model_source import file_digest, read_source
@@ -15,12 +16,14 @@ from mimic.envs.config import EnvConfig
 from mimic.runs.files import write_atomically
 
 MODELS, RECORD = "models", "models.json"
-_ROLES = "expert", "learner"
+_ROLES, _LISTS = ("expert", "learner"), ("models", "evaluated")  # fields of EnvConfig, and lists of ArmsConfig
 _MAX_RECORD = 2**20  # bytes
 
 
 def save_models(run_dir: Path, env: EnvConfig) -> None:
     """Copies the model files of the arms into the folder `models`; a run whose arms are from there keeps them.
+
+    Where the learner is drawn for each episode, these are also the files of `arms.models` and `arms.evaluated`.
 
     The file `models.json` records the original paths and the checksums of the copies. The folder has its final name
     only when it is complete.
@@ -62,18 +65,27 @@ def with_saved_models(run_dir: Path, env: EnvConfig) -> EnvConfig:
         return env
     record = _read_record(folder)
     _check_files(folder, record["sha256"])
-    changes: dict[str, Any] = {}
-    for role, arm in arms.items():
+    models: dict[str, str] = {}
+    for role in arms:
         file = record["arms"].get(role, {}).get("file")
         if file not in record["sha256"]:
             raise ValueError(f"{str(folder / RECORD)!r} has no model of the {role}; {_ADVICE}")
-        changes[role] = dataclasses.replace(arm, model=str(folder / file))
-    return dataclasses.replace(env, **changes)
+        models[role] = str(folder / file)
+    return _with_models(env, models)
 
 
 def with_original_models(env: EnvConfig) -> EnvConfig:
     """The inverse of `with_saved_models`: with the files that the run started from."""
-    return dataclasses.replace(env, **{role: _original(arm, role) for role, arm in _own_arms(env).items()})
+    return _with_models(env, {role: _original(arm, role).model for role, arm in _own_arms(env).items()})
+
+
+def _with_models(env: EnvConfig, models: Mapping[str, str]) -> EnvConfig:
+    """The environment with other files of its own arms, by their role."""
+    changes: dict[str, Any] = {
+        role: dataclasses.replace(getattr(env, role), model=models[role]) for role in _ROLES if role in models
+    }
+    lists = {key: [models.get(_role(name), name) for name in getattr(env.arms, key)] for key in _LISTS}
+    return dataclasses.replace(env, arms=dataclasses.replace(env.arms, **lists), **changes)
 
 
 def _original(arm: ArmConfig, role: str) -> ArmConfig:
@@ -87,7 +99,22 @@ _ADVICE = "copy the run again, or remove this folder to use the files that the r
 
 
 def _own_arms(env: EnvConfig) -> dict[str, ArmConfig]:
-    return {role: arm for role in _ROLES if (arm := getattr(env, role)).is_file}
+    """The arms that are read from files by their role: expert, learner, or the folder of one of many arms.
+
+    Raises:
+      ValueError: several files of one name among the many.
+    """
+    arms = {role: arm for role in _ROLES if (arm := getattr(env, role)).is_file}
+    for name in (name for key in _LISTS for name in getattr(env.arms, key)):
+        arm, role = ArmConfig(model=name), _role(name)
+        if arm.is_file and arms.setdefault(role, arm).model != arm.model:
+            raise ValueError(f"arms: expected files of different names, got {arms[role].model!r} and {arm.model!r}")
+    return arms
+
+
+def _role(name: str) -> str:
+    """The folder of one of many arms: its name in the report, so that its copy has the same name."""
+    return arm_name(ArmConfig(model=name))
 
 
 def _files(folder: Path) -> list[Path]:
@@ -102,7 +129,7 @@ def _read_record(folder: Path) -> Mapping[str, Any]:
         with path.open("rb") as file:
             record = json.loads(file.read(_MAX_RECORD))
         for role, arm in record["arms"].items():
-            if not (role in _ROLES and isinstance(arm["file"], str) and isinstance(arm["original"], str)):
+            if not (isinstance(arm["file"], str) and isinstance(arm["original"], str)):
                 raise ValueError(f"unexpected entry {role!r}")
         if not all(isinstance(text, str) for entry in record["sha256"].items() for text in entry):
             raise ValueError("expected checksums of files")

@@ -164,3 +164,29 @@ def test_actions_change_the_acceleration(env, four_joints):
     # The inertia at the middle of the step is that of the whole step to some per cent.
     np.testing.assert_allclose(np.diagonal(moved)[free], expected[free], rtol=0.1)
     assert not np.delete(moved, free, axis=0).any()
+
+
+@pytest.mark.slow
+def test_a_policy_moves_one_arm_as_it_moves_it_among_many(env, evaluator, four_joints):
+    """The policy is a random linear function of the observation; locked joints keep their places. 1e-3 as above."""
+    weights = 0.1 * jax.random.normal(jax.random.PRNGKey(3), (MAX_JOINTS, env.observation_size))
+
+    def policy(observation):
+        return jnp.tanh(weights @ observation)
+
+    def run(demonstration):
+        key = jax.random.fold_in(jax.random.PRNGKey(0), demonstration)  # of random poses, as in `Evaluator.rollout`
+        key = evaluator.env.start(key, demonstration).key
+        start = env.begin(env.start_of(four_joints, demonstration, key))
+
+        def step(state, _):
+            state = env.step(state, policy(state.obs))
+            return state, any_arm_state(state).qpos
+
+        return jax.lax.scan(step, start, None, length=HORIZON)[1]
+
+    of_many = jax.jit(jax.vmap(run))(jnp.arange(COUNT))
+    controller = nearest_pose_controller(evaluator.env, policy)
+    alone = jax.jit(lambda: evaluator.rollout(controller))()
+    assert np.abs(np.asarray(of_many)).max() > 0.1
+    np.testing.assert_allclose(of_many[:, :, [0, 1, 3, 4]], np.asarray(alone.qpos)[:COUNT], rtol=0, atol=1e-3)

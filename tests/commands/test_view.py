@@ -30,7 +30,7 @@ from tests.mocap.bodies import bvh_text, person
         (["port=0"], "port: expected a whole number from 1 to 65,535, got 0"),
         (["host=nowhere.invalid"], "host: expected an address of this machine"),
         (["env=panda5dof"], "unknown env 'panda5dof'; valid are"),
-        (["learner=missing.xml"], "learner: expected panda, an MJCF file, or an environment (bimanual, pair,"),
+        (["learner=missing.xml"], "learner: expected panda, an MJCF file, or an environment (any_arm, bimanual, pair,"),
         (["run=missing"], "not a run directory"),
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),

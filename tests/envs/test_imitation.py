@@ -17,6 +17,8 @@ def planar_env():
     return mimic.make("planar4dof", demonstrations=FEW)
 
 
+OF_MANY_ARMS = ("any_arm", "panda_family")
+OF_ONE_LEARNER = [name for name in mimic.environments() if name not in OF_MANY_ARMS]
 QUICK = ("planar4dof", "panda3dof")  # the others have all their shapes checked
 
 
@@ -31,7 +33,7 @@ def test_every_environment_has_its_shapes(name):
 
 @pytest.mark.parametrize("limits", ["none", "hardware"])
 @pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in mimic.environments()]
+    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in OF_ONE_LEARNER]
 )
 def test_every_environment_resets_and_steps(name, limits):
     # MJX takes longest to compile; other tests hold each arm's motion under it against MuJoCo's.
@@ -40,6 +42,17 @@ def test_every_environment_resets_and_steps(name, limits):
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
     assert after.reward == pytest.approx(-float(after.metrics["distance"]))  # at rest at home, far from any limit
+    assert np.all(np.isfinite(after.obs)) and not after.done
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limits", ["none", "hardware"])
+@pytest.mark.parametrize("name", OF_MANY_ARMS)
+def test_every_environment_of_many_arms_resets_and_steps(name, limits):
+    env = mimic.make(name, demonstrations=FEW, limits=limits)
+    state = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
+    assert after.reward == pytest.approx(-float(after.metrics["distance"] / after.pipeline_state.hold))
     assert np.all(np.isfinite(after.obs)) and not after.done
 
 
@@ -171,5 +184,5 @@ def test_bad_overrides_are_rejected(overrides, message):
 
 
 def test_an_unknown_environment_lists_the_valid_ones():
-    with pytest.raises(ValueError, match="panda3dof, panda4dof, panda7dof, planar4dof"):
+    with pytest.raises(ValueError, match="panda3dof, panda4dof, panda7dof, panda_family, planar4dof"):
         mimic.make("panda5dof")

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.any_arm.family import report_arms
 from mimic.arms.arm import build_arm
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.runs.files import CONFIG
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, new_run_dir, save_config
-from mimic.trainers.run_models import MODELS, RECORD, save_models
+from mimic.trainers.run_models import MODELS, RECORD, save_models, with_original_models
 from tests.helpers import original_model
 from tests.helpers.run_directories import write_run
 from tests.helpers.tiny import TINY
@@ -108,7 +109,7 @@ def test_saving_the_config_again_keeps_original_path_and_models(run, tmp_path, m
     save_models(run_dir, config.env)
     save_config(run_dir, config)
     assert load_config(run_dir, saved_models=False).env.learner.model == str(file)
-    assert MODELS not in (run_dir / CONFIG).read_text()
+    assert f"/{MODELS}/" not in (run_dir / CONFIG).read_text()
     assert {path: path.read_bytes() for path in (run_dir / MODELS).rglob("*") if path.is_file()} == before
 
 
@@ -212,3 +213,45 @@ def command(name, *arguments, code=0):
     )
     assert result.returncode == code, result.stderr[-2000:]
     return result.stderr
+
+
+@pytest.fixture
+def family_run(tmp_path):
+    """A run of many arms, of which two are files and are named by their folder or file, and one has no file."""
+    files = [write_arm(tmp_path / "arms" / "ur", "mjcf"), write_arm(tmp_path / "urdfs", "urdf")]
+    files[0] = files[0].rename(files[0].with_name("robot.xml"))
+    run_dir = write_run(tmp_path / "run", [0.1])
+    arms = {"perturbed": 1.0, "models": ["panda", str(files[0])], "evaluated": [str(files[1])]}
+    env = mimic.env_config("any_arm", arms=arms)
+    save_models(run_dir, env)
+    save_config(run_dir, dataclasses.replace(load_config(run_dir), env=env))
+    return run_dir, files
+
+
+def test_a_run_keeps_all_of_many_arms(family_run, tmp_path):
+    run_dir, files = family_run
+    arms = report_arms(load_config(run_dir, saved_models=False).env)
+    for file in files:
+        shutil.rmtree(file.parent)
+    run_dir = run_dir.rename(tmp_path / "elsewhere")
+    env = load_config(run_dir).env
+    assert env.arms.models[0] == "panda" and env.arms.models[1] == str(run_dir / MODELS / "ur" / "robot.xml")
+    kept = report_arms(env)
+    assert {split: list(names) for split, names in kept.items()} == {
+        split: list(names) for split, names in arms.items()
+    }
+    assert "ur" in kept["seen"] and "arm" in kept["unseen"]
+    save_models(run_dir, env)
+    assert with_original_models(env).arms.models == ["panda", str(files[0])]
+    append(run_dir / MODELS / "ur" / "robot.xml")
+    with pytest.raises(ValueError, match="robot.xml' was changed since the training started"):
+        load_config(run_dir)
+
+
+def test_files_of_many_arms_have_different_names(tmp_path):
+    files = [str(write_arm(tmp_path / name, "mjcf")) for name in ("a", "b")]
+    env = mimic.env_config("any_arm", arms={"evaluated": files})
+    with pytest.raises(
+        ValueError, match="arms: expected files of different names, got '.*a/arm.xml' and '.*b/arm.xml'"
+    ):
+        save_models(tmp_path, env)

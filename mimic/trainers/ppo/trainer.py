@@ -5,10 +5,11 @@ import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
+from mimic.any_arm.controller import ControllerWithMemory
 from mimic.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
@@ -26,6 +27,18 @@ from mimic.trainers.ppo.programs import Replay
 from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
 
 
+class PolicyOfManyArms(NamedTuple):
+    """A policy that was trained on many arms, to evaluate on one.
+
+    Attributes:
+      params_template: makes the parameters, or their shapes, with the structure of a checkpoint.
+      controller: from the environment of the arm and parameters to the controller of that arm.
+    """
+
+    params_template: Callable[[], Params]
+    controller: Callable[[ImitationEnv, Params], ControllerWithMemory]
+
+
 class PPOTrainer(Trainer):
     """Trains a policy on the training demonstrations, and evaluates it on these and on held-out ones.
 
@@ -33,6 +46,7 @@ class PPOTrainer(Trainer):
       config: the run's config.
       run_dir: directory of an existing run, whose demonstrations are used.
       unseen: demonstrations to evaluate on instead of the held-out ones.
+      shared: the policy, where it was trained on many arms; it can be evaluated, and not trained.
 
     Attributes:
       evaluator: evaluates controllers on the run's demonstrations.
@@ -43,9 +57,15 @@ class PPOTrainer(Trainer):
 
     unit = "env_steps"
 
-    def __init__(self, config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None):
+    def __init__(
+        self,
+        config: TrainConfig,
+        run_dir: Path | None,
+        unseen: Demonstrations | None = None,
+        shared: PolicyOfManyArms | None = None,
+    ):
         assert isinstance(config.trainer, PPOConfig)
-        self._name, self._seed = config.env.name, config.seed
+        self._name, self._seed, self._shared = config.env.name, config.seed, shared
         self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count())
         self.total_steps = self.settings.total_steps
         env, held_out = run_environment(config.env, run_dir)
@@ -54,7 +74,8 @@ class PPOTrainer(Trainer):
             check_effort(unseen, env.expert)
             held_out = unseen.of_length(env.demonstrations.horizon)
         self.evaluator = Evaluator(env, held_out)
-        self._env = _with_crossovers(env, self.settings.crossovers, config.env.demonstrations.seed)
+        mixed = with_crossovers(env.demonstrations, self.settings.crossovers, config.env.demonstrations.seed)
+        self._env = env if mixed is env.demonstrations else env.with_demonstrations(mixed)
         self._demonstrations = concatenate(env.demonstrations, held_out)
         self.env_config = dataclasses.replace(config.env, physics=env.physics.name)
         self.headline = (
@@ -72,10 +93,14 @@ class PPOTrainer(Trainer):
 
     def params_template(self) -> Params:
         """Observation statistics and the parameters of policy and value network."""
+        if self._shared is not None:
+            return self._shared.params_template()
         return ppo.params_template(self.settings, self._env.observation_size, self._env.action_size)
 
-    def controller(self, params: Params) -> Controller:
+    def controller(self, params: Params) -> Controller | ControllerWithMemory:
         """The deterministic policy of these parameters."""
+        if self._shared is not None:
+            return self._shared.controller(self.evaluator.env, params)
         return ppo.make_controller(self.settings, self._env.observation_size, self._env.action_size)(params)
 
     def policy(self, params: Params) -> Callable[[Any], Any]:
@@ -248,17 +273,21 @@ def _text(form: str, value: float) -> str:
 
 def run_environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
     """The environment with its training demonstrations, and the held-out ones; an existing run has its own."""
-    if run_dir is not None:
-        path = str(run_dir / DEMONSTRATIONS)
-        stored = dataclasses.replace(config.demonstrations, path=path)
-        config = dataclasses.replace(config, demonstrations=stored)
+    config = with_saved_demonstrations(config, run_dir)
     training, held_out = training_and_held_out(config)
     return make_env(config, training), held_out
 
 
-def _with_crossovers(env: ImitationEnv, count: int, seed: int) -> ImitationEnv:
-    """The environment with additional training demonstrations."""
-    recorded = env.demonstrations
+def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvConfig:
+    """The environment with the demonstrations of an existing run, if there is one."""
+    if run_dir is None:
+        return config
+    saved = dataclasses.replace(config.demonstrations, path=str(run_dir / DEMONSTRATIONS))
+    return dataclasses.replace(config, demonstrations=saved)
+
+
+def with_crossovers(recorded: Demonstrations, count: int, seed: int) -> Demonstrations:
+    """Training demonstrations with additional ones, see `crossovers`."""
     if count == 0 or recorded.count == 1:  # a single demonstration cannot be mixed
-        return env
-    return env.with_demonstrations(concatenate(recorded, crossovers(recorded, count, seed)))
+        return recorded
+    return concatenate(recorded, crossovers(recorded, count, seed))

@@ -1,0 +1,61 @@
+"""Makes environments of one learner and of many."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+from mimic import compat
+from mimic.envs import env_config
+from mimic.envs.config import EnvConfig
+from mimic.envs.demonstrations import Demonstrations
+
+if TYPE_CHECKING:
+    from mimic.any_arm.env import AnyArmEnv
+    from mimic.envs.imitation import ImitationEnv
+
+
+@overload
+def make(name: Literal["any_arm", "panda_family"], **overrides: Any) -> "AnyArmEnv": ...
+
+
+@overload
+def make(name: str, **overrides: Any) -> "ImitationEnv": ...
+
+
+def make(name: str, **overrides: Any) -> "ImitationEnv | AnyArmEnv":
+    """Makes an environment with its training demonstrations.
+
+    Args:
+      name: one of `environments()`. "panda_family" and "any_arm" draw another learner for each episode; these are an
+        `AnyArmEnv`, all others an `ImitationEnv`.
+      overrides: fields of the config, see `env_config`.
+
+    Raises:
+      ValueError: an unknown name or field, a value of the wrong type or out of range, demonstrations that do not fit.
+    """
+    config = env_config(name, **overrides)
+    compat.import_mjx()  # takes seconds, as the imports below
+    if config.arms.are_drawn:
+        return make_family_env(config)
+    from mimic.envs.imitation import make_env
+
+    return make_env(config)
+
+
+def make_family_env(config: EnvConfig, demonstrations: Demonstrations | None = None) -> "AnyArmEnv":
+    """Makes the environment of a config whose learner is drawn for each episode.
+
+    Args:
+      config: the config.
+      demonstrations: motions to imitate. Default None: the training demonstrations of the config.
+
+    Raises:
+      ValueError: settings that such an environment does not have, arms or demonstrations that do not fit.
+    """
+    from mimic.any_arm.env import AnyArmEnv
+    from mimic.any_arm.family import arm_sampler, check_family
+    from mimic.envs.imitation import training_and_held_out
+
+    check_family(config)
+    sampler = arm_sampler(config)
+    demonstrations = demonstrations or training_and_held_out(config)[0]
+    return AnyArmEnv(dataclasses.replace(config, physics="fused"), sampler, demonstrations)

@@ -1,0 +1,74 @@
+"""Environments whose learner is drawn for each episode: the arms of their report, and what they reject."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import mimic
+from mimic.any_arm.env import AnyArmEnv
+from mimic.any_arm.family import SEEN, UNSEEN, arm_name, report_arms
+from mimic.arms.arm import ArmConfig
+from mimic.envs.wrappers import wrap_for_training
+from tests.helpers.untrained_family import COUNT, family
+
+FAMILIES = "panda_family", "any_arm"
+SMALL = {"demonstrations": {"count": 2, "held_out": 1}, "horizon": 5}
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_make_returns_the_environment_of_any_arm(name):
+    env = mimic.make(name, **SMALL)
+    assert isinstance(env, AnyArmEnv) and env.demonstrations.count == 2
+    assert env.config.physics == env.backend == "fused"
+
+
+def test_registered_environments_of_many_arms_are_made_too(own_registry):
+    mimic.register("environment", "few", {"expert": "panda", "arms": {"locked": 1.0, "most_locked": 0}})
+    assert isinstance(mimic.make("few", **SMALL), AnyArmEnv)
+
+
+def test_brax_wraps_it_for_training():
+    env = mimic.make("panda_family", **SMALL)
+    wrapped = wrap_for_training(env, 6)
+    state = jax.eval_shape(wrapped.reset, jax.random.split(jax.random.PRNGKey(0), 3))
+    after = jax.eval_shape(wrapped.step, state, jnp.zeros((3, env.action_size)))
+    assert after.obs.shape == state.obs.shape == (3, env.observation_size)
+
+
+def test_the_report_has_each_arm_once():
+    arms = report_arms(family(arms={"random": 1.0}))
+    assert list(arms[SEEN]) == ["whole", "locked 1", "locked 7"]
+    assert list(arms[UNSEEN])[:5] == [f"locked {i}" for i in (2, 3, 4, 5, 6)]
+    assert [int(arm.is_free.sum()) for arm in arms[SEEN].values()] == [7, 6, 6]
+    assert COUNT and all(name.startswith("random") for name in list(arms[UNSEEN])[5:])
+
+
+def test_arms_are_named_by_their_files(tmp_path):
+    names = "robots/ur5e/robot.xml", "robots/ur5e/arm.urdf"
+    assert [arm_name(ArmConfig(model=str(tmp_path / name))) for name in names] == ["ur5e", "arm"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"physics": "mjx"}, "physics: expected auto or fused where the learner is drawn for each episode, got mjx"),
+        ({"start": "nearest"}, "start: expected home where .*, got nearest"),
+        ({"preview": 2}, "preview: expected 1 where .*, got 2"),
+        ({"randomization": {"mass": [0.5, 2]}}, r"randomization: expected the default where .*, got mass=\[0.5, 2.0\]"),
+        (
+            {"reward": {"terms": {"self_collision": 1.0}}},
+            "reward: expected the default where .*, got terms=.*self_coll",
+        ),
+        ({"observation": {"terms": ["distance_gradient"]}}, "observation: expected the default where .*, got terms="),
+    ],
+)
+def test_settings_of_one_learner_are_rejected(changes, message):
+    with pytest.raises(ValueError, match=message):
+        mimic.make("panda_family", **changes)
+
+
+def test_what_needs_one_learner_rejects_it():
+    config = mimic.env_config("panda_family")
+    for function in (config.build_arms, config.check_one_learner, lambda: mimic.envs.make("panda_family")):
+        with pytest.raises(ValueError, match="env: expected an environment of one learner, got 'panda_family', which"):
+            function()

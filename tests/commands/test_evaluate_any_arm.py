@@ -1,0 +1,72 @@
+"""`python -m mimic.evaluate` of a run of many arms: one of them alone, and what it and other commands reject."""
+
+import json
+
+import pytest
+
+from mimic.commands.config import EvaluateConfig
+from mimic.commands.evaluate import prepare_evaluation
+from tests.helpers.run_directories import write_run
+from tests.helpers.untrained_family import COUNT, HELD_OUT, untrained_family
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    return untrained_family(tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            ["controller=pd"],
+            "controller: expected policy or nearest_pose for all arms of a run of many, got pd; choose",
+        ),
+        (["mass=1.2"], "randomization: expected the default where the learner is drawn for each episode, got mass="),
+        (["physics=mjx"], "physics: expected auto or fused where the learner is drawn for each episode, got mjx"),
+        (["locked=[2]"], "locked: expected with learner=NAME, as in learner=panda locked=[2,4], got [2]"),
+        (["learner=panda", "locked=[8]"], "locked: "),
+        (["learner=panda_pair"], "panda_pair: expected a serial arm, got a tree of 2 chains"),
+        (["learner=no_such_arm"], "model: expected panda, planar, panda_pair, an MJCF or URDF file, or the name"),
+    ],
+)
+def test_what_many_arms_do_not_have_is_rejected(run_dir, rejected, settings, message):
+    assert message in rejected("evaluate", f"run={run_dir}", *settings)
+
+
+def test_a_run_of_one_learner_has_its_own(rejected, tmp_path):
+    run_dir = write_run(tmp_path / "one", [0.1])
+    (run_dir / "checkpoints" / "1").mkdir(parents=True)
+    assert "learner: expected a run of many arms, got one of env=planar4dof" in rejected(
+        "evaluate", f"run={run_dir}", "learner=panda"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("view", ["env=panda_family"]),
+        ("view", ["run=RUN"]),
+        ("render", ["run=RUN"]),
+        ("export", ["run=RUN", "out=policy.onnx"]),
+        ("retarget", ["learner=any_arm", "demonstrations=RUN/demonstrations.npz", "out=motions.npz"]),
+    ],
+)
+def test_commands_of_one_learner_reject_many(run_dir, rejected, name, arguments):
+    line = rejected(name, *(argument.replace("RUN", str(run_dir)) for argument in arguments))
+    assert "expected an environment of one learner, got" in line
+
+
+@pytest.mark.slow
+def test_one_arm_has_the_report_of_a_run_of_one_learner(run_dir, tmp_path):
+    """The controller without learning first: its gap is small, whereas that of initial parameters may be any."""
+    out = tmp_path / "out"
+    options = {"learner": "panda", "locked": [2], "compilation_cache": ""}
+    prepare_evaluation(EvaluateConfig(str(run_dir), controller="nearest_pose", **options), 0.0)()
+    prepare_evaluation(EvaluateConfig(str(run_dir), out=str(out), **options), 0.0)()
+    report = json.loads((out / "report.json").read_text())
+    assert report["env"] == "panda_family-panda-locked-2" and report["physics"] == "fused"
+    assert report["evaluated"]["learner"] == "panda" and report["evaluated"]["locked"] == [2]
+    assert report["mjx"]["mean_distance"] == pytest.approx(report["mean_distance"], rel=1e-3)
+    assert len((out / "demonstrations.csv").read_text().splitlines()) == 1 + COUNT + HELD_OUT
+    prepare_evaluation(EvaluateConfig(str(run_dir), controller="hold", mass=1.2, **options), 0.0)()

@@ -1,0 +1,152 @@
+"""Training of one policy for many arms: what the trainer says, and a run, its resumption and its fine-tuning."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import pytest
+
+import mimic
+from mimic.commands.fit import Run
+from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.make import make_trainer
+from mimic.trainers.memory import check_training_memory
+from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
+from mimic.trainers.run_config import load_config
+from tests.helpers.untrained_family import ARMS, COUNT, HELD_OUT, family
+
+TINY = [
+    "env=panda_family",
+    "env.horizon=5",
+    f"env.arms.most_locked={ARMS['most_locked']}",
+    f"env.arms.unseen={ARMS['unseen']}".replace(" ", ""),
+    f"env.demonstrations.count={COUNT}",
+    f"env.demonstrations.held_out={HELD_OUT}",
+    "trainer.num_envs=8",
+    "trainer.unroll_length=5",
+    "trainer.batch_size=4",
+    "trainer.num_minibatches=2",
+    "trainer.num_updates_per_batch=1",
+    "trainer.hidden_layers=[8]",
+    "trainer.num_timesteps=80",
+    "trainer.evaluations=2",
+]
+METRICS = {
+    "optimality_gap", "median_gap", "largest_gap", "controller_gap", "mean_distance", "lower_bound", "hold_distance",
+    "speed_violations",
+}  # fmt: skip
+ROW = {"seen", "joints", "gap", "controller_gap", "mean_distance", "lower_bound", "hold_distance", "span"}
+
+
+def command(module, *arguments):
+    return subprocess.run(
+        [sys.executable, "-m", f"mimic.{module}", *arguments], capture_output=True, text=True, timeout=500, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def trainer():
+    return make_trainer(TrainConfig(family(), PPOConfig(hidden_layers=[8], preset="cpu", crossovers=4)), None)
+
+
+def test_it_is_chosen_where_the_learner_is_drawn(trainer):
+    assert isinstance(trainer, AnyArmPPOTrainer)
+    assert trainer.headline == f"panda_family: {COUNT} demonstrations, 512 arms in parallel"
+    assert "report: 3 arms seen in training and 5 others, on 2 held-out demonstrations" in trainer.simulation
+    assert trainer.env_config.physics == "fused" and trainer.columns == ("seen arms", "unseen arms")
+    assert trainer._env.demonstrations.count == COUNT + 4 and trainer._demonstrations.count == COUNT + HELD_OUT
+
+
+def test_the_report_takes_few_demonstrations():
+    config = dataclasses.replace(family(), demonstrations=dataclasses.replace(family().demonstrations, held_out=12))
+    trainer = make_trainer(TrainConfig(config, PPOConfig()), None)
+    assert isinstance(trainer, AnyArmPPOTrainer)
+    assert trainer.evaluator.env.demonstrations.count == EVALUATED_DEMONSTRATIONS
+
+
+def metrics_of(gap):
+    metrics = {key: {"train": gap, "held_out": 2 * gap} for key in METRICS}
+    arm = {"joints": 7, "gap": gap, "seen": True}
+    return {**metrics, "arms": {"whole": arm, "locked 2": {**arm, "seen": False, "gap": float("nan")}}}
+
+
+def test_status_rows_and_target(trainer):
+    assert trainer.status(metrics_of(0.1)) == "gap 10.00%, unseen arms 20.00%  without learning 10.00%/20.00%"
+    rows = trainer.rows(metrics_of(0.1))
+    assert rows[0] == ("optimality gap, mean over arms", "10.00%", "20.00%")
+    assert ("    which is", "whole", "none") in rows and ("arms", "1", "1") in rows
+    assert rows[-1] == ("  without gap (span below 25%)", "0", "1")
+    assert "none" in trainer.status(metrics_of(float("nan")))
+    trained = make_trainer(TrainConfig(family(), PPOConfig(target_gap=0.1)), None)
+    assert trained.good_enough(metrics_of(0.1)) and not trained.good_enough(metrics_of(float("nan")))
+    assert not trainer.good_enough(metrics_of(0.1))
+
+
+def test_pose_mappers_and_too_large_trainings_are_rejected(unchecked):
+    with pytest.raises(ValueError, match="env: expected an environment of one learner, got 'panda_family'"):
+        make_trainer(TrainConfig(family(), PoseMapperConfig()), None)
+    too_many = dataclasses.replace(family().demonstrations, count=100_000)
+    config = dataclasses.replace(family(), horizon=50, demonstrations=too_many)
+    check_training_memory(TrainConfig(family(), PPOConfig()))
+    with pytest.raises(ValueError, match="trainer.hidden_layers"):
+        check_training_memory(TrainConfig(config, PPOConfig(hidden_layers=[65_536] * 8)))
+
+
+def test_fit_takes_no_environment_of_many_arms():
+    with pytest.raises(ValueError, match="env: expected the name or the config of an environment of many arms"):
+        mimic.fit(mimic.make("panda_family", horizon=5, demonstrations={"count": 1, "held_out": 1}))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("runs") / "family"
+    result = command("train", *TINY, f"run_dir={run_dir}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    return run_dir, result.stdout
+
+
+@pytest.mark.slow
+def test_a_run_directory_holds_everything(finished):
+    run_dir, printed = finished
+    names = {path.name for path in run_dir.iterdir()}
+    assert {"config.yaml", "report.json", "metrics.csv", "demonstrations.npz", "checkpoints", "arms.csv"} <= names
+    assert {"arms.png", "training.png"} <= names
+    report = json.loads((run_dir / "report.json").read_text())
+    assert all(report[key].keys() == {"train", "held_out"} for key in METRICS)
+    assert report["physics"] == "fused" and "mjx" not in report
+    assert list(report["arms"])[:4] == ["whole", "locked 1", "locked 7", "locked 2"]
+    assert all(row.keys() >= ROW for row in report["arms"].values())
+    assert list(report["similarity"]) == ["policy", "controller", "nearest_poses", "hold_home"]
+    assert "seen arms" in printed and "unseen arms" in printed and "without learning" in printed
+
+
+@pytest.mark.slow
+def test_it_can_be_resumed_evaluated_and_collected(finished, tmp_path):
+    run_dir, _ = finished
+    more = command("train", f"resume={run_dir}", "trainer.num_timesteps=160")
+    assert more.returncode == 0, more.stderr[-2000:]
+    report = json.loads((run_dir / "report.json").read_text())
+    assert report["env_steps"] == 160
+    again = Run(run_dir).evaluate(quiet=True)
+    # 1e-5: the same function of the same parameters, in another process
+    assert again["optimality_gap"] == pytest.approx(report["optimality_gap"], rel=1e-5)
+    alone = Run(run_dir).evaluate(quiet=True, controller="nearest_pose")
+    assert alone["optimality_gap"] == alone["controller_gap"] and alone["trainer"] == "nearest_pose"
+    collected = command("collect", str(run_dir.parent), f"out={tmp_path}")
+    assert collected.returncode == 0 and "panda_family" not in collected.stderr
+
+
+@pytest.mark.slow
+def test_it_goes_on_with_one_arm(finished, tmp_path):
+    run_dir, _ = finished
+    tuned = tmp_path / "tuned"
+    more = command("train", f"init={run_dir}", "learner=panda", "trainer.num_timesteps=80", f"run_dir={tuned}")
+    assert more.returncode == 0, more.stderr[-2000:]
+    report = json.loads((tuned / "report.json").read_text())
+    assert list(report["arms"]) == ["whole"] and report["optimality_gap"].keys() == {"train"}
+    config = load_config(tuned)
+    assert config.learner == "panda" and config.env.arms.most_locked == 0
+    resumed = command("train", f"resume={tuned}", "trainer.num_timesteps=160")
+    assert resumed.returncode == 0, resumed.stderr[-2000:]
