@@ -29,7 +29,7 @@ from mimic.any_arm.sampler import lock_masks, lock_sampler, random_arm
 from mimic.any_arm.similarity import motion_similarity
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.named_arms import named_arms
-from mimic.envs.config import EnvConfig
+from mimic.envs import env_config
 from mimic.envs.imitation import training_and_held_out
 from mimic.evaluation.rollout_metrics import MIN_SPAN
 
@@ -68,7 +68,7 @@ def run_arm(env: AnyArmEnv, expert: ArmArrays, arm: ArmArrays) -> dict[str, jax.
         start = env.begin(env.start_of(arm, index, jax.random.PRNGKey(0)))
 
         def step(state: Any, _: None) -> tuple[Any, tuple[jax.Array, jax.Array]]:
-            state = env.step(state, jnp.zeros(MAX_JOINTS))
+            state = env.step(state, jnp.zeros(env.action_size))
             return state, (state.metrics["distance"], state.pipeline_state.qpos)
 
         _, (distance, qpos) = jax.lax.scan(step, start, None, length=horizon)
@@ -106,7 +106,7 @@ def row(name: str, arm: ArmArrays, outcome: dict[str, np.ndarray]) -> Row:
 def main() -> None:
     """Runs the benchmark."""
     options: argparse.Namespace = make_parser("any_arm", __doc__, arms=KINDS, demonstrations=8, random=64).parse_args()
-    config = EnvConfig(name="any_arm")
+    config = env_config("any_arm")
     held_out = training_and_held_out(config)[1].select(slice(0, options.demonstrations))
     panda = arm_arrays(build_arm(ArmConfig()))
     env = AnyArmEnv(config, lock_sampler(panda, lock_masks(MAX_JOINTS - 1, 1)), held_out)

@@ -42,7 +42,7 @@ from mimic.retargeting.segment_alignment import Landmarks, align_segments
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.pose_mapper.model import MapperModel
-from mimic.trainers.pose_mapper.training import train
+from mimic.trainers.pose_mapper.training import mapper_objective, train
 
 _POSES = 64  # of a clip, for the effect of the trunk
 _SPEED = 15.0  # rad/s, of a joint: retargeting passes from one minimum to another within it
@@ -114,7 +114,8 @@ def mapped(case: Case) -> np.ndarray:
     poses = jnp.asarray(case.qpos[np.resize(shuffled, settings.samples)], jnp.float32)
     with tempfile.TemporaryDirectory() as folder:
         _, params = train(
-            model,
+            mapper_objective(model),
+            settings,
             lambda: (poses, poses[: settings.validation_poses]),
             Path(folder),
             seed=0,

@@ -28,6 +28,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "discounting": 0.8,
         "entropy_cost": 0.01,
         "final_entropy_cost": 1.0,
+        "network": "mlp",
         "hidden_layers": [128, 128],
         "crossovers": 0,
         "evaluations": 10,
@@ -45,11 +46,24 @@ PRESETS: dict[str, dict[str, Any]] = {
         "discounting": 0.95,
         "entropy_cost": 0.2,
         "final_entropy_cost": 0.05,
+        "network": "mlp",
         "hidden_layers": [512, 256],
         "crossovers": 2000,
         "evaluations": 8,
     },
 }
+# Where the learner is drawn for each episode, an untrained policy is a good controller already: small steps, without a
+# reward for noise, and a long horizon, because it pays off late to move to another minimum of the metric.
+_OF_DRAWN_ARMS = {
+    "network": "joints",
+    "learning_rate": 1e-4,
+    "final_learning_rate": 0.1,
+    "discounting": 0.97,
+    "entropy_cost": 0.0,
+    "final_entropy_cost": 1.0,
+}
+_ONE_ARM, _DRAWN_ARMS = ("cpu", "gpu"), ("any_arm_cpu", "any_arm")  # presets, in the order of the backends cpu and gpu
+PRESETS |= {name: {**PRESETS[base], **_OF_DRAWN_ARMS} for name, base in zip(_DRAWN_ARMS, _ONE_ARM, strict=True)}
 # Factor on the number of evaluations with a target gap, so that training ends soon after the gap is reached: an
 # evaluation takes less time than the steps between two evaluations.
 _TARGET_GAP_EVALUATIONS = 5
@@ -87,7 +101,8 @@ class PPOConfig(TrainerConfig):
 
     Attributes:
       name: "ppo".
-      preset: "cpu", "gpu", or "auto", which follows JAX's backend.
+      preset: "cpu" or "gpu", where the learner is drawn for each episode "any_arm_cpu" or "any_arm", or "auto", which
+        follows JAX's backend.
       num_timesteps: environment steps of the training, rounded up to whole training epochs; a training epoch is the
         training between two evaluations.
       num_envs: number of arms that are simulated in parallel.
@@ -140,7 +155,7 @@ class PPOConfig(TrainerConfig):
     clipping_epsilon: float = number(0.2, above=0.0, at_most=10.0)
     max_grad_norm: float = number(1.0, above=0.0, at_most=1e6)
     reward_scaling: float = number(10.0, above=0.0, at_most=1e6)  # its square is in the loss
-    network: str = "mlp"
+    network: str | None = None
     hidden_layers: list[int] | None = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     crossovers: int | None = number(None, at_least=0, at_most=100_000)
     timed_critic: bool = True
@@ -150,20 +165,24 @@ class PPOConfig(TrainerConfig):
     def __post_init__(self) -> None:
         check_choice("trainer.preset", self.preset, ("auto", *PRESETS))
         check_choice("trainer.name", self.name, ("ppo",))
-        check_choice("trainer.network", self.network, NETWORKS)
+        if self.network is not None:
+            check_choice("trainer.network", self.network, NETWORKS)
         check_ranges(self, "trainer.")
 
-    def resolve(self, backend: str = "cpu", devices: int = 1) -> "PPOSettings":
+    def resolve(self, backend: str = "cpu", devices: int = 1, *, drawn_arms: bool = False) -> "PPOSettings":
         """Returns the settings: every field has a value, and `preset` is never "auto".
 
         Args:
           backend: JAX's backend; it chooses the preset where that is "auto".
           devices: number of devices that environments and batches are distributed over.
+          drawn_arms: whether the environment draws its learner (`env.arms`).
 
         Raises:
-          ValueError: numbers out of range, or batch sizes that PPO cannot divide.
+          ValueError: numbers out of range, batch sizes that PPO cannot divide, or a network that the environment does
+            not have the observation for.
         """
-        name = self.preset if self.preset != "auto" else "cpu" if backend == "cpu" else "gpu"
+        presets = _DRAWN_ARMS if drawn_arms else _ONE_ARM
+        name = self.preset if self.preset != "auto" else presets[backend != "cpu"]
         preset = PRESETS[name]
         if self.target_gap > 0:
             preset = {**preset, "evaluations": _TARGET_GAP_EVALUATIONS * preset["evaluations"]}
@@ -172,6 +191,11 @@ class PPOConfig(TrainerConfig):
             fields["final_discounting"] = fields["discounting"]
         settings = PPOSettings(**{**fields, "preset": name})
         settings.check(devices)
+        if settings.network == "joints" and not drawn_arms:
+            raise ValueError(
+                f"trainer: expected preset={' or '.join(_ONE_ARM)} and network=mlp for one learner, got preset={name} "
+                f"and network={settings.network}; network=joints is for a learner that is drawn (env.arms)"
+            )
         return settings
 
 
@@ -191,6 +215,7 @@ class PPOSettings(PPOConfig):
     final_discounting: float = MISSING
     entropy_cost: float = MISSING
     final_entropy_cost: float = MISSING
+    network: str = MISSING
     hidden_layers: list[int] = MISSING
     crossovers: int = MISSING
     evaluations: int = MISSING
@@ -575,3 +600,20 @@ class TrainConfig:
     def loggers(self) -> list[str]:
         """The names in `logger` as a list."""
         return [self.logger] if isinstance(self.logger, str) else list(map(str, self.logger or ()))
+
+    def resolved_trainer(self, backend: str = "cpu", devices: int = 1) -> TrainerConfig:
+        """The trainer's settings for this environment, with every field that applies filled in.
+
+        Args:
+          backend: JAX's backend; it chooses the preset where that is "auto".
+          devices: number of devices.
+
+        Raises:
+          ValueError: a value out of range, or one that does not apply to the environment.
+        """
+        drawn_arms = self.env.arms.are_drawn
+        if isinstance(self.trainer, PPOConfig):
+            return self.trainer.resolve(backend, devices, drawn_arms=drawn_arms)
+        if isinstance(self.trainer, PoseMapperConfig) and drawn_arms:
+            return self.trainer.resolve_any_arm(backend)
+        return self.trainer.resolve()

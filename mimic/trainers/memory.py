@@ -49,7 +49,8 @@ def _demonstration_bytes(config: TrainConfig, expert: Embodiment) -> dict[str, f
 
 def _ppo_bytes(config: TrainConfig, trainer: PPOConfig, expert: Embodiment, learner: Embodiment) -> dict[str, float]:
     """Networks; observations of a batch and of the environments; hidden units of a minibatch."""
-    settings = trainer.resolve(jax.default_backend(), jax.device_count())
+    drawn_arms = config.env.arms.are_drawn
+    settings = trainer.resolve(jax.default_backend(), jax.device_count(), drawn_arms=drawn_arms)
     observation = 12 * (learner.num_links + (config.env.preview + 1) * expert.num_links)
     widths = [observation, *settings.hidden_layers, 1]
     units = float(settings.batch_size * settings.unroll_length * sum(settings.hidden_layers))
