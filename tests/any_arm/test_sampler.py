@@ -43,17 +43,50 @@ def test_locked_variants_are_drawn_alike(panda):
 
 
 def test_a_limited_sampler_draws_that_many_arms():
-    draw = jax.vmap(sampler.limited_sampler(sampler.random_arm, 5))
+    draw = jax.jit(jax.vmap(sampler.limited_sampler(sampler.random_arm, 5)))
     lengths = np.asarray(draw(jax.random.split(jax.random.PRNGKey(2), 200)).chain_length)
     assert len(np.unique(lengths)) == 5
 
 
 def test_a_mixture_draws_from_each_sampler(panda):
     locked = sampler.lock_sampler(panda, sampler.lock_masks(7, 1))
-    draw = jax.vmap(sampler.mixed_sampler([locked, sampler.random_arm], [0.25, 0.75]))
+    draw = jax.jit(jax.vmap(sampler.mixed_sampler([locked, sampler.random_arm], [0.25, 0.75])))
     lengths = np.asarray(draw(jax.random.split(jax.random.PRNGKey(3), 400)).chain_length)
     share = np.isclose(lengths, panda.chain_length, rtol=1e-6).mean()
     assert 0.15 < share < 0.35  # five deviations of 0.02
+
+
+@pytest.fixture(scope="module")
+def perturbed(panda):
+    """Pandas of 1.2 times the size and 1.5 times the mass, with the drives of the model."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sampler, "_SIZE", (1.2, 1.2))
+        patch.setattr(sampler, "_MASS", (1.5, 1.5))
+        patch.setattr(sampler, "_DRIVES", ((1.0, 1.0),) * 3)
+        return jax.jit(jax.vmap(sampler.perturbed_sampler([panda])))(jax.random.split(jax.random.PRNGKey(5), 40))
+
+
+def test_perturbed_arms_have_the_same_shape_about_the_vertical(panda, perturbed):
+    """Link states are relative to the chain length; only the base rotates."""
+    np.testing.assert_allclose(perturbed.chain_length, 1.2 * panda.chain_length, rtol=1e-5)
+    qpos = jnp.asarray([0.3, -0.5, 0.7, -1.2, 0.4, 1.1, -0.6, 0.0])
+    own, theirs = link_states(panda, qpos), jax.vmap(lambda arm: link_states(arm, qpos))(perturbed)
+    for part in ("position", "direction"):
+        vectors, expected = np.asarray(getattr(theirs, part)), np.asarray(getattr(own, part))
+        np.testing.assert_allclose(vectors[..., 2], np.tile(expected[:, 2], (40, 1)), atol=1e-5)
+        gram = np.einsum("alx,amx->alm", vectors, vectors)
+        np.testing.assert_allclose(gram, np.tile(expected @ expected.T, (40, 1, 1)), atol=1e-5)
+
+
+def test_perturbed_inertia_is_that_of_scaled_bodies(panda, perturbed):
+    """Times the mass and the square of the size, without the rotors; three in ten arms have a joint locked."""
+    qpos = jnp.asarray([0.3, -0.5, 0.7, -1.2, 0.4, 1.1, -0.6, 0.0])
+    whole = np.asarray(perturbed.is_free).sum(axis=1) == 7
+    assert 0.5 < whole.mean() < 0.95 and np.asarray(perturbed.is_free).sum(axis=1).min() == 6
+    matrices = np.asarray(jax.vmap(lambda arm: inertia_matrix(arm, qpos))(perturbed))[whole][:, :7, :7]
+    own = np.asarray(inertia_matrix(panda, qpos))[:7, :7] - np.diag(panda.armature[:7])
+    expected = 1.5 * 1.2**2 * own + np.diag(panda.armature[:7])
+    np.testing.assert_allclose(matrices, np.tile(expected, (len(matrices), 1, 1)), rtol=1e-4, atol=1e-4)
 
 
 def test_random_arms_are_chains_of_connected_links(arms):

@@ -190,6 +190,7 @@ def test_a_run_starts_from_the_parameters_of_another_run(finished, tmp_path):
     assert other.returncode == 2 and "another network" in other.stderr
 
 
+@pytest.mark.slow
 def test_a_damaged_last_checkpoint_is_trained_again(finished, tmp_path):
     reference, _ = finished
     run_dir = shutil.copytree(reference, tmp_path / "run")
@@ -200,6 +201,7 @@ def test_a_damaged_last_checkpoint_is_trained_again(finished, tmp_path):
     assert "is damaged" in result.stderr and differences(reference, run_dir) == ""
 
 
+@pytest.mark.slow
 def test_an_old_run_is_resumed_from_its_parameters(finished, tmp_path):
     """Its checkpoints have neither state nor metrics. No row of metrics.csv is lost; a line says what starts anew."""
     run_dir = shutil.copytree(finished[0], tmp_path / "run")
@@ -213,6 +215,7 @@ def test_an_old_run_is_resumed_from_its_parameters(finished, tmp_path):
     assert rows_of(run_dir)[: len(before)] == before and len(rows_of(run_dir)) > len(before)
 
 
+@pytest.mark.slow
 def test_init_is_kept_by_a_run_without_a_checkpoint(finished, tmp_path):
     run_dir = tmp_path / "run"
     result = command("train", *TINY, "trainer.evaluations=1", f"init={finished[0]}", f"run_dir={run_dir}")

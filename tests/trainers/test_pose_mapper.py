@@ -95,6 +95,7 @@ def test_the_nearest_head_is_taken(trained):
     np.testing.assert_allclose(mapper(qpos), candidates[int(np.argmin(distances))], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_retargeted_motions_do_not_jump(trained, tmp_path):
     mapper = mimic.PoseMapper.load(trained[0])
     env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
@@ -188,6 +189,7 @@ def test_dropout_is_for_training_only():
     )  # none at 0
 
 
+@pytest.mark.slow
 def test_a_regularised_run_differs_in_training_and_repeats_its_report(tmp_path):
     plain, regularised = (
         train(tmp_path / name, **SHORT, **settings)
