@@ -18,7 +18,7 @@ def draw(results: dict[str, Any], out: Path) -> None:
     """Draws the arms with names as bars, and the random arms as points.
 
     Args:
-      results: rows by kind of arm, as `benchmarks.any_arm` writes them.
+      results: rows by kind of arm, as `benchmarks.any_arm` writes them, and `rows` with the gaps of policies of one arm.
       out: image file.
     """
     named = [row for kind in ("presets", "locks", "real") for row in results.get(kind, []) if row["span"] >= MIN_SPAN]
@@ -27,6 +27,11 @@ def draw(results: dict[str, Any], out: Path) -> None:
     places = np.arange(len(named))
     left.bar(places, [100 * row["gap"] for row in named], color="#9db8d9", label="whole episode")
     left.bar(places, [100 * row["late"] for row in named], width=0.4, color="#1f4e8c", label="second half")
+    specialists = {row["arm"]: 100 * row["gap"]["held_out"] for row in results.get("rows", [])}
+    shown = [place for place, row in zip(places, named, strict=True) if row["arm"] in specialists]
+    if shown:
+        gaps = [specialists[named[place]["arm"]] for place in shown]
+        left.plot(shown, gaps, "_", color="#c2410c", markersize=14, markeredgewidth=2, label="PPO of this arm alone")
     left.set_xticks(places, [row["arm"] for row in named], rotation=90, fontsize=8)
     left.set(ylabel="optimality gap [%]", title="Locked joints of the Panda, and real arms")
     left.legend(frameon=False)
