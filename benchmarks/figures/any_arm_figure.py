@@ -18,7 +18,7 @@ def draw(results: dict[str, Any], out: Path) -> None:
     """Draws the arms with names as bars, and the random arms as points.
 
     Args:
-      results: rows by kind of arm, as `benchmarks.any_arm` writes them, and `rows` with the gaps of policies of one arm.
+      results: rows by kind of arm, as `benchmarks.any_arm` writes them, and `rows`: gaps of policies of one arm.
       out: image file.
     """
     named = [row for kind in ("presets", "locks", "real") for row in results.get(kind, []) if row["span"] >= MIN_SPAN]
