@@ -1,6 +1,10 @@
 """Resolved configs of trainers."""
 
-from mimic.trainers.config import PRESETS, PPOConfig
+import pytest
+
+import mimic
+from mimic.trainers.config import PRESETS, PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.make import make_trainer
 
 
 def test_a_run_with_a_target_evaluates_more_often():
@@ -8,3 +12,19 @@ def test_a_run_with_a_target_evaluates_more_often():
     assert usual and targeted
     assert usual == PRESETS["cpu"]["evaluations"] and targeted > usual
     assert PPOConfig(target_gap=0.02, evaluations=3).resolve("cpu").evaluations == 3
+
+
+def test_presets_follow_the_backend_and_whether_the_learner_is_drawn():
+    config = PPOConfig()
+    names = [config.resolve(backend, drawn_arms=drawn).preset for drawn in (False, True) for backend in ("cpu", "gpu")]
+    assert names == ["cpu", "gpu", "any_arm_cpu", "any_arm"]
+    family = TrainConfig(mimic.env_config("panda_family"), PPOConfig())
+    assert family.resolved_trainer().network == "joints"  # type: ignore[attr-defined] - the settings of PPO
+    mapper = TrainConfig(mimic.env_config("panda_family"), PoseMapperConfig())
+    assert mapper.resolved_trainer("gpu").preset == "any_arm"
+
+
+def test_the_network_of_joints_needs_a_drawn_learner():
+    config = TrainConfig(mimic.env_config("planar4dof"), PPOConfig(network="joints"))
+    with pytest.raises(ValueError, match="trainer.network: expected mlp for one learner, got joints"):
+        make_trainer(config, None)

@@ -67,6 +67,11 @@ class PPOTrainer(Trainer):
         assert isinstance(config.trainer, PPOConfig)
         self._name, self._seed, self._shared = config.env.name, config.seed, shared
         self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count())
+        if self.settings.network != "mlp" and shared is None:
+            raise ValueError(
+                f"trainer.network: expected mlp for one learner, got {self.settings.network} (preset "
+                f"{self.settings.preset}), which is for a learner that is drawn for each episode (env.arms)"
+            )
         self.total_steps = self.settings.total_steps
         env, held_out = run_environment(config.env, run_dir)
         if unseen is not None:
