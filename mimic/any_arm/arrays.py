@@ -19,7 +19,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Float, Int
 
-from mimic.arms.arm import Arm, finite_velocity_limit
+from mimic.arms.arm import Arm, ArmConfig, build_arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment, snap_to_units
 from mimic.envs.dynamics import pseudo_inertia
 from mimic.metric.spatial import array_library
@@ -134,6 +134,26 @@ def arm_arrays(arm: Arm, free: Sequence[bool] | np.ndarray | None = None) -> Arm
         link_length=_padded(embodiment.link_lengths, MAX_LINKS),
     )
     return _with_empty_slots(arrays, joints, links)
+
+
+def masked_arrays(config: ArmConfig, limits: str, links: str) -> tuple[ArmArrays, tuple[str, ...]]:
+    """The arrays of an arm where joints that its config locks have slots, and the names of the joints in the slots.
+
+    Args:
+      config: of the arm.
+      limits: see `EnvConfig`.
+      links: see `MetricConfig`.
+
+    Raises:
+      ValueError: see `arm_arrays`.
+    """
+    whole = build_arm(dataclasses.replace(config, locked=None), limits, links)
+    locked = build_arm(config, limits, links).locked if config.locked else {}
+    names = whole.embodiment.joint_names
+    arrays = arm_arrays(whole, free=[name not in locked for name in names])
+    for i, name in enumerate(names):
+        arrays.home[i] = locked.get(name, arrays.home[i])
+    return arrays, names
 
 
 def stack_arms(arms: Sequence[ArmArrays]) -> ArmArrays:

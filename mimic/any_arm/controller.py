@@ -1,6 +1,5 @@
 """Controllers of one arm that know its model: towards the pose nearest to the next of the expert, or a policy."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,17 +9,16 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
+from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
 from mimic.any_arm.control import make_plan, max_speed, planned_torque
 from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals
 from mimic.any_arm.kinematics import check_metric, correspondence
 from mimic.any_arm.observation import observe
 from mimic.arms.arm import build_arm
 from mimic.envs.arm_state import arm_state
-from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import ImitationEnv
 
-Policy = Callable[[Float[Array, " observation"]], Float[Array, " joints"]]
+Policy = Callable[[Float[Array, " observation"]], Float[Array, " actions"]]
 
 
 class ControllerWithMemory(NamedTuple):
@@ -44,7 +42,7 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
     Args:
       env: the environment of the arm.
       policy: policy of any arm, trained on `AnyArmEnv`: from its observation to its action; the zero action where None.
-        With a policy, joints that the config locks keep their places, as in training, see `arrays_with_mask`.
+        With a policy, joints that the config locks keep their places, as in training, see `masked_arrays`.
 
     Raises:
       ValueError: a tree, an arm with more joints or links than `ArmArrays` has, or another metric than the default one.
@@ -52,7 +50,10 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
     config = env.config
     expert = build_arm(config.expert, config.limits, config.metric.links)
     weights = check_metric(config.metric)
-    arrays = arm_arrays(env.arm) if policy is None else arrays_with_mask(config)
+    if policy is None:
+        arrays = arm_arrays(env.arm)
+    else:
+        arrays, _ = masked_arrays(config.learner, config.limits, config.metric.links)
     with jax.ensure_compile_time_eval():
         expert_arm, arm = (_constants(x) for x in (arm_arrays(expert), arrays))
         matrix = np.asarray(correspondence(expert_arm, arm))
@@ -80,18 +81,6 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
         return torque[places] / env.torque_scale, chosen_goal(goals, action[MAX_JOINTS])
 
     return ControllerWithMemory(start, act)
-
-
-def arrays_with_mask(config: EnvConfig) -> ArmArrays:
-    """The learner as arrays where locked joints have places of their own, as `lock_joints` makes it.
-
-    Raises:
-      ValueError: a tree, or an arm with more joints, locked ones included, or links than `ArmArrays` has.
-    """
-    limits, links = config.limits, config.metric.links
-    whole = build_arm(dataclasses.replace(config.learner, locked=None), limits, links)
-    locked = build_arm(config.learner, limits, links).locked
-    return arm_arrays(whole, free=[name not in locked for name in whole.embodiment.joint_names])
 
 
 def _constants(arm: Any) -> Any:

@@ -1,7 +1,7 @@
 """The imitation environment whose learner is another arm in each episode; one compiled function for all of them.
 
 An action does not set torques: the same torque means something else on every arm. It changes accelerations. Those
-without it lead to the nearest pose, which Newton steps find from the arm's own pose, see `nearest_pose`. Inverse
+without it lead to one of the poses nearest to the expert's, see `next_goals`. Inverse
 dynamics turns accelerations into torques within the arm's limits, see `planned_torque`. So the zero action is
 already a controller of any arm, and a policy learns what it lacks: to leave local minima, and to look ahead.
 """
@@ -51,13 +51,15 @@ class AnyArmState(ArmState):
       arm: the learner.
       max_torque: [joints] maximum torque [N m], see `torque_scale`.
       hold: mean distance of holding the home pose, the unit of the reward.
-      goals: the local minima that the controller follows; from `with_plan`.
+      followed: the local minima at the last step, after the choice of the goal.
+      goals: the local minima that the controller follows, which `with_plan` derives from `followed`.
       plan: what the controller does in the next step; from `with_plan`.
     """
 
     arm: ArmArrays = None  # type: ignore[assignment] - fields after one with a default need one too
     max_torque: Float[Array, " joints"] = None  # type: ignore[assignment]
     hold: Float[Array, ""] = None  # type: ignore[assignment]
+    followed: Goals = None  # type: ignore[assignment]
     goals: Goals = None  # type: ignore[assignment]
     plan: Plan = None  # type: ignore[assignment]
 
@@ -67,7 +69,8 @@ class AnyArmEnv(Env):
 
     Reward: minus the embodiment distance to the expert after the step, divided by the mean distance of holding the
     home pose, so that all arms count alike. Action: for each joint slot a change of its acceleration in [-1, 1], see
-    `planned_torque`. Observation: see `mimic.any_arm.observation.observe`.
+    `planned_torque`, and last the preference for another goal, see `chosen_goal`. Observation: see
+    `mimic.any_arm.observation.observe`.
 
     Args:
       config: expert, metric, demonstrations and time steps; its learner is not used.
@@ -134,17 +137,18 @@ class AnyArmEnv(Env):
             arm=arm,
             max_torque=torque_scale(arm, self.config.action_scale, self.config.control_dt),
             hold=jnp.maximum(held.mean(), _MIN_HOLD),
+            followed=first_goals(arm.home),
             goals=first_goals(arm.home),
             plan=Plan(zeros, jnp.zeros((MAX_JOINTS, MAX_JOINTS)), zeros),
         )
         return self.with_plan(state)
 
     def with_plan(self, state: AnyArmState) -> AnyArmState:
-        """The state with its goals at the next step, and the plan to move to the first of them."""
+        """The state with its goals at the next step, and the plan to move to the first of them; again, the same."""
         expert = self.expert_at(state.demonstration, state.step + 1)
         matrix, dt = correspondence(self._expert_arrays, state.arm), self.config.control_dt
         problem = Problem(state.arm, self._weights, matrix, expert, dt)
-        goals = next_goals(problem, state.goals, state.qpos, state.key, state.step)
+        goals = next_goals(problem, state.followed, state.qpos, state.key, state.step)
         speed = max_speed(state.arm, self.config.limits)
         plan = make_plan(state.arm, state.qpos, state.qvel, goals.goal, speed, dt)
         return dataclasses.replace(state, goals=goals, plan=plan)
@@ -166,13 +170,19 @@ class AnyArmEnv(Env):
         """The observation of a state."""
         return self.observe(state)
 
-    def step(self, state: State, action: Float[Array, " joints"]) -> State:
-        """Advances an episode by one control step of constant torque."""
+    def step(self, state: State, action: Float[Array, " actions"]) -> State:
+        """Advances an episode by one control step of constant torque.
+
+        Raises:
+          ValueError: an action of another length.
+        """
+        if action.shape != (self.action_size,):
+            raise ValueError(f"action: expected shape ({self.action_size},), got {action.shape}")
         before = any_arm_state(state)
         torque = self.torque(before, action)
         qpos, qvel = self._advance(before.arm, before.qpos, before.qvel, torque, Load())
-        goals = chosen_goal(before.goals, action[MAX_JOINTS])
-        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1, goals=goals)
+        followed = chosen_goal(before.goals, action[MAX_JOINTS])
+        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1, followed=followed)
         expert = self.expert_at(after.demonstration, after.step)
         runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
         distance = self.metric_of(after.arm)(expert, link_states(after.arm, qpos, qvel))
@@ -185,7 +195,7 @@ class AnyArmEnv(Env):
         reward = -steps * distance / after.hold
         return state.replace(pipeline_state=after, obs=self.observe(after), reward=reward, done=done, metrics=metrics)
 
-    def torque(self, state: AnyArmState, action: Float[Array, " joints"]) -> Float[Array, " joints"]:
+    def torque(self, state: AnyArmState, action: Float[Array, " actions"]) -> Float[Array, " joints"]:
         """The torque of an action [N m]."""
         return planned_torque(state.arm, state.plan, action[:MAX_JOINTS], state.max_torque, self.config.control_dt)
 
@@ -199,7 +209,7 @@ class AnyArmEnv(Env):
             return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
 
         arms = jax.tree.map(where_done, new, arms)
-        # Once for all: XLA removes the targets and observations of `step`, which nothing uses.
+        # Once for all: XLA removes the plans and observations of `step` and `start`, which nothing uses.
         arms = jax.vmap(self.with_plan)(arms)
         return states.replace(pipeline_state=arms, obs=jax.vmap(self.observe)(arms))
 

@@ -75,6 +75,9 @@ def report_arms(config: EnvConfig) -> dict[str, dict[str, ArmArrays]]:
 
     Seen are the locked variants of the learner, and the models as they are. Unseen are the sets `unseen`, the models
     `evaluated`, and, where training draws random arms, others of these.
+
+    Raises:
+      ValueError: see `arm_sampler`, or two arms of one name.
     """
     arms = config.arms
     result: dict[str, dict[str, ArmArrays]] = {SEEN: {}, UNSEEN: {}}
@@ -88,7 +91,10 @@ def report_arms(config: EnvConfig) -> dict[str, dict[str, ArmArrays]]:
     for split, names in ((SEEN, arms.models), (UNSEEN, arms.evaluated)):
         for name in names:
             model = _model(config, name)
-            result[split][arm_name(model)] = _arrays(config, model)
+            short = arm_name(model)
+            if short in result[SEEN] or short in result[UNSEEN]:
+                raise ValueError(f"arms: expected models and evaluated of different names, got {short!r} twice")
+            result[split][short] = _arrays(config, model)
     if arms.random:
         drawn = jax.device_get(
             jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(_RANDOM_SEED), _RANDOM_ARMS))
@@ -134,6 +140,8 @@ def _masks(config: EnvConfig, base: ArmArrays) -> np.ndarray:
     for locked in config.arms.unseen_sets:
         if locked[-1] > joints:
             raise ValueError(f"arms.unseen: the learner has {joints} joints, got joint {locked[-1]}")
+        if len(set(locked)) >= joints:
+            raise ValueError(f"arms.unseen: expected at least one of the learner's {joints} joints to move, got none")
     none = np.zeros((1, MAX_JOINTS))
     if not config.arms.most_locked:
         return none

@@ -109,9 +109,8 @@ def next_goals(problem: Problem, goals: Goals, qpos: Float[Array, " joints"], ke
     poses = jnp.concatenate([goals.others, _random_poses(problem.arm, key, step), goals.goal.qpos[None]])
     # One function for all of them compiles several times faster than one for each kind.
     near = jax.vmap(lambda pose: problem.nearest(pose, NEWTON_STEPS))(poses)
-    goal, others = jax.tree.map(lambda x: x[-1], near), jax.tree.map(lambda x: x[:-1], near)
-    others = others._replace(qpos=_without_revolutions(problem.arm, others.qpos, qpos))
-    poses = jnp.concatenate([others.qpos, goal.qpos[None]])
+    near = near._replace(qpos=_without_revolutions(problem.arm, near.qpos, qpos))
+    goal, others, poses = jax.tree.map(lambda x: x[-1], near), jax.tree.map(lambda x: x[:-1], near), near.qpos
     estimate, distance = jax.vmap(lambda pose: _estimates(problem, qpos, pose))(poses)
     differences = jnp.max(jnp.abs(poses[:, None] - poses) * problem.arm.is_free, axis=-1)
     is_goal = differences[:-1, -1] < _SAME

@@ -57,7 +57,7 @@ def lock_masks(joints: int, most: int, excluded: Collection[Sequence[int]] = ())
         for locked in itertools.combinations(range(joints), count)
         if frozenset(locked) not in left_out
     ]
-    return np.array([np.isin(np.arange(MAX_JOINTS), locked) for locked in sets], float)
+    return np.array([np.isin(np.arange(MAX_JOINTS), locked) for locked in sets], float).reshape(-1, MAX_JOINTS)
 
 
 def lock_sampler(arm: ArmArrays, masks: Float[np.ndarray, "variants 8"]) -> Sampler:

@@ -12,7 +12,7 @@ from mimic.arms.embodiment import LIMITS
 from mimic.arms.named_arms import is_arm_name
 from mimic.config import check_choice
 from mimic.envs import env_config, environments
-from mimic.envs.config import PHYSICS, EnvConfig
+from mimic.envs.config import PHYSICS, ArmsConfig, EnvConfig
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.ranges import check_ranges, number, seed_number
@@ -376,9 +376,10 @@ class ViewConfig:
           ValueError: an arm does not exist.
         """
         arms = {role: _arm(role, name) for role in ("expert", "learner") if (name := getattr(self, role))}
-        if not arms:
+        if "learner" not in arms:
             self.env.check_one_learner()
-        return dataclasses.replace(self.env, **arms)
+        env = dataclasses.replace(self.env, **arms)
+        return dataclasses.replace(env, arms=ArmsConfig()) if "learner" in arms else env
 
 
 def _without_none(values: dict[str, Any]) -> dict[str, Any]:

@@ -41,7 +41,7 @@ from mimic.trainers.fine_tuning import fine_tuned
 from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, run_schema, save_config
 from mimic.trainers.run_correspondence import save_correspondence
-from mimic.trainers.run_models import save_models
+from mimic.trainers.run_models import own_arms, save_models
 from mimic.trainers.run_plugins import save_plugins
 from mimic.trainers.trainer import Params, Trainer
 
@@ -90,6 +90,7 @@ def prepare_training(
     check_loggers(config.loggers)
     run_dir = resumed_dir or (new_run_dir(config) if is_first else Path())
     lock = RunLock(run_dir) if resumed_dir and is_first else None  # before its checkpoints are read
+    own_arms(config.env)  # rejects names that the run directory could not keep
     with stopwatch.stage("build"):
         trainer = make_trainer(config, resumed_dir)
         restored = _start(config, resumed_dir, trainer, any(key.startswith("trainer.") for key in overrides))

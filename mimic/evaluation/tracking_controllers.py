@@ -27,8 +27,8 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, float]:
     - "pd": proportional-derivative feedback of each joint along the poses of `imitate_trajectory`, scaled by the
       joint's effective inertia in the home pose. The controller has no other model of the dynamics.
     - "computed_torque": the same feedback through the arm's exact inverse dynamics, with feed-forward.
-    - "nearest_pose": inverse dynamics to the pose nearest to the expert's at the next step, found in each step from the
-      arm's own pose. In contrast to "pd" and "computed_torque" it does not know the motion in advance, see
+    - "nearest_pose": inverse dynamics to one of the poses nearest to the expert's at the next step, which are followed
+      from step to step. In contrast to "pd" and "computed_torque" it does not know the motion in advance, see
       `nearest_pose_controller`.
 
     "pd" and "computed_torque" are critically damped. Of several frequencies, the one with the smallest distance on the

@@ -122,7 +122,7 @@ class PPOConfig(TrainerConfig):
       max_grad_norm: gradients are clipped to this norm, see `updated` in mimic/trainers/ppo/updates.py.
       reward_scaling: factor on the reward inside PPO.
       network: "mlp"; or "joints", a policy with a token for each joint, for environments with a drawn arm.
-      hidden_layers: widths of the hidden layers of the policy and value networks.
+      hidden_layers: widths of the hidden layers of the policy and value networks; with network "joints" of the latter.
       crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
         `crossovers` in mimic/envs/demonstrations.py.
       timed_critic: whether the value network also observes the elapsed fraction of the episode, on which the return

@@ -7,7 +7,7 @@ from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic import compat
+from mimic.any_arm.arrays import masked_arrays
 from mimic.any_arm.family import arm_name
 from mimic.arms.arm import ArmConfig
 from mimic.config import to_dict, typed
@@ -32,6 +32,8 @@ def fine_tuned(requested: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
     run = load_config(Path(requested.init).expanduser())
     if not run.env.arms.are_drawn:
         raise ValueError(f"learner: expected init=DIR of a run of many arms, got one of env={run.env.name}")
+    if run.trainer.name != "ppo":
+        raise ValueError(f"learner: expected init=DIR of a run of trainer=ppo, got one of {run.trainer.name}")
     own_keys = tuple(f"{key}{end}" for key in _OWN for end in "=.")
     changes = [text for text in overrides if not text.startswith(own_keys) and text != "trainer=ppo"]
     for text in changes:
@@ -69,13 +71,10 @@ def with_one_learner(env: EnvConfig, model: str, locked: Sequence[int | str]) ->
     Raises:
       ValueError: there is no such arm, or a policy of many arms cannot move it.
     """
-    compat.import_mjx()
-    from mimic.any_arm.controller import arrays_with_mask  # imports brax
-
     learner = dataclasses.replace(arm_of(env, model), locked=list(locked) or None)
     label = "-".join([env.name, arm_name(learner), *(["locked", *map(str, locked)] if locked else [])])
     config = dataclasses.replace(env, name=label, arms=ArmsConfig(), learner=learner, physics="auto")
-    arrays_with_mask(config)
+    masked_arrays(learner, config.limits, config.metric.links)
     return config
 
 

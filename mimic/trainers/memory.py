@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import jax
 
 from mimic.any_arm.arrays import MAX_LINKS
+from mimic.any_arm.observation import observation_size
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import ArmsConfig
 from mimic.memory import check_memory, device_memory, host_memory
@@ -23,7 +24,7 @@ def check_training_memory(config: TrainConfig) -> None:
     Raises:
       ValueError: also where the settings or the arms are invalid.
     """
-    # Where the learner is drawn, the whole one counts: the observation of any arm is at least as long.
+    # Where the learner is drawn, the whole one counts.
     env = dataclasses.replace(config.env, arms=ArmsConfig())
     expert, learner = env.build_arms().embodiments
     if isinstance(config.trainer, PPOConfig):
@@ -52,11 +53,14 @@ def _ppo_bytes(config: TrainConfig, trainer: PPOConfig, expert: Embodiment, lear
     drawn_arms = config.env.arms.are_drawn
     settings = trainer.resolve(jax.default_backend(), jax.device_count(), drawn_arms=drawn_arms)
     observation = 12 * (learner.num_links + (config.env.preview + 1) * expert.num_links)
+    if drawn_arms:
+        observation = observation_size(expert.num_links)
+    networks = 1 if settings.network == "joints" else _NETWORKS  # with hidden layers; the other one is small
     widths = [observation, *settings.hidden_layers, 1]
     units = float(settings.batch_size * settings.unroll_length * sum(settings.hidden_layers))
     return {
-        "trainer.hidden_layers": _network_bytes(widths) * _NETWORKS,
-        "trainer.batch_size, trainer.unroll_length, trainer.hidden_layers": units * _NETWORKS * _FLOAT32,
+        "trainer.hidden_layers": _network_bytes(widths) * networks,
+        "trainer.batch_size, trainer.unroll_length, trainer.hidden_layers": units * networks * _FLOAT32,
         "trainer.batch_size, trainer.num_minibatches, trainer.unroll_length": (
             float(settings.steps_per_batch) * observation * _FLOAT32
         ),

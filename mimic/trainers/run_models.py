@@ -31,7 +31,7 @@ def save_models(run_dir: Path, env: EnvConfig) -> None:
     Raises:
       ValueError: a file that cannot be read any more.
     """
-    arms = _own_arms(env)
+    arms = own_arms(env)
     folder = run_dir / MODELS
     if not arms or any(Path(arm.model).is_relative_to(os.path.abspath(folder)) for arm in arms.values()):
         return
@@ -60,7 +60,7 @@ def with_saved_models(run_dir: Path, env: EnvConfig) -> EnvConfig:
     Raises:
       ValueError: the folder was changed.
     """
-    arms, folder = _own_arms(env), run_dir / MODELS
+    arms, folder = own_arms(env), run_dir / MODELS
     if not arms or not folder.exists():
         return env
     record = _read_record(folder)
@@ -76,7 +76,7 @@ def with_saved_models(run_dir: Path, env: EnvConfig) -> EnvConfig:
 
 def with_original_models(env: EnvConfig) -> EnvConfig:
     """The inverse of `with_saved_models`: with the files that the run started from."""
-    return _with_models(env, {role: _original(arm, role).model for role, arm in _own_arms(env).items()})
+    return _with_models(env, {role: _original(arm, role).model for role, arm in own_arms(env).items()})
 
 
 def _with_models(env: EnvConfig, models: Mapping[str, str]) -> EnvConfig:
@@ -98,15 +98,17 @@ def _original(arm: ArmConfig, role: str) -> ArmConfig:
 _ADVICE = "copy the run again, or remove this folder to use the files that the run's config names"
 
 
-def _own_arms(env: EnvConfig) -> dict[str, ArmConfig]:
+def own_arms(env: EnvConfig) -> dict[str, ArmConfig]:
     """The arms that are read from files by their role: expert, learner, or the folder of one of many arms.
 
     Raises:
-      ValueError: several files of one name among the many.
+      ValueError: several files of one name among the many, or one that is named like a role.
     """
     arms = {role: arm for role in _ROLES if (arm := getattr(env, role)).is_file}
     for name in (name for key in _LISTS for name in getattr(env.arms, key)):
         arm, role = ArmConfig(model=name), _role(name)
+        if arm.is_file and role in _ROLES:
+            raise ValueError(f"arms: expected a file of another name than expert and learner, got {arm.model!r}")
         if arm.is_file and arms.setdefault(role, arm).model != arm.model:
             raise ValueError(f"arms: expected files of different names, got {arms[role].model!r} and {arm.model!r}")
     return arms

@@ -60,7 +60,7 @@ def zero_actions(env, four_joints):
         start = env.begin(env.start_of(four_joints, demonstration, jax.random.PRNGKey(0)))
 
         def step(state, _):
-            state = env.step(state, jnp.zeros(MAX_JOINTS))
+            state = env.step(state, jnp.zeros(env.action_size))
             return state, state
 
         return jax.lax.scan(step, start, None, length=HORIZON)[1]
@@ -125,7 +125,7 @@ def test_observations_have_their_size_and_are_bounded(env, zero_actions):
 def test_a_runaway_ends_and_is_charged_for_all_remaining_steps(env, four_joints):
     start = env.start_of(four_joints, 0, jax.random.PRNGKey(0))
     state = env.begin(start.replace(qvel=jnp.full(MAX_JOINTS, 1e4) * four_joints.is_free))
-    after = jax.jit(env.step)(state, jnp.zeros(MAX_JOINTS))
+    after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
     assert after.done == 1 and after.metrics["runaway"] == 1
     assert float(after.reward) == pytest.approx(-3 * HORIZON)
 
@@ -142,7 +142,7 @@ def test_each_episode_has_a_new_arm(config, motions, panda):
     assert len(np.unique(steps)) > 3
     for _ in range(HORIZON):
         before, was_free = any_arm_state(state), drawn[-1]
-        state = step(state, jnp.zeros((8, MAX_JOINTS)))
+        state = step(state, jnp.zeros((8, env.action_size)))
         drawn.append(np.asarray(any_arm_state(state).arm.is_free))
         restarted = np.asarray(state.done) > 0
         np.testing.assert_array_equal(restarted, np.asarray(before.step) + 1 == HORIZON)
@@ -157,8 +157,9 @@ def test_actions_change_the_acceleration(env, four_joints):
     """By two velocity limits per control step and unit of the action, half of it as angle; locked joints stay."""
     state = env.begin(env.start_of(four_joints, 0, jax.random.PRNGKey(0)))
     step, size = jax.jit(env.step), 0.05
-    still = any_arm_state(step(state, jnp.zeros(MAX_JOINTS))).qpos
-    moved = np.stack([any_arm_state(step(state, action)).qpos - still for action in size * jnp.eye(MAX_JOINTS)])
+    still = any_arm_state(step(state, jnp.zeros(env.action_size))).qpos
+    actions = size * jnp.eye(MAX_JOINTS, env.action_size)
+    moved = np.stack([any_arm_state(step(state, action)).qpos - still for action in actions])
     free = [0, 1, 3, 4]
     expected = size * 0.1 * np.asarray(four_joints.velocity_limit)
     # The inertia at the middle of the step is that of the whole step to some per cent.
@@ -169,7 +170,7 @@ def test_actions_change_the_acceleration(env, four_joints):
 @pytest.mark.slow
 def test_a_policy_moves_one_arm_as_it_moves_it_among_many(env, evaluator, four_joints):
     """The policy is a random linear function of the observation; locked joints keep their places. 1e-3 as above."""
-    weights = 0.1 * jax.random.normal(jax.random.PRNGKey(3), (MAX_JOINTS, env.observation_size))
+    weights = 0.1 * jax.random.normal(jax.random.PRNGKey(3), (env.action_size, env.observation_size))
 
     def policy(observation):
         return jnp.tanh(weights @ observation)
@@ -190,3 +191,35 @@ def test_a_policy_moves_one_arm_as_it_moves_it_among_many(env, evaluator, four_j
     alone = jax.jit(lambda: evaluator.rollout(controller))()
     assert np.abs(np.asarray(of_many)).max() > 0.1
     np.testing.assert_allclose(of_many[:, :, [0, 1, 3, 4]], np.asarray(alone.qpos)[:COUNT], rtol=0, atol=1e-3)
+
+
+def test_an_action_of_another_length_is_rejected(env, four_joints):
+    state = env.begin(env.start_of(four_joints, 0, jax.random.PRNGKey(0)))
+    with pytest.raises(ValueError, match=r"action: expected shape \(9,\), got \(8,\)"):
+        env.step(state, jnp.zeros(MAX_JOINTS))
+
+
+def test_arms_that_are_not_done_go_on_as_without_a_restart(env, zero_actions):
+    """Training restarts in each step the arms that are done; the others must be those of an evaluation."""
+    some = jax.tree.map(lambda x: x[:, 3], zero_actions)
+    after = jax.jit(env.restart_done)(some)
+    before, now = any_arm_state(some), any_arm_state(after)
+    np.testing.assert_allclose(after.obs, some.obs, atol=1e-4)
+    np.testing.assert_allclose(now.goals.goal.qpos, before.goals.goal.qpos, atol=1e-4)
+    np.testing.assert_allclose(now.goals.others, before.goals.others, atol=1e-4)
+
+
+def test_observations_know_nothing_of_the_expert_after_the_next_step(env, four_joints):
+    def observed(env):
+        start = env.at_step(env.start_of(four_joints, 0, jax.random.PRNGKey(0)), 5)
+        return env.observe(start), env.torque(start, jnp.zeros(env.action_size))
+
+    later = jax.tree.map(lambda x: x.at[:, 7:].add(1.0), env.expert_states)
+    next_step = jax.tree.map(lambda x: x.at[:, 6].add(1.0), env.expert_states)
+    own, with_later, with_next = (
+        jax.jit(lambda env=env: observed(env))()
+        for env in (env, env.with_expert_states(later), env.with_expert_states(next_step))
+    )
+    for a, b in zip(own, with_later, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert np.abs(own[0] - with_next[0]).max() > 0.1

@@ -1,15 +1,18 @@
 """Environments whose learner is drawn for each episode: the arms of their report, and what they reject."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import pytest
 
 import mimic
 from mimic.any_arm.env import AnyArmEnv
-from mimic.any_arm.family import SEEN, UNSEEN, arm_name, report_arms
+from mimic.any_arm.family import SEEN, UNSEEN, arm_name, arm_sampler, report_arms
 from mimic.arms.arm import ArmConfig
+from mimic.arms.embodiment import panda_path
 from mimic.envs.wrappers import wrap_for_training
-from tests.helpers.untrained_family import COUNT, family
+from tests.helpers.untrained_family import family
 
 FAMILIES = "panda_family", "any_arm"
 SMALL = {"demonstrations": {"count": 2, "held_out": 1}, "horizon": 5}
@@ -40,7 +43,7 @@ def test_the_report_has_each_arm_once():
     assert list(arms[SEEN]) == ["whole", "locked 1", "locked 7"]
     assert list(arms[UNSEEN])[:5] == [f"locked {i}" for i in (2, 3, 4, 5, 6)]
     assert [int(arm.is_free.sum()) for arm in arms[SEEN].values()] == [7, 6, 6]
-    assert COUNT and all(name.startswith("random") for name in list(arms[UNSEEN])[5:])
+    assert list(arms[UNSEEN])[5:] == [f"random {i}" for i in range(16)]
 
 
 def test_arms_are_named_by_their_files(tmp_path):
@@ -72,3 +75,17 @@ def test_what_needs_one_learner_rejects_it():
     for function in (config.build_arms, config.check_one_learner, lambda: mimic.envs.make("panda_family")):
         with pytest.raises(ValueError, match="env: expected an environment of one learner, got 'panda_family', which"):
             function()
+
+
+def test_arms_that_cannot_be_reported_or_drawn_are_rejected(tmp_path):
+    files = [tmp_path / name / "arm.xml" for name in ("a", "b")]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text(Path(panda_path()).read_text())
+    twice = family(arms={"evaluated": [str(file) for file in files]})
+    with pytest.raises(ValueError, match="arms: expected models and evaluated of different names, got 'arm' twice"):
+        report_arms(twice)
+    with pytest.raises(ValueError, match="arms.unseen: expected at least one of the learner's 7 joints to move"):
+        arm_sampler(family(arms={"unseen": ["1+2+3+4+5+6+7"]}))
+    only_whole = arm_sampler(family(arms={"unseen": [str(i) for i in range(1, 8)]}))
+    assert only_whole(jax.random.PRNGKey(0)).is_free.sum() == 7

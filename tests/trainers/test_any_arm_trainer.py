@@ -10,7 +10,7 @@ import pytest
 import mimic
 from mimic.commands.fit import Run
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS
-from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.memory import check_training_memory
 from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
@@ -84,9 +84,7 @@ def test_status_rows_and_target(trainer):
     assert not trainer.good_enough(metrics_of(0.1))
 
 
-def test_pose_mappers_and_too_large_trainings_are_rejected(unchecked):
-    with pytest.raises(ValueError, match="env: expected an environment of one learner, got 'panda_family'"):
-        make_trainer(TrainConfig(family(), PoseMapperConfig()), None)
+def test_too_large_trainings_are_rejected(unchecked):
     too_many = dataclasses.replace(family().demonstrations, count=100_000)
     config = dataclasses.replace(family(), horizon=50, demonstrations=too_many)
     check_training_memory(TrainConfig(family(), PPOConfig()))

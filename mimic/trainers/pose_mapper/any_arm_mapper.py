@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
+from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays, masked_arrays
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
@@ -157,10 +157,8 @@ class AnyArmMapper:
         whole = build_arm(dataclasses.replace(learner, locked=None), limits, links) if arm.locked else arm
         if max(whole.embodiment.num_joints - MAX_JOINTS, whole.embodiment.num_links - MAX_LINKS) > 0:
             return DescribedArm.without_locks(arm)  # it may have few enough without those that are locked
-        names = whole.embodiment.joint_names
-        is_free = np.array([name not in arm.locked for name in names])
-        arrays = arm_arrays(whole, is_free)
-        arrays.home[: len(names)][~is_free] = [arm.locked[name] for name in names if name in arm.locked]
+        arrays, names = masked_arrays(learner, limits, links)
+        is_free = np.asarray(arrays.is_free) > 0
         return DescribedArm(arm, arrays.astype(np.float32), np.flatnonzero(is_free), names)
 
     def to(self, learner: Arm | ArmConfig | str | os.PathLike[str]) -> PoseMapper:

@@ -182,12 +182,13 @@ def _optimiser(config: MapperSettings) -> optax.GradientTransformation:
     schedule = optax.warmup_cosine_decay_schedule(0.0, rate, warm_up, max(updates, warm_up + 1), final)
     if config.final_learning_rate == 1:
         schedule = optax.constant_schedule(rate)
-    adam = optax.adamw(schedule, b2=0.99, weight_decay=config.weight_decay, mask=_is_matrix)
+    adam = optax.adamw(schedule, b2=0.99, weight_decay=config.weight_decay, mask=_is_kernel)
     return optax.chain(optax.clip_by_global_norm(1.0), adam)
 
 
-def _is_matrix(params: Params) -> Any:
-    return jax.tree.map(lambda x: x.ndim > 1, params)
+def _is_kernel(params: Params) -> Any:
+    """By name: the biases of attention have two axes."""
+    return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key == "kernel", params)
 
 
 def _training_epoch(

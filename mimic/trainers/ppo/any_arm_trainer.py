@@ -183,7 +183,7 @@ class AnyArmPPOTrainer(Trainer):
 
     def good_enough(self, metrics: Metrics) -> bool:
         """Whether the target gap is reached, as the mean over the arms seen in training."""
-        return metrics["optimality_gap"].get("train", math.inf) <= self.settings.target_gap
+        return 0 < self.settings.target_gap >= metrics["optimality_gap"].get("train", math.inf)
 
     def details(self, outcome: ArmsOutcome, controller: str = "policy") -> Metrics:
         """Physics, similarity of the motions compared with the baselines, and a row for each arm."""

@@ -2,8 +2,10 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.training import networks as brax_networks
@@ -20,6 +22,7 @@ from mimic.trainers.networks import Transformer
 # Standard deviations of an untrained policy, whose mean is the zero action: the controller is good from the start, and
 # noise of the usual size would hide it.
 _JOINT_STD, _PREFERENCE_STD = 0.05, 0.03
+_MIN_DEVIATION, _MAX_NORMALIZED = 0.1, 10.0  # of an observation of any arm, whose entries are of the order of 1
 
 
 def make_networks(config: PPOSettings, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
@@ -27,19 +30,36 @@ def make_networks(config: PPOSettings, observation_size: int, action_size: int) 
     hidden = tuple(config.hidden_layers or ())
     layers = {"policy_hidden_layer_sizes": hidden, "value_hidden_layer_sizes": hidden}
     make = functools.partial(ppo_networks.make_ppo_networks, action_size=action_size, **layers)
-    networks = make(observation_size, preprocess_observations_fn=running_statistics.normalize)
+    normalize = _normalize_bounded if config.network == "joints" else running_statistics.normalize
+    networks = make(observation_size, preprocess_observations_fn=normalize)
     if config.timed_critic:
-        timed = make(observation_size + 1, preprocess_observations_fn=_normalize_all_but_last)
+        timed = make(observation_size + 1, preprocess_observations_fn=_all_but_last(normalize))
         networks = dataclasses.replace(networks, value_network=timed.value_network)
     if config.network == "joints":
         networks = dataclasses.replace(networks, policy_network=_joint_policy(observation_size))
     return networks
 
 
-def _normalize_all_but_last(observation: Array, statistics: running_statistics.RunningStatisticsState) -> Array:
-    """The observation with normalised entries, except the last one: the elapsed fraction of the episode."""
-    normalized = running_statistics.normalize(observation[..., :-1], statistics)
-    return jnp.concatenate([normalized, observation[..., -1:]], axis=-1)
+Normalize = Callable[[Array, running_statistics.RunningStatisticsState], Array]
+
+
+def _all_but_last(normalize: Normalize) -> Normalize:
+    """Normalises all entries of an observation but the last one: the elapsed fraction of the episode."""
+
+    def normalized(observation: Array, statistics: running_statistics.RunningStatisticsState) -> Array:
+        return jnp.concatenate([normalize(observation[..., :-1], statistics), observation[..., -1:]], axis=-1)
+
+    return normalized
+
+
+def _normalize_bounded(observation: Array, statistics: running_statistics.RunningStatisticsState) -> Array:
+    """The normalised observation of any arm, in [-10, 10].
+
+    What has been the same on all arms of a training, such as an empty slot, has a deviation of 0. An arm with another
+    value there would otherwise have an entry of a million.
+    """
+    std = jax.tree.map(lambda x: jnp.maximum(x, _MIN_DEVIATION), statistics.std)
+    return running_statistics.normalize(observation, statistics.replace(std=std), max_abs_value=_MAX_NORMALIZED)
 
 
 def _joint_policy(observation_size: int) -> brax_networks.FeedForwardNetwork:
@@ -51,7 +71,7 @@ def _joint_policy(observation_size: int) -> brax_networks.FeedForwardNetwork:
 
     def apply(statistics: Any, params: Any, observation: Array) -> Any:
         is_free = observation[..., : JOINT_FEATURES * MAX_JOINTS : JOINT_FEATURES]
-        return module.apply(params, running_statistics.normalize(observation, statistics), is_free)
+        return module.apply(params, _normalize_bounded(observation, statistics), is_free)
 
     return brax_networks.FeedForwardNetwork(init=init, apply=apply)
 
