@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, stack_arms
+from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, masked_arrays, stack_arms
 from mimic.any_arm.dynamics import torque_of_arm
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.arm import ArmConfig, build_arm
@@ -131,3 +131,20 @@ def test_too_many_joints_are_rejected():
 
 def test_as_many_joints_as_slots_are_accepted():
     assert arm_arrays(build_arm(ArmConfig(model="planar", link_lengths=[0.1] * MAX_JOINTS))).is_free.all()
+
+
+def test_locked_joints_of_a_config_keep_their_slots_and_angles():
+    """Names, numbers, and angles other than home; the links are those of the arm without these joints."""
+    config = ArmConfig(locked={"joint2": 0.4, "joint6": -0.3})
+    arrays, names = masked_arrays(config, "none", "kept")
+    assert names == tuple(f"joint{i}" for i in range(1, 8))
+    np.testing.assert_array_equal(arrays.is_free, [1, 0, 1, 1, 1, 0, 1, 0])
+    np.testing.assert_allclose(arrays.home[[1, 5]], [0.4, -0.3])
+    fewer = arm_arrays(build_arm(config))
+    motion = np.array([0.3, -0.5, 0.7, -1.2, 0.4])
+    with_slots = arrays.home.copy()
+    with_slots[[0, 2, 3, 4, 6]] = motion
+    own, expected = link_states(arrays, with_slots), link_states(fewer, padded(motion))
+    assert own.direction is not None and expected.direction is not None
+    np.testing.assert_allclose(own.position, expected.position, atol=1e-6)
+    np.testing.assert_allclose(own.direction, expected.direction, atol=1e-6)
