@@ -19,7 +19,7 @@ COMMANDS = ("inspect", "render", "retarget", "train", "completion")
         ("mimic", []),
         ("mimic re", ["render ", "retarget "]),
         ("mimic completion z", ["zsh "]),
-        ("mimic train env=panda", ["env=panda3dof ", "env=panda4dof ", "env=panda7dof "]),
+        ("mimic train env=panda", ["env=panda3dof ", "env=panda4dof ", "env=panda7dof ", "env=panda_family "]),
         ("mimic train env", ["env.", "env="]),
         ("mimic train env.limi", ["env.limit_weight=", "env.limits="]),
         ("mimic train env.learner.lo", ["env.learner.locked="]),  # a list, whose entries are no keys

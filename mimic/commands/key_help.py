@@ -64,10 +64,13 @@ def _value(node: DictConfig, key: str) -> str:
     if value is None and any(key in preset for preset in presets.values()):
         if node["preset"] in presets:
             return _yaml(presets[node["preset"]].get(key))
-        values = {name: _yaml(preset[key]) for name, preset in presets.items() if key in preset}
-        if len(set(values.values())) > 1:
-            return ", ".join(f"{value} ({name})" for name, value in values.items())
-        return next(iter(values.values()))
+        names: dict[str, list[str]] = {}  # of the presets, by value
+        for name, preset in presets.items():
+            if key in preset:
+                names.setdefault(_yaml(preset[key]), []).append(name)
+        if len(names) > 1:
+            return ", ".join(f"{value} ({', '.join(some)})" for value, some in names.items())
+        return next(iter(names))
     return _yaml(value)
 
 

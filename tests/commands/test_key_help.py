@@ -41,7 +41,8 @@ def value(keys, key):
 
 def test_presets_are_shown_in_place_of_null(monkeypatch, capsys):
     keys = shown(monkeypatch, capsys, "train")
-    assert value(keys, "num_envs") == f"{PRESETS['cpu']['num_envs']} (cpu), {PRESETS['gpu']['num_envs']} (gpu)"
+    cpu, gpu = (PRESETS[name]["num_envs"] for name in ("cpu", "gpu"))
+    assert value(keys, "num_envs") == f"{cpu} (cpu, any_arm_cpu), {gpu} (gpu, any_arm)"
     assert value(keys, "unroll_length") == "10" and value(keys, "final_discounting") == "null"
     keys = shown(monkeypatch, capsys, "train", "trainer.preset=gpu", "trainer.crossovers=7")
     assert value(keys, "num_envs") == str(PRESETS["gpu"]["num_envs"]) and value(keys, "crossovers") == "7"
