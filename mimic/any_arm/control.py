@@ -89,7 +89,7 @@ class Plan(NamedTuple):
 
     Attributes:
       acceleration: [joints] of the joints, constant [rad/s^2].
-      inertia: [joints, joints] joint-space inertia [kg m^2].
+      inertia: [joints, joints] torques per unit of acceleration: inertia, and damping of half a step [kg m^2].
       bias: [joints] torques of zero acceleration [N m].
     """
 
@@ -114,7 +114,9 @@ def make_plan(
     dt = control_dt
     acceleration = tracking_acceleration(arm, qpos, qvel, targets, speed, dt)
     middle = qpos + 0.5 * dt * qvel + 0.125 * dt**2 * acceleration, qvel + 0.5 * dt * acceleration
-    return Plan(acceleration, *inertia_and_bias(arm, *middle))
+    inertia, bias = inertia_and_bias(arm, *middle)
+    drag = 0.5 * dt * arm.is_free * arm.damping  # torque at the middle of the step per unit of acceleration
+    return Plan(acceleration, inertia + jnp.diag(drag), bias - drag * acceleration)
 
 
 def planned_torque(
