@@ -15,6 +15,7 @@ from tests.helpers.repository import REPOSITORY
 # From the lowest up: a module may import its own layer and the layers before it.
 LAYERS = (
     ("compat", "compilation", "config", "config_files", "distribution", "memory", "npz", "ranges", "registry"),
+    ("control",),
     ("arms",),
     ("metric",),
     ("runs",),

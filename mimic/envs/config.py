@@ -6,8 +6,10 @@ from mimic import registry
 from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
 from mimic.config import check_choice
+from mimic.control.joint_control import MODES
 from mimic.envs.recording import KINDS
 from mimic.envs.start_poses import START_POSES
+from mimic.envs.world import WorldConfig
 from mimic.metric.config import MetricConfig
 from mimic.ranges import check_ranges, number
 
@@ -166,6 +168,9 @@ class EnvConfig:
       substeps: physics steps in a control step.
       physics: "mjx"; "fused": the same equations in one fused kernel, many times faster; or "auto": "fused" where it
         covers the learner exactly, otherwise "mjx", see `choose_physics` in mimic/envs/physics.py.
+      control: what an action is: "torque", which is constant in a control step (paper); or the target of an inner loop
+        at 1 kHz: "joint_position", "joint_velocity" or "joint_impedance", see `mimic.control`.
+      world: gravity, friction, load, sensors and delays.
       randomization: how the learner's dynamics differ from its model.
       preview: how many control steps ahead the learner also observes the expert; 0 is the paper.
       limit_weight: weight in the reward of joints near or beyond their range and velocity limit; only where `limits`
@@ -189,6 +194,8 @@ class EnvConfig:
     control_dt: float = number(0.1, at_least=1e-4, at_most=10.0)  # robots are controlled at 10 kHz at most
     substeps: int = number(10, at_least=1, at_most=1000)  # 0.1 ms for the default control step
     physics: str = AUTO
+    control: str = "torque"
+    world: WorldConfig = dataclasses.field(default_factory=WorldConfig)
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     preview: int = number(1, at_least=0, at_most=100)  # each step adds an expert to the observation
     limit_weight: float = number(1.0, at_least=0.0, at_most=1e6)
@@ -203,6 +210,7 @@ class EnvConfig:
         check_choice("limits", self.limits, LIMITS)
         check_choice("start", self.start, START_POSES)
         check_choice("physics", self.physics, (AUTO, *PHYSICS))
+        check_choice("control", self.control, MODES)
         check_ranges(self)
         for name in self.reward.terms:
             registry.check("reward_term", name, "reward.terms")
@@ -218,6 +226,11 @@ class EnvConfig:
                 f"demonstrations: expected (count + held_out) * horizon * substeps of at most {_MAX_RECORDED_STEPS:,} "
                 f"physics steps to record, got {steps:,}"
             )
+
+    @property
+    def has_inner_loop(self) -> bool:
+        """Whether a controller runs at 1 kHz between actions and torques, or the world is not the paper's."""
+        return self.control != "torque" or self.world != WorldConfig()
 
     def build_arms(self) -> ArmPair:
         """Both arms, with the links that the metric compares.

@@ -1,0 +1,67 @@
+"""What a robot's manufacturer states about its joints beyond MJCF: limits of acceleration, jerk and torque rate, friction."""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from mimic.arms.arm import Arm, ArmConfig, arm_spec, finite_velocity_limit
+from mimic.control.limits import JointLimits, joint_limits
+
+# Names of custom numerics with a number for each joint of a model, in the order of its joints.
+ACCELERATION_LIMIT, JERK_LIMIT, TORQUE_RATE_LIMIT = "acceleration_limit", "jerk_limit", "torque_rate_limit"
+FRICTION_LEVEL, FRICTION_RATE = "friction_level", "friction_rate"
+# Where a model states no friction: 0.6 % of the torque limit, about what the Panda's large joints have.
+_FRICTION_FRACTION, _FRICTION_RATE = 0.006, 5.0
+_UNLIMITED_TORQUE = 1e3  # N m, for joints without a torque limit
+
+
+class JointFriction(NamedTuple):
+    """Friction torque of each joint, level * tanh(rate * qvel), against its motion: a smooth Coulomb friction.
+
+    Attributes:
+      level: [joints] at high speed [N m].
+      rate: [joints] inverse of the speed at which it saturates [s/rad].
+    """
+
+    level: Float[np.ndarray, " joints"]
+    rate: Float[np.ndarray, " joints"]
+
+
+class Drives(NamedTuple):
+    """Limits and friction of the free joints of an arm."""
+
+    limits: JointLimits
+    friction: JointFriction
+
+
+def drives_of(config: ArmConfig, arm: Arm) -> Drives:
+    """The drives of an arm: what its model states in custom numerics, and assumed numbers elsewhere.
+
+    Args:
+      config: of the arm.
+      arm: built from it.
+    """
+    model = arm_spec(config).compile()
+    joints = [model.joint(name).id for name in arm.embodiment.joint_names]
+
+    def stated(name: str) -> np.ndarray | None:
+        numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+        return np.array(model.numeric(numeric).data, float)[joints] if numeric >= 0 else None
+
+    torque = np.minimum(arm.embodiment.torque_limit, _UNLIMITED_TORQUE)
+    limits = joint_limits(
+        np.asarray(arm.embodiment.joint_range),
+        finite_velocity_limit(arm.embodiment),
+        torque,
+        *(stated(name) for name in (ACCELERATION_LIMIT, JERK_LIMIT, TORQUE_RATE_LIMIT)),
+    )
+    level, rate = stated(FRICTION_LEVEL), stated(FRICTION_RATE)
+    return Drives(
+        limits,
+        JointFriction(
+            _FRICTION_FRACTION * torque if level is None else level,
+            np.full(len(joints), _FRICTION_RATE) if rate is None else rate,
+        ),
+    )

@@ -1,0 +1,187 @@
+"""The inner loop of a joint controller: from a policy's target to a reference motion within limits, and to torques.
+
+Every function is elementwise. `xp` is the array library of its arguments, `numpy` or `jax.numpy`.
+"""
+
+from typing import Any, NamedTuple
+
+Array = Any
+
+MODES = ("torque", "joint_position", "joint_velocity", "joint_impedance")
+PERIOD = 0.001  # s, of the inner loop: that of the robots' interfaces, such as libfranka's
+# The working limits are these fractions of the manufacturer's: a reference may exceed a working limit slightly, because
+# its jerk is limited too.
+VELOCITY_FRACTION, ACCELERATION_FRACTION, JERK_FRACTION, TORQUE_FRACTION = 0.95, 0.9, 0.9, 0.95
+POSITION_MARGIN = (
+    0.03  # rad: a reference stays this far inside the joint range, and an arm that lags behind it does too
+)
+BRAKING_FRACTION = 0.7  # of the working acceleration, with which a reference slows down before its target or a limit
+APPROACH_RATE = 20.0  # 1/s: near its target a reference approaches it exponentially
+_VELOCITY_LAG = 0.01  # s: time constant of the reference's velocity; below 1 / (4 APPROACH_RATE), so nothing overshoots
+MIN_STIFFNESS = 1 / 16  # of joint_impedance, as a fraction of the stiffness of the other modes
+
+
+class Reference(NamedTuple):
+    """The motion that the inner loop tracks.
+
+    Attributes:
+      qpos: joint angles [rad].
+      qvel: joint velocities [rad/s].
+      qacc: joint accelerations [rad/s^2].
+    """
+
+    qpos: Array
+    qvel: Array
+    qacc: Array
+
+
+class JointParameters(NamedTuple):
+    """Working limits and gains of the inner loop, one number for each joint.
+
+    Attributes:
+      lower, upper: range of the reference's angle [rad].
+      velocity, acceleration, jerk: maxima of the reference [rad/s, rad/s^2, rad/s^3].
+      torque: maximum torque [N m].
+      torque_rate: maximum change of the torque [N m/s].
+      stiffness: [N m/rad].
+      damping: [N m s/rad].
+      torque_scale: torque of the action 1 in the mode "torque" [N m].
+      reach: displacement of the target of the action 1 in the modes of a target position [rad].
+    """
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    torque: Array
+    torque_rate: Array
+    stiffness: Array
+    damping: Array
+    torque_scale: Array
+    reach: Array
+
+
+class Target(NamedTuple):
+    """What a policy commands for one of its ticks.
+
+    Attributes:
+      value: angle [rad], velocity [rad/s] or torque [N m], as the mode says.
+      stiffness: factor on the joint's stiffness; 1 but for "joint_impedance".
+    """
+
+    value: Array
+    stiffness: Array
+
+
+def action_size(mode: str, joints: int) -> int:
+    """Length of an action: a number for each joint; for "joint_impedance" also the stiffness of each."""
+    return 2 * joints if mode == "joint_impedance" else joints
+
+
+def action_target(mode: str, action: Array, reference: Reference, joints: JointParameters, xp: Any) -> Target:
+    """The target of an action in [-1, 1].
+
+    "joint_velocity": velocity, as a fraction of the working limit. "joint_position": displacement of the target angle
+    from the reference, as a fraction of `reach`. "joint_impedance": the same, and then the logarithm of the stiffness,
+    from `MIN_STIFFNESS` for -1 to 1 for 1. "torque": as a fraction of `torque_scale`.
+
+    Args:
+      mode: one of `MODES`.
+      action: [numbers] of `action_size`.
+      reference: at the start of the tick.
+      joints: parameters, [joints] each.
+      xp: array library.
+    """
+    action = xp.clip(action, -1.0, 1.0)
+    size = joints.lower.shape[0]
+    value, full = action[:size], xp.ones_like(action[:size])
+    if mode == "torque":
+        return Target(value * joints.torque_scale, full)
+    if mode == "joint_velocity":
+        return Target(value * joints.velocity, full)
+    position = xp.clip(reference.qpos + value * joints.reach, joints.lower, joints.upper)
+    if mode == "joint_position":
+        return Target(position, full)
+    return Target(position, MIN_STIFFNESS ** (0.5 * (1.0 - action[size:])))
+
+
+def approach_speed(distance: Array, acceleration: Array, xp: Any) -> Array:
+    """Speed at which a joint may approach a point so that it can stop there [rad/s]; negative beyond the point.
+
+    Exponential within the last acceleration / APPROACH_RATE^2, a constant deceleration before. Both have the same slope
+    where they meet.
+
+    Args:
+      distance: to the point [rad].
+      acceleration: deceleration [rad/s^2].
+      xp: array library.
+    """
+    near = acceleration / APPROACH_RATE**2
+    far_speed = xp.sqrt(2.0 * acceleration * xp.maximum(distance - 0.5 * near, 0.5 * near))
+    return xp.where(distance < near, APPROACH_RATE * distance, far_speed)
+
+
+def next_reference(
+    mode: str, reference: Reference, target: Array, joints: JointParameters, xp: Any, period: float = PERIOD
+) -> Reference:
+    """Moves a reference by one period, within the limits on angle, velocity, acceleration and jerk.
+
+    Args:
+      mode: "joint_velocity", where the target is a velocity; else it is an angle. To stop a reference in any mode, use
+        the mode "joint_velocity" and the target 0.
+      reference: the last one.
+      target: angle [rad] or velocity [rad/s].
+      joints: parameters.
+      xp: array library.
+      period: [s].
+    """
+    braking = BRAKING_FRACTION * joints.acceleration
+    if mode == "joint_velocity":
+        speed = target
+    else:
+        error = target - reference.qpos
+        speed = xp.sign(error) * approach_speed(xp.abs(error), braking, xp)
+    speed = xp.clip(speed, -joints.velocity, joints.velocity)
+    speed = xp.minimum(speed, approach_speed(joints.upper - reference.qpos, braking, xp))
+    speed = xp.maximum(speed, -approach_speed(reference.qpos - joints.lower, braking, xp))
+    qacc = xp.clip((speed - reference.qvel) / _VELOCITY_LAG, -joints.acceleration, joints.acceleration)
+    change = joints.jerk * period
+    qacc = reference.qacc + xp.clip(qacc - reference.qacc, -change, change)
+    qvel = reference.qvel + period * qacc
+    return Reference(reference.qpos + period * qvel, qvel, qacc)
+
+
+def joint_torque(
+    mode: str,
+    qpos: Array,
+    qvel: Array,
+    reference: Reference,
+    target: Target,
+    previous: Array,
+    joints: JointParameters,
+    xp: Any,
+    period: float = PERIOD,
+) -> Array:
+    """Torque of one period [N m], in addition to gravity compensation: PD control of the reference, within limits.
+
+    Args:
+      mode: one of `MODES`; in "torque" the target is the torque.
+      qpos: measured joint angles [rad].
+      qvel: measured joint velocities [rad/s].
+      reference: the motion to track.
+      target: of the policy.
+      previous: torque of the last period [N m].
+      joints: parameters.
+      xp: array library.
+      period: [s].
+    """
+    if mode == "torque":
+        torque = target.value
+    else:
+        stiffness = target.stiffness * joints.stiffness
+        damping = xp.sqrt(target.stiffness) * joints.damping  # the damping ratio stays the same
+        torque = stiffness * (reference.qpos - qpos) + damping * (reference.qvel - qvel)
+    torque = xp.clip(torque, -joints.torque, joints.torque)
+    change = joints.torque_rate * period
+    return previous + xp.clip(torque - previous, -change, change)

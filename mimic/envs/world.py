@@ -1,0 +1,64 @@
+"""The config of a world: how the learner's surroundings and its hardware differ from the ideal arm of the paper."""
+
+import dataclasses
+from typing import Any
+
+from mimic.ranges import check_ranges, number
+
+MAX_DELAY = 3  # ticks
+
+
+def _interval(minimum: float, maximum: float, *, at_least: float, at_most: float) -> Any:
+    """Field for [minimum, maximum] of a number that is drawn for each episode."""
+    return number(lambda: [minimum, maximum], at_least=at_least, at_most=at_most, entries=(2, 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class WorldConfig:
+    """Gravity, friction, load, sensors and delays. Ranges are drawn from uniformly at the start of each episode.
+
+    The default is the world of the paper, without any of it. A tick is a control step of the environment.
+
+    Attributes:
+      gravity: whether there is gravity. The robot compensates the weight of its links and of its payload.
+      gravity_error: range of the part of the weight that the compensation lacks, as a fraction.
+      payload: range of the mass at the tip [kg].
+      payload_lever: range of the distance of its centre of mass from the end of the last link, along the link [m].
+      link_mass: range of the factor on mass and inertia of each link; another one for each link.
+      friction: range of the factor on the joints' friction, another one for each joint, see `JointFriction`.
+      motor_gain: range of the ratio of the torque that acts to the commanded one; another one for each joint.
+      position_bias: maximum of the constant error of each measured angle [rad].
+      position_noise, velocity_noise: standard deviation of each measured angle [rad] and velocity [rad/s].
+      observation_delay: range of the age of a measurement when the policy observes it, in ticks.
+      action_delay: range of the time from an observation to the moment when its action acts, in ticks.
+      packet_loss: probability that an action does not arrive; the one before is then used again.
+      start_noise: maximum deviation of each joint from the start pose [rad].
+      stops: whether joints have mechanical stops at the ends of their ranges.
+      contacts: whether links touch each other and the floor. Only of `physics=mjx` and of the virtual robot.
+    """
+
+    gravity: bool = False
+    gravity_error: list[float] = _interval(0.0, 0.0, at_least=-1.0, at_most=1.0)
+    payload: list[float] = _interval(0.0, 0.0, at_least=0.0, at_most=1000.0)
+    payload_lever: list[float] = _interval(0.0, 0.0, at_least=0.0, at_most=10.0)
+    link_mass: list[float] = _interval(1.0, 1.0, at_least=0.1, at_most=10.0)
+    friction: list[float] = _interval(0.0, 0.0, at_least=0.0, at_most=100.0)
+    motor_gain: list[float] = _interval(1.0, 1.0, at_least=0.1, at_most=10.0)
+    position_bias: float = number(0.0, at_least=0.0, at_most=1.0)
+    position_noise: float = number(0.0, at_least=0.0, at_most=1.0)
+    velocity_noise: float = number(0.0, at_least=0.0, at_most=10.0)
+    observation_delay: list[int] = number(lambda: [0, 0], at_least=0, at_most=MAX_DELAY, entries=(2, 2))
+    action_delay: list[int] = number(lambda: [0, 0], at_least=0, at_most=MAX_DELAY, entries=(2, 2))
+    packet_loss: float = number(0.0, at_least=0.0, below=1.0)
+    start_noise: float = number(0.0, at_least=0.0, at_most=1.0)
+    stops: bool = False
+    contacts: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self, "world.")
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, list) and value[0] > value[1]:
+                raise ValueError(f"world.{field.name}: expected [minimum, maximum], got {value}")
+        if (any(self.gravity_error) or self.contacts) and not self.gravity:
+            raise ValueError("world: expected gravity=true with gravity_error or contacts, got gravity=false")

@@ -1,0 +1,124 @@
+"""The inner loop: whatever a policy commands, the reference and the torque stay within the manufacturer's limits."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mimic.control import joint_control
+from mimic.control.joint_control import MODES, PERIOD, JointParameters, Reference
+from mimic.control.limits import JointLimits, joint_limits, joint_parameters
+
+JOINTS = 7
+RANGE = np.array([[-2.9, 2.9], [-1.76, 1.76], [-2.9, 2.9], [-3.07, -0.07], [-2.9, 2.9], [-0.02, 3.75], [-2.9, 2.9]])
+
+
+def panda_limits() -> JointLimits:
+    return joint_limits(
+        RANGE,
+        np.array([2.175] * 4 + [2.61] * 3),
+        np.array([87.0] * 4 + [12.0] * 3),
+        np.array([15, 7.5, 10, 12.5, 15, 20, 20.0]),
+        np.array([7500, 3750, 5000, 6250, 7500, 10000, 10000.0]),
+        np.full(7, 1000.0),
+    )
+
+
+def parameters() -> JointParameters:
+    return joint_parameters(panda_limits(), np.linspace(1.0, 0.1, JOINTS), np.full(JOINTS, 5.0), 0.05)
+
+
+def start() -> Reference:
+    return Reference(RANGE.mean(axis=1), np.zeros(JOINTS), np.zeros(JOINTS))
+
+
+@pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "torque"])
+@pytest.mark.parametrize("hold", [1, 7, 50, 700])  # periods of a target: from noise to ramps into the joint limits
+def test_reference_stays_within_the_manufacturers_limits(mode: str, hold: int) -> None:
+    limits, joints, reference = panda_limits(), parameters(), start()
+    rng, rows = np.random.default_rng(hold), []
+    for step in range(7000):
+        if step % hold == 0:
+            action = rng.choice([-1.0, 1.0, 0.3, 0.0], joint_control.action_size(mode, JOINTS))
+            target = joint_control.action_target(mode, action, reference, joints, np).value
+        reference = joint_control.next_reference(mode, reference, target, joints, np)
+        rows.append(reference)
+    qpos, qvel, qacc = (np.stack(x) for x in zip(*rows, strict=True))
+    assert np.all((qpos > limits.position[:, 0]) & (qpos < limits.position[:, 1]))
+    assert np.abs(qvel / limits.velocity).max() < 1
+    assert np.abs(qacc / limits.acceleration).max() < 1
+    assert np.abs(np.diff(qacc, axis=0) / PERIOD / limits.jerk).max() < 1
+    # The limits are used, not only kept.
+    if hold >= 50:
+        assert np.abs(qvel / limits.velocity).max() > 0.7
+    if hold == 700 and mode == "joint_velocity":
+        assert qpos.max(axis=0)[0] > limits.position[0, 1] - 0.06
+
+
+def test_reference_reaches_a_target_angle_without_overshoot() -> None:
+    joints, reference = parameters(), start()
+    target, largest = reference.qpos + 0.5, np.full(JOINTS, -np.inf)
+    for _ in range(2000):
+        reference = joint_control.next_reference("joint_position", reference, target, joints, np)
+        largest = np.maximum(largest, reference.qpos)
+    np.testing.assert_allclose(reference.qpos, target, atol=1e-6)
+    assert np.all(largest < target + 1e-3)
+
+
+def test_reference_stops_within_its_braking_time() -> None:
+    joints = parameters()
+    reference = Reference(np.zeros(JOINTS), joints.velocity.copy(), joints.acceleration.copy())
+    reference = reference._replace(qpos=RANGE.mean(axis=1))
+    for _ in range(600):
+        reference = joint_control.next_reference("joint_velocity", reference, np.zeros(JOINTS), joints, np)
+    assert np.abs(reference.qvel).max() < 1e-6
+
+
+def test_torque_changes_at_most_at_its_rate() -> None:
+    limits, joints, reference = panda_limits(), parameters(), start()
+    rng, torque = np.random.default_rng(0), np.zeros(JOINTS)
+    for _ in range(500):
+        target = joint_control.Target(rng.uniform(-500, 500, JOINTS), np.ones(JOINTS))
+        qpos = reference.qpos + rng.normal(size=JOINTS)
+        for mode in ("torque", "joint_position"):
+            after = joint_control.joint_torque(mode, qpos, np.zeros(JOINTS), reference, target, torque, joints, np)
+            assert np.all(np.abs(after - torque) <= limits.torque_rate * PERIOD)
+            assert np.all(np.abs(after) <= limits.torque)
+            torque = after
+
+
+def test_impedance_action_sets_the_stiffness() -> None:
+    joints = parameters()
+    action = np.concatenate([np.zeros(JOINTS), np.linspace(-1, 1, JOINTS)])
+    target = joint_control.action_target("joint_impedance", action, start(), joints, np)
+    np.testing.assert_allclose(target.stiffness[[0, -1]], [joint_control.MIN_STIFFNESS, 1.0])
+    np.testing.assert_allclose(target.value, start().qpos)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_jax_and_numpy_agree(mode: str) -> None:
+    """Both run the same code; float32 rounds an angle of 3 rad to 2e-7, which adds up, and gains multiply by 1600."""
+    joints, rng = parameters(), np.random.default_rng(1)
+    results = []
+    for xp, dtype in ((np, np.float64), (jnp, np.float32)):
+        rng = np.random.default_rng(1)
+        values = JointParameters(*(xp.asarray(x, dtype) for x in joints))
+        reference = Reference(*(xp.asarray(x, dtype) for x in start()))
+        torque = xp.zeros(JOINTS, dtype)
+        for _ in range(5):
+            action = xp.asarray(rng.uniform(-1, 1, joint_control.action_size(mode, JOINTS)), dtype)
+            target = joint_control.action_target(mode, action, reference, values, xp)
+            for _ in range(10):
+                if mode != "torque":
+                    reference = joint_control.next_reference(mode, reference, target.value, values, xp)
+                torque = joint_control.joint_torque(
+                    mode, reference.qpos, reference.qvel * 0, reference, target, torque, values, xp
+                )
+        results.append((np.asarray(reference.qpos), np.asarray(torque)))
+    np.testing.assert_allclose(results[0][0], results[1][0], atol=1e-5)
+    np.testing.assert_allclose(results[0][1], results[1][1], atol=5e-2)
+
+
+def test_unstated_limits_follow_from_the_others() -> None:
+    limits = joint_limits(RANGE, np.full(7, 2.0), np.full(7, 50.0))
+    assert limits.acceleration[0] == pytest.approx(8.0)
+    assert JointLimits.from_lists(limits.as_lists()).torque_rate == pytest.approx(limits.torque_rate)
