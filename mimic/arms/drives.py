@@ -1,4 +1,4 @@
-"""What a robot's manufacturer states about its joints beyond MJCF: limits of acceleration, jerk and torque rate, friction."""
+"""What a manufacturer states about joints beyond MJCF: limits of acceleration, jerk and torque rate, friction."""
 
 from typing import NamedTuple
 
@@ -12,8 +12,8 @@ from mimic.control.limits import JointLimits, joint_limits
 # Names of custom numerics with a number for each joint of a model, in the order of its joints.
 ACCELERATION_LIMIT, JERK_LIMIT, TORQUE_RATE_LIMIT = "acceleration_limit", "jerk_limit", "torque_rate_limit"
 FRICTION_LEVEL, FRICTION_RATE = "friction_level", "friction_rate"
-# Where a model states no friction: 0.6 % of the torque limit, about what the Panda's large joints have.
-_FRICTION_FRACTION, _FRICTION_RATE = 0.006, 5.0
+# Where a model states no friction: a fifth of the viscous friction at the velocity limit, as a Panda has.
+_FRICTION_FRACTION, _FRICTION_RATE = 0.2, 5.0
 _UNLIMITED_TORQUE = 1e3  # N m, for joints without a torque limit
 
 
@@ -61,7 +61,7 @@ def drives_of(config: ArmConfig, arm: Arm) -> Drives:
     return Drives(
         limits,
         JointFriction(
-            _FRICTION_FRACTION * torque if level is None else level,
+            _FRICTION_FRACTION * np.asarray(arm.model.dof_damping) * limits.velocity if level is None else level,
             np.full(len(joints), _FRICTION_RATE) if rate is None else rate,
         ),
     )
