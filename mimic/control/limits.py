@@ -19,7 +19,7 @@ from mimic.control.joint_control import (
 # Critically damped PD control at this frequency: an angular acceleration of 10 rad/s^2 costs 6 mrad, and a period of
 # 1 ms is short against it.
 FREQUENCY = 40.0  # rad/s
-# Where a model states no limits of acceleration, jerk and torque rate, they follow from the Panda's times to reach them.
+# Where a model states no limits of acceleration, jerk and torque rate, they follow from the times that a Panda needs.
 _SECONDS_TO_VELOCITY, _SECONDS_TO_ACCELERATION, _SECONDS_TO_TORQUE = 0.25, 0.002, 0.087
 
 
