@@ -28,6 +28,7 @@ COLLISION, INVALID, REPEATED, LATE = "clearance", "invalid action", "repeated ac
 INTERVENTIONS = (COLLISION, INVALID, REPEATED, LATE)
 MEASURED_CLEARANCE = "measured clearance"
 _CLEARANCE_PERIODS = 3  # of those of a check: a part of the path in each
+_SLOWING = 3.0  # of the damping of the inner loop
 _ACTION_TOLERANCE = 1e-3  # beyond [-1, 1]: float32 rounds a saturated tanh
 
 
@@ -49,6 +50,9 @@ class SafetyConfig:
       tracking: maximum difference between a measured angle and the reference [rad].
       position: distance from the ends of a joint's range at which the arm stops [rad].
       velocity: fraction of the velocity limit at which the arm stops.
+      slow_down: fraction of the velocity limit from which on a torque brakes a joint in addition: an arm that accelerates
+        overshoots its reference's velocity.
+      velocity_scale, acceleration_scale: factors on the reference's limits, for first trials of a controller.
       velocity_periods: periods in a row beyond that fraction: noise does not stop the arm.
     """
 
@@ -64,6 +68,9 @@ class SafetyConfig:
     tracking: float = 0.2
     position: float = 0.005
     velocity: float = 0.985
+    slow_down: float = 0.96
+    velocity_scale: float = 1.0
+    acceleration_scale: float = 1.0
     velocity_periods: int = 3
 
 
@@ -108,7 +115,8 @@ class SafetyLayer:
                 f"together, got {bundle.control_dt} s and {config.grace} s"
             )
         self._mode, self._config, self._clearance, self._hold = bundle.mode, config, clearance, hold
-        self._joints = JointParameters(*(np.asarray(x, float)[:, None] for x in bundle.parameters))
+        self._joints = _scaled(bundle.parameters, config)
+        self._slow = config.slow_down * np.asarray(bundle.limits.velocity)[:, None]
         is_position = bundle.mode != "joint_velocity"
         self._path = PathPrediction(self._joints, is_position, config.check_periods, hold, robots)
         self._path_periods = config.check_periods - _CLEARANCE_PERIODS
@@ -125,7 +133,7 @@ class SafetyLayer:
         self.cause = np.full(robots, "", object)
         self.counts = {name: np.zeros(robots, int) for name in INTERVENTIONS}
         self.tracking_error, self.clearance = np.zeros(robots), np.full(robots, np.inf)
-        self._qpos = np.zeros((joints, robots))
+        self._qpos, self._is_tracked = np.zeros((joints, robots)), np.ones(robots, bool)
 
     def start(self, qpos: np.ndarray, qvel: np.ndarray, start_pose: np.ndarray) -> np.ndarray:
         """Begins to control arms that are near their start poses and at rest; gives the cause for those that are not.
@@ -174,7 +182,7 @@ class SafetyLayer:
             self._accept(self._pending)
         self._qpos = qpos
         cause, error = self._measurements(qpos, qvel, self.reference, self.cause)
-        np.maximum(self.tracking_error, error, out=self.tracking_error)
+        np.maximum(self.tracking_error, error, out=self.tracking_error, where=self._is_tracked)
         if cause is not None:
             self._stop(cause)
         self._move_reference()
@@ -183,10 +191,17 @@ class SafetyLayer:
             stiffness = np.where(is_lost, 0.0, stiffness)
             qpos, qvel = np.where(is_lost, self.reference.qpos, qpos), np.where(is_lost, self.reference.qvel, qvel)
         target = Target(self._value, stiffness)
-        self.torque = joint_torque(
-            "joint_position", qpos, qvel, self.reference, target, self.torque, self._joints, np
-        )
+        torque = joint_torque("joint_position", qpos, qvel, self.reference, target, self.torque, self._joints, np)
+        excess = qvel - np.minimum(np.maximum(qvel, -self._slow), self._slow)
+        self.torque = self._slowed(torque, excess) if excess.any() else torque
         return self.torque
+
+    def _slowed(self, torque: np.ndarray, excess: np.ndarray) -> np.ndarray:
+        """Torques that also brake joints beyond `slow_down`, by some velocity, within the limits of the torque."""
+        joints = self._joints
+        braking = np.clip(torque - _SLOWING * joints.damping * excess, -joints.torque, joints.torque)
+        change = joints.torque_rate * PERIOD
+        return self.torque + np.clip(braking - self.torque, -change, change)
 
     def work(self) -> None:
         """Computes a part of the check that is under way, or the clearance of the measured pose."""
@@ -206,10 +221,15 @@ class SafetyLayer:
         """Makes all arms that are controlled brake and hold, for good."""
         self._stop(np.where(self.cause == "", cause, ""))
 
+    def release(self, robots: np.ndarray, cause: str) -> None:
+        """No longer controls some arms: their robots stopped by themselves."""
+        if np.any(robots & (self.cause != cause)):
+            self.cause[robots], self._left[robots], self._is_tracked[robots] = cause, 0, False
+
     def _check_clearance(self) -> None:
         """Stops arms whose measured pose has no clearance left."""
         clearance = np.nan_to_num(self._clearance(self._qpos.T), nan=np.inf)
-        np.minimum(self.clearance, clearance, out=self.clearance)
+        np.minimum(self.clearance, clearance, out=self.clearance, where=self._is_tracked)
         if clearance.min() < self._config.measured_margin:
             self._stop(np.where(clearance < self._config.measured_margin, MEASURED_CLEARANCE, ""))
 
@@ -263,6 +283,14 @@ class SafetyLayer:
         else:
             self.reference = Reference(*(np.where(is_held, x, y) for x, y in zip(held, braking, strict=True)))
         np.maximum(self._left - 1, 0, out=self._left)
+
+
+def _scaled(parameters: JointParameters, config: SafetyConfig) -> JointParameters:
+    """The parameters of a bundle as columns, with the config's factors."""
+    joints = JointParameters(*(np.asarray(x, float)[:, None] for x in parameters))
+    return joints._replace(
+        velocity=config.velocity_scale * joints.velocity, acceleration=config.acceleration_scale * joints.acceleration
+    )
 
 
 @dataclasses.dataclass
