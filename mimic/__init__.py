@@ -15,7 +15,6 @@ from mimic import compat  # noqa: E402
 compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
 compat.import_mujoco()
 
-from mimic.any_arm.making import make  # noqa: E402
 from mimic.arms.arm import ArmConfig, build_arm  # noqa: E402
 from mimic.arms.capsules import Capsules, fit_capsules  # noqa: E402
 from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
@@ -24,6 +23,7 @@ from mimic.envs import env_config, environments  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
 from mimic.envs.importing import import_demonstrations  # noqa: E402
 from mimic.envs.recording import record_demonstrations  # noqa: E402
+from mimic.making import make  # noqa: E402
 from mimic.metric.correspondence import (  # noqa: E402
     arc_length_correspondence,
     hard_correspondence,

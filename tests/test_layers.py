@@ -22,6 +22,8 @@ LAYERS = (
     ("retargeting",),
     ("envs",),
     ("any_arm",),
+    ("hardware",),
+    ("making",),
     ("mocap",),
     ("evaluation",),
     ("trainers",),
