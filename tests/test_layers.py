@@ -19,6 +19,7 @@ LAYERS = (
     ("arms",),
     ("metric",),
     ("runs",),
+    ("datasets",),
     ("retargeting",),
     ("envs",),
     ("any_arm",),
