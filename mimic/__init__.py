@@ -18,7 +18,6 @@ from mimic.distribution import VERSION  # noqa: E402
 compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
 
 if TYPE_CHECKING:
-    from mimic.any_arm.making import make
     from mimic.arms.arm import ArmConfig, build_arm
     from mimic.arms.capsules import Capsules, fit_capsules
     from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
     from mimic.envs.importing import import_demonstrations
     from mimic.envs.recording import record_demonstrations
+    from mimic.making import make
     from mimic.metric.correspondence import (
         arc_length_correspondence,
         hard_correspondence,
@@ -128,7 +128,6 @@ __all__ = [
 # Modules of the public names. They are imported at the first access: JAX, MuJoCo and brax take seconds, and `mimic.deploy`
 # needs none of them.
 _MODULES = {
-    "any_arm.making": ("make",),
     "arms.arm": ("ArmConfig", "build_arm"),
     "arms.capsules": ("Capsules", "fit_capsules"),
     "arms.embodiment": ("Embodiment", "load_mjcf", "panda", "planar_arm"),
@@ -140,6 +139,7 @@ _MODULES = {
     "envs.imitation": ("ImitationEnv",),
     "envs.importing": ("import_demonstrations",),
     "envs.recording": ("record_demonstrations",),
+    "making": ("make",),
     "metric.correspondence": (
         "arc_length_correspondence",
         "hard_correspondence",

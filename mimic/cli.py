@@ -27,6 +27,7 @@ from mimic import __version__, compat, registry
 from mimic.commands.arguments import check_arguments, load_plugins
 from mimic.commands.config import (
     CollectConfig,
+    DatasetConfig,
     EvaluateConfig,
     ExportConfig,
     FiguresConfig,
@@ -220,6 +221,7 @@ def _register_schemas() -> None:
     store = ConfigStore.instance()
     store.store(name="train_schema", node=schema(TrainConfig))
     store.store(name="collect_schema", node=schema(CollectConfig))
+    store.store(name="dataset_schema", node=schema(DatasetConfig))
     store.store(name="evaluate_schema", node=schema(EvaluateConfig))
     store.store(name="export_schema", node=schema(ExportConfig))
     store.store(name="figures_schema", node=schema(FiguresConfig))

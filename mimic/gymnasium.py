@@ -17,13 +17,14 @@ from gymnasium.vector.utils import batch_space
 from mimic import compat
 from mimic.arms.rendering import ArmScene
 from mimic.config import check_choice
-from mimic.envs import environments, make
+from mimic.envs import env_config, environments
 
 compat.import_mjx()  # first, and quietly: brax imports it too
 
 from brax.envs.base import State  # noqa: E402
 
 from mimic.envs.imitation import ArmState, ImitationEnv  # noqa: E402
+from mimic.making import make_env  # noqa: E402
 
 RENDER_MODES = ("rgb_array",)
 
@@ -223,7 +224,7 @@ class _Renderer:
 
 def _imitation_env(env: str | ImitationEnv, overrides: dict[str, Any]) -> ImitationEnv:
     if isinstance(env, str):
-        return make(env, **overrides)
+        return make_env(env_config(env, **overrides))
     if overrides:
         raise ValueError(f"{next(iter(overrides))}: expected the name of an environment with it, got an ImitationEnv")
     return env

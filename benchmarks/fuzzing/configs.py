@@ -34,6 +34,7 @@ _COMMANDS = {
     "evaluate": commands.EvaluateConfig,
     "render": commands.RenderConfig,
     "export": commands.ExportConfig,
+    "dataset": commands.DatasetConfig,
     "demonstrations": commands.RecordingConfig,
     "inspect": commands.InspectConfig,
     "retarget": commands.RetargetConfig,

@@ -104,9 +104,9 @@ def arm_arrays(arm: Arm, free: Sequence[bool] | np.ndarray | None = None) -> Arm
         raise ValueError(
             f"{embodiment.name}: expected at most {MAX_JOINTS} joints and {MAX_LINKS} links, got {joints} and {links}"
         )
-    rotations, origins = joint_frames(np.asarray(embodiment.joint_axis), np.asarray(embodiment.joint_anchor))
+    masses, rotations, origins = body_moments(arm)
     twist, offset, reference = placements(rotations, origins)
-    masses = without_mass_on_axes(_masses(model, embodiment, rotations, origins), rotations, origins)
+    first_moment, second_moment = moments_of_joints(masses, rotations, origins)
     is_free = np.ones(joints) if free is None else np.asarray(free, float)
     link_joint = np.array(embodiment.link_joint)
     axes_of_link = np.concatenate([np.eye(3)[None], rotations])[link_joint + 1]
@@ -119,8 +119,8 @@ def arm_arrays(arm: Arm, free: Sequence[bool] | np.ndarray | None = None) -> Arm
         twist=_padded(snap_to_units(twist), MAX_JOINTS),
         offset=_padded(snap_to_units(offset), MAX_JOINTS),
         reference=_padded(reference, MAX_JOINTS),
-        first_moment=_padded(masses[:, :2, 3], MAX_JOINTS),
-        second_moment=_padded(masses[:, (0, 1, 0, 0, 1), (0, 1, 1, 2, 2)], MAX_JOINTS),
+        first_moment=_padded(first_moment, MAX_JOINTS),
+        second_moment=_padded(second_moment, MAX_JOINTS),
         armature=_padded(model.dof_armature, MAX_JOINTS),
         damping=_padded(model.dof_damping, MAX_JOINTS),
         is_free=_padded(is_free, MAX_JOINTS),
@@ -134,6 +134,23 @@ def arm_arrays(arm: Arm, free: Sequence[bool] | np.ndarray | None = None) -> Arm
         link_length=_padded(embodiment.link_lengths, MAX_LINKS),
     )
     return _with_empty_slots(arrays, joints, links)
+
+
+def body_moments(
+    arm: Arm,
+) -> tuple[Float[np.ndarray, "joints 4 4"], Float[np.ndarray, "joints 3 3"], Float[np.ndarray, "joints 3"]]:
+    """Moments of mass of each joint's body in its frame, see `pseudo_inertia`; and the frames, see `joint_frames`."""
+    embodiment = arm.embodiment
+    rotations, origins = joint_frames(np.asarray(embodiment.joint_axis), np.asarray(embodiment.joint_anchor))
+    return _masses(arm.model, embodiment, rotations, origins), rotations, origins
+
+
+def moments_of_joints(
+    masses: Float[Any, "joints 4 4"], rotations: Float[Any, "joints 3 3"], origins: Float[Any, "joints 3"]
+) -> tuple[Float[Any, "joints 2"], Float[Any, "joints 5"]]:
+    """`first_moment` and `second_moment` of `ArmArrays`, which are linear in the moments of the bodies."""
+    masses = without_mass_on_axes(masses, rotations, origins)
+    return masses[:, :2, 3], masses[:, (0, 1, 0, 0, 1), (0, 1, 1, 2, 2)]
 
 
 def masked_arrays(config: ArmConfig, limits: str, links: str) -> tuple[ArmArrays, tuple[str, ...]]:
@@ -276,6 +293,14 @@ def _masses(
             frame = to_world[:3, :3] @ rotation
             masses[joint] = pseudo_inertia(model, data, body, frame, to_world[:3, :3] @ origin + to_world[:3, 3])
     return masses
+
+
+def base_in_world(arm: Arm) -> Float[np.ndarray, "4 4"]:
+    """Pose of the arm's base frame in the world of its model, whose z-axis is vertical."""
+    data = mujoco.MjData(arm.model)
+    data.qpos[:] = 0.0
+    mujoco.mj_kinematics(arm.model, data)
+    return _rigid_transform(arm.embodiment, data)
 
 
 def _rigid_transform(embodiment: Embodiment, data: mujoco.MjData) -> Float[np.ndarray, "4 4"]:

@@ -104,8 +104,10 @@ def kernel_body(
         def joint_at(index: Array) -> JointNumbers:
             return dynamics.joint_of([numbers.read(dynamics.NUMBERS * index + k) for k in range(dynamics.NUMBERS)])
 
+        torques = tuple(torque.read(jnp.asarray(k)) for k in range(torque.width))
+
         def qacc(qpos: tuple[Scalar, ...], qvel: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-            return acceleration(joint_at, torque.read, loop, qpos, qvel, factors)
+            return acceleration(joint_at, loop, qpos, qvel, torques, factors)
 
         for columns, values in zip(outputs, runge_kutta(qacc, qpos, qvel, timestep, substeps), strict=False):
             for k, value in enumerate(values):
@@ -148,39 +150,41 @@ def rotating_rows(bound: Scalar, unroll: int) -> OverJoints:
 
 def acceleration(
     joint_at: Callable[[Array], JointNumbers],
-    torque_at: Callable[[Array], Scalar],
     loop: OverJoints,
     qpos: tuple[Scalar, ...],
     qvel: tuple[Scalar, ...],
+    torque: tuple[Scalar, ...],
     load: tuple[Scalar, ...],
+    base: Vector | None = None,
 ) -> tuple[Scalar, ...]:
     """Forward dynamics: joint accelerations [rad/s^2] under joint torques; 0 for locked joints.
 
     Args:
       joint_at: numbers of the joint of an index.
-      torque_at: its torque [N m].
       loop: see `rotating_rows`.
       qpos: joint angles [rad].
       qvel: joint velocities [rad/s]; those of locked joints are 0.
+      torque: joint torques [N m].
       load: factors on the masses and inertias of all bodies, and on the damping of all joints.
+      base: acceleration of the base, in the frame of the first joint at angle 0 [m/s^2]: minus gravity. 0 where None.
     """
     # Longer than 40 lines: the steps of the loops share the arguments.
     zero, inverse_mass = jnp.zeros_like(qpos[0]), 1.0 / load[0]
     zeros: Vector = zero, zero, zero
 
     def outward(index: Array, motion: Motion, row: tuple[Scalar, ...]) -> Any:
-        speed, angle, _ = row
+        speed, angle, _, torque = row
         joint = joint_at(index)
         angle = angle + joint.reference
         turn = jnp.cos(angle), jnp.sin(angle)
         field = acceleration_field(motion[0], motion[1])
-        return dynamics.child_motion(joint, turn, speed, motion, field), (speed, *turn)
+        return dynamics.child_motion(joint, turn, speed, motion, field), (speed, *turn, torque)
 
     def inward(index: Array, carry: tuple[Motion, Articulated], row: tuple[Scalar, ...]) -> Any:
-        (motion, distal), (speed, *turn) = carry, row[:3]
+        (motion, distal), (speed, *turn, torque) = carry, row[:4]
         joint, turn = joint_at(index), (turn[0], turn[1])
         # Dividing the other terms by the factor on masses is cheaper than multiplying the inertias by it.
-        force = (torque_at(index) - load[1] * joint.damping * speed) * inverse_mass
+        force = (torque - load[1] * joint.damping * speed) * inverse_mass
         inertia = with_body(distal, joint, motion)
         inertia, at_rest, by_parent = with_free_joint(inertia, joint, force, inverse_mass)
         carry = parent_motion(joint, turn, speed, motion), to_parent(inertia, joint, turn)
@@ -194,10 +198,12 @@ def acceleration(
         qacc = at_rest - dot(tuple(by_parent[:3]), linear) - dot(tuple(by_parent[3:]), alpha)
         return ((alpha[0], alpha[1], alpha[2] + qacc), linear), (qacc, *row[1:])
 
-    motion, rows = loop(outward, (zeros,) * 3, tuple((v, q, zero) for q, v in zip(qpos, qvel, strict=True)))
+    at_base: Motion = zeros, zeros, zeros if base is None else base
+    rows = tuple((v, q, zero, tau) for q, v, tau in zip(qpos, qvel, torque, strict=True))
+    motion, rows = loop(outward, at_base, rows)
     symmetric = dict.fromkeys(_UPPER, zero)
     nothing = Articulated(symmetric, dict.fromkeys(_ALL, zero), symmetric, zeros, zeros)
-    _, rows = loop(inward, (motion, nothing), rows, extra=6, reverse=True)
+    _, rows = loop(inward, (motion, nothing), rows, extra=5, reverse=True)
     _, rows = loop(solve, (zeros, zeros), rows)
     return tuple(row[0] for row in rows)
 

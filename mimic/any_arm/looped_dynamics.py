@@ -26,6 +26,7 @@ def acceleration(
     torque: Joints,
     mass: Float[Array, "*batch"],
     damping: Float[Array, "*batch"],
+    base: Any = None,
 ) -> Joints:
     """Forward dynamics: joint accelerations [rad/s^2] under joint torques; 0 for locked joints.
 
@@ -36,16 +37,17 @@ def acceleration(
       torque: joint torques [N m].
       mass: factor on the masses and inertias of all bodies.
       damping: factor on the damping of all joints.
+      base: three components of the base's acceleration, see mimic/any_arm/articulated_kernel.py; 0 where None.
     """
     joints = dynamics.joint_of(jnp.moveaxis(numbers, 1, 0))
     angles = qpos + joints.reference
     turns = jnp.cos(angles), jnp.sin(angles)
-    matrix, bias = _mass_matrix_and_bias(numbers, turns, _wrenches(numbers, turns, qvel))
+    matrix, bias = _mass_matrix_and_bias(numbers, turns, _wrenches(numbers, turns, qvel, base))
     force = (torque - damping * joints.damping * qvel) / mass - bias
     return _solve(matrix, joints.armature / mass, force, joints.is_free)
 
 
-def _wrenches(numbers: Array, turns: _Turns, qvel: Joints) -> Any:
+def _wrenches(numbers: Array, turns: _Turns, qvel: Joints, base: Any) -> Any:
     """Force and moment that accelerate each body at zero joint acceleration: vectors of [joints, *batch]."""
 
     def outward(parent: Any, joint: Any) -> Any:
@@ -55,7 +57,9 @@ def _wrenches(numbers: Array, turns: _Turns, qvel: Joints) -> Any:
         return motion, motion
 
     zero = jnp.zeros_like(qvel[0])
-    _, (omega, alpha, linear) = jax.lax.scan(outward, ((zero,) * 3,) * 3, (numbers, turns, qvel))
+    zeros = (zero,) * 3
+    start = zeros, zeros, zeros if base is None else tuple(zero + x for x in base)
+    _, (omega, alpha, linear) = jax.lax.scan(outward, start, (numbers, turns, qvel))
     joints = dynamics.joint_of(jnp.moveaxis(numbers, 1, 0))
     return dynamics.inertial_wrench(joints, linear, acceleration_field(omega, alpha))
 

@@ -1,7 +1,6 @@
 """Simulation of any arm: steps with the numbers of the arm as one more argument."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +27,7 @@ def make_advance(timestep: float, substeps: int) -> AdvanceAny:
     """
     kernel = articulated_kernel.gpu_kernel(timestep, substeps)
     plain = jax.jit(_array_step(timestep, substeps))
-    step = fused_kernel.batched_by(kernel, plain, _with_batch_last(plain))
+    step = fused_kernel.batched_by(kernel, plain, fused_kernel.with_batch_last(plain))
 
     def advance(
         arm: ArmArrays,
@@ -57,19 +56,3 @@ def _array_step(timestep: float, substeps: int) -> Callable[..., tuple[Array, ..
         return runge_kutta(acceleration, qpos, qvel, timestep, substeps)
 
     return step
-
-
-def _with_batch_last(step: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple[Array, ...]]:
-    """A function of vectors whose batch is the last axis of the arrays of `step`, so that its loops are vectorized."""
-    function = jax.custom_batching.custom_vmap(step)
-
-    @function.def_vmap
-    def batch(size: int, batched: Any, *vectors: Array) -> Any:
-        columns = [
-            jnp.moveaxis(vector, 0, -1) if is_batched else jnp.broadcast_to(vector[:, None], (*vector.shape, size))
-            for vector, is_batched in zip(vectors, batched, strict=True)
-        ]
-        outputs = tuple(jnp.moveaxis(x, -1, 0) for x in step(*columns))
-        return outputs, (True,) * len(outputs)
-
-    return function

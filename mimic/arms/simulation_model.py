@@ -14,6 +14,13 @@ _IGNORED = (
 def simulation_model(
     source: mujoco.MjModel, joint_names: tuple[str, ...], locked: Mapping[str, float] | None = None
 ) -> mujoco.MjModel:
+    """The compiled `simulation_spec`."""
+    return simulation_spec(source, joint_names, locked).compile()
+
+
+def simulation_spec(
+    source: mujoco.MjModel, joint_names: tuple[str, ...], locked: Mapping[str, float] | None = None
+) -> mujoco.MjSpec:
     """The bodies, inertias and named joints of a model and nothing else.
 
     No geoms, actuators, constraints, contacts or gravity. Bodies without a remaining joint are fused into their
@@ -46,7 +53,7 @@ def simulation_model(
             target.inertia = body.inertia
         for joint, anchor, axis in kept:
             _add_joint(target, joint, anchor, axis, reference=float(source.qpos0[joint.qposadr[0]]))
-    return spec.compile()
+    return spec
 
 
 def _empty_spec() -> mujoco.MjSpec:
@@ -79,6 +86,31 @@ def effective_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
     inverse = np.zeros((model.nv, model.nv))
     mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))
     return 1 / np.diag(inverse)
+
+
+def joint_inertia(model: mujoco.MjModel, qpos: np.ndarray, payload: float = 0.0, tip: Any = None) -> np.ndarray:
+    """Inertia [kg m^2] about each joint while the others are locked, the diagonal of the mass matrix: [joints].
+
+    Args:
+      model: from `simulation_model`.
+      qpos: joint angles [rad].
+      payload: point mass [kg] on the last body.
+      tip: [3] its position at angles 0, in the world [m].
+    """
+    data = mujoco.MjData(model)
+    last = model.nbody - 1
+    data.qpos[:] = 0.0
+    mujoco.mj_kinematics(model, data)
+    in_body = np.zeros(3) if tip is None else data.xmat[last].reshape(3, 3).T @ (tip - data.xpos[last])
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    inertia, unit = np.zeros((model.nv, model.nv)), np.eye(model.nv)
+    for column, row in zip(unit, inertia, strict=True):
+        mujoco.mj_mulM(model, data, row, column)
+    jacobian = np.zeros((3, model.nv))
+    point = data.xpos[last] + data.xmat[last].reshape(3, 3) @ in_body
+    mujoco.mj_jac(model, data, jacobian, None, point, last)
+    return np.diag(inertia) + payload * np.sum(jacobian**2, axis=0)
 
 
 def _rotated_pose(

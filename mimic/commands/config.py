@@ -22,6 +22,7 @@ from mimic.trainers.config import trainers
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "searched")
 ARM_SIDES = ("left", "right")
 EXPORT_FORMATS = ("onnx", "jax")
+DATASET_FORMATS = ("lerobot", "rosbag2")
 
 
 def _steps() -> Any:
@@ -162,6 +163,40 @@ class ExportConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class DatasetConfig:
+    """Config of a dataset of rollouts of a policy, or of motions from files.
+
+    Attributes:
+      run: run directory of a policy.
+      checkpoint: steps of the checkpoint. Default None: the last checkpoint.
+      split: "held_out" or "train": demonstrations of the run to roll the policy out on. Default "": both.
+      demonstrations: file of motions to write instead of rollouts: demonstrations, or those of `mimic.retarget`.
+      retargeted: file of the learner's motions that `mimic.retarget` computed from `demonstrations`, which are then
+        the expert's.
+      format: "lerobot" or "rosbag2".
+      task: what the robot does, in words. Default "": made of the names of environment and arms.
+      out: folder of the dataset; must not exist.
+      compilation_cache: see `TrainConfig`.
+    """
+
+    run: str = ""
+    checkpoint: int | None = _steps()
+    split: str = ""
+    demonstrations: str = ""
+    retargeted: str = ""
+    format: str = "lerobot"
+    task: str = ""
+    out: str = ""
+    compilation_cache: str = "~/.cache/mimic/jax"
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        check_choice("format", self.format, DATASET_FORMATS)
+        if self.split:
+            check_choice("split", self.split, SPLITS)
+
+
+@dataclasses.dataclass(frozen=True)
 class CollectConfig:
     """Config of a collection of runs.
 
@@ -222,8 +257,9 @@ class RecordingConfig:
       env: environment whose expert is recorded, with its control step.
       kind, count, seed: see `DemonstrationConfig`. Default None: those of the environment.
       limits: see `EnvConfig`. Default None: those of the environment.
-      source: file of motions to import instead of recording, see `import_demonstrations`.
+      source: file or folder of motions to import instead of recording, see `import_demonstrations`.
       joints: names of the expert's joints in `source`, base to tip. Default []: the expert's own names.
+      topic: topic or feature of `source` that has the joints, where several do; see `import_demonstrations`.
       arm: "left" or "right" arm of the person in a motion capture file `source`, or "both". Default "": right.
       capture: how such a file is read and cut.
       out: .npz file of the demonstrations; must not exist.
@@ -237,6 +273,7 @@ class RecordingConfig:
     limits: str | None = None
     source: str = ""
     joints: list[str] = dataclasses.field(default_factory=list)
+    topic: str = ""
     arm: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
     out: str = ""

@@ -35,13 +35,15 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
     out, plot = _files(config)
     env, console = config.resolve(), Console()
     if config.source and (config.arm or Path(config.source).suffix.lower() in MOTION_CAPTURE):
-        _check_unused(config, "kind", "count", "seed", "limits", "joints")
+        _check_unused(config, "kind", "count", "seed", "limits", "joints", "topic")
         return prepare_capture(config, env, out, plot)
     arm = build_arm(env.expert, env.limits)
     if config.source:
         return _prepare_import(config, env, arm, out, plot)
     if config.joints:
         raise ValueError("joints: expected only with source=FILE, as the names of its joints")
+    if config.topic:
+        raise ValueError(f"topic: expected only with source=FOLDER, got {config.topic!r}")
     demonstrations, redrawn = _record(arm, env, console)
     check_effort(demonstrations, arm.embodiment)  # of the exact arrays to be written
 
@@ -64,7 +66,7 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
     _check_unused(config, "kind", "count", "seed")
     source = Path(config.source).expanduser()
     imported, differentiated = import_demonstrations(
-        source, arm.embodiment, dt=env.control_dt, horizon=env.horizon, joints=config.joints
+        source, arm.embodiment, dt=env.control_dt, horizon=env.horizon, joints=config.joints, topic=config.topic
     )
 
     def run() -> None:
@@ -85,7 +87,7 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
 
 
 def _check_unused(config: RecordingConfig, *keys: str) -> None:
-    if unused := [key for key in keys if getattr(config, key) not in (None, [])]:
+    if unused := [key for key in keys if getattr(config, key) not in (None, [], "")]:
         raise ValueError(f"{unused[0]}: expected none with source=FILE, whose motions are not recorded")
 
 

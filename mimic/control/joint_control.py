@@ -11,13 +11,16 @@ MODES = ("torque", "joint_position", "joint_velocity", "joint_impedance")
 PERIOD = 0.001  # s, of the inner loop: that of the robots' interfaces, such as libfranka's
 # The working limits are these fractions of the manufacturer's: a reference may exceed a working limit slightly, because
 # its jerk is limited too.
-VELOCITY_FRACTION, ACCELERATION_FRACTION, JERK_FRACTION, TORQUE_FRACTION = 0.95, 0.9, 0.9, 0.95
+VELOCITY_FRACTION, ACCELERATION_FRACTION, JERK_FRACTION, TORQUE_FRACTION = 0.95, 0.4, 0.9, 0.95
 POSITION_MARGIN = (
     0.03  # rad: a reference stays this far inside the joint range, and an arm that lags behind it does too
 )
-BRAKING_FRACTION = 0.7  # of the working acceleration, with which a reference slows down before its target or a limit
-APPROACH_RATE = 20.0  # 1/s: near its target a reference approaches it exponentially
-_VELOCITY_LAG = 0.01  # s: time constant of the reference's velocity; below 1 / (4 APPROACH_RATE), so nothing overshoots
+BRAKING_FRACTION = (
+    0.7  # of the working acceleration and jerk, with which a reference slows down before a target or limit
+)
+APPROACH_RATE = 12.0  # 1/s: near its target angle a reference approaches it exponentially
+VELOCITY_RATE = 50.0  # 1/s: the same for velocities; above 4 APPROACH_RATE, so that nothing overshoots
+REACTION_FRACTION = 1.0  # of the time in which a reference reaches its full acceleration
 MIN_STIFFNESS = 1 / 16  # of joint_impedance, as a fraction of the stiffness of the other modes
 
 
@@ -43,6 +46,8 @@ class JointParameters(NamedTuple):
       velocity, acceleration, jerk: maxima of the reference [rad/s, rad/s^2, rad/s^3].
       torque: maximum torque [N m].
       torque_rate: maximum change of the torque [N m/s].
+      inertia, friction: for the torque that moves the joint as the reference moves, in proportion to its acceleration
+        and velocity [kg m^2, N m s/rad].
       stiffness: [N m/rad].
       damping: [N m s/rad].
       torque_scale: torque of the action 1 in the mode "torque" [N m].
@@ -56,6 +61,8 @@ class JointParameters(NamedTuple):
     jerk: Array
     torque: Array
     torque_rate: Array
+    inertia: Array
+    friction: Array
     stiffness: Array
     damping: Array
     torque_scale: Array
@@ -106,20 +113,21 @@ def action_target(mode: str, action: Array, reference: Reference, joints: JointP
     return Target(position, MIN_STIFFNESS ** (0.5 * (1.0 - action[size:])))
 
 
-def approach_speed(distance: Array, acceleration: Array, xp: Any) -> Array:
-    """Speed at which a joint may approach a point so that it can stop there [rad/s]; negative beyond the point.
+def approach_speed(distance: Array, acceleration: Array, rate: float, xp: Any) -> Array:
+    """Speed at which a value may approach a point so that it can stop there; negative beyond the point.
 
-    Exponential within the last acceleration / APPROACH_RATE^2, a constant deceleration before. Both have the same slope
-    where they meet.
+    Exponential within the last acceleration / rate^2, a constant deceleration before, with the same slope where they
+    meet.
 
     Args:
-      distance: to the point [rad].
-      acceleration: deceleration [rad/s^2].
+      distance: to the point.
+      acceleration: deceleration.
+      rate: of the exponential approach [1/s].
       xp: array library.
     """
-    near = acceleration / APPROACH_RATE**2
+    near = acceleration / rate**2
     far_speed = xp.sqrt(2.0 * acceleration * xp.maximum(distance - 0.5 * near, 0.5 * near))
-    return xp.where(distance < near, APPROACH_RATE * distance, far_speed)
+    return xp.where(distance < near, rate * distance, far_speed)
 
 
 def next_reference(
@@ -137,16 +145,20 @@ def next_reference(
       period: [s].
     """
     braking = BRAKING_FRACTION * joints.acceleration
+    delay = REACTION_FRACTION * joints.acceleration / joints.jerk  # until the reference brakes: its jerk is limited
+    ahead = reference.qpos + delay * reference.qvel
     if mode == "joint_velocity":
         speed = target
     else:
-        error = target - reference.qpos
-        speed = approach_speed(xp.abs(error), braking, xp)
+        error = target - ahead
+        speed = approach_speed(xp.abs(error), braking, APPROACH_RATE, xp)
         speed = xp.where(error < 0, -speed, speed)
     speed = _bounded(speed, joints.velocity, xp)
-    speed = xp.minimum(speed, approach_speed(joints.upper - reference.qpos, braking, xp))
-    speed = xp.maximum(speed, -approach_speed(reference.qpos - joints.lower, braking, xp))
-    qacc = _bounded((speed - reference.qvel) / _VELOCITY_LAG, joints.acceleration, xp)
+    speed = xp.minimum(speed, approach_speed(joints.upper - ahead, braking, APPROACH_RATE, xp))
+    speed = xp.maximum(speed, -approach_speed(ahead - joints.lower, braking, APPROACH_RATE, xp))
+    change = speed - reference.qvel
+    qacc = approach_speed(xp.abs(change), BRAKING_FRACTION * joints.jerk, VELOCITY_RATE, xp)
+    qacc = _bounded(xp.where(change < 0, -qacc, qacc), joints.acceleration, xp)
     qacc = reference.qacc + _bounded(qacc - reference.qacc, joints.jerk * period, xp)
     qvel = reference.qvel + period * qacc
     return Reference(reference.qpos + period * qvel, qvel, qacc)
@@ -182,6 +194,7 @@ def joint_torque(
         stiffness = target.stiffness * joints.stiffness
         damping = xp.sqrt(target.stiffness) * joints.damping  # the damping ratio stays the same
         torque = stiffness * (reference.qpos - qpos) + damping * (reference.qvel - qvel)
+        torque = torque + joints.inertia * reference.qacc + joints.friction * reference.qvel
     torque = _bounded(torque, joints.torque, xp)
     return previous + _bounded(torque - previous, joints.torque_rate * period, xp)
 

@@ -16,9 +16,9 @@ from mimic.control.joint_control import (
     JointParameters,
 )
 
-# Critically damped PD control at this frequency: an angular acceleration of 10 rad/s^2 costs 6 mrad, and a period of
-# 1 ms is short against it.
-FREQUENCY = 40.0  # rad/s
+# Critically damped PD control at this frequency: faster control would need a torque rate beyond the limit.
+FREQUENCY = 30.0  # rad/s
+TORQUE_RATE_FRACTION = 0.6  # of the maximum torque rate, which the jerk of the reference may need
 # Where a model states no limits of acceleration, jerk and torque rate, they follow from the times that a Panda needs.
 _SECONDS_TO_VELOCITY, _SECONDS_TO_ACCELERATION, _SECONDS_TO_TORQUE = 0.25, 0.002, 0.087
 
@@ -70,28 +70,41 @@ def joint_limits(
 
 
 def joint_parameters(
-    limits: JointLimits, inertia: np.ndarray, torque_scale: np.ndarray, control_dt: float
+    limits: JointLimits,
+    inertia: tuple[np.ndarray, np.ndarray],
+    friction: np.ndarray,
+    torque_scale: np.ndarray,
+    control_dt: float,
 ) -> JointParameters:
     """Working limits and gains of the inner loop.
 
+    The jerk is also limited so that the torque can follow: a controller whose torque lags behind is unstable.
+
     Args:
       limits: the manufacturer's.
-      inertia: [joints] effective inertia of each joint in the home pose [kg m^2], for the gains.
+      inertia: [joints] inertia about each joint in the home pose, and in the worst pose with the heaviest payload
+        [kg m^2].
+      friction: [joints] viscous friction [N m s/rad].
       torque_scale: [joints] torque of the action 1 in the mode "torque" [N m].
       control_dt: tick of the policy [s].
     """
     velocity = VELOCITY_FRACTION * limits.velocity
+    largest, typical = inertia[1], (inertia[0] + inertia[1]) / 2
     lower, upper = limits.position.T
+    torque_rate = TORQUE_FRACTION * limits.torque_rate
+    jerk = np.minimum(JERK_FRACTION * limits.jerk, TORQUE_RATE_FRACTION * torque_rate / largest)
     return JointParameters(
         lower=lower + POSITION_MARGIN,
         upper=upper - POSITION_MARGIN,
         velocity=velocity,
         acceleration=ACCELERATION_FRACTION * limits.acceleration,
-        jerk=JERK_FRACTION * limits.jerk,
+        jerk=jerk,
         torque=TORQUE_FRACTION * limits.torque,
-        torque_rate=TORQUE_FRACTION * limits.torque_rate,
-        stiffness=inertia * FREQUENCY**2,
-        damping=2 * inertia * FREQUENCY,
+        torque_rate=torque_rate,
+        inertia=typical,
+        friction=np.asarray(friction, float),
+        stiffness=typical * FREQUENCY**2,
+        damping=2 * typical * FREQUENCY,
         torque_scale=np.asarray(torque_scale, float),
         # At a constant velocity a reference lags 1 / APPROACH_RATE behind its target.
         reach=velocity * (control_dt + 2 / APPROACH_RATE),

@@ -4,45 +4,52 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mimic.control.joint_control import APPROACH_RATE, BRAKING_FRACTION, PERIOD, JointParameters, Reference
+from mimic.control.joint_control import (
+    APPROACH_RATE,
+    BRAKING_FRACTION,
+    PERIOD,
+    REACTION_FRACTION,
+    VELOCITY_RATE,
+    JointParameters,
+    Reference,
+)
 
-SAMPLE = 0.01  # s, between two angles of a path; also the step of the prediction while a reference brakes
-_LAG = 0.01  # s: time constant of the reference's velocity, as in `next_reference`
-_PER_SAMPLE = round(SAMPLE / PERIOD)
-_DECAY = (1 - (1 - PERIOD / _LAG) ** _PER_SAMPLE) / SAMPLE  # 1/s, of the velocity in the larger step
+HOLD, BRAKE = 2, 10  # periods of a step, while targets act and while the references brake
+SAMPLE = 10  # periods between two angles of a path
 
 
 class PathPrediction:
     """Paths of many robots' references that follow their present target, hold a new one for a time, and brake to a stop.
 
-    The steps until a reference brakes are those of the inner loop. The larger ones of braking differ from them by less than
-    `ERROR`, and take a tenth of the time. A path is computed in parts that fit between two periods.
+    Its steps are larger than those of the inner loop; the angles differ by less than `ERROR`. A path is computed in parts
+    that fit between two periods.
 
     Args:
       joints: parameters, [joints, 1] each.
       is_position: whether targets are angles [rad]; otherwise velocities [rad/s].
-      delay: periods until the new target acts.
-      hold: periods for which it acts, a multiple of 10.
+      delay: periods until the new target acts, a multiple of `HOLD`.
+      hold: periods for which it acts, a multiple of `SAMPLE`.
       robots: number of robots.
     """
 
-    ERROR = 0.003  # rad, maximum over the joints
+    ERROR = 0.004  # rad, maximum over the joints
 
     def __init__(self, joints: JointParameters, is_position: bool, delay: int, hold: int, robots: int = 1):
-        self._delay_steps, self._hold_steps = delay, delay + hold
-        self.steps = self._hold_steps + braking_steps(joints)
+        self._delay_steps, self._hold_steps = delay // HOLD, (delay + hold) // HOLD
+        self._brake_steps = braking_steps(joints)
+        self.steps = self._hold_steps + self._brake_steps
         size = joints.lower.shape[0], robots
-        self._path = np.zeros((1 + hold // _PER_SAMPLE + self.steps - self._hold_steps, *size))
-        self._qpos, self._qvel, self._qacc, self._speed, self._change, self._swing = np.zeros((6, *size))
+        self._path = np.zeros((1 + hold // SAMPLE + self._brake_steps * BRAKE // SAMPLE, *size))
+        self._qpos, self._qvel, self._qacc, self._speed, self._a, self._b = np.zeros((6, *size))
         self._room, self._bound, self._far = np.zeros((3, 2, *size))
+        self._is_position, self._joints = is_position, joints
         self._ends = np.stack([joints.upper, -joints.lower])
         self._sign = np.array([1.0, -1.0])[:, None, None]
-        braking = BRAKING_FRACTION * joints.acceleration
-        self._slope, self._offset = 2 * braking, braking**2 / APPROACH_RATE**2
-        self._velocity, self._is_position = joints.velocity, is_position
+        self._reaction = REACTION_FRACTION * joints.acceleration / joints.jerk
+        self._position = _Approach(BRAKING_FRACTION * joints.acceleration, APPROACH_RATE)
+        self._velocity = {n: _Approach(BRAKING_FRACTION * joints.jerk, _rate(n)) for n in (HOLD, BRAKE)}
         self._swing_time = 1 / (2 * joints.jerk)
-        self._most, self._least = joints.acceleration * np.ones(size), -joints.acceleration * np.ones(size)
-        self._most_swing, self._least_swing = joints.jerk * PERIOD, -joints.jerk * PERIOD
+        self._most, self._least = joints.acceleration, -joints.acceleration
         self._target, self._left = np.zeros(size), np.zeros(robots, int)
         self._count, self._samples = self.steps, 0
 
@@ -67,15 +74,16 @@ class PathPrediction:
         for _ in range(min(steps, self.steps - self._count)):
             if self._count == self._delay_steps:
                 self._target = new_target(Reference(self._qpos, self._qvel, self._qacc))
-                self._left[:] = self._hold_steps
                 self._sample()
-            if self._count < self._hold_steps:
-                self._hold()
+            is_braking = self._count >= self._hold_steps
+            if is_braking:
+                self._speed[:] = 0.0
             else:
-                self._brake()
+                self._follow()
+            self._step(BRAKE if is_braking else HOLD)
             self._count += 1
-            since = self._count - self._delay_steps
-            if since > 0 and (self._count > self._hold_steps or since % _PER_SAMPLE == 0):
+            since = HOLD * (self._count - self._delay_steps)
+            if since > 0 and (is_braking or since % SAMPLE == 0):
                 self._sample()
         return self._count == self.steps
 
@@ -92,65 +100,72 @@ class PathPrediction:
         self._path[self._samples] = self._qpos
         self._samples += 1
 
-    def _hold(self) -> None:
-        """A step as in `next_reference`."""
+    def _follow(self) -> None:
+        """The speed for the target that acts, and for those that no longer act, 0."""
         if self._is_position:
-            error = self._target - self._qpos
-            np.multiply(np.sign(error), self._approach(np.abs(error)), out=self._speed)
+            error = self._target - self._qpos - self._reaction * self._qvel
+            self._speed[:] = self._position(np.abs(error))
+            self._speed *= np.sign(error)
         else:
             self._speed[:] = self._target
         if self._count < self._delay_steps:
-            self._speed *= self._left > self._count
-        acceleration = self._limited_change(1 / _LAG)
-        swing = np.subtract(acceleration, self._qacc, out=self._swing)
-        np.minimum(swing, self._most_swing, out=swing)
-        np.maximum(swing, self._least_swing, out=swing)
+            self._speed *= self._left > HOLD * self._count
+
+    def _step(self, periods: int) -> None:
+        """A step as in `next_reference`, towards `speed`."""
+        step, a, b = periods * PERIOD, self._a, self._b
+        change = self._bounded_speed()
+        change -= self._qvel
+        swing = self._velocity[periods](np.abs(change, out=a))
+        swing *= np.sign(change, out=a)
+        np.minimum(swing, self._most, out=swing)
+        np.maximum(swing, self._least, out=swing)
+        swing -= self._qacc
+        most = self._joints.jerk * step
+        np.minimum(swing, most, out=swing)
+        np.maximum(swing, -most, out=swing)
         self._qacc += swing
-        self._move(np.multiply(self._qacc, PERIOD, out=self._change), PERIOD)
+        np.multiply(self._qacc, step, out=a)
+        np.multiply(np.abs(swing, out=b), swing, out=b)  # the jerk limit delays a part of the change
+        b *= self._swing_time
+        a -= b
+        # The angle moves at the mean of the velocities after each period.
+        self._qpos += np.multiply(self._qvel, step, out=b)
+        self._qpos += np.multiply(a, 0.5 * (step + PERIOD), out=b)
+        self._qvel += a
 
-    def _brake(self) -> None:
-        """A larger step towards rest: the velocity decays exactly, and the jerk limit delays the change."""
-        self._speed[:] = 0.0
-        acceleration = self._limited_change(_DECAY)
-        swing = np.subtract(acceleration, self._qacc, out=self._swing)
-        self._qacc[:] = acceleration
-        swing *= np.abs(swing)
-        swing *= self._swing_time
-        change = np.multiply(acceleration, SAMPLE, out=self._change)
-        change -= swing
-        self._move(change, SAMPLE)
-
-    def _limited_change(self, rate: float) -> np.ndarray:
-        """The acceleration towards `speed`, which the joint's ends and its velocity limit bound."""
-        speed, room, bound, far = self._speed, self._room, self._bound, self._far
-        np.multiply(self._sign, self._qpos, out=room)
+    def _bounded_speed(self) -> np.ndarray:
+        """The speed within the velocity limit, and so that the joint stops before its ends."""
+        speed, room, bound = self._speed, self._room, self._bound
+        np.multiply(self._reaction, self._qvel, out=self._a)
+        self._a += self._qpos
+        np.multiply(self._sign, self._a, out=room)
         np.subtract(self._ends, room, out=room)
-        np.multiply(room, self._slope, out=far)
+        bound[:] = np.minimum(self._position(room), self._joints.velocity)
+        np.minimum(speed, bound[0], out=speed)
+        return np.maximum(speed, np.negative(bound[1], out=bound[1]), out=speed)
+
+
+class _Approach:
+    """`approach_speed` with its constants; its two pieces are the minimum of a line and of a root."""
+
+    def __init__(self, acceleration: np.ndarray, rate: float):
+        self._slope, self._offset, self._rate = 2 * acceleration, acceleration**2 / rate**2, rate
+
+    def __call__(self, distance: np.ndarray) -> np.ndarray:
+        far = distance * self._slope
         far -= self._offset
         np.maximum(far, self._offset, out=far)
         np.sqrt(far, out=far)
-        np.multiply(room, APPROACH_RATE, out=bound)
-        np.minimum(bound, far, out=bound)
-        np.minimum(bound, self._velocity, out=bound)
-        np.minimum(speed, bound[0], out=speed)
-        np.maximum(speed, np.negative(bound[1], out=bound[1]), out=speed)
-        speed -= self._qvel
-        speed *= rate
-        np.minimum(speed, self._most, out=speed)
-        return np.maximum(speed, self._least, out=speed)
+        return np.minimum(far, distance * self._rate, out=far)
 
-    def _move(self, change: np.ndarray, step: float) -> None:
-        """Adds a change of the velocity; the angle moves at the mean of the velocities after each period."""
-        self._qpos += np.multiply(self._qvel, step, out=self._swing)
-        self._qvel += change
-        self._qpos += np.multiply(change, 0.5 * (step + PERIOD), out=self._swing)
 
-    def _approach(self, distance: np.ndarray) -> np.ndarray:
-        far = np.sqrt(np.maximum(self._slope * distance - self._offset, self._offset))
-        return np.minimum(APPROACH_RATE * distance, far)
+def _rate(periods: int) -> float:
+    """The rate that gives the decay of VELOCITY_RATE over some periods in one step."""
+    return (1 - (1 - VELOCITY_RATE * PERIOD) ** periods) / (periods * PERIOD)
 
 
 def braking_steps(joints: JointParameters) -> int:
     """Steps in which every joint stops from its velocity limit."""
-    longest = float(np.max(joints.velocity / joints.acceleration))
-    return int(np.ceil((longest + 5 * _LAG) / SAMPLE)) + 1
+    times = joints.velocity / joints.acceleration + 2 * joints.acceleration / joints.jerk + 5 / VELOCITY_RATE
+    return int(np.ceil(float(np.max(times)) / (BRAKE * PERIOD))) + 1

@@ -1,21 +1,18 @@
-"""The imitation environments: `environments` lists their names, `make` makes one by its name."""
+"""The imitation environments: `environments` lists their names, `env_config` is the config of one."""
 
 import importlib.resources
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mimic import compat, registry
+from mimic import registry
 from mimic.config import check_choice, explain, merged, schema, suggestion, to_dict, typed
 from mimic.envs.config import EnvConfig
 
-if TYPE_CHECKING:
-    from mimic.envs.imitation import ImitationEnv
-
 _PRESETS = importlib.resources.files("mimic") / "conf" / "env"
-_METRICS = importlib.resources.files("mimic") / "conf" / "metric"
+_GROUPS = ("metric", "world")  # groups of presets, in folders of that name
 
 
 _BUILT_IN = tuple(sorted(path.name.removesuffix(".yaml") for path in _PRESETS.iterdir() if path.name.endswith(".yaml")))
@@ -53,7 +50,8 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     Args:
       name: one of `environments()`.
       overrides: fields of `EnvConfig`. A nested config is a dict, as in `demonstrations={"count": 1}`. An arm may also
-        be its name or file, as in `learner="arm.xml"`, and the metric the name of a preset, as in `metric="paper"`.
+        be its name or file, as in `learner="arm.xml"`, and metric and world the name of a preset, as in
+        `metric="paper"` and `world="hardware"`, which sets other fields too.
 
     Raises:
       ValueError: an unknown name or field, or a value of the wrong type or out of range.
@@ -62,9 +60,11 @@ def env_config(name: str, **overrides: Any) -> EnvConfig:
     if name not in valid:
         raise ValueError(f"unknown environment {name!r}; valid are {', '.join(valid)}{suggestion(name, valid)}")
     preset = _built_in_preset(name) if name in _BUILT_IN else registered_preset(name)
-    presets = {"metric": _metric_preset(overrides["metric"])} if isinstance(overrides.get("metric"), str) else {}
+    named = {group: overrides[group] for group in _GROUPS if isinstance(overrides.get(group), str)}
+    overrides = {key: value for key, value in overrides.items() if key not in named}
+    presets = [_preset_of_group(group, preset) for group, preset in named.items()]
     try:
-        return typed(merged(schema(EnvConfig), preset, {**with_arm_configs(overrides), **presets}))
+        return typed(merged(schema(EnvConfig), preset, *presets, with_arm_configs(overrides)))
     except OmegaConfBaseException as error:
         raise ValueError(explain(error)) from error
 
@@ -76,30 +76,14 @@ def _built_in_preset(name: str) -> DictConfig:
     return preset
 
 
-def _metric_preset(name: str) -> DictConfig:
-    names = sorted(path.name.removesuffix(".yaml") for path in _METRICS.iterdir() if path.name.endswith(".yaml"))
-    check_choice("metric", name, names)
-    preset = OmegaConf.load(str(_METRICS / f"{name}.yaml"))
+def _preset_of_group(group: str, name: str) -> DictConfig:
+    """The fields of `EnvConfig` that a preset of a group sets."""
+    folder = importlib.resources.files("mimic") / "conf" / group
+    names = sorted(path.name.removesuffix(".yaml") for path in folder.iterdir() if path.name.endswith(".yaml"))
+    check_choice(group, name, names)
+    preset = OmegaConf.load(str(folder / f"{name}.yaml"))
     assert isinstance(preset, DictConfig)
-    return preset
+    return OmegaConf.create({"metric": preset}) if group == "metric" else preset
 
 
-def make(name: str, **overrides: Any) -> "ImitationEnv":
-    """Makes an environment of one learner with its training demonstrations; `mimic.make` makes those of many too.
-
-    Args:
-      name: one of `environments()`.
-      overrides: fields of the config, see `env_config`.
-
-    Raises:
-      ValueError: an unknown name or field, a value of the wrong type or out of range, demonstrations that do not fit.
-    """
-    config = env_config(name, **overrides)
-    config.check_one_learner()
-    compat.import_mjx()
-    from mimic.envs.imitation import make_env  # imports brax and MJX, which takes seconds
-
-    return make_env(config)
-
-
-__all__ = ["EnvConfig", "env_config", "environments", "make"]
+__all__ = ["EnvConfig", "env_config", "environments"]

@@ -18,6 +18,7 @@ AUTO = "auto"
 REWARD_TERMS, OBSERVATION_TERMS = ("self_collision",), ("distance_gradient",)  # built in, see mimic/envs/terms.py
 registry.reserve("reward_term", REWARD_TERMS)
 registry.reserve("observation_term", OBSERVATION_TERMS)
+_RECORDING_TIMESTEP = 0.01  # s, of the physics of an expert in an environment with an inner loop
 _MAX_RECORDED_STEPS = 10**8  # an hour on two cores
 
 
@@ -165,7 +166,7 @@ class EnvConfig:
         nearest to the expert's first one, for demonstrations that start anywhere.
       horizon: control steps of an episode.
       control_dt: duration of a control step [s]; the torque is constant within it.
-      substeps: physics steps in a control step.
+      substeps: physics steps in a control step; with an inner loop there is one for each of its periods of 1 ms.
       physics: "mjx"; "fused": the same equations in one fused kernel, many times faster; or "auto": "fused" where it
         covers the learner exactly, otherwise "mjx", see `choose_physics` in mimic/envs/physics.py.
       control: what an action is: "torque", which is constant in a control step (paper); or the target of an inner loop
@@ -220,7 +221,7 @@ class EnvConfig:
             registry.check("environment", self.environment, "environment")
         is_recorded = not (self.demonstrations.path or self.demonstrations.source)
         recorded = 0 if not is_recorded else self.demonstrations.count + self.demonstrations.held_out
-        steps = recorded * self.horizon * self.substeps
+        steps = recorded * self.horizon * self.recording_substeps
         if steps > _MAX_RECORDED_STEPS:
             raise ValueError(
                 f"demonstrations: expected (count + held_out) * horizon * substeps of at most {_MAX_RECORDED_STEPS:,} "
@@ -231,6 +232,11 @@ class EnvConfig:
     def has_inner_loop(self) -> bool:
         """Whether a controller runs at 1 kHz between actions and torques, or the world is not the paper's."""
         return self.control != "torque" or self.world != WorldConfig()
+
+    @property
+    def recording_substeps(self) -> int:
+        """Physics steps in a control step of the demonstrations that are recorded."""
+        return max(1, round(self.control_dt / _RECORDING_TIMESTEP)) if self.has_inner_loop else self.substeps
 
     def build_arms(self) -> ArmPair:
         """Both arms, with the links that the metric compares.

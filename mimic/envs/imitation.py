@@ -96,6 +96,10 @@ class ImitationEnv(Env):
         env._set_physics(choose_physics(physics, self.arm.model))
         return env
 
+    def on_mjx(self) -> "ImitationEnv":
+        """The environment that cross-checks this one: simulated by MJX, an engine that is not ours."""
+        return self.with_physics("mjx")
+
     def with_expert_states(self, states: LinkStates) -> "ImitationEnv":
         """The same environment with another array for `expert_states`: an argument of the function that JAX compiles.
 
@@ -169,19 +173,11 @@ class ImitationEnv(Env):
         return Load(*jax.random.uniform(key, (2,), minval=minimum, maxval=maximum))
 
     def step(self, state: State, action: Float[Array, " joints"]) -> State:
-        """Advances an episode by one control step of constant torque."""
+        """Advances an episode by one control step."""
         before = arm_state(state)
         command = jnp.clip(action, -1.0, 1.0)
-        step = before.step + 1
-        randomization = self.config.randomization
-        torque = command
-        if randomization.torque_noise:
-            key_noise = jax.random.fold_in(jax.random.fold_in(before.key, _NOISE), step)
-            noise = jax.random.normal(key_noise, command.shape)
-            torque = jnp.clip(command + randomization.torque_noise * noise, -1.0, 1.0)
-        load = Load(randomization.mass[0], randomization.damping[0]) if before.load is None else before.load
-        torque = torque * self.torque_scale
-        qpos, qvel = self._advance(before.qpos, before.qvel, torque, load)
+        after, torque = self._simulate(before, command)
+        qpos, qvel, step = after.qpos, after.qvel, after.step
         runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
         remaining = (self.config.horizon - step).astype(jnp.float32)
         states = link_states(self.learner, qpos, qvel)
@@ -191,7 +187,6 @@ class ImitationEnv(Env):
         # A runaway is charged its penalty for all remaining steps, so that ending an episode early is never better.
         steps = jnp.where(runaway, 1.0 + remaining, 1.0)
         done = (runaway | (step >= self.config.horizon)).astype(jnp.float32)
-        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=step)
         metrics = {
             **state.metrics,
             "distance": distance,
@@ -207,6 +202,26 @@ class ImitationEnv(Env):
             reward = reward + term.weight * value * steps
         obs = self._observe_states(after, states)
         return state.replace(pipeline_state=after, obs=obs, reward=reward, done=done, metrics=metrics)
+
+    def _simulate(
+        self, before: ArmState, command: Float[Array, " numbers"]
+    ) -> tuple[ArmState, Float[Array, " joints"]]:
+        """The state after a control step of an action in [-1, 1], and the torque in it [N m], which is constant."""
+        step, randomization = before.step + 1, self.config.randomization
+        torque = command
+        if randomization.torque_noise:
+            key_noise = jax.random.fold_in(jax.random.fold_in(before.key, _NOISE), step)
+            noise = jax.random.normal(key_noise, command.shape)
+            torque = jnp.clip(command + randomization.torque_noise * noise, -1.0, 1.0)
+        load = Load(randomization.mass[0], randomization.damping[0]) if before.load is None else before.load
+        torque = torque * self.torque_scale
+        qpos, qvel = self._advance(before.qpos, before.qvel, torque, load)
+        return dataclasses.replace(before, qpos=qpos, qvel=qvel, step=step), torque
+
+    def commanded_torque(self, state: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
+        """The torque that was commanded in the control step before a state [N m], without noise."""
+        del state
+        return action * self.torque_scale
 
     def restart_done(self, states: State) -> State:
         """Starts a new episode, on a random demonstration, for each arm of a batch whose episode is done."""
@@ -318,18 +333,20 @@ def _opposite_links() -> tuple[LinkStates, LinkStates]:
     return jax.tree.map(lambda leaf: leaf[0], links)
 
 
-def make_env(config: EnvConfig, demonstrations: Demonstrations | None = None) -> ImitationEnv:
-    """The environment of a config: an `ImitationEnv`, or an object of the registered class that the config names.
+def env_class(config: EnvConfig) -> type[ImitationEnv]:
+    """The class of an environment: `ImitationEnv`, or the registered class that the config names.
 
     Raises:
-      ValueError: an unknown class, or what `ImitationEnv` rejects.
+      ValueError: an unknown class.
     """
     if not config.environment:
-        return ImitationEnv(config, demonstrations)
-    env_class = registry.find("environment", config.environment, "environment")
-    if not (isinstance(env_class, type) and issubclass(env_class, ImitationEnv)):
-        raise ValueError(f"environment: {config.environment!r}: expected a subclass of ImitationEnv, got {env_class!r}")
-    return env_class(config, demonstrations)
+        return ImitationEnv
+    registered = registry.find("environment", config.environment, "environment")
+    if not (isinstance(registered, type) and issubclass(registered, ImitationEnv)):
+        raise ValueError(
+            f"environment: {config.environment!r}: expected a subclass of ImitationEnv, got {registered!r}"
+        )
+    return registered
 
 
 def observation_layout(expert: Embodiment, learner: Embodiment, preview: int) -> list[dict[str, Any]]:
@@ -388,7 +405,7 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
             seed=settings.seed,
             horizon=config.horizon,
             dt=config.control_dt,
-            substeps=config.substeps,
+            substeps=config.recording_substeps,
         )
     training = loaded.select(slice(0, settings.count))
     held_out = loaded.select(slice(settings.count, settings.count + settings.held_out))

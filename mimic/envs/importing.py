@@ -1,19 +1,21 @@
-"""Imports motions as demonstrations: CSV tables, and npz files in LocoMuJoCo's format."""
+"""Imports motions as demonstrations: CSV tables, npz files in LocoMuJoCo's format, LeRobot datasets and rosbag2."""
 
 import csv
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.datasets.episodes import Motion
+from mimic.datasets.lerobot_reading import is_lerobot, read_lerobot
+from mimic.datasets.rosbag2 import BAG_FILES, is_rosbag2, read_rosbag2
 from mimic.envs.demonstrations import MAX_VALUE, Demonstrations, check_effort
 from mimic.npz import read_arrays
 
-SOURCES = (".csv", ".npz")
+SOURCES = (".csv", ".npz", *BAG_FILES)
 _TIME, _DEMONSTRATION = ("time", "t"), "demonstration"  # columns of a table
 _ANGLE_PREFIXES, _VELOCITY_PREFIXES = ("", "q_", "q", "qpos_"), ("qdot_", "qdot", "qvel_", "dq_")
 _SIZES = {0: (7, 6), 2: (1, 1), 3: (1, 1)}  # columns of qpos and qvel by MuJoCo's joint type: free, slide, revolute
@@ -25,17 +27,15 @@ _FORMS = {  # of the arrays of an npz file: kinds of their types, and their numb
 _ROUNDING = 1e-6  # tolerance of the duration (relative) and of joint ranges (rad): float32 rounds pi by 9e-8
 
 
-class Motion(NamedTuple):
-    """One motion at the times of its file; `qvel` is None if the file has no velocities."""
-
-    time: Float[np.ndarray, " samples"]
-    qpos: Float[np.ndarray, "samples joints"]
-    qvel: Float[np.ndarray, "samples joints"] | None
-
-
 # Above 40 lines because of its docstring.
 def import_demonstrations(
-    path: str | os.PathLike[str], arm: Embodiment, *, dt: float = 0.1, horizon: int = 50, joints: Sequence[str] = ()
+    path: str | os.PathLike[str],
+    arm: Embodiment,
+    *,
+    dt: float = 0.1,
+    horizon: int = 50,
+    joints: Sequence[str] = (),
+    topic: str = "",
 ) -> tuple[Demonstrations, bool]:
     """Reads motions, resamples them at control steps, and checks them against the arm's limits.
 
@@ -44,32 +44,33 @@ def import_demonstrations(
     `demonstration`, the number of the motion. An npz file has `qpos`, `joint_names` and `frequency` [1/s] (or `dt`),
     and optionally `qvel`, `jnt_type` and `split_points`, the first samples of the motions, in LocoMuJoCo's format.
 
+    A folder is a LeRobot dataset of version 3, where an episode is a motion and a joint's angle [rad] is named NAME.pos
+    or NAME, its velocity [rad/s] NAME.vel; or a rosbag2, or a folder of them, where a bag is a motion of
+    sensor_msgs/JointState messages. Both need the extra `datasets`.
+
     Between samples the angles are cubic in time, with the file's velocities, or with central differences if it has
     none. Every demonstration is cut to the horizon.
 
     Args:
-      path: the file; its suffix selects the format.
+      path: the file, whose suffix selects the format, or the folder.
       arm: the expert.
       dt: control step [s].
       horizon: steps of a demonstration.
       joints: names of the arm's joints in the file, base to tip; the arm's own names where empty.
+      topic: topic of a rosbag2, or feature of a LeRobot dataset; only needed where several have the joints.
 
     Returns:
       The demonstrations, and whether their velocities were computed by differentiation.
 
     Raises:
       ValueError: a file that is missing or has another format, lacks joints, is shorter than the horizon, is not in
-        rad, or exceeds the arm's velocity limits.
+        rad, or exceeds the arm's velocity limits; a package that is not installed.
     """
     source = Path(path)
-    if not source.is_file():
-        raise ValueError(f"source: no file at {str(source)!r}")
-    if source.suffix not in SOURCES:
-        raise ValueError(f"source: expected a file that ends in {', '.join(SOURCES)}, got {str(source)!r}")
     names = tuple(joints) or arm.joint_names
     if len(names) != arm.num_joints:
         raise ValueError(f"joints: expected {arm.num_joints} names, of {', '.join(arm.joint_names)}, got {len(names)}")
-    motions = (_read_csv if source.suffix == ".csv" else _read_npz)(source, names)
+    motions = _read(source, names, topic)
     for index, motion in enumerate(motions):
         _check(motion, f"demonstration {index} in {str(source)!r}", arm, dt * horizon)
     resampled = [_resampled(motion, dt, horizon) for motion in motions]
@@ -77,6 +78,23 @@ def import_demonstrations(
     imported = Demonstrations(qpos, qvel, qpos[:, -1], float(dt), arm.name, arm.joint_names)
     check_effort(imported, arm)
     return imported, any(motion.qvel is None for motion in motions)
+
+
+def _read(source: Path, names: Sequence[str], topic: str) -> list[Motion]:
+    """The motions of a file or a folder."""
+    if is_lerobot(source):
+        return read_lerobot(source, names, topic)
+    if is_rosbag2(source):
+        return read_rosbag2(source, names, topic)
+    if topic:
+        raise ValueError(f"topic: expected only for a LeRobot dataset or a rosbag2, got {topic!r} for {str(source)!r}")
+    if source.is_dir():
+        raise ValueError(f"source: expected a folder of a LeRobot dataset or of rosbag2, got {str(source)!r}")
+    if not source.is_file():
+        raise ValueError(f"source: no file at {str(source)!r}")
+    if source.suffix not in SOURCES:
+        raise ValueError(f"source: expected a file that ends in {', '.join(SOURCES)}, got {str(source)!r}")
+    return (_read_csv if source.suffix == ".csv" else _read_npz)(source, names)
 
 
 def _check(motion: Motion, name: str, arm: Embodiment, duration: float) -> None:

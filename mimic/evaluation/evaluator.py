@@ -65,10 +65,10 @@ class Evaluator:
         self.env = env.with_demonstrations(concatenate(env.demonstrations, held_out))
         self._references = Background(lambda: _references(self.env))
 
-    def with_physics(self, physics: str) -> "Evaluator":
-        """An evaluator of rollouts in another physics, with the same bound and the same baselines."""
+    def on_mjx(self) -> "Evaluator":
+        """An evaluator of rollouts on MJX, with the same bound and the same baselines."""
         evaluator = copy.copy(self)
-        evaluator.env = self.env.with_physics(physics)
+        evaluator.env = self.env.on_mjx()
         return evaluator
 
     def prepare(self) -> None:
@@ -111,7 +111,8 @@ class Evaluator:
             action = jnp.clip(action, -1.0, 1.0)
             state = env.step(carry[0], action)
             after: Any = state.pipeline_state
-            rollouts = Rollouts(after.qpos, after.qvel, action * env.torque_scale, state.metrics["distance"])
+            torque = env.commanded_torque(after, action)
+            rollouts = Rollouts(after.qpos, after.qvel, torque, state.metrics["distance"])
             return (state, memory), rollouts
 
         # `vmap` is inside the loop: around the loop, JAX would trace a step twice, without and with the batch.

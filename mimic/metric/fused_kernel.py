@@ -106,6 +106,22 @@ def batched_by(
     return function
 
 
+def with_batch_last(step: Callable[..., tuple[Array, ...]]) -> Callable[..., tuple[Array, ...]]:
+    """A function of vectors whose batch is the last axis of the arrays of `step`, so that its loops are vectorized."""
+    function = jax.custom_batching.custom_vmap(step)
+
+    @function.def_vmap
+    def batch(size: int, batched: Any, *vectors: Array) -> Any:
+        columns = [
+            jnp.moveaxis(vector, 0, -1) if is_batched else jnp.broadcast_to(vector[:, None], (*vector.shape, size))
+            for vector, is_batched in zip(vectors, batched, strict=True)
+        ]
+        outputs = tuple(jnp.moveaxis(x, -1, 0) for x in step(*columns))
+        return outputs, (True,) * len(outputs)
+
+    return function
+
+
 def gpu_kernel(
     function: ScalarFunction, widths: Sequence[int], launch: LaunchConfig = DEFAULT
 ) -> Callable[..., tuple[Array, ...]]:

@@ -1,9 +1,11 @@
 """Files of a run directory: their names, and writing them atomically."""
 
+import contextlib
 import json
 import math
 import os
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,18 @@ def write_atomically(path: Path, text: str) -> None:
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text, newline="")
     os.replace(partial, path)
+
+
+@contextlib.contextmanager
+def written_atomically(folder: Path) -> Iterator[Path]:
+    """An empty folder to write into, next to a new one that it becomes at the end; removed where writing fails."""
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    partial.mkdir()
+    try:
+        yield partial
+        os.replace(partial, folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:

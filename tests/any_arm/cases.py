@@ -59,23 +59,24 @@ def acceleration(model, qpos, qvel, torque):
     return data.qacc.copy()
 
 
-def looped(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0):
+def looped(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: Any = None):
     """Accelerations of an arm by the equations for CPUs."""
     numbers = dynamics.joint_numbers(arm).reshape(MAX_JOINTS, dynamics.NUMBERS)
-    return looped_dynamics.acceleration(numbers, qpos, qvel, torque, jnp.asarray(mass), jnp.asarray(damping))
+    return looped_dynamics.acceleration(numbers, qpos, qvel, torque, jnp.asarray(mass), jnp.asarray(damping), base)
 
 
-def articulated(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0):
+def articulated(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: Any = None):
     """Accelerations of an arm by the equations of the GPU kernel."""
     numbers = dynamics.joint_numbers(arm).reshape(MAX_JOINTS, dynamics.NUMBERS)
     return jnp.stack(
         articulated_kernel.acceleration(
             lambda index: dynamics.joint_of(numbers[index]),
-            lambda index: torque[index],
             articulated_kernel.rotating_rows(MAX_JOINTS, 1),
             tuple(qpos),
             tuple(qvel),
+            tuple(torque),
             (mass, damping),
+            base,
         )
     )
 

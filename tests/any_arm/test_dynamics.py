@@ -1,5 +1,6 @@
 """The dynamics of any arm against C MuJoCo and Pinocchio in double precision."""
 
+import copy
 import dataclasses
 import itertools
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from mimic.any_arm import dynamics
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
+from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, base_in_world, lock_joints, stack_arms
 from mimic.arms.arm import ArmConfig, build_arm
 from tests.any_arm.cases import Batch, acceleration, articulated, assert_near, looped, padded, random_source
 
@@ -42,6 +43,25 @@ def test_random_arms_accelerate_as_in_mujoco(x64):
         assert_near(actual, np.stack(expected))
         assert_near(actual, batch.qacc)  # what `torque` was computed from
         assert empty.any() and not actual[empty].any()
+
+
+def test_gravity_is_that_of_mujoco(x64, batch):
+    """As an acceleration of the base, in the frame of the first joint."""
+    gravity, expected = np.array([1.0, -2.0, -9.0]), []
+    for arm, (qpos, qvel, _, torque) in zip(batch.arms, batch.motions, strict=True):
+        model = copy.copy(arm.model)
+        model.opt.gravity = gravity
+        model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+        expected.append(padded(acceleration(model, qpos, qvel, torque)))
+    to_world = [
+        base_in_world(arm)[:3, :3] @ frame for arm, frame in zip(batch.arms, batch.arrays.base_rotation, strict=True)
+    ]
+    base = tuple(np.stack([rotation.T @ -gravity for rotation in to_world]).T)
+    for form in (looped, articulated):
+        actual = jax.jit(jax.vmap(lambda *x, form=form: form(*x[:4], base=x[4])))(
+            batch.arrays, batch.qpos, batch.qvel, batch.torque, base
+        )
+        assert_near(np.asarray(actual), np.stack(expected))
 
 
 def test_random_arms_include_the_hard_cases(batch):

@@ -11,11 +11,11 @@ import numpy as np
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.drives import drives_of
-from mimic.arms.simulation_model import effective_inertia
 from mimic.commands.onnx_graph import to_onnx
 from mimic.control.joint_control import JointParameters, action_size
-from mimic.control.limits import joint_parameters
 from mimic.deploy.bundle import load_bundle, write_bundle
+from mimic.envs import env_config
+from mimic.hardware.plant import make_plant
 from mimic.retargeting.clearance import make_clearance
 
 PREVIEW, PAST, LINKS, TICKS, CONTROL_DT = 2, 3, 7, 40, 0.05
@@ -34,6 +34,15 @@ def panda_clearance(locked: tuple[int, ...] = ()) -> bytes:
     joints = panda(locked).embodiment.num_joints
     model = to_onnx(lambda qpos: {"clearance": clearance(qpos)}, name="clearance", inputs={"qpos": joints}, metadata={})
     return model.SerializeToString()
+
+
+@functools.cache
+def parameters(locked: tuple[int, ...] = ()) -> JointParameters:
+    """The parameters of the inner loop of a Panda in the hardware world."""
+    config = env_config("panda7dof", world="hardware", learner={"locked": list(locked)})
+    joints = panda(locked).embodiment.num_joints
+    padded = make_plant(config, panda(locked)).constants.parameters
+    return JointParameters(*(np.asarray(x, float)[:joints] for x in padded))
 
 
 def policy(joints: int, size: int, action: Any) -> bytes:
@@ -74,13 +83,10 @@ def make_bundle(
     """Writes a bundle for a Panda and loads it."""
     arm, locked = panda(tuple(locked)), tuple(locked)
     limits = drives_of(ArmConfig(locked=list(locked)), arm).limits
-    home = np.asarray(arm.embodiment.home)
-    inertia = effective_inertia(arm.model, home)
-    parameters: JointParameters = joint_parameters(limits, inertia, 5 * inertia, CONTROL_DT)
+    home, joints = np.asarray(arm.embodiment.home), arm.embodiment.num_joints
     start_poses = np.stack([home, home]) if start_poses is None else start_poses
     expert = np.zeros((len(start_poses), ticks + 1, LINKS * 12))
     expert[:, :, 0] = 2 * np.pi * CONTROL_DT * np.arange(ticks + 1)  # one cycle a second
-    joints = arm.embodiment.num_joints
     write_bundle(
         folder,
         policy=policy(joints, action_size(mode, joints), action),
@@ -92,7 +98,7 @@ def make_bundle(
             "control_dt": CONTROL_DT,
             "joint_names": list(arm.embodiment.joint_names),
             "limits": limits.as_lists(),
-            "parameters": {name: np.asarray(x).tolist() for name, x in parameters._asdict().items()},
+            "parameters": {name: x.tolist() for name, x in parameters(locked)._asdict().items()},
             "preview": PREVIEW,
             "past_actions": PAST,
             "expert_links": LINKS,

@@ -13,11 +13,12 @@ from mimic.any_arm.controller import ControllerWithMemory
 from mimic.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
-from mimic.envs.imitation import ImitationEnv, make_env, training_and_held_out
+from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.rollout_metrics import MIN_SPAN
+from mimic.making import make_env
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
@@ -126,7 +127,7 @@ class PPOTrainer(Trainer):
             return evaluator.rollout(self.controller(params))
 
         with on_host():
-            evaluator = self.evaluator.with_physics("mjx")
+            evaluator = self.evaluator.on_mjx()
             compiled = jax.jit(rollouts_on_mjx).lower(self._params_shapes()).compile()
         return evaluator, compiled
 

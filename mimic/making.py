@@ -1,4 +1,4 @@
-"""Makes environments of one learner and of many."""
+"""Makes environments: of one learner, as in the paper or with an inner loop, and of many learners."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any, Literal, overload
@@ -36,9 +36,31 @@ def make(name: str, **overrides: Any) -> "ImitationEnv | AnyArmEnv":
     compat.import_mjx()  # takes seconds, as the imports below
     if config.arms.are_drawn:
         return make_family_env(config)
-    from mimic.envs.imitation import make_env
-
     return make_env(config)
+
+
+def make_env(config: EnvConfig, demonstrations: Demonstrations | None = None) -> "ImitationEnv":
+    """Makes the environment of a config with one learner: an `ImitationEnv`, or an object of a subclass of it.
+
+    The subclass is `HardwareEnv` where `config.has_inner_loop`, or the registered class that the config names.
+
+    Args:
+      config: the config.
+      demonstrations: motions to imitate. Default None: the training demonstrations of the config.
+
+    Raises:
+      ValueError: an unknown class, arms or demonstrations that do not fit.
+    """
+    from mimic.envs.imitation import ImitationEnv, env_class
+
+    config.check_one_learner()
+    if not config.has_inner_loop:
+        return env_class(config)(config, demonstrations)
+    from mimic.hardware.env import HardwareEnv
+
+    if env_class(config) is not ImitationEnv:
+        raise ValueError(f"environment: expected none with an inner loop (control, world), got {config.environment!r}")
+    return HardwareEnv(config, demonstrations)
 
 
 def make_family_env(config: EnvConfig, demonstrations: Demonstrations | None = None) -> "AnyArmEnv":

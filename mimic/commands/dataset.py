@@ -1,0 +1,154 @@
+"""`python -m mimic.dataset`: writes rollouts or demonstrations as a LeRobot dataset or as rosbag2."""
+
+import importlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from mimic.commands.config import DatasetConfig
+from mimic.commands.dataset_sources import command_quantity, file_episodes, rollout_episodes
+from mimic.commands.progress import is_animated
+from mimic.compilation import use_compilation_cache
+from mimic.config import new_folder
+from mimic.datasets.episodes import Episodes, package_error
+from mimic.datasets.lerobot import action_of, frames_per_second, write_lerobot
+from mimic.datasets.rosbag2 import write_rosbag2
+from mimic.distribution import NAME, VERSION
+from mimic.envs.demonstrations import load_demonstrations
+from mimic.evaluation.labels import SPLITS
+from mimic.runs.checkpoints import load_checkpoint
+from mimic.runs.files import written_atomically
+from mimic.trainers.make import make_ppo_trainer
+from mimic.trainers.run_config import policy_run
+
+_PACKAGES = {"lerobot": "pyarrow", "rosbag2": "rosbags"}  # the package that writes each format
+
+
+def prepare_dataset(config: DatasetConfig) -> Callable[[], int]:
+    """Checks the config of a dataset, and restores the policy or loads the files.
+
+    Raises:
+      ValueError: `out` exists, the package of the format is not installed, the run or the checkpoint does not exist, a
+        file cannot be read, or the format does not have the time step.
+    """
+    use_compilation_cache(config.compilation_cache)
+    _check_keys(config)
+    out = new_folder("out", config.out)
+    _check_package(config.format)
+    compute = _prepare_rollouts(config) if config.run else _prepare_files(config)
+
+    def run() -> int:
+        console = Console()
+        episodes, notes = compute(console)
+        if not episodes.steps:
+            print("error: no episode to write: each rollout of this policy is a runaway", file=sys.stderr)
+            return 1
+        _write(config.format, out, episodes, console)
+        for line in [*_lines(config.format, episodes), *notes]:
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
+        console.print(f"results: {out}", soft_wrap=True, highlight=False)
+        return 0
+
+    return run
+
+
+def _check_keys(config: DatasetConfig) -> None:
+    """Rejects keys that exclude each other."""
+    if bool(config.run) == bool(config.demonstrations):
+        got = f"run={config.run} and demonstrations={config.demonstrations}" if config.run else "neither"
+        raise ValueError(
+            f"run, demonstrations: expected one of them, as in run=runs/NAME or demonstrations=FILE.npz, got {got}"
+        )
+    for key in ("checkpoint", "split"):
+        if not config.run and getattr(config, key) not in ("", None):
+            raise ValueError(f"{key}: expected only with run=, got {getattr(config, key)!r}")
+    if config.retargeted and config.run:
+        raise ValueError(f"retargeted: expected only with demonstrations=, got {config.retargeted!r}")
+
+
+def _check_package(format: str) -> None:
+    package = _PACKAGES[format]
+    try:
+        importlib.import_module(package)
+    except ImportError as error:
+        raise package_error(f"format={format}", package) from error
+
+
+_Computed = tuple[Episodes, list[str]]  # what to write, and what to tell about it
+
+
+def _prepare_rollouts(config: DatasetConfig) -> Callable[[Console], _Computed]:
+    """Restores the policy of a run; the returned function computes its rollouts."""
+    run_dir, trained = policy_run(config.run, config.checkpoint)
+    _check_time_step(config.format, trained.env.control_dt)
+    command_quantity(trained.env.control)
+    trainer = make_ppo_trainer(trained, run_dir)
+    steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
+    splits = [config.split] if config.split else SPLITS
+    facts = {
+        "env": trained.env.name, "control": trained.env.control, "physics": trainer.env_config.physics,
+        "checkpoint": steps, "seed": trained.seed,
+    }  # fmt: skip
+
+    def compute(console: Console) -> _Computed:
+        with console.status(f"rolling out the policy of {config.run}"):
+            rollouts = trainer.evaluate(params)
+        provenance = _provenance("rollouts of a policy", facts)
+        episodes, cut = rollout_episodes(trainer.evaluator, rollouts, splits, config.task, provenance)
+        note = f"{cut} rollouts end before the step in which a joint exceeds {trained.env.speed_bound:g} rad/s"
+        return episodes, [note] if cut else []
+
+    return compute
+
+
+def _prepare_files(config: DatasetConfig) -> Callable[[Console], _Computed]:
+    """Loads motions; the returned function returns them."""
+    demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
+    retargeted = load_demonstrations(Path(config.retargeted).expanduser()) if config.retargeted else None
+    _check_time_step(config.format, demonstrations.dt)
+    kind = "retargeted motions" if retargeted else "motions of a file"
+    episodes = file_episodes(demonstrations, retargeted, config.task, _provenance(kind, {"seed": demonstrations.seed}))
+    return lambda console: (episodes, [])
+
+
+def _check_time_step(format: str, dt: float) -> None:
+    if format == "lerobot":
+        frames_per_second(dt)
+
+
+def _provenance(kind: str, facts: dict[str, Any]) -> dict[str, Any]:
+    return {"written_by": f"{NAME} {VERSION}", "source": kind, **facts}
+
+
+def _write(format: str, out: Path, episodes: Episodes, console: Console) -> None:
+    """Writes the dataset; its folder has its name when it is complete."""
+    columns = BarColumn(), MofNCompleteColumn(), TextColumn("left"), TimeRemainingColumn()
+    with (
+        written_atomically(out) as folder,
+        Progress(TextColumn("[bold]writing"), *columns, console=console, disable=not is_animated(console)) as bar,
+    ):
+        if format == "lerobot":
+            write_lerobot(folder, episodes)
+            return
+        task = bar.add_task("write", total=len(episodes.steps))
+        write_rosbag2(folder, episodes, lambda: bar.advance(task))
+
+
+def _lines(format: str, episodes: Episodes) -> list[str]:
+    """What a dataset has."""
+    robot, expert = episodes.robot, episodes.expert
+    splits = ", ".join(f"{end - first} {split}" for split, (first, end) in episodes.ranges.items())
+    head = f"{len(episodes.steps)} episodes ({splits}), {sum(episodes.steps)} steps of {episodes.dt:g} s"
+    arms = f"robot: {robot.arm}, {len(robot.joint_names)} joints"
+    arms += f"; expert: {expert.arm}, {len(expert.joint_names)} joints" if expert else ""
+    if format == "lerobot":
+        _, quantity, meaning = action_of(robot)
+        action = f"action: {quantity.name} [{quantity.unit}], {meaning}"
+    else:
+        known = robot.command is not None
+        action = f"commands: {robot.quantity.name} [{robot.quantity.unit}]" if known else "commands: none are known"
+    return [head, arms, action]

@@ -1,0 +1,96 @@
+"""Motions to write as a dataset: rollouts of a policy, or what files have."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mimic.datasets.episodes import TORQUE, ArmMotions, Episodes, Quantity
+from mimic.envs.demonstrations import Demonstrations
+from mimic.evaluation.evaluator import Evaluator, Rollouts
+from mimic.evaluation.labels import SPLITS
+
+# What a policy commands, by `env.control`. Another mode is added here once `Rollouts` has its targets.
+_COMMANDS = {"torque": TORQUE}
+
+
+def command_quantity(control: str) -> Quantity:
+    """What the commands in the rollouts of an environment are, one for each joint.
+
+    Raises:
+      ValueError: rollouts do not have the commands of this mode of control.
+    """
+    if control not in _COMMANDS:
+        raise ValueError(f"run: expected a run with env.control={' or '.join(_COMMANDS)}, got {control}")
+    return _COMMANDS[control]
+
+
+def rollout_episodes(
+    evaluator: Evaluator, rollouts: Rollouts, splits: Sequence[str], task: str, provenance: dict[str, Any]
+) -> tuple[Episodes, int]:
+    """The rollouts on the demonstrations of some splits, and the number of those that a runaway cut short.
+
+    An episode ends before the step in which a joint exceeds the environment's speed bound. Episodes without a step are
+    left out.
+    """
+    env, parts = evaluator.env, evaluator.parts
+    horizon, demonstrations = env.config.horizon, env.demonstrations
+    indices = {split: np.arange(demonstrations.count)[parts[split]] for split in SPLITS if split in splits}
+    chosen = np.concatenate(list(indices.values()))
+    labels = np.repeat(list(indices), [len(index) for index in indices.values()])
+    numbers = np.concatenate([np.arange(len(index)) for index in indices.values()])
+    start = np.asarray(env.start_poses)[chosen][:, None]
+    qpos, qvel, command = (np.asarray(values)[chosen] for values in (rollouts.qpos, rollouts.qvel, rollouts.torque))
+    steps = steps_before_runaway(qvel, env.config.speed_bound)
+    kept = np.flatnonzero(steps)
+    learner = ArmMotions(
+        env.learner.name,
+        env.learner.joint_names,
+        np.concatenate([start, qpos], axis=1)[kept],
+        np.concatenate([np.zeros_like(start), qvel], axis=1)[kept],
+        command[kept],
+        command_quantity(env.config.control),
+    )
+    shown = demonstrations.of_length(horizon).select(chosen[kept].tolist())
+    expert = _arm_motions(shown)
+    task = task or f"imitate the motion of {env.expert.name} with {env.learner.name} ({env.config.name})"
+    episodes = Episodes(
+        env.config.control_dt, task, learner, expert, steps[kept].tolist(), labels[kept].tolist(),
+        numbers[kept].tolist(), provenance,
+    )  # fmt: skip
+    return episodes, int(np.sum(steps < horizon))
+
+
+def steps_before_runaway(qvel: np.ndarray, speed_bound: float) -> np.ndarray:
+    """The steps [episodes] before the first one in which a joint reaches the speed bound or is not a number.
+
+    Args:
+      qvel: [episodes, steps, joints] after each step [rad/s].
+      speed_bound: see `EnvConfig` [rad/s].
+    """
+    runaway = ~np.all(np.abs(qvel) < speed_bound, axis=-1)  # True for NaN too
+    return np.where(runaway.any(axis=1), runaway.argmax(axis=1), qvel.shape[1])
+
+
+def file_episodes(
+    demonstrations: Demonstrations, retargeted: Demonstrations | None, task: str, provenance: dict[str, Any]
+) -> Episodes:
+    """The motions of a file; with retargeted ones, these are the robot's and the others the expert's.
+
+    Raises:
+      ValueError: the two have other numbers of motions, lengths or time steps.
+    """
+    sizes = [(motions.count, motions.horizon, motions.dt) for motions in (demonstrations, retargeted or demonstrations)]
+    if sizes[0] != sizes[1]:
+        expected, got = ("{} motions of {} steps of {} s".format(*size) for size in sizes)
+        raise ValueError(f"retargeted: expected {expected}, as in demonstrations, got {got}")
+    count, horizon, dt = sizes[0]
+    expert, robot = _arm_motions(demonstrations), _arm_motions(retargeted or demonstrations)
+    task = task or (f"imitate the motion of {expert.arm} with {robot.arm}" if retargeted else f"move {robot.arm}")
+    return Episodes(
+        dt, task, robot, expert if retargeted else None, [horizon] * count, ["train"] * count, range(count), provenance
+    )
+
+
+def _arm_motions(motions: Demonstrations) -> ArmMotions:
+    return ArmMotions(motions.arm, motions.joint_names, motions.qpos, motions.qvel, motions.torque, TORQUE)

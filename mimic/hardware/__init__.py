@@ -1,0 +1,1 @@
+"""Environments of a robot as it is: an inner loop at 1 kHz, gravity, friction, payload, sensors and delays."""

@@ -1,0 +1,203 @@
+"""The environment of a robot: targets of an inner loop at 1 kHz, and measurements with noise and delay."""
+
+import copy
+import dataclasses
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mimic.any_arm.arrays import MAX_JOINTS
+from mimic.control import joint_control
+from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
+from mimic.envs.arm_state import ArmState
+from mimic.envs.config import EnvConfig
+from mimic.envs.demonstrations import Demonstrations
+from mimic.envs.imitation import ImitationEnv
+from mimic.envs.physics import PhysicsChoice
+from mimic.envs.world import MAX_DELAY
+from mimic.hardware.inner_loop import InnerLoop, LoopState, make_inner_loop
+from mimic.hardware.mjx_loop import MjxLoop, make_mjx_loop
+from mimic.hardware.mujoco_world import mujoco_world
+from mimic.hardware.plant import Draw, draw_episode, make_plant
+from mimic.hardware.state import HardwareState
+from mimic.metric.kinematics import LinkStates, link_states
+
+SENT_ACTIONS = 3  # that the policy observes: from them it tells how long its actions take
+_DRAW, _START, _MEASURE, _LOSS = 5, 6, 7, 8  # folded into an episode's key, see mimic/envs/imitation.py
+
+
+class HardwareEnv(ImitationEnv):
+    """An `ImitationEnv` whose actions are targets of an inner loop, in a world with gravity, friction and delays.
+
+    Reward and metrics are those of the true motion. The observation has the measured link states of the learner in
+    place of the true ones, and then the angles and velocities of the reference and the last actions that were sent.
+
+    Args:
+      config: see `EnvConfig`; `has_inner_loop`.
+      demonstrations: see `ImitationEnv`.
+
+    Attributes:
+      plant: the learner, as the inner loop simulates it.
+      action_size: length of an action.
+
+    Raises:
+      ValueError: arms, demonstrations or settings that do not fit.
+    """
+
+    def __init__(self, config: EnvConfig, demonstrations: Demonstrations | None = None):
+        _check(config)
+        super().__init__(config, demonstrations)
+
+    def _set_physics(self, physics: PhysicsChoice) -> None:
+        config, arm = self.config, self.arm
+        self.physics, self.config = physics, dataclasses.replace(config, physics=physics.name)
+        self.plant = make_plant(config, arm)
+        periods, joints = round(config.control_dt / PERIOD), self.learner.num_joints
+        if physics.name == "fused":
+            self._inner_loop = self._fused_loop(make_inner_loop(config.control, self.plant.constants, periods))
+        else:
+            capsules = self.capsules if config.world.contacts else None
+            world = mujoco_world(arm, config.world, capsules)
+            self._inner_loop = make_mjx_loop(config.control, self.plant, world, periods)
+        parameters = self.plant.constants.parameters
+        self._parameters = JointParameters(*(jnp.asarray(x[:joints], jnp.float32) for x in parameters))
+
+    def _fused_loop(self, loop: InnerLoop) -> MjxLoop:
+        """The fused loop on vectors without empty slots."""
+        joints = self.learner.num_joints
+
+        def run(draw: Draw, state: LoopState, target: Target) -> LoopState:
+            state, target = jax.tree.map(lambda x: jnp.pad(x, (0, MAX_JOINTS - joints)), (state, target))
+            return jax.tree.map(lambda x: x[:joints], loop(self.plant.episode(draw), state, target))
+
+        return run
+
+    def on_mjx(self) -> "HardwareEnv":
+        """See `ImitationEnv`; without contacts, which take ten times as long and which the fused loop lacks too."""
+        env = copy.copy(self)
+        env.config = dataclasses.replace(self.config, world=dataclasses.replace(self.config.world, contacts=False))
+        return cast(HardwareEnv, env.with_physics("mjx"))
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action, see `joint_control.action_target`."""
+        return joint_control.action_size(self.config.control, self.learner.num_joints)
+
+    def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> HardwareState:
+        """The first state of an episode: at rest near the start pose, which is also the reference."""
+        state, joints = super().start(key, demonstration), self.learner.num_joints
+        deviation = self.config.world.start_noise
+        noise = jax.random.uniform(jax.random.fold_in(key, _START), (joints,), minval=-deviation, maxval=deviation)
+        qpos = jnp.clip(state.qpos + noise, self._parameters.lower, self._parameters.upper) if deviation else state.qpos
+        draw = draw_episode(self.config, joints, jax.random.fold_in(key, _DRAW))
+        zero = jnp.zeros_like(qpos)
+        actions = jnp.zeros((MAX_DELAY + 1, self.action_size))
+        reference = Reference(qpos, zero, zero)
+        fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+        begun = HardwareState(
+            **{**fields, "qpos": qpos, "load": None}
+        ).replace(  # type: ignore[attr-defined]
+            reference=reference, torque=zero, sent=actions[:SENT_ACTIONS], arrived=actions, draw=draw
+        )
+        measured = self._measure(begun)
+        return dataclasses.replace(begun, measured=jnp.tile(measured, (MAX_DELAY + 1, 1)))
+
+    def _simulate(
+        self, before: ArmState, command: Float[Array, " numbers"]
+    ) -> tuple[HardwareState, Float[Array, " joints"]]:
+        """See `ImitationEnv`; the torque is that of the last period."""
+        state = cast(HardwareState, before)
+        assert state.reference is not None and state.arrived is not None and state.draw is not None
+        assert state.sent is not None and state.measured is not None and (torque := state.torque) is not None
+        step = state.step + 1
+        arrived = command
+        if self.config.world.packet_loss:
+            key_loss = jax.random.fold_in(jax.random.fold_in(state.key, _LOSS), step)
+            is_lost = jax.random.uniform(key_loss) < self.config.world.packet_loss
+            arrived = jnp.where(is_lost, state.arrived[0], command)
+        history = _pushed(state.arrived, arrived)
+        acting = history[state.draw.action_delay]
+        target = joint_control.action_target(self.config.control, acting, state.reference, self._parameters, jnp)
+        loop = self._inner_loop(state.draw, LoopState(state.qpos, state.qvel, state.reference, torque), target)
+        after = dataclasses.replace(
+            state,
+            qpos=loop.qpos,
+            qvel=loop.qvel,
+            step=step,
+            reference=loop.reference,
+            torque=loop.torque,
+            sent=_pushed(state.sent, command),
+            arrived=history,
+        )
+        after = dataclasses.replace(after, measured=_pushed(state.measured, self._measure(after)))
+        return after, loop.torque
+
+    def _measure(self, state: HardwareState) -> Float[Array, " numbers"]:
+        """Measured angles and velocities, and those of the reference."""
+        world, reference, draw = self.config.world, state.reference, state.draw
+        assert reference is not None and draw is not None
+        key = jax.random.fold_in(jax.random.fold_in(state.key, _MEASURE), state.step)
+        noise = jax.random.normal(key, (2, len(state.qpos)))
+        qpos = state.qpos + draw.bias + world.position_noise * noise[0]
+        return jnp.concatenate([qpos, state.qvel + world.velocity_noise * noise[1], reference.qpos, reference.qvel])
+
+    def commanded_torque(self, state: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
+        """The torque of the last period [N m], in addition to gravity compensation."""
+        del action
+        return cast(Any, state).torque
+
+    def observe(self, state: ArmState) -> Float[Array, " observation"]:
+        """See the class, and `control_observation`."""
+        state = cast(HardwareState, state)
+        assert state.measured is not None and state.draw is not None and state.sent is not None
+        measured = state.measured[state.draw.observation_delay]
+        expert = [self.expert_at(state.demonstration, state.step + k) for k in range(self.config.preview + 1)]
+        return control_observation(self, measured, state.sent.ravel(), expert_vector(expert))
+
+    def observe_start(self, state: ArmState) -> Float[Array, " observation"]:
+        """The observation of a state of `start`."""
+        return self.observe(state)
+
+
+def _check(config: EnvConfig) -> None:
+    """Raises a ValueError for settings that such an environment does not have."""
+    periods = config.control_dt / PERIOD
+    if abs(periods - round(periods)) > 1e-6:
+        raise ValueError(f"control_dt: expected a multiple of {PERIOD} s with an inner loop, got {config.control_dt}")
+    if config.observation.terms:
+        raise ValueError(f"observation.terms: expected none with an inner loop, got {config.observation.terms}")
+    if config.randomization.torque_noise:
+        raise ValueError("randomization.torque_noise: expected 0 with an inner loop; world.motor_gain is there")
+
+
+def _pushed(history: Float[Array, "ticks numbers"], newest: Float[Array, " numbers"]) -> Float[Array, "ticks numbers"]:
+    return jnp.concatenate([newest[None], history[:-1]])
+
+
+def expert_vector(states: list[LinkStates]) -> Float[Array, " numbers"]:
+    """Link states of the expert now and at the next ticks, as one vector."""
+    return jnp.concatenate([leaf.ravel() for of_tick in states for leaf in jax.tree.leaves(of_tick)])
+
+
+def control_observation(
+    env: ImitationEnv,
+    measured: Float[Array, " numbers"],
+    past_actions: Float[Array, " actions"],
+    expert: Float[Array, " expert"],
+) -> Float[Array, " observation"]:
+    """The observation of a policy of `HardwareEnv`, from what a controller knows.
+
+    Args:
+      env: the environment.
+      measured: measured angles [rad] and velocities [rad/s], and those of the reference.
+      past_actions: the last actions that were sent, the newest first.
+      expert: see `expert_vector`.
+    """
+    qpos, qvel, reference_qpos, reference_qvel = jnp.split(measured, 4)
+    own = jax.tree.leaves(link_states(env.learner, qpos, qvel))
+    home = np.asarray(env.learner.home, np.float32)
+    parts = [*(leaf.ravel() for leaf in own), expert, reference_qpos - home, reference_qvel, past_actions]
+    return jnp.concatenate(parts)

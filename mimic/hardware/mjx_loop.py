@@ -1,0 +1,71 @@
+"""The inner loop with MJX as its physics: what the fused loop covers, and contacts."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+from mujoco import mjx
+
+from mimic.control import joint_control
+from mimic.control.joint_control import Target
+from mimic.hardware.inner_loop import JointConstants, LoopState, control
+from mimic.hardware.mujoco_world import MujocoWorld
+from mimic.hardware.plant import Draw, Plant
+
+MjxLoop = Callable[[Draw, LoopState, Target], LoopState]
+
+
+def make_mjx_loop(mode: str, plant: Plant, world: MujocoWorld, periods: int) -> MjxLoop:
+    """Makes a function (draw, state, target) -> state after `periods` ms; vectors are [joints], without empty slots.
+
+    Args:
+      mode: one of `joint_control.MODES`.
+      plant: the learner with its drives.
+      world: its model.
+      periods: duration [ms].
+    """
+    assert mode in joint_control.MODES
+    joints = world.model.nv
+    constants: JointConstants = jax.tree.map(lambda x: x[:joints], plant.constants)
+    # The stops are those of MuJoCo.
+    constants = constants._replace(
+        stop_stiffness=0.0 * constants.stop_stiffness, stop_damping=0.0 * constants.stop_damping
+    )
+    device = jax.local_devices()[0]
+    parts = jax.device_get((mjx.put_model(world.model, device=device), mjx.make_data(world.model, device=device)))
+
+    def loop(draw: Draw, state: LoopState, target: Target) -> LoopState:
+        model, data = jax.tree.map(_constant, parts)
+        model = _with_draw(model, world, draw)
+        by_row = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), constants)
+        drive = draw.gain, draw.friction * jnp.asarray(plant.friction, jnp.float32), draw.bias
+
+        def period(_: int, carry: tuple[mjx.Data, LoopState]) -> tuple[mjx.Data, LoopState]:
+            data, state = carry
+            reference, torque, acting = control(mode, by_row, state, target, drive)
+            data = mjx.step(model, data.replace(qfrc_applied=acting))
+            return data, LoopState(data.qpos, data.qvel, reference, torque)
+
+        data = data.replace(qpos=state.qpos, qvel=state.qvel)
+        return jax.lax.fori_loop(0, periods, period, (data, state))[1]
+
+    return loop
+
+
+def _with_draw(model: mjx.Model, world: MujocoWorld, draw: Draw) -> mjx.Model:
+    """The model with the masses, the damping, the payload and the gravity of an episode."""
+    factors = jnp.ones(model.nbody).at[world.moving].set(draw.load.mass * draw.link_mass)
+    place = jnp.asarray(world.tip, jnp.float32) + draw.payload_lever * jnp.asarray(world.along, jnp.float32)
+    return model.replace(
+        opt=model.opt.replace(gravity=draw.gravity_error * model.opt.gravity),
+        body_mass=(factors * model.body_mass).at[world.payload].set(draw.payload),
+        body_inertia=factors[:, None] * model.body_inertia,
+        body_pos=model.body_pos.at[world.payload].set(place),
+        dof_damping=draw.load.damping * model.dof_damping,
+    )
+
+
+def _constant(value: Array) -> Array:
+    """A constant array. Empty ones are computed: jaxlib 0.11.2 crashes on empty literals with several devices."""
+    return jnp.asarray(value) if value.size else jnp.zeros(value.shape, value.dtype)

@@ -1,0 +1,29 @@
+"""The state of an episode with an inner loop."""
+
+from flax import struct
+from jaxtyping import Array, Float
+
+from mimic.control.joint_control import Reference
+from mimic.envs.arm_state import ArmState
+from mimic.hardware.plant import Draw
+
+
+@struct.dataclass
+class HardwareState(ArmState):
+    """The state of an episode with an inner loop. Rows of a history are ticks, the newest first.
+
+    Attributes:
+      reference: the motion that the inner loop tracks, [joints] each.
+      torque: [joints] torque of the last period [N m].
+      sent: [ticks, numbers] the policy's last actions, which it observes.
+      arrived: [ticks, numbers] the last actions that arrived at the robot.
+      measured: [ticks, 4 * joints] measured angles and velocities, and angles and velocities of the reference.
+      draw: what was drawn for the episode.
+    """
+
+    reference: Reference | None = None
+    torque: Float[Array, " joints"] | None = None
+    sent: Float[Array, "ticks numbers"] | None = None
+    arrived: Float[Array, "ticks numbers"] | None = None
+    measured: Float[Array, "ticks numbers"] | None = None
+    draw: Draw | None = None

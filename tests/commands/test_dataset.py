@@ -1,0 +1,284 @@
+"""`python -m mimic.dataset`: rollouts and motions as datasets, back from them, and what is rejected."""
+
+import dataclasses
+import importlib
+import json
+import subprocess
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic import cli
+from mimic.commands import dataset as command
+from mimic.commands.config import DatasetConfig
+from mimic.commands.dataset import prepare_dataset
+from mimic.commands.dataset_sources import command_quantity, file_episodes, steps_before_runaway
+from mimic.control.joint_control import MODES
+from mimic.datasets.episodes import TORQUE
+from mimic.envs.imitation import make_env
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from mimic.trainers.run_config import save_config
+from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run
+
+pq = pytest.importorskip("pyarrow.parquet")
+pytest.importorskip("rosbags")
+from rosbags.highlevel import AnyReader  # noqa: E402
+
+FORMATS = ("lerobot", "rosbag2")
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    return untrained_run(tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Demonstrations of a Panda."""
+    path = tmp_path_factory.mktemp("demonstrations") / "panda.npz"
+    mimic.record_demonstrations(mimic.build_arm(mimic.ArmConfig()), 3).save(path)
+    return path
+
+
+def write(out, **settings):
+    prepare_dataset(DatasetConfig(out=str(out), compilation_cache="", **settings))()
+    return out
+
+
+def run(monkeypatch, capsys, name, *arguments):
+    monkeypatch.setattr(sys, "argv", [f"mimic.{name}", *map(str, arguments)])
+    cli.run(importlib.import_module(f"mimic.{name}").prepare, name)
+    return capsys.readouterr().out
+
+
+def frames(folder):
+    """The columns of the data [episodes, steps, numbers] of episodes of one length."""
+    table, info = (
+        pq.read_table(folder / "data/chunk-000/file-000.parquet"),
+        json.loads((folder / "meta/info.json").read_text()),
+    )
+    count = info["total_episodes"]
+    return {name: np.array(table[name].to_pylist()).reshape(count, HORIZON, -1) for name in table.column_names}
+
+
+def test_the_actions_lead_from_each_state_to_the_next(run_dir, tmp_path):
+    """The environment steps from each frame with the frame's torque, and arrives in the next one."""
+    columns = frames(write(tmp_path / "set", run=str(run_dir)))
+    rows = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet")
+    final = np.array(rows["final/observation.state"].to_pylist())
+    env = make_env(environment())
+    states = np.concatenate([columns["observation.state"], final[:, None]], axis=1)
+    assert np.ptp(columns["action"]) > 0.1  # N m: a check that can fail
+
+    def advance(state, torque):
+        start = env.start(jax.random.PRNGKey(0), 0)
+        qpos, qvel = jnp.split(state, 2)
+        moved = dataclasses.replace(start, qpos=qpos, qvel=qvel)
+        after = env.step(env.begin(start).replace(pipeline_state=moved), torque / env.torque_scale).pipeline_state
+        return jnp.concatenate([after.qpos, after.qvel])
+
+    reached = jax.jit(jax.vmap(jax.vmap(advance)))(jnp.asarray(states[:, :-1], jnp.float32), columns["action"])
+    np.testing.assert_allclose(reached, states[:, 1:], rtol=0, atol=1e-4)  # rad, rad/s: float32, compiled anew
+    np.testing.assert_array_equal(states[:, 0], np.zeros((COUNT + HELD_OUT, 4)))  # the start pose, at rest
+
+
+def test_the_expert_of_a_rollout_is_its_demonstration(run_dir, tmp_path):
+    demonstrations = mimic.load_demonstrations(run_dir / "demonstrations.npz")
+    columns = frames(write(tmp_path / "set", run=str(run_dir)))
+    expected = np.concatenate([demonstrations.qpos, demonstrations.qvel], axis=-1)[:, :-1]
+    np.testing.assert_array_equal(columns["observation.environment_state"], expected.astype(np.float32))
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    assert info["splits"] == {"train": f"0:{COUNT}", "held_out": f"{COUNT}:{COUNT + HELD_OUT}"}
+    facts = json.loads((tmp_path / "set/meta/mimic.json").read_text())
+    assert (facts["control"], facts["checkpoint"], facts["env"]) == ("torque", 0, "planar4dof")
+
+
+def test_a_split_of_a_run(run_dir, tmp_path):
+    both, held_out = (
+        frames(write(tmp_path / name, run=str(run_dir), split=split)) for name, split in (("a", ""), ("b", "held_out"))
+    )
+    assert len(held_out["action"]) == HELD_OUT
+    for name in ("observation.state", "action", "observation.environment_state"):
+        np.testing.assert_array_equal(held_out[name], both[name][COUNT:])
+
+
+def test_rollouts_as_bags_are_the_same(run_dir, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "bags"
+    text = run(monkeypatch, capsys, "dataset", f"run={run_dir}", f"out={out}", "format=rosbag2", "compilation_cache=")
+    assert f"{COUNT + HELD_OUT} episodes ({COUNT} train, {HELD_OUT} held_out)" in text
+    assert "commands: torque [N m]" in text and text.endswith(f"results: {out}\n")
+    columns = frames(write(tmp_path / "set", run=str(run_dir)))
+    for episode in (0, COUNT):
+        with AnyReader([out / f"episode_{episode:06d}"]) as reader:
+            rows: list[tuple[str, Any]] = [
+                (c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()
+            ]
+        position = [message.position for topic, message in rows if topic == "/learner/joint_states"]
+        torque = [message.effort for topic, message in rows if topic == "/learner/joint_commands"]
+        assert len(position) == HORIZON + 1
+        np.testing.assert_allclose(position[:-1], columns["observation.state"][episode, :, :2], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(torque, columns["action"][episode], rtol=0, atol=1e-6)  # compiled twice
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_demonstrations_come_back_from_a_dataset(recorded, tmp_path, monkeypatch, capsys, format):
+    dataset = write(tmp_path / "set", demonstrations=str(recorded), format=format)
+    text = run(monkeypatch, capsys, "demonstrations", f"source={dataset}", f"out={tmp_path / 'back.npz'}")
+    assert "set: 3 demonstrations, 50 steps of 0.1 s; velocities: from the file" in text
+    before, after = mimic.load_demonstrations(recorded), mimic.load_demonstrations(tmp_path / "back.npz")
+    tolerance = {"lerobot": 2e-7, "rosbag2": 1e-12}[format]  # rad: single precision of up to 3 rad; double
+    np.testing.assert_allclose(after.qpos, before.qpos, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(after.qvel, before.qvel, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize(("format", "topic"), [("lerobot", "observation.state"), ("rosbag2", "/learner/joint_states")])
+def test_a_policys_motions_become_demonstrations(run_dir, tmp_path, format, topic):
+    dataset = write(tmp_path / "set", run=str(run_dir), format=format)
+    learner = mimic.build_arm(environment().learner).embodiment
+    free = np.full(2, np.inf)  # an untrained policy keeps no limits
+    learner = dataclasses.replace(learner, joint_range=np.stack([-free, free], axis=1), velocity_limit=free)
+    imported, differentiated = mimic.import_demonstrations(dataset, learner, dt=0.05, horizon=2 * HORIZON, topic=topic)
+    assert imported.count == COUNT + HELD_OUT and not differentiated  # twice the rate: resampled
+    same = mimic.import_demonstrations(dataset, learner, dt=0.1, horizon=HORIZON, topic=topic)[0]
+    np.testing.assert_allclose(imported.qpos[:, ::2], same.qpos, rtol=0, atol=1e-6)  # rad
+    expert = mimic.build_arm(environment().expert).embodiment
+    of_expert, _ = mimic.import_demonstrations(dataset, expert, dt=0.1, horizon=HORIZON)  # only it has three joints
+    demonstrations = mimic.load_demonstrations(run_dir / "demonstrations.npz")
+    np.testing.assert_allclose(of_expert.qpos, demonstrations.qpos, rtol=0, atol=1e-6)  # rad
+
+
+def test_retargeted_motions_have_both_arms(recorded, tmp_path):
+    expert = mimic.load_demonstrations(recorded)
+    names = tuple(name for name in expert.joint_names if name not in ("joint3", "joint6", "joint7"))
+    learner = dataclasses.replace(
+        expert, qpos=expert.qpos[..., :4], qvel=expert.qvel[..., :4], goals=expert.goals[:, :4], joint_names=names,
+        torque=None,
+    )  # fmt: skip
+    learner.save(tmp_path / "learner.npz")
+    write(tmp_path / "set", demonstrations=str(recorded), retargeted=str(tmp_path / "learner.npz"))
+    features = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
+    assert features["observation.state"]["shape"] == [8] and features["observation.environment_state"]["shape"] == [14]
+    assert features["action"]["names"] == [f"{name}.pos" for name in names]
+    with pytest.raises(ValueError, match="retargeted: expected 3 motions of 50 steps of 0.1 s, .* got 2 motions"):
+        file_episodes(expert, learner.select([0, 1]), "", {})
+
+
+def test_a_runaway_ends_an_episode():
+    qvel = np.ones((4, 5, 2))
+    qvel[1, 3, 0], qvel[2, 0, 1], qvel[3, 4] = 30.0, -40.0, np.nan
+    assert steps_before_runaway(qvel, 30.0).tolist() == [5, 3, 0, 4]
+
+
+def test_a_policy_of_runaways_is_an_error(run_dir, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(
+        "mimic.commands.dataset_sources.steps_before_runaway", lambda qvel, bound: np.zeros(len(qvel), int)
+    )
+    config = DatasetConfig(run=str(run_dir), out=str(tmp_path / "set"), compilation_cache="")
+    assert prepare_dataset(config)() == 1
+    assert capsys.readouterr().err == "error: no episode to write: each rollout of this policy is a runaway\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_rollouts_that_a_runaway_cuts_short_are_counted(run_dir, tmp_path, monkeypatch, capsys):
+    cut = np.array([HORIZON, 3, 0, HORIZON, HORIZON, HORIZON])
+    monkeypatch.setattr("mimic.commands.dataset_sources.steps_before_runaway", lambda qvel, bound: cut)
+    write(tmp_path / "set", run=str(run_dir))
+    assert "5 episodes (3 train, 2 held_out), 83 steps" in (text := capsys.readouterr().out)
+    assert "2 rollouts end before the step in which a joint exceeds 30 rad/s" in text
+    rows = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [row["demonstration"] for row in rows] == [0, 1, 3, 0, 1]
+    assert [row["length"] for row in rows] == [HORIZON, 3, *[HORIZON] * 3]
+
+
+def test_what_a_policy_commands_is_known_or_rejected():
+    assert command_quantity("torque") == TORQUE
+    for mode in set(MODES) - {"torque"}:
+        with pytest.raises(ValueError, match=f"run: expected a run with env.control=torque, got {mode}"):
+            command_quantity(mode)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_nothing_is_left_where_writing_fails(recorded, tmp_path, monkeypatch, format):
+    def fail(folder, *_):
+        (folder / "half").write_text("")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(command, f"write_{format}", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write(tmp_path / "set", demonstrations=str(recorded), format=format)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("format", "package"), [("lerobot", "pyarrow"), ("rosbag2", "rosbags")])
+def test_a_missing_package_is_named(rejected, recorded, monkeypatch, format, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    line = rejected("dataset", f"demonstrations={recorded}", "out=new", f"format={format}")
+    assert f"format={format} needs the package {package}: pip install 'mimic-arms[datasets]'" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["out=new"], "expected one of them, as in run=runs/NAME or demonstrations=FILE.npz, got neither"),
+        (["out=new", "run=a", "demonstrations=b"], "expected one of them"),
+        (["demonstrations={npz}"], "out: expected a folder"),
+        (["demonstrations={npz}", "out={npz}"], "exists; name a new folder"),
+        (["demonstrations={npz}", "out=no/new"], "there is no folder 'no'"),
+        (["demonstrations=nothing.npz", "out=new"], "no file at 'nothing.npz'"),
+        (["demonstrations={npz}", "out=new", "format=hdf5"], "format: expected one of lerobot, rosbag2, got 'hdf5'"),
+        (["demonstrations={npz}", "out=new", "split=train"], "split: expected only with run="),
+        (["demonstrations={npz}", "out=new", "checkpoint=0"], "checkpoint: expected only with run="),
+        (["run={run}", "out=new", "retargeted={npz}"], "retargeted: expected only with demonstrations="),
+        (["run={run}", "out=new", "split=test"], "split: expected one of train, held_out, got 'test'"),
+        (["run={run}", "out=new", "checkpoint=5"], "checkpoint"),
+        (["run=nowhere", "out=new"], "'nowhere' is not a run directory"),
+        (["run={run}", "out=new", "formt=lerobot"], "unknown key 'formt'"),
+    ],
+)
+def test_bad_input_of_the_command(rejected, recorded, run_dir, arguments, message):
+    given = (argument.format(npz=recorded, run=run_dir) for argument in arguments)
+    assert message in rejected("dataset", *given, "compilation_cache=")
+
+
+def test_runs_of_another_trainer_are_rejected(rejected, tmp_path):
+    (tmp_path / "mapper").mkdir()
+    save_config(tmp_path / "mapper", TrainConfig(mimic.env_config("planar4dof"), PoseMapperConfig().resolve()))
+    line = rejected("dataset", f"run={tmp_path / 'mapper'}", "out=new", "compilation_cache=")
+    assert "expected a run of trainer=ppo, got one of pose_mapper" in line
+
+
+def test_a_time_step_that_lerobot_does_not_have(rejected, recorded, tmp_path):
+    path = tmp_path / "odd.npz"
+    dataclasses.replace(mimic.load_demonstrations(recorded), dt=0.03).save(path)
+    assert "as LeRobot counts whole frames per second" in rejected("dataset", f"demonstrations={path}", "out=new")
+    write(tmp_path / "bags", demonstrations=str(path), format="rosbag2")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["source={folder}"], "expected a folder of a LeRobot dataset or of rosbag2"),
+        (["source={csv}", "topic=/joint_states"], "topic: expected only for a LeRobot dataset or a rosbag2"),
+        (["topic=/joint_states"], "topic: expected only with source=FOLDER"),
+    ],
+)
+def test_bad_sources_of_demonstrations(rejected, tmp_path, arguments, message):
+    (tmp_path / "motions.csv").write_text("time,joint1\n0,0\n")
+    given = (argument.format(folder=tmp_path, csv=tmp_path / "motions.csv") for argument in arguments)
+    assert message in rejected("demonstrations", *given, "out=new.npz")
+
+
+def test_the_command_runs_as_a_process(recorded, tmp_path):
+    arguments = [sys.executable, "-m", "mimic.dataset", f"demonstrations={recorded}", f"out={tmp_path / 'set'}"]
+    result = subprocess.run(arguments, capture_output=True, text=True, timeout=280, check=False)
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert result.stdout == (
+        "3 episodes (3 train), 150 steps of 0.1 s\nrobot: panda, 7 joints\n"
+        f"action: torque [N m], commanded; constant in the step\nresults: {tmp_path / 'set'}\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
