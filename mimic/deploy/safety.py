@@ -52,11 +52,13 @@ class SafetyConfig:
       velocity: fraction of the velocity limit at which the arm stops.
       slow_down: fraction of the velocity limit from which on a torque brakes a joint in addition: an arm that accelerates
         overshoots its reference's velocity.
-      velocity_scale, acceleration_scale: factors on the reference's limits, for first trials of a controller.
+      velocity_scale, acceleration_scale: factors on the limits of the reference; noise and payloads add to its velocity.
+        Smaller ones are for first trials of a controller.
+      min_stiffness: of joint_impedance, as a fraction: softer arms leave the path that was checked.
       velocity_periods: periods in a row beyond that fraction: noise does not stop the arm.
     """
 
-    margin: float = 0.03
+    margin: float = 0.02
     measured_margin: float = 0.005
     creep: float = 0.005
     grace: float = 0.02
@@ -69,8 +71,9 @@ class SafetyConfig:
     position: float = 0.005
     velocity: float = 0.985
     slow_down: float = 0.96
-    velocity_scale: float = 1.0
+    velocity_scale: float = 0.96
     acceleration_scale: float = 1.0
+    min_stiffness: float = 0.5
     velocity_periods: int = 3
 
 
@@ -115,7 +118,11 @@ class SafetyLayer:
                 f"together, got {bundle.control_dt} s and {config.grace} s"
             )
         self._mode, self._config, self._clearance, self._hold = bundle.mode, config, clearance, hold
-        self._joints = _scaled(bundle.parameters, config)
+        self._actions = JointParameters(*(np.asarray(x, float)[:, None] for x in bundle.parameters))
+        self._joints = self._actions._replace(
+            velocity=config.velocity_scale * self._actions.velocity,
+            acceleration=config.acceleration_scale * self._actions.acceleration,
+        )
         self._slow = config.slow_down * np.asarray(bundle.limits.velocity)[:, None]
         is_position = bundle.mode != "joint_velocity"
         self._path = PathPrediction(self._joints, is_position, config.check_periods, hold, robots)
@@ -235,9 +242,10 @@ class SafetyLayer:
 
     def _new_target(self, reference: Reference) -> np.ndarray:
         """The target of the pending actions, relative to the reference when they begin to act."""
-        target = action_target(self._mode, self._action, reference, self._joints, np)
+        target = action_target(self._mode, self._action, reference, self._actions, np)
         assert self._pending is not None
-        self._pending.target = Target(np.array(target.value), np.array(target.stiffness))
+        stiffness = np.maximum(target.stiffness, self._config.min_stiffness)
+        self._pending.target = Target(np.array(target.value), stiffness)
         return self._pending.target.value
 
     def _clearance_of(self, path: np.ndarray) -> np.ndarray:
@@ -283,14 +291,6 @@ class SafetyLayer:
         else:
             self.reference = Reference(*(np.where(is_held, x, y) for x, y in zip(held, braking, strict=True)))
         np.maximum(self._left - 1, 0, out=self._left)
-
-
-def _scaled(parameters: JointParameters, config: SafetyConfig) -> JointParameters:
-    """The parameters of a bundle as columns, with the config's factors."""
-    joints = JointParameters(*(np.asarray(x, float)[:, None] for x in parameters))
-    return joints._replace(
-        velocity=config.velocity_scale * joints.velocity, acceleration=config.acceleration_scale * joints.acceleration
-    )
 
 
 @dataclasses.dataclass
