@@ -32,7 +32,7 @@ class PathPrediction:
       robots: number of robots.
     """
 
-    ERROR = 0.006  # rad, maximum over the joints
+    ERROR = 0.008  # rad, maximum over the joints
 
     def __init__(self, joints: JointParameters, is_position: bool, delay: int, hold: int, robots: int = 1):
         self._delay_steps, self._hold_steps = delay // HOLD, (delay + hold) // HOLD
