@@ -49,28 +49,35 @@ class LibfrankaDriver:
         torque, force = list(collision_torque), list(collision_force)
         self._call(self._robot.set_collision_behavior, torque, torque, force, force)
         self._control: Any = None
+        self._is_answered, self._torque = True, [0.0] * JOINTS
 
     def read(self) -> RobotState:
         """See `Driver`. The first call starts the torque control; after each call the robot expects a torque."""
         if self._control is None:
             self._control = self._call(self._robot.start_torque_control)
         state, _ = self._call(self._control.readOnce)
+        self._is_answered = False
         return RobotState(state.time.to_sec(), np.array(state.q), np.array(state.dq), np.array(state.tau_J))
 
     def write(self, torque: np.ndarray) -> None:
         """See `Driver`."""
-        self._call(self._control.writeOnce, self._library.Torques([float(x) for x in torque]))
+        self._torque = [float(x) for x in torque]
+        self._call(self._control.writeOnce, self._library.Torques(self._torque))
+        self._is_answered = True
 
     def stop(self) -> None:
-        """See `Driver`. The last command says that the motion has ended."""
+        """See `Driver`. The last command, of the last torque, says that the motion has ended."""
         control, self._control = self._control, None
-        if control is not None:
-            last = self._library.Torques([0.0] * JOINTS)
-            last.motion_finished = True
-            try:
-                self._call(control.writeOnce, last)
-            finally:
-                self._call(self._robot.stop)
+        if control is None:
+            return
+        last = self._library.Torques(self._torque)
+        last.motion_finished = True
+        try:
+            if self._is_answered:
+                self._call(control.readOnce)
+            self._call(control.writeOnce, last)
+        finally:
+            self._call(self._robot.stop)
 
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         try:
