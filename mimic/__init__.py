@@ -3,6 +3,8 @@
 The core functions are pure and take one sample; batch them with `jax.vmap`.
 """
 
+import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 from mimic.runs import signals
@@ -11,52 +13,50 @@ if signals.runs_as_command():  # a command ends in one line from here on: the im
     signals.watch_signals()
 
 from mimic import compat  # noqa: E402
+from mimic.distribution import VERSION  # noqa: E402
 
 compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
-compat.import_mujoco()
-
-from mimic.arms.arm import ArmConfig, build_arm  # noqa: E402
-from mimic.arms.capsules import Capsules, fit_capsules  # noqa: E402
-from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm  # noqa: E402
-from mimic.distribution import VERSION  # noqa: E402
-from mimic.envs import env_config, environments  # noqa: E402
-from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations  # noqa: E402
-from mimic.envs.importing import import_demonstrations  # noqa: E402
-from mimic.envs.recording import record_demonstrations  # noqa: E402
-from mimic.making import make  # noqa: E402
-from mimic.metric.correspondence import (  # noqa: E402
-    arc_length_correspondence,
-    hard_correspondence,
-    overlap_correspondence,
-    soft_correspondence,
-)
-from mimic.metric.distance import (  # noqa: E402
-    PAPER_WEIGHTS,
-    DistanceWeights,
-    LinkDistance,
-    PairDistances,
-    adaptive_weights,
-    embodiment_distance,
-    link_distances,
-    rotation_distance,
-)
-from mimic.metric.kinematics import (  # noqa: E402
-    Frames,
-    LinkStates,
-    body_twists,
-    candidate_points,
-    forward_kinematics,
-    link_states,
-)
-from mimic.metric.landscape import distance_landscape, local_minima  # noqa: E402
-from mimic.metric.motion_distance import motion_distance  # noqa: E402
-from mimic.registry import register  # noqa: E402
-from mimic.retargeting.costs import Costs  # noqa: E402
-from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound  # noqa: E402
-from mimic.retargeting.pose import PoseImitation, imitate_pose  # noqa: E402
-from mimic.retargeting.trajectory import imitate_trajectory  # noqa: E402
 
 if TYPE_CHECKING:
+    from mimic.arms.arm import ArmConfig, build_arm
+    from mimic.arms.capsules import Capsules, fit_capsules
+    from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm
+    from mimic.envs import env_config, environments
+    from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
+    from mimic.envs.importing import import_demonstrations
+    from mimic.envs.recording import record_demonstrations
+    from mimic.making import make
+    from mimic.metric.correspondence import (
+        arc_length_correspondence,
+        hard_correspondence,
+        overlap_correspondence,
+        soft_correspondence,
+    )
+    from mimic.metric.distance import (
+        PAPER_WEIGHTS,
+        DistanceWeights,
+        LinkDistance,
+        PairDistances,
+        adaptive_weights,
+        embodiment_distance,
+        link_distances,
+        rotation_distance,
+    )
+    from mimic.metric.kinematics import (
+        Frames,
+        LinkStates,
+        body_twists,
+        candidate_points,
+        forward_kinematics,
+        link_states,
+    )
+    from mimic.metric.landscape import distance_landscape, local_minima
+    from mimic.metric.motion_distance import motion_distance
+    from mimic.registry import register
+    from mimic.retargeting.costs import Costs
+    from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound
+    from mimic.retargeting.pose import PoseImitation, imitate_pose
+    from mimic.retargeting.trajectory import imitate_trajectory
     from mimic.arms.rendering import ArmScene
     from mimic.commands.export import export_run
     from mimic.commands.fit import Run, fit
@@ -125,39 +125,74 @@ __all__ = [
 ]
 
 
+# Modules of the public names. They are imported at the first access: JAX, MuJoCo and brax take seconds, and `mimic.deploy`
+# needs none of them.
+_MODULES = {
+    "arms.arm": ("ArmConfig", "build_arm"),
+    "arms.capsules": ("Capsules", "fit_capsules"),
+    "arms.embodiment": ("Embodiment", "load_mjcf", "panda", "planar_arm"),
+    "arms.rendering": ("ArmScene",),
+    "commands.export": ("export_run",),
+    "commands.fit": ("Run", "fit"),
+    "envs": ("env_config", "environments"),
+    "envs.demonstrations": ("Demonstrations", "check_effort", "load_demonstrations"),
+    "envs.imitation": ("ImitationEnv",),
+    "envs.importing": ("import_demonstrations",),
+    "envs.recording": ("record_demonstrations",),
+    "making": ("make",),
+    "metric.correspondence": (
+        "arc_length_correspondence",
+        "hard_correspondence",
+        "overlap_correspondence",
+        "soft_correspondence",
+    ),
+    "metric.distance": (
+        "PAPER_WEIGHTS",
+        "DistanceWeights",
+        "LinkDistance",
+        "PairDistances",
+        "adaptive_weights",
+        "embodiment_distance",
+        "link_distances",
+        "rotation_distance",
+    ),
+    "metric.kinematics": (
+        "Frames",
+        "LinkStates",
+        "body_twists",
+        "candidate_points",
+        "forward_kinematics",
+        "link_states",
+    ),
+    "metric.landscape": ("distance_landscape", "local_minima"),
+    "metric.motion_distance": ("motion_distance",),
+    "pretrained.network": ("Pretrained", "load"),
+    "registry": ("register",),
+    "retargeting.costs": ("Costs",),
+    "retargeting.kinematic_bound": ("ClosestMotion", "closest_motion", "kinematic_bound"),
+    "retargeting.pose": ("PoseImitation", "imitate_pose"),
+    "retargeting.trajectory": ("imitate_trajectory",),
+    "trainers.pose_mapper.any_arm_mapper": ("AnyArmMapper",),
+    "trainers.pose_mapper.model": ("PoseMapper",),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+_WITH_MJX = ("ImitationEnv", "Run", "export_run", "fit")  # MJX is imported first, see `compat.import_mjx`
+_WITHOUT_MJX = [name for name in _MODULES if not {"rendering", "imitation", "commands", "trainers"} & {*name.split(".")}]
+_FOLDERS = ("any_arm", "arms", "envs", "metric", "registry", "retargeting")  # attributes after `import mimic` alone
+
+
 def __getattr__(name: str) -> Any:
-    if name == "ImitationEnv":  # imports brax and MJX, which takes seconds
+    if name in _FOLDERS:
+        for module in (name, *(module for module in _WITHOUT_MJX if module.startswith(f"{name}."))):
+            importlib.import_module(f"mimic.{module}")
+        return sys.modules[f"mimic.{name}"]
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'mimic' has no attribute {name!r}")
+    if name in _WITH_MJX:
         compat.import_mjx()
-        from mimic.envs.imitation import ImitationEnv
-
-        return ImitationEnv
-    if name == "ArmScene":  # imports the renderer, which few need
-        from mimic.arms.rendering import ArmScene
-
-        return ArmScene
-    if name == "PoseMapper":  # imports flax networks and checkpoints
-        from mimic.trainers.pose_mapper.model import PoseMapper
-
-        return PoseMapper
-    if name == "AnyArmMapper":
-        from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-
-        return AnyArmMapper
-    if name in ("Pretrained", "load"):  # imports the trainers' configs
-        from mimic.pretrained import network
-
-        return getattr(network, name)
-    if name == "export_run":  # imports all of these
-        compat.import_mjx()
-        from mimic.commands.export import export_run
-
-        return export_run
-    if name in ("Run", "fit"):  # imports training
-        compat.import_mjx()
-        from mimic.commands import fit
-
-        return getattr(fit, name)
-    raise AttributeError(f"module 'mimic' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"mimic.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

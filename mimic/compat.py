@@ -24,9 +24,12 @@ def needs_cpu_flag(jaxlib_version: str | None = None) -> bool:
     """Whether the fusion emitters of XLA's CPU backend must be turned off.
 
     Before jaxlib 0.11 they make batched kinematics several hundred times slower. From 0.11 on XLA does not know the
-    flag and aborts on it.
+    flag and aborts on it. False where jaxlib is not installed, as on a computer that only runs `mimic.deploy`.
     """
-    version = jaxlib_version or importlib.metadata.version("jaxlib")
+    try:
+        version = jaxlib_version or importlib.metadata.version("jaxlib")
+    except importlib.metadata.PackageNotFoundError:
+        return False
     major, minor = (int(part) for part in version.split(".")[:2])
     return (major, minor) < (0, 11)
 
@@ -45,7 +48,10 @@ def prepare_cpu() -> None:
 
 
 def import_mujoco() -> None:
-    """Imports MuJoCo even if the graphics library that MUJOCO_GL names is missing; only rendering fails then."""
+    """Imports MuJoCo even if the graphics library that MUJOCO_GL names is missing; only rendering fails then.
+
+    Called by each folder of mimic whose modules import MuJoCo.
+    """
     user_setting = os.environ.get("MUJOCO_GL", "")
     try:
         importlib.import_module("mujoco")

@@ -14,11 +14,11 @@ REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_
 @pytest.mark.parametrize(
     "code",
     [
-        "import mimic, sys",
+        "import mimic, sys\nmimic.make",
         "import sys\nfrom mimic import cli, train\nsys.argv = ['mimic.train', '--help']\n"
         "try:\n    cli.run(train.prepare, 'train')\nexcept SystemExit:\n    pass",
     ],
-    ids=["import", "help"],
+    ids=["name", "help"],
 )
 def test_heavy_packages_are_imported_late(code):
     result = subprocess.run([sys.executable, "-c", code + REPORT], capture_output=True, text=True, check=False)
@@ -26,6 +26,13 @@ def test_heavy_packages_are_imported_late(code):
     imported = set(result.stdout.splitlines()[-1].split())
     assert "mimic.envs.config" in imported
     assert not imported.intersection(HEAVY)
+
+
+def test_import_mimic_imports_no_other_package():
+    """Each public name imports what it needs at its first use; `mimic.deploy` runs where nothing else is installed."""
+    code = "import mimic, sys\nfor name in [*sys.modules]: print(name.partition('.')[0], end=' ')"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not set(result.stdout.split()).intersection({"jax", "mujoco", "brax", "flax", "numpy", "omegaconf"})
 
 
 def test_pose_mappers_need_no_simulator():

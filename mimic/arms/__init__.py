@@ -1,1 +1,5 @@
 """Arms: embodiments, MJCF and URDF readers, and the models that simulate and draw an arm."""
+
+from mimic import compat
+
+compat.import_mujoco()

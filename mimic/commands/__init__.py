@@ -1,1 +1,5 @@
 """The commands: mimic/NAME.py starts mimic/commands/NAME.py."""
+
+from mimic import compat
+
+compat.import_mujoco()

@@ -19,6 +19,8 @@ from mimic.ranges import check_ranges, number, seed_number
 from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
 
+ROBOT_WORLDS = ("paper", "nominal", "hardware")
+ROBOTS = ("virtual_panda", "virtual_robot")
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "searched")
 ARM_SIDES = ("left", "right")
 EXPORT_FORMATS = ("onnx", "jax")
@@ -50,6 +52,12 @@ class EvaluateConfig:
       physics: see `EnvConfig`. Default "": that of the run.
       mass, damping, torque_noise: deviation of the arm from its model, see `RandomizationConfig`. Default None: as in
         training.
+      robot: "virtual_panda": the policy controls virtual Pandas in C MuJoCo, which abort as real ones do;
+        "virtual_robot": the same for another learner. Default "": the environment of the run.
+      episodes: number of episodes of `robot`, of each case with `edges`.
+      robot_world: preset of the world of `robot`: "paper", "nominal" or "hardware". Default "": that of the run.
+      edges: whether there are also cases with each range of the world at its ends.
+      seed: of what is drawn for each episode of `robot`.
       out: new folder for report, table and plots. Default "": the report is printed only.
       compilation_cache: see `TrainConfig`.
     """
@@ -65,16 +73,38 @@ class EvaluateConfig:
     mass: float | None = _factor()
     damping: float | None = _factor()
     torque_noise: float | None = number(None, at_least=0.0, at_most=10.0)
+    robot: str = ""
+    episodes: int = number(1000, at_least=1, at_most=10_000_000)
+    robot_world: str = ""
+    edges: bool = False
+    seed: int = number(0, at_least=0, at_most=2**31 - 1)
     out: str = ""
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:
         check_ranges(self)
         check_choice("controller", self.controller, CONTROLLERS)
+        self._check_robot()
         if self.locked and not self.learner:
             raise ValueError(f"locked: expected with learner=NAME, as in learner=panda locked=[2,4], got {self.locked}")
         if self.physics:
             check_choice("physics", self.physics, PHYSICS)
+
+    def _check_robot(self) -> None:
+        """Raises a `ValueError` for options of another kind of evaluation."""
+        if not self.robot:
+            if self.robot_world or self.edges:
+                raise ValueError("robot_world, edges: expected only with robot=, as in robot=virtual_panda")
+            return
+        check_choice("robot", self.robot, ROBOTS)
+        if self.robot_world:
+            check_choice("robot_world", self.robot_world, ROBOT_WORLDS)
+        others = self.learner, self.physics, self.mass, self.damping, self.torque_noise
+        if self.controller != "policy" or any(value not in ("", None) for value in others):
+            raise ValueError(
+                "controller, learner, physics, mass, damping and torque_noise: expected none with robot=, whose world has "
+                "ranges of them"
+            )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,6 +33,8 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
       ValueError: the run directory or the checkpoint is missing, `out` exists, or the options need a policy and the
         run has none.
     """
+    if config.robot:
+        return _robot_evaluation(config)
     evaluate = prepare_report(config, started, Console())
 
     def run() -> None:
@@ -41,15 +43,31 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
     return run
 
 
-def prepare_report(config: EvaluateConfig, started: float, console: Console) -> Callable[[], dict[str, Any]]:
-    """The same as `prepare_evaluation`, as a function that returns the report."""
-    stopwatch = Stopwatch(started)
+def _robot_evaluation(config: EvaluateConfig) -> Callable[[], None]:
+    """An evaluation on virtual robots, see `prepare_robot_evaluation`."""
+    from mimic.commands.evaluate_robot import prepare_robot_evaluation  # imports onnxruntime, of the extra "deploy"
+
     use_compilation_cache(config.compilation_cache)
+    run_dir, trained = _run_to_evaluate(config)
+    trained, trainer = _trainer_to_evaluate(trained, run_dir, config)
+    return prepare_robot_evaluation(config, trained, trainer, run_dir)
+
+
+def _run_to_evaluate(config: EvaluateConfig) -> tuple[Path, TrainConfig]:
+    """The run directory and its config."""
     if not config.run:
         raise ValueError("run: expected the run directory to evaluate, as in run=runs/NAME")
     run_dir = Path(config.run).expanduser()
     trained = load_config(run_dir)  # saved with all values resolved, so that they do not depend on this machine
     check_checkpoint(run_dir, config.checkpoint)
+    return run_dir, trained
+
+
+def prepare_report(config: EvaluateConfig, started: float, console: Console) -> Callable[[], dict[str, Any]]:
+    """The same as `prepare_evaluation`, as a function that returns the report."""
+    stopwatch = Stopwatch(started)
+    use_compilation_cache(config.compilation_cache)
+    run_dir, trained = _run_to_evaluate(config)
     out = new_folder("out", config.out) if config.out else None
     with stopwatch.stage("build"):
         trained, trainer = _trainer_to_evaluate(trained, run_dir, config)

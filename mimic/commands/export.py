@@ -89,7 +89,7 @@ def export_run(
     if describe := _description_writer(config):
         describe()
     else:
-        _write(_exported_function(config), _file(config), format)
+        _write(exported_function(config), _file(config), format)
     return Path(out).expanduser()
 
 
@@ -102,7 +102,7 @@ def prepare_export(config: ExportConfig) -> Callable[[], None]:
     if describe := _description_writer(config):
         return describe
     out = _file(config)
-    exported = _exported_function(config)
+    exported = exported_function(config)
 
     def run() -> None:
         _write(exported, out, config.format)
@@ -137,7 +137,7 @@ def _metadata_file(out: Path) -> Path:
     return out.with_name(out.name + ".json")
 
 
-def _exported_function(config: ExportConfig) -> ExportedFunction:
+def exported_function(config: ExportConfig) -> ExportedFunction:
     """The function of a run's network."""
     if not config.run:
         raise ValueError("run: expected the run directory to export, as in run=runs/NAME")

@@ -233,9 +233,10 @@ class _Graph:
     def _dot(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         (contracted, batch) = params["dimension_numbers"]
         left, right = inputs
-        vector_times_matrix = (((0,), (0,)), ((), ()))
         dimensions = (tuple(map(tuple, contracted)), tuple(map(tuple, batch)))
-        if dimensions == vector_times_matrix and isinstance(right, np.ndarray) and len(left.shape) == 1:
+        is_vector_times_matrix = dimensions == (((0,), (0,)), ((), ())) and isinstance(right, np.ndarray)
+        is_product_of_matrices = dimensions == (((1,), (0,)), ((), ())) and len(right.shape) == 2
+        if (is_vector_times_matrix and len(left.shape) == 1) or (is_product_of_matrices and len(left.shape) == 2):
             return self.node("MatMul", left, right)
         return self.node("Einsum", left, right, equation=einsum_equation(left, right, contracted, batch))
 

@@ -1,0 +1,242 @@
+"""`python -m mimic.evaluate robot=virtual_panda`: a run's policy on virtual robots, and what makes them abort."""
+
+import dataclasses
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from mimic.commands.config import EvaluateConfig, ExportConfig
+from mimic.config import new_folder
+from mimic.deploy.bundle import MOTIONS
+from mimic.deploy.safety import COLLISION, LATE
+from mimic.envs import env_config
+from mimic.envs.world import WorldConfig
+from mimic.evaluation.evaluator import Evaluator
+from mimic.evaluation.rollout_metrics import gaps
+from mimic.metric.kinematics import link_state_table, link_states
+from mimic.runs.checkpoints import check_checkpoint
+from mimic.runs.files import write_report
+from mimic.runs.provenance import hardware, versions
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.ppo.trainer import PPOTrainer
+from mimic.virtual_robot.arm_model import RobotModel, robot_model
+from mimic.virtual_robot.draws import draw_world, edge_cases
+from mimic.virtual_robot.episodes import Episodes, TorquePolicy
+from mimic.virtual_robot.robots import LIMIT_CAUSES, SELF_CONTACT
+from mimic.virtual_robot.runs import Task, run_tasks
+
+ALL = "all ranges"
+_CHUNK = 500  # episodes whose distances are computed together
+
+
+def prepare_robot_evaluation(
+    config: EvaluateConfig, trained: TrainConfig, trainer: Any, run_dir: Path
+) -> Callable[[], None]:
+    """Checks the config of an evaluation on virtual robots.
+
+    Raises:
+      ValueError: options that such an evaluation does not have, or a run whose robot is another one.
+    """
+    _check(config, trained)
+    assert isinstance(trainer, PPOTrainer)
+    out = new_folder("out", config.out) if config.out else None
+    steps = check_checkpoint(run_dir, config.checkpoint)
+    world = env_config("panda7dof", world=config.robot_world).world if config.robot_world else trained.env.world
+    robot = robot_model(trained.env.learner)
+
+    def run() -> None:
+        console = Console()
+        with tempfile.TemporaryDirectory(prefix="mimic-") as folder:
+            policy = _policy(trained, trainer.evaluator, run_dir, steps, Path(folder))
+            cases = _cases(world, config)
+            tasks = [_task(robot, policy, trainer.evaluator, case, config) for case in cases]
+            results = _run(tasks, console)
+        rows = {name: summary(trainer.evaluator, result) for (name, *_), result in zip(cases, results, strict=True)}
+        report = {
+            "robot": config.robot,
+            "run": config.run,
+            "env": trained.env.name,
+            "env_steps": steps,
+            "control": trained.env.control,
+            "world": dataclasses.asdict(world),
+            "cases": rows,
+            "hardware": hardware(),
+            "versions": versions(),
+        }
+        show(console, config.robot, rows)
+        if out:
+            out.mkdir()
+            write_report(out, report)
+            console.print(f"results: {config.out}", soft_wrap=True, highlight=False)
+
+    return run
+
+
+def _check(config: EvaluateConfig, trained: TrainConfig) -> None:
+    """Raises a `ValueError` for what virtual robots do not have."""
+    if trained.trainer.name != "ppo" or trained.env.arms.are_drawn:
+        raise ValueError(f"robot: expected a run of trainer=ppo with one learner, got env={trained.env.name} and "
+                         f"trainer={trained.trainer.name}")  # fmt: skip
+    if config.robot == "virtual_panda" and trained.env.learner.model != "panda":
+        raise ValueError("robot: expected virtual_robot for another learner than a Panda, got virtual_panda")
+    env = trained.env
+    if not env.has_inner_loop and (env.observation.terms or env.environment):
+        raise ValueError("robot: expected a run without observation.terms and environment, or with an inner loop")
+
+
+def _cases(world: WorldConfig, config: EvaluateConfig) -> list[tuple[str, WorldConfig, str]]:
+    """Name, ranges and edge of each case."""
+    cases = [(ALL, world, "")]
+    return [*cases, *edge_cases(world)] if config.edges else cases
+
+
+def _task(
+    robot: RobotModel,
+    policy: Path | TorquePolicy,
+    evaluator: Evaluator,
+    case: tuple[str, WorldConfig, str],
+    config: EvaluateConfig,
+) -> Task:
+    """The episodes of a case: the held-out motions in turn."""
+    _, world, edge = case
+    held_out = evaluator.parts["held_out"]
+    first, count = held_out.start, evaluator.env.demonstrations.count - held_out.start
+    motion = first + np.arange(config.episodes) % count
+    joints = robot.model.nv
+    drawn = draw_world(world, config.episodes, joints, len(robot.links), np.random.default_rng(config.seed), edge)
+    return Task(robot, policy, drawn, motion, np.asarray(evaluator.env.start_poses)[motion], config.seed)
+
+
+def _run(tasks: list[Task], console: Console) -> list[Episodes]:
+    total = sum(len(task.motion) for task in tasks)
+    with Progress(console=console, transient=True) as progress:
+        bar = progress.add_task("episodes", total=total)
+        return run_tasks(tasks, lambda count: progress.advance(bar, count))
+
+
+def _policy(
+    trained: TrainConfig, evaluator: Evaluator, run_dir: Path, steps: int, folder: Path
+) -> Path | TorquePolicy:
+    """The policy as a bundle, or as torques where the run has no inner loop."""
+    expert = _expert_table(evaluator)
+    if not trained.env.has_inner_loop:
+        model = _torque_model(evaluator, run_dir, steps)
+        return TorquePolicy(model, expert, trained.env.preview, trained.env.control_dt)
+    from mimic.commands.export_controller import export_controller
+
+    bundle = folder / "bundle"
+    export_controller(run_dir, bundle, steps)
+    count = evaluator.env.demonstrations.count
+    np.savez(  # the motions of the evaluation, in its order
+        bundle / MOTIONS,
+        expert=expert,
+        start_poses=np.asarray(evaluator.env.start_poses, float),
+        names=np.array([f"motion {i}" for i in range(count)]),
+    )
+    return bundle
+
+
+def _expert_table(evaluator: Evaluator) -> np.ndarray:
+    """The expert's link states [motions, ticks + 1, numbers], as policies observe them."""
+    steps = evaluator.env.config.horizon + 1
+    leaves = [np.asarray(leaf)[:, :steps] for leaf in jax.tree.leaves(evaluator.env.expert_states)]
+    return np.concatenate([leaf.reshape(*leaf.shape[:2], -1) for leaf in leaves], axis=-1).astype(np.float32)
+
+
+def _torque_model(evaluator: Evaluator, run_dir: Path, steps: int) -> bytes:
+    """The exported policy behind its observation, as ONNX: from qpos, qvel and expert to torque."""
+    from mimic.commands.export import exported_function
+    from mimic.commands.onnx_graph import to_onnx  # needs the extra "export"
+
+    env = evaluator.env
+    policy = exported_function(ExportConfig(str(run_dir), checkpoint=steps))
+
+    def function(qpos: jax.Array, qvel: jax.Array, expert: jax.Array) -> dict[str, jax.Array]:
+        own = [leaf.ravel() for leaf in jax.tree.leaves(link_states(env.learner, qpos, qvel))]
+        return {"torque": policy.function(jnp.concatenate([*own, expert]))["torque"]}
+
+    joints, experts = env.learner.num_joints, (env.config.preview + 1) * env.expert.num_links * 12
+    model = to_onnx(function, name="policy", inputs={"qpos": joints, "qvel": joints, "expert": experts}, metadata={})
+    return model.SerializeToString()
+
+
+def summary(evaluator: Evaluator, episodes: Episodes) -> dict[str, Any]:
+    """The numbers of a case. The gap is that of `Evaluator`, over the motions of these episodes."""
+    distance = np.concatenate(list(_distances(evaluator, episodes)))
+    bound, hold = (x[episodes.motion].mean() for x in (evaluator.lower_bound, evaluator.hold_distance))
+    aborts, stops = Counter(episodes.aborts.tolist()), Counter(episodes.stops.tolist())
+    completed = (episodes.aborts == "") & (episodes.stops == "")
+    return {
+        "episodes": len(episodes.motion),
+        "optimality_gap": float(gaps(distance.mean(), bound, hold)),
+        "mean_distance": float(distance.mean()),
+        "lower_bound": float(bound),
+        "hold_distance": float(hold),
+        "completed": int(completed.sum()),
+        "aborts": {cause: count for cause, count in sorted(aborts.items()) if cause},
+        "stops": {cause: count for cause, count in sorted(stops.items()) if cause},
+        "limit_violations": sum(aborts[cause] for cause in LIMIT_CAUSES),
+        "self_contacts": aborts[SELF_CONTACT],
+        "interventions": {name: int(count.sum()) for name, count in episodes.interventions.items()},
+        "episodes_with_interventions": {
+            name: int((count > 0).sum()) for name, count in episodes.interventions.items()
+        },
+        "tracking_error": float(episodes.tracking_error.max()),
+        "clearance": float(episodes.clearance.min()),
+    }
+
+
+def _distances(evaluator: Evaluator, episodes: Episodes) -> Iterator[np.ndarray]:
+    """The embodiment distance after each tick, [episodes, ticks] in parts."""
+    env = evaluator.env
+    distance = jax.jit(jax.vmap(jax.vmap(env.states_distance)))
+    expert = jax.tree.map(lambda x: np.asarray(x)[:, 1 : env.config.horizon + 1], env.expert_states)
+    for start in range(0, len(episodes.motion), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        motion, qpos, qvel = episodes.motion[part], episodes.qpos[part], episodes.qvel[part]
+        states = link_state_table(env.learner, qpos.astype(np.float32), qvel.astype(np.float32))
+        yield np.asarray(distance(jax.tree.map(lambda x, motion=motion: x[motion], expert), states))
+
+
+def show(console: Console, robot: str, rows: dict[str, dict[str, Any]]) -> None:
+    """Prints a column of numbers for one case, and a row for each of several."""
+    if len(rows) == 1:
+        (row,) = rows.values()
+        table = Table("", "", title=f"{row['episodes']:,} episodes on {robot}", show_header=False)
+        for label, value in _lines(row):
+            table.add_row(label, value)
+    else:
+        header = ("case", "episodes", "gap", "aborts", "stops", "rejected", "late", "clearance")
+        table = Table(*header, title=f"each range of the world at its ends, on {robot}")
+        for name, row in rows.items():
+            aborts, stops = (sum(cast(dict[str, int], row[key]).values()) for key in ("aborts", "stops"))
+            numbers = aborts, stops, row["interventions"][COLLISION], row["interventions"][LATE]
+            clearance = f"{row['clearance'] * 1e3:.0f} mm"
+            table.add_row(name, f"{row['episodes']:,}", f"{row['optimality_gap']:.2%}", *map(str, numbers), clearance)
+    console.print(table)
+
+
+def _lines(row: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    yield "optimality gap, held out", f"{row['optimality_gap']:.2%}"
+    yield "episodes completed", f"{row['completed']:,}"
+    yield "aborts of the robot", _counted(row["aborts"])
+    yield "stops of the safety layer", _counted(row["stops"])
+    yield "limit violations", str(row["limit_violations"])
+    yield "self-contacts", str(row["self_contacts"])
+    yield "interventions of the safety layer", _counted(row["interventions"])
+    yield "largest tracking error", f"{row['tracking_error']:.3f} rad"
+    if np.isfinite(row["clearance"]):
+        yield "smallest clearance", f"{row['clearance'] * 1e3:.1f} mm"
+
+
+def _counted(counts: dict[str, int]) -> str:
+    return ", ".join(f"{cause} {count:,}" for cause, count in counts.items() if count) or "none"

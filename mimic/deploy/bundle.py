@@ -1,0 +1,221 @@
+"""Controller bundles: the folders that hold a policy, its safety layer's clearance, its parameters and motions."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mimic.control.joint_control import MODES, PERIOD, JointParameters, action_size
+from mimic.control.limits import JointLimits
+from mimic.npz import read_arrays
+
+FORMAT = 1
+POLICY, CLEARANCE, CONTROLLER, MOTIONS = "policy.onnx", "clearance.onnx", "controller.json", "motions.npz"
+LINK_NUMBERS = 12  # position, direction, linear and angular velocity
+_KEYS = (
+    "format", "mimic_version", "mode", "period", "control_dt", "joint_names", "start_pose", "limits", "parameters",
+    "preview", "past_actions", "expert_links", "robot", "hashes",
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Bundle:
+    """A controller that was exported.
+
+    Attributes:
+      folder: where it is.
+      robot: name of the robot's model.
+      joint_names: base to tip.
+      mode: of the inner loop, see `mimic.control`.
+      control_dt: tick of the policy [s].
+      start_pose: [joints] of the first motion [rad].
+      limits: the manufacturer's.
+      parameters: of the inner loop, [joints] each.
+      preview: number of later ticks whose expert states the policy observes.
+      past_actions: number of its own actions that the policy observes.
+      expert_links: number of links of the expert.
+      expert: [motions, ticks + 1, expert_links * 12] the expert's link states at each tick.
+      start_poses: [motions, joints] where each motion starts [rad].
+      names: of the motions.
+    """
+
+    folder: Path
+    robot: str
+    joint_names: tuple[str, ...]
+    mode: str
+    control_dt: float
+    start_pose: np.ndarray
+    limits: JointLimits
+    parameters: JointParameters
+    preview: int
+    past_actions: int
+    expert_links: int
+    expert: np.ndarray
+    start_poses: np.ndarray
+    names: tuple[str, ...]
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action."""
+        return action_size(self.mode, self.num_joints)
+
+    @property
+    def ticks(self) -> int:
+        """Ticks of a motion."""
+        return self.expert.shape[1] - 1
+
+    @property
+    def periods(self) -> int:
+        """Periods of the inner loop in a tick."""
+        return round(self.control_dt / PERIOD)
+
+    def motion_index(self, motion: int | str) -> int:
+        """The index of a motion, by its name or its index.
+
+        Raises:
+          ValueError: there is no such motion.
+        """
+        if motion in self.names:
+            return self.names.index(str(motion))
+        if isinstance(motion, int) and 0 <= motion < len(self.expert):
+            return motion
+        raise ValueError(
+            f"motion: expected a number from 0 to {len(self.expert) - 1} or a name such as {self.names[0]!r}, got "
+            f"{motion!r:.80}"
+        )
+
+
+def write_bundle(
+    folder: Path,
+    *,
+    policy: bytes,
+    clearance: bytes,
+    controller: Mapping[str, Any],
+    expert: np.ndarray,
+    start_poses: np.ndarray,
+    names: Sequence[str],
+) -> None:
+    """Writes a bundle into a new folder.
+
+    Args:
+      folder: must not exist.
+      policy, clearance: ONNX models.
+      controller: what `controller.json` has, without `format`, `period`, `start_pose` and `hashes`.
+      expert, start_poses, names: see `Bundle`.
+    """
+    folder.mkdir()
+    (folder / POLICY).write_bytes(policy)
+    (folder / CLEARANCE).write_bytes(clearance)
+    content = {
+        "format": FORMAT,
+        **controller,
+        "period": PERIOD,
+        "start_pose": np.asarray(start_poses, float)[0].tolist(),
+        "hashes": {name: _sha256(folder / name) for name in (POLICY, CLEARANCE)},
+    }
+    np.savez(
+        folder / MOTIONS,
+        expert=np.asarray(expert, np.float32),
+        start_poses=np.asarray(start_poses, float),
+        names=np.asarray(names, str),
+    )
+    (folder / CONTROLLER).write_text(json.dumps(content, indent=2) + "\n")
+
+
+def load_bundle(folder: str | Path) -> Bundle:
+    """Reads a bundle and checks that its parts fit together.
+
+    Raises:
+      ValueError: a file is missing, damaged or of another version, or does not fit the others. The message is one line.
+    """
+    folder = Path(folder).expanduser()
+    missing = [name for name in (CONTROLLER, POLICY, CLEARANCE, MOTIONS) if not (folder / name).is_file()]
+    if missing:
+        raise ValueError(f"bundle: {str(folder)!r}: expected a folder of mimic.export with format=controller, which has "
+                         f"{', '.join(missing)}")  # fmt: skip
+    content = _controller(folder)
+    for name in (POLICY, CLEARANCE):
+        if content["hashes"].get(name) != _sha256(folder / name):
+            raise ValueError(f"bundle: {name}: expected the file that {CONTROLLER} was written for, got another one")
+    try:
+        motions = read_arrays(folder / MOTIONS, ("expert", "start_poses", "names"))
+    except ValueError as error:
+        raise ValueError(f"bundle: {MOTIONS}: {error}") from error
+    bundle = _parsed(folder, content, motions)
+    _check(bundle)
+    return bundle
+
+
+def _controller(folder: Path) -> dict[str, Any]:
+    try:
+        content = json.loads((folder / CONTROLLER).read_text())
+    except (ValueError, UnicodeDecodeError) as error:
+        raise ValueError(f"bundle: {CONTROLLER}: expected JSON: {error}") from error
+    keys = content if isinstance(content, dict) else {}
+    if keys.get("format", FORMAT) != FORMAT:
+        raise ValueError(f"bundle: {CONTROLLER}: format: expected {FORMAT}, got {keys['format']!r:.40}")
+    missing = [key for key in _KEYS if key not in keys]
+    if missing:
+        raise ValueError(f"bundle: {CONTROLLER}: expected the keys {', '.join(_KEYS)}; missing {', '.join(missing)}")
+    return keys
+
+
+def _parsed(folder: Path, content: Mapping[str, Any], motions: Mapping[str, np.ndarray]) -> Bundle:
+    try:
+        links = content["expert_links"]
+        return Bundle(
+            folder=folder,
+            robot=str(content["robot"]),
+            joint_names=tuple(content["joint_names"]),
+            mode=content["mode"],
+            control_dt=float(content["control_dt"]),
+            start_pose=np.asarray(content["start_pose"], float),
+            limits=JointLimits.from_lists(content["limits"]),
+            parameters=JointParameters(
+                *(np.asarray(content["parameters"][name], float) for name in JointParameters._fields)
+            ),
+            preview=int(content["preview"]),
+            past_actions=int(content["past_actions"]),
+            expert_links=int(links) if isinstance(links, int) else len(links),
+            expert=np.asarray(motions["expert"], np.float32),
+            start_poses=np.asarray(motions["start_poses"], float),
+            names=tuple(str(name) for name in motions["names"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"bundle: expected numbers and names of a controller, got an error in {error!r:.120}") from error
+
+
+def _check(bundle: Bundle) -> None:
+    """Raises a `ValueError` where parts of a bundle do not fit together."""
+    if bundle.mode not in MODES:
+        raise ValueError(f"bundle: mode: expected one of {', '.join(MODES)}, got {bundle.mode!r:.40}")
+    if not bundle.control_dt >= PERIOD or abs(bundle.control_dt / PERIOD - bundle.periods) > 1e-6:
+        raise ValueError(f"bundle: control_dt: expected a multiple of {PERIOD} s, got {bundle.control_dt}")
+    joints, motions = bundle.num_joints, len(bundle.expert)
+    vectors = {"start_pose": bundle.start_pose, **bundle.parameters._asdict()}
+    limits = {field.name: getattr(bundle.limits, field.name) for field in dataclasses.fields(bundle.limits)}
+    shapes = {
+        **{name: (value, (joints,)) for name, value in vectors.items()},
+        **{f"limits.{name}": (value, (joints, 2) if name == "position" else (joints,)) for name, value in limits.items()},
+        "expert": (bundle.expert, (motions, bundle.ticks + 1, LINK_NUMBERS * bundle.expert_links)),
+        "start_poses": (bundle.start_poses, (motions, joints)),
+        "names": (np.asarray(bundle.names), (motions,)),
+    }
+    for name, (value, shape) in shapes.items():
+        if value.shape != shape or not motions:
+            raise ValueError(f"bundle: {name}: expected the shape {shape} of {joints} joints, got {value.shape}")
+        if value.dtype.kind == "f" and not np.all(np.isfinite(value)):
+            raise ValueError(f"bundle: {name}: expected finite numbers")
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

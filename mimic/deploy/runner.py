@@ -1,0 +1,194 @@
+"""Runs a motion of a bundle on a robot."""
+
+import contextlib
+import dataclasses
+import gc
+import time
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+import numpy as np
+
+from mimic.control.joint_control import PERIOD, Reference
+from mimic.deploy.bundle import Bundle
+from mimic.deploy.driver import Driver, RobotAbort, RobotState
+from mimic.deploy.policy_process import PolicyProcess
+from mimic.deploy.safety import INTERVENTIONS, LATE, SafetyConfig, SafetyLayer
+from mimic.deploy.sessions import Clearance
+
+ENDED = "policy ended"
+_REST = 1e-3  # rad/s, of a reference that has stopped
+_AT_REST = 200  # periods that the arm is held at the end, for its tracking error to decay
+_MAX_STOP = 2000  # periods to brake and hold, many times what it takes
+_LATEST = 10  # periods after the start of a tick at which the last action is used again
+
+
+class PolicyConnection(Protocol):
+    """A policy, as `LocalPolicy` and `PolicyProcess` are."""
+
+    def send(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> None: ...  # noqa: D102
+
+    def receive(self) -> tuple[int, np.ndarray] | None: ...  # noqa: D102
+
+    def close(self) -> None: ...  # noqa: D102
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What happened in a run.
+
+    Attributes:
+      cause: why the arm was stopped or the robot aborted; empty where the motion was completed.
+      aborted: whether the robot stopped by itself.
+      ticks: of the policy that were run.
+      interventions: number of interventions of the safety layer, by kind.
+      tracking_error: largest difference between a measured angle and the reference [rad].
+      clearance: smallest clearance of a measured pose [m].
+      compute_ms: wall times of the computation in a period [ms]: p50, p99, p99.9 and max.
+      cpu_ms: the same of the CPU time, which other processes on the computer do not add to.
+    """
+
+    cause: str
+    aborted: bool
+    ticks: int
+    interventions: dict[str, int]
+    tracking_error: float
+    clearance: float
+    compute_ms: dict[str, float]
+    cpu_ms: dict[str, float]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the whole motion was run, under the policy's control."""
+        return not self.cause and not self.interventions[LATE]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report for JSON."""
+        return {**dataclasses.asdict(self), "is_complete": self.is_complete}
+
+
+def run_controller(
+    driver: Driver,
+    bundle: Bundle,
+    motion: int | str = 0,
+    *,
+    config: SafetyConfig | None = None,
+    policy: PolicyConnection | None = None,
+) -> Report:
+    """Runs a motion on a robot, from its start pose until the arm is at rest again.
+
+    Args:
+      driver: of the robot.
+      bundle: see `load_bundle`.
+      motion: index or name of the motion.
+      config: thresholds of the safety layer.
+      policy: connection to the policy; default: the bundle's policy in a new process.
+
+    Raises:
+      ValueError: there is no such motion, or the bundle's mode has no braking path.
+      RuntimeError: the policy's process does not start.
+    """
+    index = bundle.motion_index(motion)
+    layer = SafetyLayer(bundle, Clearance(bundle), config=config)
+    connection = policy or PolicyProcess(bundle, index)
+    loop = _Loop(driver, bundle, layer, connection)
+    try:
+        with _without_collection():
+            loop.run(bundle.start_poses[index])
+    except RobotAbort as abort:
+        return loop.report(abort.cause, aborted=True)
+    finally:
+        connection.close()
+        with contextlib.suppress(RobotAbort):
+            driver.stop()
+    return loop.report(str(layer.cause[0]), aborted=False)
+
+
+class _Loop:
+    """The periods of a run."""
+
+    def __init__(self, driver: Driver, bundle: Bundle, layer: SafetyLayer, policy: PolicyConnection):
+        self._driver, self._bundle, self._layer, self._policy = driver, bundle, layer, policy
+        self._wall: list[float] = []
+        self._cpu: list[float] = []
+        self._tick, self._due, self._action = -1, False, np.zeros((bundle.action_size, 1))
+
+    def run(self, start_pose: np.ndarray) -> None:
+        """Runs all ticks, then brakes and holds."""
+        state = self._driver.read()
+        cause = self._layer.start(state.qpos[:, None], state.qvel[:, None], start_pose[:, None])
+        if cause[0]:
+            return
+        is_first = True
+        for period in range(self._bundle.ticks * self._bundle.periods):
+            state = state if is_first else self._driver.read()
+            self._period(state, period)
+            is_first = False
+            if self._layer.cause[0]:
+                break
+        self._due, at_rest = False, 0
+        for _ in range(_MAX_STOP):
+            self._period(self._driver.read(), None)
+            at_rest = at_rest + 1 if np.abs(self._layer.reference.qvel).max() < _REST else 0
+            if at_rest > _AT_REST:
+                break
+
+    def _period(self, state: RobotState, period: int | None) -> None:
+        """One period; `period` counts those of the motion, None after its end."""
+        wall, cpu = time.perf_counter(), time.thread_time()
+        if period is not None:
+            self._policy_step(state, period)
+        torque = self._layer.period(state.qpos[:, None], state.qvel[:, None])
+        self._driver.write(torque[:, 0])
+        self._layer.work()
+        self._wall.append(time.perf_counter() - wall)
+        self._cpu.append(time.thread_time() - cpu)
+
+    def _policy_step(self, state: RobotState, period: int) -> None:
+        """Sends an observation at the start of a tick, and begins the check of an action when it has arrived."""
+        tick, since = divmod(period, self._bundle.periods)
+        if since == 0:
+            reference = Reference(*(x[:, 0] for x in self._layer.reference))
+            self._policy.send(tick, state.qpos, state.qvel, reference)
+            self._tick, self._due = tick, True
+        if not self._due or self._layer.is_checking:
+            return
+        received = self._policy.receive()
+        is_present = received is not None and received[0] == tick
+        if is_present or since >= _LATEST:
+            if received is not None and is_present:
+                self._action = received[1][:, None]
+            self._layer.tick(self._action, np.array([is_present]))
+            self._due = False
+
+    def report(self, cause: str, *, aborted: bool) -> Report:
+        """The report of the run."""
+        counts = {name: int(self._layer.counts[name][0]) for name in INTERVENTIONS}
+        error = float(self._layer.tracking_error[0])
+        times = _percentiles(self._wall), _percentiles(self._cpu)
+        return Report(cause, aborted, self._tick + 1, counts, error, float(self._layer.clearance[0]), *times)
+
+
+def _percentiles(seconds: list[float]) -> dict[str, float]:
+    values = 1e3 * np.asarray(seconds or [0.0])
+    p50, p99, p999 = np.percentile(values, [50, 99, 99.9])
+    return {"p50": float(p50), "p99": float(p99), "p99.9": float(p999), "max": float(values.max())}
+
+
+@contextlib.contextmanager
+def _without_collection() -> Iterator[None]:
+    """Context without garbage collection, which would take a period or more."""
+    was_enabled = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def missed_periods(states: list[RobotState]) -> int:
+    """Periods of the robot's clock without a state among these."""
+    times = np.array([state.time for state in states])
+    return int(np.maximum(np.round(np.diff(times) / PERIOD) - 1, 0).sum())

@@ -1,0 +1,230 @@
+"""Episodes of a controller on virtual robots in lockstep, and what is counted in them."""
+
+import dataclasses
+from typing import Any, Protocol
+
+import numpy as np
+
+from mimic.control.joint_control import PERIOD, Reference
+from mimic.deploy.bundle import Bundle
+from mimic.deploy.safety import INTERVENTIONS, SafetyConfig, SafetyLayer
+from mimic.deploy.sessions import Clearance, Policy, open_session
+from mimic.virtual_robot.draws import World
+from mimic.virtual_robot.robots import VirtualRobots
+
+ABORTED = "aborted"  # the cause for which the safety layer no longer controls a robot
+
+
+@dataclasses.dataclass(frozen=True)
+class Episodes:
+    """What happened in some episodes.
+
+    Attributes:
+      motion: [episodes] index of the motion.
+      qpos, qvel: [episodes, ticks, joints] true state after each tick [rad, rad/s]; after an abort the arm is at rest.
+      torque: [episodes, ticks, joints] commanded torque at the end of each tick [N m].
+      aborts: [episodes] why the robot aborted, or "".
+      stops: [episodes] why the safety layer stopped the arm for good, or "".
+      interventions: [episodes] number of interventions of the safety layer, by kind.
+      tracking_error: [episodes] largest tracking error [rad].
+      clearance: [episodes] smallest clearance of a measured pose [m]; inf where nothing watches it.
+    """
+
+    motion: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    torque: np.ndarray
+    aborts: np.ndarray
+    stops: np.ndarray
+    interventions: dict[str, np.ndarray]
+    tracking_error: np.ndarray
+    clearance: np.ndarray
+
+
+def joined(parts: list[Episodes]) -> Episodes:
+    """The episodes of all parts, in order."""
+    fields = [field.name for field in dataclasses.fields(Episodes) if field.name != "interventions"]
+    return Episodes(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields},
+        interventions={
+            name: np.concatenate([part.interventions[name] for part in parts]) for name in parts[0].interventions
+        },
+    )
+
+
+class Controller(Protocol):
+    """Controls robots in lockstep; all arrays are [robots, ...]."""
+
+    ticks: int
+    periods: int  # of a tick
+
+    def tick(self, tick: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Begins a tick with a measurement."""
+        ...
+
+    def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """The torques of a period, from a measurement."""
+        ...
+
+    def work(self) -> None:
+        """Is called at the end of each period."""
+        ...
+
+    def drop(self, is_aborted: np.ndarray) -> None:
+        """Is told which robots have aborted."""
+        ...
+
+    def counted(self) -> dict[str, Any]:
+        """`stops`, `interventions`, `tracking_error` and `clearance` of the episodes."""
+        ...
+
+
+def run_episodes(robots: VirtualRobots, controller: Controller, motion: np.ndarray) -> Episodes:
+    """Runs one episode on each robot."""
+    rows: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for tick in range(controller.ticks):
+        for period in range(controller.periods):
+            measured = robots.measure()
+            if period == 0:
+                controller.tick(tick, *measured)
+            robots.step(controller.torque(*measured))
+            controller.work()
+            controller.drop(~robots.is_active)
+        rows.append((robots.qpos.copy(), robots.qvel * robots.is_active[:, None], robots.torque.copy()))
+    qpos, qvel, torque = (np.stack(x, axis=1) for x in zip(*rows, strict=True))
+    return Episodes(motion, qpos, qvel, torque, robots.cause.copy(), **controller.counted())
+
+
+class Channel:
+    """Delays and losses between robots and their policies, in ticks, see `WorldConfig`."""
+
+    def __init__(self, world: World, size: int, seed: int):
+        self._observation_delay, self._action_delay = world.observation_delay, world.action_delay
+        self._loss, self._rng = world.packet_loss, np.random.default_rng(seed)
+        self._observations: list[np.ndarray] = []
+        self._actions: list[np.ndarray] = []
+        self._robots, self._size = np.arange(len(world.action_delay)), size
+
+    def observed(self, values: np.ndarray) -> np.ndarray:
+        """What a policy observes at a tick, for the values [robots, numbers] at that tick."""
+        self._observations.append(values)
+        ticks = np.maximum(len(self._observations) - 1 - self._observation_delay, 0)
+        return np.stack(self._observations)[ticks, self._robots]
+
+    def arrived(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The actions [robots, numbers] that arrive at a tick, and whether there is one, for those that are sent."""
+        self._actions.append(action)
+        ticks = len(self._actions) - 1 - self._action_delay
+        is_lost = self._rng.uniform(size=len(ticks)) < self._loss
+        return np.stack(self._actions)[np.maximum(ticks, 0), self._robots], (ticks >= 0) & ~is_lost
+
+
+class SafeController:
+    """The policy of a bundle with its inner loop and the safety layer, as `mimic.deploy` runs them on a robot."""
+
+    def __init__(
+        self,
+        bundle: Bundle,
+        motion: np.ndarray,
+        world: World,
+        robots: VirtualRobots,
+        config: SafetyConfig | None = None,
+        seed: int = 0,
+    ):
+        self._policy = Policy(bundle, motion.tolist())
+        self._layer = SafetyLayer(bundle, Clearance(bundle), len(motion), config)
+        self._channel = Channel(world, bundle.action_size, seed)
+        self.ticks, self.periods = bundle.ticks, bundle.periods
+        qpos, qvel = robots.measure()
+        self._layer.start(qpos.T, qvel.T, bundle.start_poses[motion].T)
+
+    def tick(self, tick: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """See `Controller`."""
+        reference = self._layer.reference
+        values = np.concatenate([qpos, qvel, reference.qpos.T, reference.qvel.T], axis=1)
+        seen = np.split(self._channel.observed(values), 4, axis=1)
+        action = self._policy.act(tick, seen[0], seen[1], Reference(seen[2], seen[3], seen[3]))
+        arrived, is_present = self._channel.arrived(action)
+        self._layer.tick(arrived.T, is_present)
+
+    def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """See `Controller`."""
+        return self._layer.period(qpos.T, qvel.T).T
+
+    def work(self) -> None:
+        """See `Controller`."""
+        self._layer.work()
+
+    def drop(self, is_aborted: np.ndarray) -> None:
+        """See `Controller`."""
+        self._layer.release(is_aborted, ABORTED)
+
+    def counted(self) -> dict[str, Any]:
+        """See `Controller`."""
+        layer = self._layer
+        return {
+            "stops": np.where(layer.cause == ABORTED, "", layer.cause),
+            "interventions": layer.counts,
+            "tracking_error": layer.tracking_error,
+            "clearance": layer.clearance,
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class TorquePolicy:
+    """A policy of torques that are constant in a tick, without an inner loop: the paper's.
+
+    Attributes:
+      model: ONNX from qpos, qvel and expert (link states as in a bundle) to torque [N m].
+      expert: [motions, ticks + 1, numbers] the expert's link states.
+      preview: see `Bundle`.
+      control_dt: tick [s].
+    """
+
+    model: bytes
+    expert: np.ndarray
+    preview: int
+    control_dt: float
+
+
+class TorqueController:
+    """Robots with torques straight from a policy: nothing limits them and nothing checks them."""
+
+    def __init__(self, policy: TorquePolicy, motion: np.ndarray, joints: int, world: World, seed: int = 0):
+        experts = (policy.preview + 1) * policy.expert.shape[-1]
+        inputs = {"qpos": joints, "qvel": joints, "expert": experts}
+        self._session = open_session(policy.model, inputs, {"torque": joints})
+        self._expert, self._preview = policy.expert[motion], policy.preview
+        self.ticks, self.periods = policy.expert.shape[1] - 1, round(policy.control_dt / PERIOD)
+        self._channel = Channel(world, joints, seed)
+        self._torque = np.zeros((len(motion), joints))
+
+    def tick(self, tick: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """See `Controller`."""
+        qpos, qvel = np.split(self._channel.observed(np.concatenate([qpos, qvel], axis=1)), 2, axis=1)
+        steps = np.minimum(np.arange(tick, tick + self._preview + 1), self.ticks)
+        feed = {"qpos": qpos, "qvel": qvel, "expert": self._expert[:, steps].reshape(len(qpos), -1)}
+        (torque,) = self._session.run(["torque"], {key: np.asarray(x, np.float32) for key, x in feed.items()})
+        arrived, is_present = self._channel.arrived(np.asarray(torque, float))
+        self._torque = np.where(is_present[:, None], arrived, self._torque)
+
+    def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """See `Controller`."""
+        return self._torque
+
+    def work(self) -> None:
+        """Does nothing."""
+
+    def drop(self, is_aborted: np.ndarray) -> None:
+        """Does nothing."""
+
+    def counted(self) -> dict[str, Any]:
+        """See `Controller`."""
+        zero = np.zeros(len(self._torque))
+        return {
+            "stops": np.full(len(zero), "", object),
+            "interventions": {name: zero.astype(int) for name in INTERVENTIONS},
+            "tracking_error": zero,
+            "clearance": zero + np.inf,
+        }
+

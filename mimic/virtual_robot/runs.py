@@ -1,0 +1,95 @@
+"""Runs many episodes on virtual robots, in several processes."""
+
+import dataclasses
+import multiprocessing
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mimic.deploy.bundle import load_bundle
+from mimic.virtual_robot.arm_model import RobotModel
+from mimic.virtual_robot.draws import World
+from mimic.virtual_robot.episodes import (
+    Episodes,
+    SafeController,
+    TorqueController,
+    TorquePolicy,
+    joined,
+    run_episodes,
+)
+from mimic.virtual_robot.robots import VirtualRobots
+
+GROUP = 100  # robots in lockstep: more are not faster
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """Episodes that run in lockstep.
+
+    Attributes:
+      robot: the model.
+      policy: folder of a bundle, or a policy of torques.
+      world: of each episode.
+      motion: [episodes] index of the motion.
+      start_poses: [episodes, joints] [rad].
+      seed: of noise and losses.
+    """
+
+    robot: RobotModel
+    policy: Path | TorquePolicy
+    world: World
+    motion: np.ndarray
+    start_poses: np.ndarray
+    seed: int
+
+
+def run_task(task: Task) -> Episodes:
+    """Runs the episodes of a task."""
+    robots = VirtualRobots(task.robot, task.world, task.start_poses, task.seed)
+    if isinstance(task.policy, TorquePolicy):
+        joints = task.start_poses.shape[1]
+        controller = TorqueController(task.policy, task.motion, joints, task.world, task.seed)
+    else:
+        bundle = load_bundle(task.policy)
+        controller = SafeController(bundle, task.motion, task.world, robots, seed=task.seed)
+    return run_episodes(robots, controller, task.motion)
+
+
+def groups(task: Task) -> list[Task]:
+    """A task in parts of at most `GROUP` episodes."""
+    parts = [slice(i, i + GROUP) for i in range(0, len(task.motion), GROUP)]
+    return [
+        dataclasses.replace(
+            task,
+            world=task.world.select(part),
+            motion=task.motion[part],
+            start_poses=task.start_poses[part],
+            seed=task.seed + part.start,
+        )
+        for part in parts
+    ]
+
+
+def run_tasks(tasks: list[Task], update: Callable[[int], None], processes: int | None = None) -> list[Episodes]:
+    """Runs tasks in processes, one for each core.
+
+    Args:
+      tasks: each gives one result.
+      update: is called with the number of episodes that have ended.
+      processes: number of them; 1 runs all in this process.
+    """
+    parts = [(i, part) for i, task in enumerate(tasks) for part in groups(task)]
+    processes = min(processes or len(os.sched_getaffinity(0)), len(parts))
+    results: dict[int, list[Episodes]] = {i: [] for i in range(len(tasks))}
+    if processes == 1:
+        for i, part in parts:
+            results[i].append(run_task(part))
+            update(len(part.motion))
+        return [joined(results[i]) for i in range(len(tasks))]
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for (i, part), result in zip(parts, pool.imap(run_task, [part for _, part in parts]), strict=True):
+            results[i].append(result)
+            update(len(part.motion))
+    return [joined(results[i]) for i in range(len(tasks))]

@@ -1,0 +1,110 @@
+"""Controller bundles without a training: policies that are one layer of ONNX, and clearances of a Panda or constant ones."""
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from mimic.arms.arm import Arm, ArmConfig, build_arm
+from mimic.arms.capsules import fit_capsules
+from mimic.arms.drives import drives_of
+from mimic.commands.onnx_graph import to_onnx
+from mimic.control.joint_control import JointParameters, action_size
+from mimic.deploy.bundle import load_bundle, write_bundle
+from mimic.envs import env_config
+from mimic.hardware.plant import make_plant
+from mimic.retargeting.clearance import make_clearance
+
+PREVIEW, PAST, LINKS, TICKS, CONTROL_DT = 2, 3, 7, 40, 0.05
+
+
+@functools.cache
+def panda(locked: tuple[int, ...] = ()) -> Arm:
+    """The Panda with the manufacturer's limits."""
+    return build_arm(ArmConfig(locked=list(locked)), "hardware")
+
+
+@functools.cache
+def panda_clearance(locked: tuple[int, ...] = ()) -> bytes:
+    """The clearance of a Panda as ONNX."""
+    clearance = make_clearance(panda(locked).embodiment, fit_capsules(ArmConfig(locked=list(locked)), "hardware"))
+    joints = panda(locked).embodiment.num_joints
+    model = to_onnx(lambda qpos: {"clearance": clearance(qpos)}, name="clearance", inputs={"qpos": joints}, metadata={})
+    return model.SerializeToString()
+
+
+@functools.cache
+def parameters(locked: tuple[int, ...] = ()) -> JointParameters:
+    """The parameters of the inner loop of a Panda in the hardware world."""
+    config = env_config("panda7dof", world="hardware", learner={"locked": list(locked)})
+    joints = panda(locked).embodiment.num_joints
+    padded = make_plant(config, panda(locked)).constants.parameters
+    return JointParameters(*(np.asarray(x, float)[:joints] for x in padded))
+
+
+def policy(joints: int, size: int, action: Any) -> bytes:
+    """A policy as ONNX; `action` gives the action of the six inputs by name."""
+    inputs = {name: joints for name in ("qpos", "qvel", "reference_qpos", "reference_qvel")}
+    inputs |= {"past_actions": PAST * size, "expert": (PREVIEW + 1) * LINKS * 12}
+    names = list(inputs)
+
+    def function(*values: Any) -> dict[str, Any]:
+        by_name = dict(zip(names, values, strict=True))
+        unused = 0 * sum(jnp.sum(value) for value in values)  # keeps all inputs in the graph
+        return {"action": jnp.clip(action(by_name) + unused, -1, 1)}
+
+    return to_onnx(function, name="policy", inputs=inputs, metadata={}).SerializeToString()
+
+
+def sine(values: dict[str, Any]) -> Any:
+    """A motion of all joints: the first number of the expert is its phase."""
+    phase = values["expert"][0]
+    return 0.4 * jnp.sin(phase + jnp.arange(values["qpos"].shape[0]))
+
+
+def constant(*numbers: float) -> Any:
+    """The policy that always gives these numbers."""
+    return lambda values: jnp.asarray(numbers, jnp.float32)
+
+
+def make_bundle(
+    folder: Path,
+    action: Any = sine,
+    *,
+    mode: str = "joint_velocity",
+    locked: Sequence[int] = (),
+    start_poses: np.ndarray | None = None,
+    ticks: int = TICKS,
+    clearance: bytes | None = None,
+) -> Any:
+    """Writes a bundle for a Panda and loads it."""
+    arm, locked = panda(tuple(locked)), tuple(locked)
+    limits = drives_of(ArmConfig(locked=list(locked)), arm).limits
+    home, joints = np.asarray(arm.embodiment.home), arm.embodiment.num_joints
+    start_poses = np.stack([home, home]) if start_poses is None else start_poses
+    expert = np.zeros((len(start_poses), ticks + 1, LINKS * 12))
+    expert[:, :, 0] = 2 * np.pi * CONTROL_DT * np.arange(ticks + 1)  # one cycle a second
+    write_bundle(
+        folder,
+        policy=policy(joints, action_size(mode, joints), action),
+        clearance=clearance or panda_clearance(locked),
+        controller={
+            "mimic_version": "test",
+            "robot": "panda",
+            "mode": mode,
+            "control_dt": CONTROL_DT,
+            "joint_names": list(arm.embodiment.joint_names),
+            "limits": limits.as_lists(),
+            "parameters": {name: x.tolist() for name, x in parameters(locked)._asdict().items()},
+            "preview": PREVIEW,
+            "past_actions": PAST,
+            "expert_links": LINKS,
+        },
+        expert=expert,
+        start_poses=start_poses,
+        names=[f"motion {i}" for i in range(len(start_poses))],
+    )
+    return load_bundle(folder)
