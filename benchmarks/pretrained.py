@@ -4,10 +4,12 @@
     python -m benchmarks.pretrained --runs runs/pretrained/* --out mimic/pretrained/networks [--half] [--commit HASH]
 
 Each run directory becomes the folder ENV-KIND; one that exists is replaced, others stay. Every number of its report is
-that of the stored weights; `copying_distance` is that of copying the angles of joints with the same name. `--half`
+that of the stored weights; `copying_distance` is that of copying the angles of joints with the same name. A mapper to
+any arm keeps the rows of the arms in `env.arms.evaluated` in its report, but not their files in its config. `--half`
 stores matrices as float16. The commit is the one that the runs were trained at; default: that of this checkout.
 """
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -40,6 +42,7 @@ COLUMNS = (
     "copying_distance[held_out]:.4f"
 )
 GAPS = {"policy": ("optimality_gap", "lower_bound"), "pose_mapper": ("quality", "optimal_distance")}
+MATRICES = {False: "float32", True: "float16"}
 _NOT_TRAINED = {"run_dir", "resume", "init", "compilation_cache", "env.name", "trainer.name"}
 
 
@@ -47,21 +50,30 @@ def make_network(run_dir: Path, out: Path, commit: str, half: bool) -> dict[str,
     """Writes the folder of a run's network, and returns its row of the table."""
     config = load_config(run_dir)
     kind = next(kind for kind, trainer in TRAINERS.items() if trainer == config.trainer.name)
+    if config.env.arms.are_drawn and kind == "policy":
+        raise ValueError(f"{str(run_dir)!r}: expected a pose mapper or a policy of one learner, got one of many arms")
     trainer = make_trainer(config, run_dir)
     _, params = load_checkpoint(run_dir, trainer.params_template())
     rounded = jax.tree.map(np.asarray, _rounded(params) if half else params)
     outcome = trainer.evaluate(rounded)
+    stored_config = without_evaluated(config)
     report = {
         **read_json(run_dir / REPORT),
         **trainer.metrics(outcome),
         **trainer.details(outcome),
-        "copying_distance": copying_distance(trainer),
-        SOURCE: {"command": training_command(config), "commit": commit, "matrices": "float16" if half else "float32"},
+        "copying_distance": None if config.env.arms.are_drawn else copying_distance(trainer),
+        SOURCE: {"command": training_command(stored_config), "commit": commit, "matrices": MATRICES[half]},
     }
     folder = out / f"{config.env.name}-{kind}"
     stored = rounded[:2] if kind == "policy" else rounded  # without the value network
-    write_network(folder, config, stored, report, half=half)
+    write_network(folder, stored_config, stored, report, half=half)
     return row(folder, kind, report)
+
+
+def without_evaluated(config: TrainConfig) -> TrainConfig:
+    """The config without the files of arms that only the report of a run needs."""
+    arms = dataclasses.replace(config.env.arms, evaluated=[])
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, arms=arms))
 
 
 def row(folder: Path, kind: str, report: dict[str, Any]) -> dict[str, Any]:
@@ -73,7 +85,8 @@ def row(folder: Path, kind: str, report: dict[str, Any]) -> dict[str, Any]:
 def training_command(config: TrainConfig) -> str:
     """The shortest command that trains with this config, as far as it differs from the defaults."""
     trainer = CONFIGS[config.trainer.name](preset=config.trainer.preset)
-    default = TrainConfig(env_config(config.env.name), trainer.resolve())
+    env = env_config(config.env.name)
+    default = TrainConfig(env, TrainConfig(env, trainer).resolved_trainer())
     values, defaults = flatten(to_dict(config)), flatten(to_dict(default))
     changed = {key: value for key, value in values.items() if value != defaults.get(key) and key not in _NOT_TRAINED}
     shown = {"env": config.env.name, "trainer": config.trainer.name, "trainer.preset": config.trainer.preset, **changed}

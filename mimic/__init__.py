@@ -177,7 +177,9 @@ _MODULES = {
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 _WITH_MJX = ("ImitationEnv", "Run", "export_run", "fit")  # MJX is imported first, see `compat.import_mjx`
-_WITHOUT_MJX = [name for name in _MODULES if not {"rendering", "imitation", "commands", "trainers"} & {*name.split(".")}]
+_WITHOUT_MJX = [
+    name for name in _MODULES if not {"rendering", "imitation", "commands", "trainers"} & {*name.split(".")}
+]
 _FOLDERS = ("any_arm", "arms", "envs", "metric", "registry", "retargeting")  # attributes after `import mimic` alone
 
 

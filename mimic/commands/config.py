@@ -102,7 +102,7 @@ class EvaluateConfig:
         others = self.learner, self.physics, self.mass, self.damping, self.torque_noise
         if self.controller != "policy" or any(value not in ("", None) for value in others):
             raise ValueError(
-                "controller, learner, physics, mass, damping and torque_noise: expected none with robot=, whose world has "
+                "controller, learner, physics, mass, damping, torque_noise: expected none with robot=, whose world has "
                 "ranges of them"
             )
 

@@ -123,9 +123,7 @@ def _run(tasks: list[Task], console: Console) -> list[Episodes]:
         return run_tasks(tasks, lambda count: progress.advance(bar, count))
 
 
-def _policy(
-    trained: TrainConfig, evaluator: Evaluator, run_dir: Path, steps: int, folder: Path
-) -> Path | TorquePolicy:
+def _policy(trained: TrainConfig, evaluator: Evaluator, run_dir: Path, steps: int, folder: Path) -> Path | TorquePolicy:
     """The policy as a bundle, or as torques where the run has no inner loop."""
     expert = _expert_table(evaluator)
     if not trained.env.has_inner_loop:
@@ -187,9 +185,7 @@ def summary(evaluator: Evaluator, episodes: Episodes) -> dict[str, Any]:
         "limit_violations": sum(aborts[cause] for cause in LIMIT_CAUSES),
         "self_contacts": aborts[SELF_CONTACT],
         "interventions": {name: int(count.sum()) for name, count in episodes.interventions.items()},
-        "episodes_with_interventions": {
-            name: int((count > 0).sum()) for name, count in episodes.interventions.items()
-        },
+        "episodes_with_interventions": {name: int((count > 0).sum()) for name, count in episodes.interventions.items()},
         "tracking_error": float(episodes.tracking_error.max()),
         "clearance": float(episodes.clearance.min()),
     }

@@ -191,7 +191,9 @@ def _parsed(folder: Path, content: Mapping[str, Any], motions: Mapping[str, np.n
             names=tuple(str(name) for name in motions["names"]),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"bundle: expected numbers and names of a controller, got an error in {error!r:.120}") from error
+        raise ValueError(
+            f"bundle: expected numbers and names of a controller, got an error in {error!r:.120}"
+        ) from error
 
 
 def _check(bundle: Bundle) -> None:
@@ -205,7 +207,10 @@ def _check(bundle: Bundle) -> None:
     limits = {field.name: getattr(bundle.limits, field.name) for field in dataclasses.fields(bundle.limits)}
     shapes = {
         **{name: (value, (joints,)) for name, value in vectors.items()},
-        **{f"limits.{name}": (value, (joints, 2) if name == "position" else (joints,)) for name, value in limits.items()},
+        **{
+            f"limits.{name}": (value, (joints, 2) if name == "position" else (joints,))
+            for name, value in limits.items()
+        },
         "expert": (bundle.expert, (motions, bundle.ticks + 1, LINK_NUMBERS * bundle.expert_links)),
         "start_poses": (bundle.start_poses, (motions, joints)),
         "names": (np.asarray(bundle.names), (motions,)),

@@ -23,8 +23,8 @@ class MujocoWorld(NamedTuple):
     """A model of a learner in its world.
 
     Attributes:
-      model: with a body for the payload at the end of the last link, without mass. Gravity is that of a gravity error of
-        1: nothing is compensated.
+      model: with a body for the payload at the end of the last link, without mass. Gravity is that of a gravity error
+        of 1: nothing is compensated.
       moving: [joints] index of the body that each joint moves.
       payload: index of the body of the payload.
       tip, along: [3] its position without a lever, and the direction of the lever, in the frame of its parent.

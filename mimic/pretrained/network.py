@@ -5,7 +5,7 @@ import functools
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +15,13 @@ from jaxtyping import Array, Float
 from mimic import compat
 from mimic.arms.embodiment import Embodiment
 from mimic.config import check_choice
+from mimic.envs import env_config
 from mimic.pretrained.files import SOURCE, read_config_and_report, read_params
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
+    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
 
 NETWORKS = Path(__file__).parent / "networks"
 TRAINERS = {"policy": "ppo", "pose_mapper": "pose_mapper"}  # of each kind of network
@@ -93,19 +95,31 @@ class Pretrained:
         return self._arms[1]
 
 
-def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> Pretrained:
+@overload
+def load(name: Literal["any_arm"], kind: Literal["pose_mapper"]) -> "AnyArmMapper": ...
+
+
+@overload
+def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> Pretrained: ...
+
+
+def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> "Pretrained | AnyArmMapper":
     """Loads a trained network that comes with mimic. Nothing is downloaded.
 
     Args:
       name: name of an environment, as in `mimic.make`.
       kind: "policy", or "pose_mapper".
 
+    Returns:
+      The network; of `load("any_arm", "pose_mapper")` an `AnyArmMapper`, which takes the learner as a second argument.
+
     Raises:
       ValueError: there is no such network.
     """
     check_choice("kind", kind, tuple(TRAINERS))
     check_choice("name", name, pretrained_names(kind))
-    return read_network(NETWORKS / f"{name}-{kind}", kind)
+    folder = NETWORKS / f"{name}-{kind}"
+    return read_any_arm_mapper(folder) if env_config(name).arms.are_drawn else read_network(folder, kind)
 
 
 def pretrained_names(kind: str) -> tuple[str, ...]:
@@ -113,8 +127,13 @@ def pretrained_names(kind: str) -> tuple[str, ...]:
     return tuple(sorted(path.name.removesuffix(f"-{kind}") for path in NETWORKS.glob(f"*-{kind}")))
 
 
+def names_of_one_learner(kind: str) -> tuple[str, ...]:
+    """The environments with a trained network of this kind that do not draw their learner."""
+    return tuple(name for name in pretrained_names(kind) if not env_config(name).arms.are_drawn)
+
+
 def read_network(folder: Path, kind: str) -> Pretrained:
-    """The network in a folder that `write_network` wrote.
+    """The network of one learner in a folder that `write_network` wrote.
 
     Raises:
       ValueError: a file is missing, damaged, or of another kind of network.
@@ -124,6 +143,18 @@ def read_network(folder: Path, kind: str) -> Pretrained:
         raise ValueError(f"{str(folder)!r}: expected a network of trainer={TRAINERS[kind]}, got {config.trainer.name}")
     function = {"policy": _policy, "pose_mapper": _mapper}[kind](folder, config)
     return Pretrained(config.env.name, kind, config, report, function)
+
+
+def read_any_arm_mapper(folder: Path) -> "AnyArmMapper":
+    """The mapper to any arm in a folder that `write_network` wrote.
+
+    Raises:
+      ValueError: a file is missing or damaged.
+    """
+    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper  # imports flax networks
+
+    config, report = read_config_and_report(folder)
+    return AnyArmMapper.read(config, lambda template: read_params(folder, template), report)
 
 
 def policy_template(config: TrainConfig) -> tuple[Any, Any]:

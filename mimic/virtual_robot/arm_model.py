@@ -111,9 +111,7 @@ def _set_stops(spec: mujoco.MjSpec, arm: Arm, position: np.ndarray) -> None:
         joint.limited, joint.range = True, bounds
 
 
-def _add_capsules(
-    spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, rotation: np.ndarray, origin: np.ndarray
-) -> None:
+def _add_capsules(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, rotation: np.ndarray, origin: np.ndarray) -> None:
     """Adds the capsules as geoms, the floor, and the pairs that may touch: those of the safety layer's clearance."""
     spec.worldbody.add_geom(
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 1], pos=origin, quat=_quaternion(rotation),

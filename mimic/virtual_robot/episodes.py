@@ -227,4 +227,3 @@ class TorqueController:
             "tracking_error": zero,
             "clearance": zero + np.inf,
         }
-

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.pretrained.network import pretrained_names
+from mimic.pretrained.network import names_of_one_learner
 from mimic.retargeting.pose_baselines import copy_joints
 from tests.helpers.repository import REPOSITORY
 
@@ -48,7 +48,7 @@ def quick(names):
 
 
 @needs_node
-@pytest.mark.parametrize("name", quick(pretrained_names("pose_mapper")))
+@pytest.mark.parametrize("name", quick(names_of_one_learner("pose_mapper")))
 def test_javascript_computes_what_jax_computes(name, scripts):
     mapper = mimic.load(name, "pose_mapper")
     model = mapper.function.model  # type: ignore[attr-defined]

@@ -9,17 +9,22 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.any_arm.family import UNSEEN, report_arms
+from mimic.any_arm.kinematics import link_states
 from mimic.evaluation.evaluator import Evaluator
 from mimic.pretrained.files import PARAMETERS, read_params, write_network
-from mimic.pretrained.network import NETWORKS, TRAINERS, pretrained_names, read_network
+from mimic.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network
 from mimic.runs.files import REPORT
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 from tests.helpers.repository import REPOSITORY
 
 MAX_BYTES = 3_000_000  # of all of them: the package stays small
 OBSERVATION = 12 * (7 + 7 + 4)  # of planar4dof: four vectors for each link; expert now and next, learner
 DEFAULT = ("panda3dof", "panda4dof", "panda7dof", "planar4dof", "planar7dof")
-POLICIES, MAPPERS = (pretrained_names(kind) for kind in TRAINERS)
+POLICIES, MAPPERS = (names_of_one_learner(kind) for kind in TRAINERS)
+FOLDERS = [f"{name}-{kind}" for kind in TRAINERS for name in names_of_one_learner(kind)]
 
 
 def quick(names):
@@ -28,13 +33,14 @@ def quick(names):
 
 
 def test_each_default_environment_has_both_and_they_are_small():
-    assert MAPPERS == POLICIES == DEFAULT
+    assert MAPPERS == POLICIES == DEFAULT == pretrained_names("policy")
+    assert pretrained_names("pose_mapper") == ("any_arm", *DEFAULT)
     assert sum(path.stat().st_size for path in NETWORKS.rglob("*") if path.is_file()) <= MAX_BYTES
 
 
-@pytest.mark.parametrize("folder", sorted(NETWORKS.iterdir()), ids=lambda folder: folder.name)
+@pytest.mark.parametrize("folder", FOLDERS)
 def test_each_says_where_it_comes_from(folder):
-    network = mimic.load(*folder.name.rsplit("-", 1))  # type: ignore[arg-type]
+    network = mimic.load(*folder.rsplit("-", 1))  # type: ignore[arg-type]
     source = network.source
     assert len(source["commit"]) == 40 and source["command"].startswith(f"python -m mimic.train env={network.name} ")
     assert {"python", "jax", "numpy"} <= set(source["versions"]) and source["hardware"]["device"]
@@ -67,6 +73,49 @@ def test_a_policy_reaches_its_recorded_distance(name):
     distance = np.asarray(rollouts.distance)[: held_out.count].mean()
     assert float(distance) == pytest.approx(recorded, rel=1e-3)
     assert recorded < 0.5 * policy.report["hold_distance"]["held_out"]
+
+
+@pytest.fixture(scope="module")
+def any_arm():
+    return mimic.load("any_arm", "pose_mapper")
+
+
+def test_the_mapper_to_any_arm_says_where_it_comes_from(any_arm):
+    report = any_arm.report
+    assert len(report["source"]["commit"]) == 40 and report["training_poses"] > 2e7
+    assert report["source"]["command"] == "python -m mimic.train env=any_arm trainer=pose_mapper trainer.preset=any_arm"
+    assert report["hardware"]["device"] and {"python", "jax", "numpy"} <= set(report["versions"])
+    assert any_arm.env.arms.evaluated == [] and "ur5e" in report["arms"]
+
+
+def test_the_mapper_to_any_arm_reaches_its_recorded_distance_on_unseen_locks(any_arm):
+    arms = {name: arm for name, arm in report_arms(any_arm.env)[UNSEEN].items() if name.startswith("locked")}
+    poses = AnyArmMapperTrainer(TrainConfig(any_arm.env, PoseMapperConfig(preset="any_arm")))._expert_qpos
+    states = jax.jit(jax.vmap(lambda qpos: link_states(any_arm.model.expert, qpos)))(poses)
+    distances = jax.jit(jax.vmap(any_arm.model.distance, (0, None, 0)))
+    recorded = {name: any_arm.report["arms"][name] for name in arms}
+    assert len(arms) == 8 and not any(row["seen"] for row in recorded.values())
+    for name, arm in arms.items():
+        arrays = any_arm.arrays(arm)
+        distance = float(distances(states, arrays, any_arm(poses[:, :7], arrays)).mean())
+        # Where two proposals are equally near, another machine may take the other one.
+        assert distance == pytest.approx(recorded[name]["mean_distance"], rel=2e-3)
+    # None of these arms was in the training: 1 % of the way from the optimum to a random pose, in the mean.
+    assert np.mean([row["quality"] for row in recorded.values()]) < 0.01
+    assert all(row["quality"] < row["quality_random_guesses"] for row in recorded.values())
+
+
+def test_the_mapper_to_any_arm_is_near_the_optimum_of_three_locked_joints(any_arm):
+    lower, upper = np.asarray(any_arm.expert.joint_range).T
+    poses = np.random.default_rng(0).uniform(lower, upper, (64, 7)).astype(np.float32)
+    mapper = any_arm.to("panda4dof")  # training has locked two joints at most
+    distance = jax.jit(jax.vmap(mapper.model.distance))
+    mapped = any_arm(poses, "panda4dof")
+    metric = mimic.env_config("panda4dof").metric.build(any_arm.expert, mapper.model.learner)
+    optimum = mimic.imitate_pose(any_arm.expert, mapper.model.learner, poses, **metric.arguments).qpos
+    difference = np.asarray(distance(poses, mapped) - distance(poses, optimum))
+    assert mapped.shape == (64, 4)
+    assert -0.01 < difference.mean() < 0.02  # a random pose is 1 farther
 
 
 def test_a_batch_is_the_same_as_its_samples():
@@ -156,3 +205,17 @@ def mapper_cells(name):
     distances = ("mean_distance", "optimal_distance", "copying_distance")
     cells = " / ".join(f"{report[key]['held_out']:.3f}" for key in distances)
     return f"{report['quality']['held_out']:.2%} | {cells}"
+
+
+def test_the_page_has_the_recorded_metrics_of_the_mapper_to_any_arm(any_arm):
+    page = (REPOSITORY / "docs" / "pretrained.md").read_text()
+    arms = any_arm.report["arms"]
+    groups = {}
+    for name, arm in arms.items():
+        group = "seen" if arm["seen"] else name.split()[0] if " " in name else "real"
+        groups.setdefault(group, []).append(arm)
+    assert [len(rows) for rows in groups.values()] == [21, 8, 7, 16]
+    for rows in groups.values():
+        quality = np.array([row["quality"] for row in rows])
+        guesses = np.mean([row["quality_random_guesses"] for row in rows])
+        assert f"| {quality.mean():.2%} / {quality.max():.2%} | {guesses:.1%} |" in page

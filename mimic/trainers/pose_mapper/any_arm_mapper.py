@@ -3,7 +3,9 @@
 import dataclasses
 import functools
 import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +21,7 @@ from mimic.envs import env_config, environments
 from mimic.envs.config import ArmsConfig, EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, Params, make_any_arm_model
 from mimic.trainers.pose_mapper.model import PoseMapper, check_poses
 from mimic.trainers.run_config import load_config
@@ -59,12 +61,14 @@ class AnyArmMapper:
       params: parameters of the network.
       expert: the arm of the input poses.
       env: config of the environment; learners that are no arrays are built with its `limits` and `metric.links`.
+      report: of `mimic.load`: the metrics of these weights, as in report.json of a run, and where they come from.
     """
 
     model: AnyArmMapperModel
     params: Params
     expert: Embodiment
     env: EnvConfig
+    report: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def load(cls, run_dir: str | os.PathLike[str], checkpoint: int | None = None) -> "AnyArmMapper":
@@ -84,11 +88,25 @@ class AnyArmMapper:
                 f"{os.fspath(run_dir)!r}: expected a run of trainer=pose_mapper that draws its arms, as env=any_arm "
                 f"does, got one of {kind}"
             )
+        return cls.read(config, lambda template: load_checkpoint(Path(run_dir), template, checkpoint)[1])
+
+    @classmethod
+    def read(
+        cls, config: TrainConfig, read_params: Callable[[Params], Params], report: Mapping[str, Any] | None = None
+    ) -> "AnyArmMapper":
+        """The mapper of a config.
+
+        Args:
+          config: of a run of trainer=pose_mapper that draws its arms.
+          read_params: the parameters, from their shapes.
+          report: see `AnyArmMapper`.
+        """
+        assert isinstance(config.trainer, PoseMapperConfig)
         env = config.env
         model = make_any_arm_model(env, config.trainer.resolve_any_arm())
         template = jax.eval_shape(model.init, jax.random.key(0))
         expert = build_arm(env.expert, env.limits, env.metric.links).embodiment
-        return cls(model, load_checkpoint(Path(run_dir), template, checkpoint)[1], expert, env)
+        return cls(model, read_params(template), expert, env, report or {})
 
     @functools.cached_property
     def _map(self):  # compiled once for each shape of the poses, whatever the learner is

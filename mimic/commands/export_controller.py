@@ -1,0 +1,123 @@
+"""`python -m mimic.export format=controller`: a policy with what a robot needs beside it, for `mimic.deploy`."""
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mimic.arms.drives import drives_of
+from mimic.control import joint_control
+from mimic.control.joint_control import JointParameters
+from mimic.deploy.bundle import write_bundle
+from mimic.distribution import VERSION
+from mimic.hardware.env import SENT_ACTIONS, HardwareEnv, control_observation
+from mimic.metric.kinematics import LinkStates
+from mimic.retargeting.clearance import make_clearance
+from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
+from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo import training
+from mimic.trainers.ppo.trainer import run_environment
+from mimic.trainers.run_config import load_config
+
+_NUMBERS = 12  # of a link's state
+
+
+def export_controller(run_dir: Path, out: Path, checkpoint: int | None = None) -> None:
+    """Writes the controller of a run to a new folder, complete or not at all.
+
+    Args:
+      run_dir: run directory of a policy with an inner loop (`env.control`, `world`).
+      out: must not exist.
+      checkpoint: steps of the checkpoint. Default None: the last checkpoint.
+
+    Raises:
+      ValueError: a run of another kind, or a checkpoint that does not exist.
+    """
+    trained = load_config(run_dir)
+    config = trained.trainer
+    if not isinstance(config, PPOConfig) or not trained.env.has_inner_loop:
+        raise ValueError(
+            "format=controller: expected a run of trainer=ppo with an inner loop, as of world=hardware, got one of "
+            f"trainer={config.name} with control={trained.env.control} in the world of the paper"
+        )
+    steps = check_checkpoint(run_dir, checkpoint)
+    env = cast(HardwareEnv, run_environment(trained.env, run_dir)[0])
+    settings = config.resolve()
+    params = load_checkpoint(run_dir, training.params_template(settings, env.observation_size, env.action_size), steps)[
+        1
+    ]
+    policy = training.make_controller(settings, env.observation_size, env.action_size)(jax.device_get(params))
+    partial = Path(tempfile.mkdtemp(prefix=".mimic-", dir=out.absolute().parent))
+    try:
+        write_bundle(
+            partial / "bundle",
+            policy=_policy_graph(env, policy),
+            clearance=_clearance_graph(env),
+            controller=_description(env, steps),
+            expert=expert_table(env),
+            start_poses=np.asarray(env.start_poses, float),
+            names=[f"demonstration {index}" for index in range(env.demonstrations.count)],
+        )
+        os.rename(partial / "bundle", out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def expert_table(env: HardwareEnv) -> np.ndarray:
+    """The expert's link states [demonstrations, ticks + 1, numbers], as the policy observes them."""
+    states: LinkStates = jax.tree.map(lambda x: np.asarray(x)[:, : env.config.horizon + 1], env.expert_states)
+    leaves = [leaf.reshape(*leaf.shape[:2], -1) for leaf in jax.tree.leaves(states)]
+    return np.concatenate(leaves, axis=-1).astype(np.float32)
+
+
+def _policy_graph(env: HardwareEnv, policy: Any) -> bytes:
+    from mimic.commands.onnx_graph import to_onnx  # needs the extra "export"
+
+    joints = env.learner.num_joints
+    inputs = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
+    inputs["past_actions"] = SENT_ACTIONS * env.action_size
+    inputs["expert"] = (env.config.preview + 1) * _NUMBERS * env.expert.num_links
+
+    def function(*parts: jax.Array) -> dict[str, jax.Array]:
+        *measured, past_actions, expert = parts
+        observation = control_observation(env, jnp.concatenate(measured), past_actions, expert)
+        return {"action": jnp.clip(policy(SimpleNamespace(obs=observation)), -1.0, 1.0)}
+
+    return to_onnx(function, name="policy", inputs=inputs, metadata={"mimic_version": VERSION}).SerializeToString()
+
+
+def _clearance_graph(env: HardwareEnv) -> bytes:
+    from mimic.commands.onnx_graph import to_onnx
+
+    clearance = make_clearance(env.learner, env.capsules)
+    inputs = {"qpos": env.learner.num_joints}
+    return to_onnx(
+        lambda qpos: {"clearance": clearance(qpos)}, name="clearance", inputs=inputs, metadata={}
+    ).SerializeToString()
+
+
+def _description(env: HardwareEnv, steps: int) -> dict[str, Any]:
+    """What `controller.json` has, see `mimic.deploy.bundle.Bundle`."""
+    config, joints = env.config, env.learner.num_joints
+    assert config.control in joint_control.MODES
+    parameters = JointParameters(*(np.asarray(x, float)[:joints] for x in env.plant.constants.parameters))
+    return {
+        "mimic_version": VERSION,
+        "env": config.name,
+        "checkpoint": steps,
+        "robot": env.learner.name,
+        "mode": config.control,
+        "control_dt": config.control_dt,
+        "joint_names": list(env.learner.joint_names),
+        "limits": drives_of(config.learner, env.arm).limits.as_lists(),
+        "parameters": {name: x.tolist() for name, x in parameters._asdict().items()},
+        "preview": config.preview,
+        "past_actions": SENT_ACTIONS,
+        "expert_links": env.expert.num_links,
+    }
