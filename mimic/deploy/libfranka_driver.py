@@ -45,10 +45,10 @@ class LibfrankaDriver:
     ):
         self._library = _import() if library is None else library
         self._errors = (self._library.FrankaException, RuntimeError)
+        self._control: Any = None
         self._robot = self._call(self._library.Robot, address)
         torque, force = list(collision_torque), list(collision_force)
         self._call(self._robot.set_collision_behavior, torque, torque, force, force)
-        self._control: Any = None
         self._is_answered, self._torque = True, [0.0] * JOINTS
 
     def read(self) -> RobotState:
@@ -67,22 +67,23 @@ class LibfrankaDriver:
 
     def stop(self) -> None:
         """See `Driver`. The last command, of the last torque, says that the motion has ended."""
-        control, self._control = self._control, None
-        if control is None:
-            return
-        last = self._library.Torques(self._torque)
-        last.motion_finished = True
+        control = self._control
         try:
-            if self._is_answered:
-                self._call(control.readOnce)
-            self._call(control.writeOnce, last)
+            if control is not None:
+                last = self._library.Torques(self._torque)
+                last.motion_finished = True
+                if self._is_answered:
+                    self._call(control.readOnce)
+                self._call(control.writeOnce, last)
         finally:
+            self._control = None
             self._call(self._robot.stop)
 
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         try:
             return function(*arguments)
         except self._errors as error:
+            self._control = None  # an error ends the control
             raise RobotAbort(" ".join(str(error).split())[:200] or type(error).__name__) from error
 
 
