@@ -13,7 +13,7 @@ import numpy as np
 from mimic.deploy.driver import RobotAbort, RobotState
 
 JOINTS = 7
-# Thresholds of the collision reflex, as in libfranka's examples of joint motions: N m for each joint, N and N m at the hand.
+# Thresholds of the collision reflex, as in libfranka's examples of joint motions [N m], and at the hand [N, N m].
 COLLISION_TORQUE = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
 COLLISION_FORCE = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
 
@@ -21,8 +21,8 @@ COLLISION_FORCE = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
 class LibfrankaDriver:
     """A `Driver` of a Franka arm: joint torques at 1 kHz, in addition to the gravity compensation of its controller.
 
-    The mass and the inertia of a tool and a payload are set in the robot's own configuration; its gravity compensation and
-    its collision reflex need them.
+    The mass and the inertia of a tool and a payload are set in the robot's own configuration; its gravity compensation
+    and its collision reflex need them.
 
     Args:
       address: host name or address of the robot's control unit.

@@ -19,10 +19,10 @@ SAMPLE = 10  # periods between two angles of a path
 
 
 class PathPrediction:
-    """Paths of many robots' references that follow their present target, hold a new one for a time, and brake to a stop.
+    """Paths of robots' references that follow their present target, hold a new one for a time, and brake to a stop.
 
-    Its steps are larger than those of the inner loop; the angles differ by less than `ERROR`. A path is computed in parts
-    that fit between two periods.
+    Its steps are larger than those of the inner loop; the angles differ by less than `ERROR`. A path is computed in
+    parts that fit between two periods.
 
     Args:
       joints: parameters, [joints, 1] each.

@@ -11,9 +11,10 @@ import numpy as np
 
 from mimic.control.joint_control import PERIOD, Reference
 from mimic.deploy.bundle import Bundle
+from mimic.deploy.config import SafetyConfig
 from mimic.deploy.driver import Driver, RobotAbort, RobotState
 from mimic.deploy.policy_process import PolicyProcess
-from mimic.deploy.safety import INTERVENTIONS, LATE, SafetyConfig, SafetyLayer
+from mimic.deploy.safety import INTERVENTIONS, LATE, SafetyLayer
 from mimic.deploy.sessions import Clearance
 
 ENDED = "policy ended"
@@ -26,7 +27,7 @@ _LATEST = 10  # periods after the start of a tick at which the last action is us
 class PolicyConnection(Protocol):
     """A policy, as `LocalPolicy` and `PolicyProcess` are."""
 
-    def send(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> None: ...  # noqa: D102
+    def send(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference, /) -> None: ...  # noqa: D102
 
     def receive(self) -> tuple[int, np.ndarray] | None: ...  # noqa: D102
 

@@ -95,7 +95,7 @@ class Scripted:
     def __init__(self, actions):
         self._actions, self._tick = actions, -1
 
-    def send(self, tick, *observation):
+    def send(self, tick, qpos, qvel, reference):
         self._tick = tick
 
     def receive(self):

@@ -7,7 +7,8 @@ import pytest
 
 from mimic.control.joint_control import PERIOD
 from mimic.deploy import measurements
-from mimic.deploy.safety import COLLISION, INVALID, LATE, MEASURED_CLEARANCE, REPEATED, SafetyConfig, SafetyLayer
+from mimic.deploy.config import SafetyConfig
+from mimic.deploy.safety import COLLISION, INVALID, LATE, MEASURED_CLEARANCE, REPEATED, SafetyLayer
 from mimic.deploy.sessions import Clearance
 from tests.helpers import bundles
 

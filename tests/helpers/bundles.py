@@ -1,4 +1,4 @@
-"""Controller bundles without a training: policies that are one layer of ONNX, and clearances of a Panda or constant ones."""
+"""Controller bundles without a training, for Pandas with policies of a line."""
 
 import functools
 from collections.abc import Sequence

@@ -60,6 +60,6 @@ def test_it_is_that_of_mujocos_geoms():
 
 def test_the_floor_may_be_lower():
     arm, capsules = build_arm(ArmConfig(), "hardware").embodiment, fit_capsules(ArmConfig(), "hardware")
-    pose = np.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785], np.float32)
-    low, high = (make_clearance(arm, capsules, height)(pose)[0] for height in (-0.1, 0.0))
+    pose = jnp.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])
+    low, high = (float(make_clearance(arm, capsules, height)(pose)[0]) for height in (-0.1, 0.0))
     assert low == pytest.approx(high + 0.1, abs=1e-6)
