@@ -33,7 +33,7 @@ class SafetyConfig:
     measured_margin: float = 0.005
     creep: float = 0.005
     grace: float = 0.02
-    check_periods: int = 18
+    check_periods: int = 20
     repeats: int = 2
     start_distance: float = 0.05
     start_speed: float = 0.1

@@ -83,7 +83,7 @@ class SafetyLayer:
         is_position = bundle.mode != "joint_velocity"
         self._path = PathPrediction(self._joints, is_position, config.check_periods, hold, robots)
         self._path_periods = config.check_periods - _CLEARANCE_PERIODS
-        self._steps = -(-self._path.steps // self._path_periods)  # in a period
+        self._steps = -(-self._path.steps // (self._path_periods - self._path_periods // 2))  # in each second period
         self._start, self._measurements = StartCheck(bundle.limits, config), MeasurementCheck(bundle.limits, config)
         joints = bundle.num_joints
         self.torque, self._value = np.zeros((2, joints, robots))
@@ -174,9 +174,10 @@ class SafetyLayer:
             return
         pending.periods += 1
         part = pending.periods - self._path_periods
-        if part <= 0:
+        if part <= 0 and pending.periods % 2:
             self._path.advance(self._steps, self._new_target)
-            self._check_clearance()  # in each period: else the caches lose onnxruntime's code, and a call takes 0.4 ms
+        elif part <= 0:  # in between, or the caches lose onnxruntime's code, and the next calls take 0.4 ms
+            self._check_clearance()
         elif part <= _CLEARANCE_PERIODS:
             pending.clearance.append(self._clearance_of(self._path.parts(_CLEARANCE_PERIODS)[part - 1]))
 

@@ -8,7 +8,7 @@ from mimic.control.joint_control import JointParameters, Reference
 from mimic.deploy.path import PathPrediction
 from tests.helpers.bundles import parameters
 
-DELAY, HOLD, ROBOTS, TICKS = 18, 70, 30, 20
+DELAY, HOLD, ROBOTS, TICKS = 20, 70, 30, 20
 
 
 @pytest.mark.parametrize("mode", ["joint_velocity", "joint_position"])

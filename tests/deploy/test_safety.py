@@ -221,7 +221,7 @@ def test_softness_is_bounded(tmp_path):
 def test_torque_policies_and_short_ticks_are_rejected(bundle):
     with pytest.raises(ValueError, match="got torque"):
         SafetyLayer(dataclasses.replace(bundle, mode="torque"), Clearance(bundle))
-    with pytest.raises(ValueError, match="control_dt, grace: expected a tick of more than 18 ms"):
+    with pytest.raises(ValueError, match="control_dt, grace: expected a tick of more than 20 ms"):
         SafetyLayer(dataclasses.replace(bundle, control_dt=0.01), Clearance(bundle))
 
 
