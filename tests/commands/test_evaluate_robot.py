@@ -90,7 +90,9 @@ def test_the_gap_is_that_of_the_evaluator(hardware_run):
     from mimic.commands.evaluate import _run_to_evaluate, _trainer_to_evaluate
 
     run_dir, trained = _run_to_evaluate(config)
-    evaluator = _trainer_to_evaluate(trained, run_dir, config)[1].evaluator
+    trainer = _trainer_to_evaluate(trained, run_dir, config)[1]
+    assert isinstance(trainer, PPOTrainer)
+    evaluator = trainer.evaluator
     motion = np.arange(2, 2 + HELD_OUT)
     held = np.repeat(np.asarray(evaluator.env.start_poses)[motion][:, None], HORIZON, axis=1)
     zero, none = np.zeros(HELD_OUT), np.full(HELD_OUT, "", object)
