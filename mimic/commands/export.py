@@ -16,8 +16,8 @@ from rich.console import Console
 from mimic.any_arm.description import SIZE, SUFFIXES, described_arm, description_layout, save_description
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.embodiment import Embodiment
-from mimic.commands.config import EXPORT_FORMATS, ExportConfig
-from mimic.config import check_choice, new_file
+from mimic.commands.config import CONTROLLER, ExportConfig
+from mimic.config import check_choice, new_file, new_folder
 from mimic.distribution import VERSION, install_command
 from mimic.envs import env_config
 from mimic.envs.imitation import layout_of, observation_layout, torque_scale
@@ -99,6 +99,8 @@ def prepare_export(config: ExportConfig) -> Callable[[], None]:
     Raises:
       ValueError: see `export_run`.
     """
+    if config.format == CONTROLLER:
+        return _controller_writer(config)
     if describe := _description_writer(config):
         return describe
     out = _file(config)
@@ -116,20 +118,41 @@ def prepare_export(config: ExportConfig) -> Callable[[], None]:
     return run
 
 
+def _controller_writer(config: ExportConfig) -> Callable[[], None]:
+    """Writes the controller of a run, see `mimic.commands.export_controller`."""
+    from mimic.commands.export_controller import check_run, export_controller
+
+    if not config.run:
+        raise ValueError("run: expected the run directory to export, as in run=runs/NAME")
+    out, run_dir = new_folder("out", config.out), Path(config.run).expanduser()
+    _import_package("onnx", CONTROLLER)
+    check_run(load_config(run_dir))
+    steps = check_checkpoint(run_dir, config.checkpoint)
+
+    def run() -> None:
+        export_controller(run_dir, out, steps)
+        Console().print(f"results: {out}", soft_wrap=True, highlight=False)
+
+    return run
+
+
 def _file(config: ExportConfig) -> Path:
     """The new file of the export."""
-    check_choice("format", config.format, EXPORT_FORMATS)
+    check_choice("format", config.format, tuple(_PACKAGES))
     out = new_file("out", config.out)
     if config.format == "jax":
         new_file("out", str(_metadata_file(out)))
     if not os.access(out.parent, os.W_OK):
         raise ValueError(f"out: {str(out)!r}: the folder cannot be written to")
-    package = _PACKAGES[config.format]
+    _import_package(_PACKAGES[config.format], config.format)
+    return out
+
+
+def _import_package(package: str, format: str) -> None:
     try:
         importlib.import_module(package)
     except ImportError as error:
-        raise ValueError(f"format={config.format} needs the package {package}: {install_command('export')}") from error
-    return out
+        raise ValueError(f"format={format} needs the package {package}: {install_command('export')}") from error
 
 
 def _metadata_file(out: Path) -> Path:

@@ -20,7 +20,7 @@ from mimic.hardware.env import SENT_ACTIONS, HardwareEnv, control_observation
 from mimic.metric.kinematics import LinkStates
 from mimic.retargeting.clearance import make_clearance
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
-from mimic.trainers.config import PPOConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
@@ -40,12 +40,7 @@ def export_controller(run_dir: Path, out: Path, checkpoint: int | None = None) -
       ValueError: a run of another kind, or a checkpoint that does not exist.
     """
     trained = load_config(run_dir)
-    config = trained.trainer
-    if not isinstance(config, PPOConfig) or not trained.env.has_inner_loop:
-        raise ValueError(
-            "format=controller: expected a run of trainer=ppo with an inner loop, as of world=hardware, got one of "
-            f"trainer={config.name} with control={trained.env.control} in the world of the paper"
-        )
+    config = check_run(trained)
     steps = check_checkpoint(run_dir, checkpoint)
     env = cast(HardwareEnv, run_environment(trained.env, run_dir)[0])
     settings = config.resolve()
@@ -67,6 +62,17 @@ def export_controller(run_dir: Path, out: Path, checkpoint: int | None = None) -
         os.rename(partial / "bundle", out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def check_run(trained: TrainConfig) -> PPOConfig:
+    """The trainer's config; raises a `ValueError` for a run without a controller."""
+    config = trained.trainer
+    if not isinstance(config, PPOConfig) or not trained.env.has_inner_loop:
+        raise ValueError(
+            "format=controller: expected a run of trainer=ppo with an inner loop, as of world=hardware, got one of "
+            f"trainer={config.name} with control={trained.env.control} in the world of the paper"
+        )
+    return config
 
 
 def expert_table(env: HardwareEnv) -> np.ndarray:

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands.config import EvaluateConfig
+from mimic.commands.config import EvaluateConfig, ExportConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.commands.evaluate_robot import summary
+from mimic.commands.export import prepare_export
+from mimic.deploy.bundle import load_bundle
+from mimic.deploy.fake_robot import FakeRobot
+from mimic.deploy.policy_process import LocalPolicy
+from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import INTERVENTIONS
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
@@ -104,6 +109,20 @@ def test_the_gap_is_that_of_the_evaluator(hardware_run):
         episodes, qpos=expert.qpos[motion, 1 : HORIZON + 1], qvel=expert.qvel[motion, 1 : HORIZON + 1]
     )
     assert summary(evaluator, copied)["optimality_gap"] == pytest.approx(0, abs=1e-5)  # the expert has the same joints
+
+
+def test_a_controller_is_exported(hardware_run, tmp_path, capsys):
+    prepare_export(ExportConfig(str(hardware_run), str(tmp_path / "controller"), "controller"))()
+    bundle = load_bundle(tmp_path / "controller")
+    assert bundle.mode == "joint_velocity" and bundle.ticks == HORIZON and bundle.joint_names[6] == "joint7"
+    robot = FakeRobot(bundle.start_poses[0], bundle.limits, bundle.parameters.inertia, 1.0)
+    assert run_controller(robot, bundle, policy=LocalPolicy(bundle, 0)).is_complete
+    assert "results: " in capsys.readouterr().out
+
+
+def test_a_run_without_an_inner_loop_has_no_controller(rejected, paper_run):
+    error = rejected("export", f"run={paper_run}", "format=controller", "out=new")
+    assert "format=controller: expected a run of trainer=ppo with an inner loop" in error
 
 
 def test_what_does_not_fit_is_rejected(rejected, hardware_run, tmp_path):
