@@ -29,6 +29,7 @@ COLLISION, INVALID, REPEATED, LATE = "clearance", "invalid action", "repeated ac
 INTERVENTIONS = (COLLISION, INVALID, REPEATED, LATE)
 MEASURED_CLEARANCE = "measured clearance"
 _CLEARANCE_PERIODS = 3  # of those of a check: a part of the path in each
+_REFRESH = 4  # periods of a check in which the clearance of the measured pose is computed once
 _SLOWING = 3.0  # of the damping of the inner loop
 _ACTION_TOLERANCE = 1e-3  # beyond [-1, 1]: float32 rounds a saturated tanh
 
@@ -83,7 +84,7 @@ class SafetyLayer:
         is_position = bundle.mode != "joint_velocity"
         self._path = PathPrediction(self._joints, is_position, config.check_periods, hold, robots)
         self._path_periods = config.check_periods - _CLEARANCE_PERIODS
-        self._steps = -(-self._path.steps // (self._path_periods - self._path_periods // 2))  # in each second period
+        self._steps = -(-self._path.steps // (self._path_periods - self._path_periods // _REFRESH))  # in a period
         self._start, self._measurements = StartCheck(bundle.limits, config), MeasurementCheck(bundle.limits, config)
         joints = bundle.num_joints
         self.torque, self._value = np.zeros((2, joints, robots))
@@ -174,7 +175,7 @@ class SafetyLayer:
             return
         pending.periods += 1
         part = pending.periods - self._path_periods
-        if part <= 0 and pending.periods % 2:
+        if part <= 0 and pending.periods % _REFRESH:
             self._path.advance(self._steps, self._new_target)
         elif part <= 0:  # in between, or the caches lose onnxruntime's code, and the next calls take 0.4 ms
             self._check_clearance()
