@@ -21,8 +21,12 @@ if TYPE_CHECKING:
     from mimic.arms.arm import ArmConfig, build_arm
     from mimic.arms.capsules import Capsules, fit_capsules
     from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm
+    from mimic.arms.rendering import ArmScene
+    from mimic.commands.export import export_run
+    from mimic.commands.fit import Run, fit
     from mimic.envs import env_config, environments
     from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
+    from mimic.envs.imitation import ImitationEnv
     from mimic.envs.importing import import_demonstrations
     from mimic.envs.recording import record_demonstrations
     from mimic.making import make
@@ -52,16 +56,12 @@ if TYPE_CHECKING:
     )
     from mimic.metric.landscape import distance_landscape, local_minima
     from mimic.metric.motion_distance import motion_distance
+    from mimic.pretrained.network import Pretrained, load
     from mimic.registry import register
     from mimic.retargeting.costs import Costs
     from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound
     from mimic.retargeting.pose import PoseImitation, imitate_pose
     from mimic.retargeting.trajectory import imitate_trajectory
-    from mimic.arms.rendering import ArmScene
-    from mimic.commands.export import export_run
-    from mimic.commands.fit import Run, fit
-    from mimic.envs.imitation import ImitationEnv
-    from mimic.pretrained.network import Pretrained, load
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.trainers.pose_mapper.model import PoseMapper
 
