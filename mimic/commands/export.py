@@ -73,8 +73,8 @@ def export_run(
     Args:
       run: run directory.
       out: exported file; must not exist.
-      format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json"; or
-        "controller" for `mimic.deploy`, a folder, see `export_controller`.
+      format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json";
+        or "controller", a folder for `mimic.deploy`, see `export_controller`.
       learner: name of the environment that the run's arms must equal. Default "": not checked. For a pose mapper to any
         arm, an arm (see `AnyArmMapper`) whose description is written to `out`, a .json or .npz file, instead of the
         network.
