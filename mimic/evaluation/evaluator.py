@@ -92,6 +92,11 @@ class Evaluator:
         """Embodiment distance at each step of a learner that stays at rest in its start pose."""
         return self._references().hold
 
+    @property
+    def nearest_poses(self) -> Motions:
+        """The poses of the kinematic bound [rad]."""
+        return self._references().motions["nearest_poses"]
+
     def only(self, index: int) -> "Evaluator":
         """An evaluator of one of the demonstrations, whose references take a fraction of the time; it is held out."""
         demonstrations = self.env.demonstrations
