@@ -125,8 +125,8 @@ __all__ = [
 ]
 
 
-# Modules of the public names. They are imported at the first access: JAX, MuJoCo and brax take seconds, and `mimic.deploy`
-# needs none of them.
+# Modules of the public names. They are imported at the first access: JAX, MuJoCo and brax take seconds, and
+# `mimic.deploy` needs none of them.
 _MODULES = {
     "arms.arm": ("ArmConfig", "build_arm"),
     "arms.capsules": ("Capsules", "fit_capsules"),

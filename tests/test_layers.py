@@ -16,6 +16,7 @@ from tests.helpers.repository import REPOSITORY
 LAYERS = (
     ("compat", "compilation", "config", "config_files", "distribution", "memory", "npz", "ranges", "registry"),
     ("control",),
+    ("deploy",),
     ("arms",),
     ("metric",),
     ("runs",),
@@ -25,6 +26,7 @@ LAYERS = (
     ("any_arm",),
     ("hardware",),
     ("making",),
+    ("virtual_robot",),
     ("mocap",),
     ("evaluation",),
     ("trainers",),

@@ -1,6 +1,7 @@
 """`python -m mimic.evaluate`: evaluates a run from a checkpoint, or another controller in place of its policy."""
 
 import dataclasses
+import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from mimic.commands.progress import SearchProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
 from mimic.config import new_folder
+from mimic.distribution import install_command
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
@@ -45,7 +47,13 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
 
 def _robot_evaluation(config: EvaluateConfig) -> Callable[[], None]:
     """An evaluation on virtual robots, see `prepare_robot_evaluation`."""
-    from mimic.commands.evaluate_robot import prepare_robot_evaluation  # imports onnxruntime, of the extra "deploy"
+    try:
+        importlib.import_module("onnx")
+        from mimic.commands.evaluate_robot import prepare_robot_evaluation  # imports onnxruntime
+    except ImportError as error:
+        raise ValueError(
+            f"robot: needs the packages onnx and onnxruntime: {install_command('deploy,export')}"
+        ) from error
 
     use_compilation_cache(config.compilation_cache)
     run_dir, trained = _run_to_evaluate(config)

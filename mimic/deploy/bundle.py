@@ -135,12 +135,12 @@ def load_bundle(folder: str | Path) -> Bundle:
     """Reads a bundle and checks that its parts fit together.
 
     Raises:
-      ValueError: a file is missing, damaged or of another version, or does not fit the others. The message is one line.
+      ValueError: a file is missing, damaged or of another version, or does not fit the others; in one line.
     """
     folder = Path(folder).expanduser()
     missing = [name for name in (CONTROLLER, POLICY, CLEARANCE, MOTIONS) if not (folder / name).is_file()]
     if missing:
-        raise ValueError(f"bundle: {str(folder)!r}: expected a folder of mimic.export with format=controller, which has "
+        raise ValueError(f"bundle: {str(folder)!r}: expected a folder of mimic.export with format=controller; it lacks "
                          f"{', '.join(missing)}")  # fmt: skip
     content = _controller(folder)
     for name in (POLICY, CLEARANCE):

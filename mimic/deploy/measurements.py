@@ -1,14 +1,10 @@
 """Checks of measured states: at the start, and whether a measurement is plausible and within limits in each period."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from mimic.control.joint_control import Reference
 from mimic.control.limits import JointLimits
-
-if TYPE_CHECKING:
-    from mimic.deploy.safety import SafetyConfig
+from mimic.deploy.config import SafetyConfig
 
 START_POSE, NOT_AT_REST = "start pose", "not at rest"
 INVALID_STATE, JUMP, TRACKING = "invalid state", "state jump", "tracking error"
@@ -18,7 +14,7 @@ POSITION, VELOCITY = "near position limit", "near velocity limit"
 class StartCheck:
     """Finds arms that are not near their start poses and at rest, all arrays [joints, robots]."""
 
-    def __init__(self, limits: JointLimits, config: "SafetyConfig"):
+    def __init__(self, limits: JointLimits, config: SafetyConfig):
         self._lower, self._upper = (np.asarray(x, float)[:, None] for x in limits.position.T)
         self._distance, self._speed = config.start_distance, config.start_speed
 
@@ -38,7 +34,7 @@ class MeasurementCheck:
       is_lost: [robots] whether the measurements of an arm can no longer be used.
     """
 
-    def __init__(self, limits: JointLimits, config: "SafetyConfig"):
+    def __init__(self, limits: JointLimits, config: SafetyConfig):
         position, velocity = np.asarray(limits.position, float), np.asarray(limits.velocity, float)
         self._lower, self._upper = position[:, :1] + config.position, position[:, 1:] - config.position
         self._velocity, self._periods = config.velocity * velocity[:, None], config.velocity_periods

@@ -14,15 +14,16 @@ from mimic.control.joint_control import (
     Reference,
 )
 
-HOLD, BRAKE = 2, 10  # periods of a step, while targets act and while the references brake
-SAMPLE = 10  # periods between two angles of a path
+HOLD, BRAKE = 2, 20  # periods of a step, while targets act and while the references brake
+SAMPLE = 10  # periods between two angles of a path; those in the middle of a step of braking are interpolated
+_PER_BRAKE = BRAKE // SAMPLE
 
 
 class PathPrediction:
-    """Paths of many robots' references that follow their present target, hold a new one for a time, and brake to a stop.
+    """Paths of robots' references that follow their present target, hold a new one for a time, and brake to a stop.
 
-    Its steps are larger than those of the inner loop; the angles differ by less than `ERROR`. A path is computed in parts
-    that fit between two periods.
+    Its steps are larger than those of the inner loop; the angles differ by less than `ERROR`. A path is computed in
+    parts that fit between two periods.
 
     Args:
       joints: parameters, [joints, 1] each.
@@ -32,14 +33,14 @@ class PathPrediction:
       robots: number of robots.
     """
 
-    ERROR = 0.006  # rad, maximum over the joints
+    ERROR = 0.008  # rad, maximum over the joints
 
     def __init__(self, joints: JointParameters, is_position: bool, delay: int, hold: int, robots: int = 1):
         self._delay_steps, self._hold_steps = delay // HOLD, (delay + hold) // HOLD
         self._brake_steps = braking_steps(joints)
         self.steps = self._hold_steps + self._brake_steps
         size = joints.lower.shape[0], robots
-        self._path = np.zeros((1 + hold // SAMPLE + self._brake_steps * BRAKE // SAMPLE, *size))
+        self._path = np.zeros((1 + hold // SAMPLE + self._brake_steps * _PER_BRAKE, *size))
         self._qpos, self._qvel, self._qacc, self._speed, self._a, self._b = np.zeros((6, *size))
         self._room, self._bound, self._far = np.zeros((3, 2, *size))
         self._is_position, self._joints = is_position, joints
@@ -83,7 +84,9 @@ class PathPrediction:
             self._step(BRAKE if is_braking else HOLD)
             self._count += 1
             since = HOLD * (self._count - self._delay_steps)
-            if since > 0 and (is_braking or since % SAMPLE == 0):
+            if is_braking:
+                self._sample(_PER_BRAKE)
+            elif since > 0 and since % SAMPLE == 0:
                 self._sample()
         return self._count == self.steps
 
@@ -96,16 +99,20 @@ class PathPrediction:
         """The path in parts of about the same length."""
         return np.array_split(self.path, count)
 
-    def _sample(self) -> None:
-        self._path[self._samples] = self._qpos
-        self._samples += 1
+    def _sample(self, count: int = 1) -> None:
+        """Adds the present angles to the path, and before them some that are interpolated."""
+        last = self._samples + count - 1
+        self._path[last] = self._qpos
+        for k in range(1, count):
+            before = self._path[self._samples - 1]
+            self._path[self._samples + k - 1] = before + k / count * (self._qpos - before)
+        self._samples = last + 1
 
     def _follow(self) -> None:
         """The speed for the target that acts, and for those that no longer act, 0."""
         if self._is_position:
             error = self._target - self._qpos - self._reaction * self._qvel
-            self._speed[:] = self._position(np.abs(error))
-            self._speed *= np.sign(error)
+            np.copysign(self._position(np.abs(error)), error, out=self._speed)
         else:
             self._speed[:] = self._target
         if self._count < self._delay_steps:
@@ -117,7 +124,7 @@ class PathPrediction:
         change = self._bounded_speed()
         change -= self._qvel
         swing = self._velocity[periods](np.abs(change, out=a))
-        swing *= np.sign(change, out=a)
+        np.copysign(swing, change, out=swing)
         np.minimum(swing, self._most, out=swing)
         np.maximum(swing, self._least, out=swing)
         swing -= self._qacc

@@ -1,7 +1,7 @@
-"""The policy in a process of its own: the inner loop sends it observations and takes its actions, and waits for neither.
+"""The policy in a process of its own: the inner loop sends it observations and takes its actions, but never waits.
 
-Messages are datagrams of a pair of sockets, so that a policy that is killed or stopped at any moment leaves the inner loop
-nothing to wait for. Linux and macOS have such sockets.
+Messages are datagrams of a pair of sockets, so that a policy that is killed or stopped at any moment leaves the inner
+loop nothing to wait for. Linux and macOS have such sockets.
 """
 
 import contextlib

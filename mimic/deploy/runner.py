@@ -11,9 +11,10 @@ import numpy as np
 
 from mimic.control.joint_control import PERIOD, Reference
 from mimic.deploy.bundle import Bundle
+from mimic.deploy.config import SafetyConfig
 from mimic.deploy.driver import Driver, RobotAbort, RobotState
 from mimic.deploy.policy_process import PolicyProcess
-from mimic.deploy.safety import INTERVENTIONS, LATE, SafetyConfig, SafetyLayer
+from mimic.deploy.safety import INTERVENTIONS, LATE, SafetyLayer
 from mimic.deploy.sessions import Clearance
 
 ENDED = "policy ended"
@@ -26,7 +27,7 @@ _LATEST = 10  # periods after the start of a tick at which the last action is us
 class PolicyConnection(Protocol):
     """A policy, as `LocalPolicy` and `PolicyProcess` are."""
 
-    def send(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> None: ...  # noqa: D102
+    def send(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference, /) -> None: ...  # noqa: D102
 
     def receive(self) -> tuple[int, np.ndarray] | None: ...  # noqa: D102
 
@@ -46,6 +47,7 @@ class Report:
       clearance: smallest clearance of a measured pose [m].
       compute_ms: wall times of the computation in a period [ms]: p50, p99, p99.9 and max.
       cpu_ms: the same of the CPU time, which other processes on the computer do not add to.
+      wall_s, cpu_s: the times of each period [s].
     """
 
     cause: str
@@ -56,6 +58,8 @@ class Report:
     clearance: float
     compute_ms: dict[str, float]
     cpu_ms: dict[str, float]
+    wall_s: list[float]
+    cpu_s: list[float]
 
     @property
     def is_complete(self) -> bool:
@@ -63,8 +67,10 @@ class Report:
         return not self.cause and not self.interventions[LATE]
 
     def as_dict(self) -> dict[str, Any]:
-        """The report for JSON."""
-        return {**dataclasses.asdict(self), "is_complete": self.is_complete}
+        """The report for JSON, without the times of each period."""
+        fields = dataclasses.asdict(self)
+        del fields["wall_s"], fields["cpu_s"]
+        return {**fields, "is_complete": self.is_complete}
 
 
 def run_controller(
@@ -165,7 +171,7 @@ class _Loop:
         """The report of the run."""
         counts = {name: int(self._layer.counts[name][0]) for name in INTERVENTIONS}
         error = float(self._layer.tracking_error[0])
-        times = _percentiles(self._wall), _percentiles(self._cpu)
+        times = _percentiles(self._wall), _percentiles(self._cpu), self._wall, self._cpu
         return Report(cause, aborted, self._tick + 1, counts, error, float(self._layer.clearance[0]), *times)
 
 

@@ -1,7 +1,7 @@
-"""The safety layer: the inner loop of some robots at 1 kHz, which accepts a target only if it knows how to stop after it.
+"""The safety layer: the inner loop of some robots at 1 kHz, which accepts a target only if it can stop after it.
 
 Each accepted target comes with a path that was checked: the target acts for a tick and a grace time, then the reference
-brakes. A target that is rejected, late or missing changes nothing, so that the arm brakes along the path that was checked.
+brakes. A target that is rejected, late or missing changes nothing: the arm then brakes along the path that was checked.
 All arrays are [joints, robots]: a robot alone and thousands in simulation run the same code.
 """
 
@@ -20,6 +20,7 @@ from mimic.control.joint_control import (
     next_reference,
 )
 from mimic.deploy.bundle import Bundle
+from mimic.deploy.config import SafetyConfig
 from mimic.deploy.measurements import MeasurementCheck, StartCheck
 from mimic.deploy.path import PathPrediction
 
@@ -30,51 +31,6 @@ MEASURED_CLEARANCE = "measured clearance"
 _CLEARANCE_PERIODS = 3  # of those of a check: a part of the path in each
 _SLOWING = 3.0  # of the damping of the inner loop
 _ACTION_TOLERANCE = 1e-3  # beyond [-1, 1]: float32 rounds a saturated tanh
-
-
-@dataclasses.dataclass(frozen=True)
-class SafetyConfig:
-    """Thresholds of the safety layer.
-
-    Attributes:
-      margin: minimum clearance of the reference along a path [m]. It covers the tracking error of the arm, the motion
-        between two points of a path that are checked, and the error of the path.
-      measured_margin: clearance of the measured pose at which the arm stops [m].
-      creep: part of the margin that rounding may use up [m], so that an arm at the margin can move away.
-      grace: time that a target acts beyond its tick [s], for a policy that is a few milliseconds late.
-      check_periods: periods that the check of a target takes, over which its computation is spread.
-      repeats: ticks in a row without an action in which the last one is used again.
-      start_distance: maximum deviation of a joint from the start pose [rad].
-      start_speed: maximum speed of a joint at the start [rad/s].
-      jump: maximum change of a measured angle in a period [rad].
-      tracking: maximum difference between a measured angle and the reference [rad].
-      position: distance from the ends of a joint's range at which the arm stops [rad].
-      velocity: fraction of the velocity limit at which the arm stops.
-      slow_down: fraction of the velocity limit from which on a torque brakes a joint in addition: an arm that accelerates
-        overshoots its reference's velocity.
-      velocity_scale, acceleration_scale: factors on the limits of the reference; noise and payloads add to its velocity.
-        Smaller ones are for first trials of a controller.
-      min_stiffness: of joint_impedance, as a fraction: softer arms leave the path that was checked.
-      velocity_periods: periods in a row beyond that fraction: noise does not stop the arm.
-    """
-
-    margin: float = 0.02
-    measured_margin: float = 0.005
-    creep: float = 0.005
-    grace: float = 0.02
-    check_periods: int = 18
-    repeats: int = 2
-    start_distance: float = 0.05
-    start_speed: float = 0.1
-    jump: float = 0.05
-    tracking: float = 0.2
-    position: float = 0.005
-    velocity: float = 0.985
-    slow_down: float = 0.96
-    velocity_scale: float = 0.96
-    acceleration_scale: float = 1.0
-    min_stiffness: float = 0.5
-    velocity_periods: int = 3
 
 
 class SafetyLayer:
@@ -127,7 +83,7 @@ class SafetyLayer:
         is_position = bundle.mode != "joint_velocity"
         self._path = PathPrediction(self._joints, is_position, config.check_periods, hold, robots)
         self._path_periods = config.check_periods - _CLEARANCE_PERIODS
-        self._steps = -(-self._path.steps // self._path_periods)  # in a period
+        self._steps = -(-self._path.steps // (self._path_periods - self._path_periods // 2))  # in each second period
         self._start, self._measurements = StartCheck(bundle.limits, config), MeasurementCheck(bundle.limits, config)
         joints = bundle.num_joints
         self.torque, self._value = np.zeros((2, joints, robots))
@@ -218,9 +174,10 @@ class SafetyLayer:
             return
         pending.periods += 1
         part = pending.periods - self._path_periods
-        if part <= 0:
+        if part <= 0 and pending.periods % 2:
             self._path.advance(self._steps, self._new_target)
-            self._check_clearance()  # in each period: else the caches lose onnxruntime's code, and a call takes 0.4 ms
+        elif part <= 0:  # in between, or the caches lose onnxruntime's code, and the next calls take 0.4 ms
+            self._check_clearance()
         elif part <= _CLEARANCE_PERIODS:
             pending.clearance.append(self._clearance_of(self._path.parts(_CLEARANCE_PERIODS)[part - 1]))
 

@@ -1,7 +1,7 @@
-"""The clearance of an arm as a function of few operations on matrices, for an ONNX graph that runs between two periods.
+"""The clearance of an arm by few operations on matrices, for an ONNX graph that runs within a period of 1 ms.
 
-`mimic.retargeting.costs` computes the same distances for optimisation, in scalar arithmetic: that is fast on GPUs, but a
-graph of thousands of nodes takes milliseconds.
+`mimic.retargeting.costs` computes the same distances for optimisation, in scalar arithmetic: that is fast on GPUs, but
+a graph of thousands of nodes takes milliseconds.
 """
 
 from collections.abc import Callable
@@ -24,8 +24,8 @@ def make_clearance(
 ) -> Callable[[Float[Array, " joints"]], Float[Array, "1"]]:
     """Makes the function from joint angles [rad] to the clearance [m] of an arm, negative where something touches.
 
-    It is the minimum distance of the capsules' pairs that joints change, and of the capsules from the floor, except those
-    on the base and on the joints at the base.
+    It is the minimum distance of the capsules' pairs that joints change, and of the capsules from the floor, except
+    those on the base and on the joints at the base.
 
     Args:
       arm: the embodiment.

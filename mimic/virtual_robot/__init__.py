@@ -1,4 +1,4 @@
-"""Virtual robots: C MuJoCo at 1 kHz with loads, friction, noise, delays, and the reflexes with which a real robot aborts."""
+"""Virtual robots: C MuJoCo at 1 kHz with loads, friction, noise, delays, and reflexes that abort as real ones do."""
 
 from mimic import compat
 

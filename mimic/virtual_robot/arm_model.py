@@ -17,9 +17,11 @@ from mimic.retargeting.costs import changing_pairs
 GRAVITY = 9.81  # m/s^2
 FLOOR, PAYLOAD = "floor", "payload"
 _MIN_PAYLOAD_INERTIA = 1e-6  # kg m^2: the payload is a point mass
-# External torque at which a Panda's collision reflex stops it: the thresholds of libfranka's examples, as fractions of the
-# torque limits 87 and 12 N m; other robots get the same fractions.
-_COLLISION_FRACTION = np.array([20 / 87, 20 / 87, 18 / 87, 18 / 87, 16 / 12, 14 / 12, 12 / 12])
+# External torque at which a Panda's collision reflex stops it [N m], as in libfranka's examples of joint motions. Other
+# robots get the smallest of these, as a fraction of the torque limit.
+_COLLISION_TORQUE = {"joint1": 20.0, "joint2": 20.0, "joint3": 18.0, "joint4": 18.0, "joint5": 16.0, "joint6": 14.0,
+                     "joint7": 12.0}  # fmt: skip
+_COLLISION_FRACTION = 18.0 / 87.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,11 +61,10 @@ def robot_model(config: ArmConfig) -> RobotModel:
     model = spec.compile()
     payload = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, PAYLOAD)
     links = np.array([i for i in range(1, model.nbody) if i != payload and model.body_mass[i] > 0])
-    fraction = np.ones(arm.embodiment.num_joints) * _COLLISION_FRACTION.min()
-    names = [f"joint{i}" for i in range(1, 8)]
+    collision_torque = _COLLISION_FRACTION * drives.limits.torque
     if config.model == "panda":
-        fraction = _COLLISION_FRACTION[[names.index(name) for name in arm.embodiment.joint_names]]
-    return RobotModel(model, drives.limits, drives.friction, fraction * drives.limits.torque, links, tip_direction)
+        collision_torque = np.array([_COLLISION_TORQUE[name] for name in arm.embodiment.joint_names])
+    return RobotModel(model, drives.limits, drives.friction, collision_torque, links, tip_direction)
 
 
 def _base_frame(config: ArmConfig, arm: Arm) -> tuple[np.ndarray, np.ndarray]:
@@ -139,7 +140,7 @@ def _add_capsules(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, rotation: n
 
 
 def _zero_frames(arm: Arm) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Rotation and position in the world of the body of each joint in the zero pose, after those of the world itself."""
+    """Rotation and position of the world, and of the body of each joint in the zero pose."""
     data = mujoco.MjData(arm.model)
     data.qpos[:] = zero_pose(arm.model)
     mujoco.mj_kinematics(arm.model, data)

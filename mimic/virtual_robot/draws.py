@@ -1,7 +1,7 @@
 """What differs between episodes: loads, friction, sensors and delays, drawn from the ranges of a `WorldConfig`."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -45,7 +45,8 @@ class World:
     def select(self, episodes: slice) -> "World":
         """The numbers of some of the episodes."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return World(**{key: x[episodes] if isinstance(x, np.ndarray) else x for key, x in fields.items()})
+        selected = {key: x[episodes] for key, x in fields.items() if isinstance(x, np.ndarray)}
+        return dataclasses.replace(self, **selected)
 
 
 def draw_world(
@@ -64,7 +65,7 @@ def draw_world(
     fraction = {"": lambda shape: rng.uniform(size=shape), "minimum": np.zeros, "maximum": np.ones,
                 "corners": lambda shape: rng.integers(0, 2, shape).astype(float)}[edge]  # fmt: skip
 
-    def between(bounds: list[float], shape: tuple[int, ...]) -> np.ndarray:
+    def between(bounds: Sequence[float], shape: tuple[int, ...]) -> np.ndarray:
         return bounds[0] + (bounds[1] - bounds[0]) * fraction(shape)
 
     def delay(bounds: list[int]) -> np.ndarray:

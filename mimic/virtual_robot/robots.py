@@ -51,7 +51,9 @@ class VirtualRobots:
         self._level = world.friction * robot.friction.level
         self._rng = np.random.default_rng(seed)
         self.qpos = np.asarray(start_poses, float) + world.start_offset
-        self.qvel, self.torque, self.external_torque = np.zeros((3, *self.qpos.shape))
+        self.qvel: np.ndarray = np.zeros(self.qpos.shape)
+        self.torque: np.ndarray = np.zeros(self.qpos.shape)
+        self.external_torque: np.ndarray = np.zeros(self.qpos.shape)
         self.cause, self._missing = np.full(count, "", object), np.zeros(count, int)
         self.periods = 0
         for data, qpos in zip(self._data, self.qpos, strict=True):
@@ -83,7 +85,7 @@ class VirtualRobots:
         self.torque = torque
         speed = self._robot.friction.rate * self.qvel
         applied = self._world.motor_gain * torque - self._level * np.tanh(speed) + self.external_torque
-        for i in np.flatnonzero(self.cause == ""):
+        for i in np.flatnonzero(self.cause == "").tolist():
             self._applied[i][:] = applied[i]
             mujoco.mj_step(self._models[i], self._data[i])
             self.qpos[i], self.qvel[i] = self._states[i]

@@ -209,7 +209,7 @@ def test_bad_input_is_rejected(rejected, tmp_path):
         (["out=new.onnx", run, "checkpoint=6"], "has no checkpoint 6; it has 5"),
         ([f"out={taken}", run], "exists; name a new file"),
         (["out=no/new.onnx", run], "there is no folder 'no'"),
-        (["out=new.onnx", run, "format=tflite"], "expected one of onnx, jax, got 'tflite'"),
+        (["out=new.onnx", run, "format=tflite"], "expected one of onnx, jax, controller, got 'tflite'"),
         (
             ["out=new.onnx", run, "learner=panda3dof"],
             "but the run's is panda-joint3-joint6-joint7 with joints",

@@ -1,4 +1,4 @@
-"""Controller bundles without a training: policies that are one layer of ONNX, and clearances of a Panda or constant ones."""
+"""Controller bundles without a training, for Pandas with policies of a line."""
 
 import functools
 from collections.abc import Sequence
@@ -18,6 +18,8 @@ from mimic.envs import env_config
 from mimic.hardware.plant import make_plant
 from mimic.retargeting.clearance import make_clearance
 
+ON_FLOOR = np.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])  # poses in which a Panda touches the floor, and itself
+FOLDED = np.array([0, 0.6, 0, -3.05, 2.8, 3.7, 0])
 PREVIEW, PAST, LINKS, TICKS, CONTROL_DT = 2, 3, 7, 40, 0.05
 
 

@@ -1,0 +1,140 @@
+"""Times of `mimic.deploy` on one core: `python -m benchmarks.deploy [--out FILE] [--bundle FOLDER] [--motions N]`.
+
+A period of the inner loop lasts 1 ms. What is timed is what it computes from a state to the end of the period: torque,
+checks of the measurement, and a part of the check of a target. Wall times include what other processes on the core
+cost; CPU times do not. The last row is a loop of Python alone, which is as long each time: what its p99.9 is above its
+p50 is the machine's.
+"""
+
+import dataclasses
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, collect
+from mimic.control.joint_control import Reference
+from mimic.deploy.bundle import Bundle, load_bundle
+from mimic.deploy.fake_robot import FakeRobot
+from mimic.deploy.policy_process import LocalPolicy, PolicyProcess
+from mimic.deploy.runner import missed_periods, run_controller
+from mimic.deploy.sessions import Policy
+
+_POLICY_CALLS = 400
+_TICK = 0.01  # s between two calls of the policy: the caches are then as cold as on a robot
+_PERCENTILES = (50, 99, 99.9)
+_COLUMNS = " ".join(
+    ["what count", *(f"{kind}_{name}:.3f" for kind in ("cpu", "wall") for name in ("p50", "p99", "p999")), "missed"]
+)
+_LOOP, _LOOPS = 2000, 5000  # additions of a loop, and periods of it
+
+
+def untrained_bundle(folder: Path) -> Bundle:
+    """The controller of an untrained policy for a Panda in the hardware world: it has the size of a trained one."""
+    import jax
+
+    import mimic
+    from mimic.commands.export_controller import export_controller
+    from mimic.runs.checkpoints import save_checkpoint
+    from mimic.trainers.config import PPOConfig, TrainConfig
+    from mimic.trainers.ppo import training
+    from mimic.trainers.ppo.programs import initial_params
+    from mimic.trainers.ppo.trainer import PPOTrainer
+    from mimic.trainers.run_config import save_config
+    from mimic.trainers.run_models import save_models
+
+    env = mimic.env_config("panda7dof", world="hardware", demonstrations={"count": 4, "held_out": 1})
+    config = TrainConfig(env, PPOConfig(preset="gpu"), compilation_cache="")
+    trainer = PPOTrainer(config, None)
+    run = folder / "run"
+    run.mkdir()
+    save_models(run, config.env)
+    save_config(run, dataclasses.replace(config, trainer=trainer.settings))
+    trainer.save_inputs(run)
+    made = trainer.evaluator.env
+    networks = training.make_networks(trainer.settings, made.observation_size, made.action_size)
+    save_checkpoint(run, 0, initial_params(networks, made.observation_size, jax.random.PRNGKey(0)))
+    export_controller(run, folder / "bundle")
+    return load_bundle(folder / "bundle")
+
+
+def _robot(bundle: Bundle) -> FakeRobot:
+    return FakeRobot(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0, is_paced=True)
+
+
+def _row(what: str, wall: list[float], cpu: list[float], **more: int) -> Row:
+    names = ("p50", "p99", "p999")
+    wall_ms, cpu_ms = (1e3 * np.percentile(values, _PERCENTILES) for values in (wall, cpu))
+    return {
+        "what": what,
+        "count": len(wall),
+        **{f"wall_{name}": float(x) for name, x in zip(names, wall_ms, strict=True)},
+        **{f"cpu_{name}": float(x) for name, x in zip(names, cpu_ms, strict=True)},
+        "wall_max": 1e3 * max(wall),
+        **more,
+    }
+
+
+def periods(what: str, bundle: Bundle, motions: int, *, in_process: bool) -> Row:
+    """Periods of motions on a fake robot in real time."""
+    wall, cpu, missed, interventions = [], [], 0, 0
+    for motion in range(motions):
+        index = motion % len(bundle.expert)
+        robot, connection = _robot(bundle), (PolicyProcess if not in_process else LocalPolicy)(bundle, index)
+        report = run_controller(robot, bundle, index, policy=connection)
+        assert not report.cause, report.cause
+        wall += report.wall_s
+        cpu += report.cpu_s
+        missed += missed_periods(robot.states)
+        interventions += sum(report.interventions.values())
+    return _row(what, wall, cpu, missed=missed, interventions=interventions)
+
+
+def policy_calls(bundle: Bundle) -> Row:
+    """Calls of the policy alone, at intervals."""
+    policy, rows = Policy(bundle, [0]), np.zeros((1, bundle.num_joints))
+    wall, cpu = [], []
+    for call in range(_POLICY_CALLS):
+        time.sleep(_TICK)
+        started, started_cpu = time.perf_counter(), time.thread_time()
+        policy.act(call % bundle.ticks, rows, rows, Reference(rows, rows, rows))
+        if call > 0:
+            wall.append(time.perf_counter() - started)
+            cpu.append(time.thread_time() - started_cpu)
+    return _row("policy alone", wall, cpu)
+
+
+def python_loop() -> Row:
+    """A loop that does the same in each period."""
+    wall, cpu = [], []
+    for _ in range(_LOOPS):
+        time.sleep(0.0005)
+        started, started_cpu = time.perf_counter(), time.thread_time()
+        sum(range(_LOOP))
+        wall.append(time.perf_counter() - started)
+        cpu.append(time.thread_time() - started_cpu)
+    return _row("loop of Python alone", wall, cpu)
+
+
+def measure(bundle: Bundle, motions: int) -> Iterator[Row]:
+    yield periods("period, policy in another process", bundle, motions, in_process=False)
+    yield periods("period, policy in the same process", bundle, motions, in_process=True)
+    yield policy_calls(bundle)
+    yield python_loop()
+
+
+def main() -> None:
+    options = make_parser("deploy", __doc__, bundle=str, motions=20).parse_args()
+    core = min(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {core})
+    with tempfile.TemporaryDirectory() as folder:
+        bundle = load_bundle(options.bundle) if options.bundle else untrained_bundle(Path(folder))
+        collect(options, measure(bundle, options.motions), "rows", _COLUMNS, unit="ms")
+
+
+if __name__ == "__main__":
+    main()

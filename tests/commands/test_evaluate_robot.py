@@ -1,0 +1,147 @@
+"""`python -m mimic.evaluate robot=`: policies on virtual robots, their gap, and what is counted."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import mimic
+from mimic.commands.config import EvaluateConfig, ExportConfig
+from mimic.commands.evaluate import prepare_evaluation
+from mimic.commands.evaluate_robot import summary
+from mimic.commands.export import prepare_export
+from mimic.deploy.bundle import load_bundle
+from mimic.deploy.fake_robot import FakeRobot
+from mimic.deploy.policy_process import LocalPolicy
+from mimic.deploy.runner import run_controller
+from mimic.deploy.safety import INTERVENTIONS
+from mimic.runs.checkpoints import save_checkpoint
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.ppo import training
+from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.ppo.trainer import PPOTrainer
+from mimic.trainers.run_config import save_config
+from mimic.trainers.run_models import save_models
+from mimic.virtual_robot.episodes import Episodes
+
+pytest.importorskip("onnxruntime")
+HORIZON, HELD_OUT = 10, 3
+
+
+def untrained(folder, **settings):
+    """A run of a Panda with initial parameters."""
+    env = mimic.env_config(
+        "panda7dof", limits="hardware", horizon=HORIZON, demonstrations={"count": 2, "held_out": HELD_OUT}, **settings
+    )
+    config = TrainConfig(env, PPOConfig(hidden_layers=[8], preset="cpu"), compilation_cache="")
+    trainer = PPOTrainer(config, None)
+    folder.mkdir()
+    save_models(folder, config.env)
+    save_config(folder, dataclasses.replace(config, trainer=trainer.settings))
+    trainer.save_inputs(folder)
+    env = trainer.evaluator.env
+    networks = training.make_networks(trainer.settings, env.observation_size, env.action_size)
+    save_checkpoint(folder, 0, initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def hardware_run(tmp_path_factory):
+    return untrained(tmp_path_factory.mktemp("runs") / "hardware", world="hardware")
+
+
+@pytest.fixture(scope="module")
+def paper_run(tmp_path_factory):
+    return untrained(tmp_path_factory.mktemp("runs") / "paper")
+
+
+def evaluate(run_dir, out, **settings):
+    settings = {"robot": "virtual_panda", "episodes": 4, **settings}
+    config = EvaluateConfig(str(run_dir), out=str(out), compilation_cache="", **settings)
+    prepare_evaluation(config, 0.0)()
+    return json.loads((out / "report.json").read_text())
+
+
+def test_a_policy_of_the_hardware_world(hardware_run, tmp_path, capsys):
+    report = evaluate(hardware_run, tmp_path / "new")
+    row = report["cases"]["all ranges"]
+    assert report["robot"] == "virtual_panda" and report["world"]["payload"] == [0.0, 3.0]
+    assert row["episodes"] == row["completed"] == 4 and row["aborts"] == row["stops"] == {}
+    assert row["limit_violations"] == row["self_contacts"] == 0 and row["clearance"] > 0.01
+    assert row["lower_bound"] < row["mean_distance"] and np.isfinite(row["optimality_gap"])
+    printed = capsys.readouterr().out
+    assert "4 episodes on virtual_panda" in printed and "aborts of the robot" in printed
+
+
+def test_a_policy_of_the_papers_world_aborts(paper_run, tmp_path):
+    """Torques that jump from one tick to the next: the robot's limit is 1000 N m/s."""
+    report = evaluate(paper_run, tmp_path / "new", robot_world="hardware")
+    row = report["cases"]["all ranges"]
+    assert row["aborts"] == {"torque rate": 4} and row["completed"] == 0 and row["limit_violations"] == 4
+    assert report["control"] == "torque" and report["world"]["gravity"]
+
+
+def test_the_edges_of_the_world(hardware_run, tmp_path):
+    report = evaluate(hardware_run, tmp_path / "new", episodes=1, edges=True)
+    assert {"all ranges", "payload=0", "payload=3", "all: corners", "action_delay=3"} <= report["cases"].keys()
+    assert all(row["episodes"] == 1 and not row["aborts"] for row in report["cases"].values())
+
+
+def test_the_gap_is_that_of_the_evaluator(hardware_run):
+    """An arm that stays in its start pose has a gap of one, and one in the nearest poses that of the evaluator."""
+    config = EvaluateConfig(str(hardware_run), compilation_cache="")
+    from mimic.commands.evaluate import _run_to_evaluate, _trainer_to_evaluate
+
+    run_dir, trained = _run_to_evaluate(config)
+    trainer = _trainer_to_evaluate(trained, run_dir, config)[1]
+    assert isinstance(trainer, PPOTrainer)
+    evaluator = trainer.evaluator
+    motion = np.arange(2, 2 + HELD_OUT)
+    held = np.repeat(np.asarray(evaluator.env.start_poses)[motion][:, None], HORIZON, axis=1)
+    zero, none = np.zeros(HELD_OUT), np.full(HELD_OUT, "", object)
+    counts = {name: zero.astype(int) for name in INTERVENTIONS}
+    episodes = Episodes(motion, held, 0 * held, 0 * held, none, none, counts, zero, zero)
+    assert summary(evaluator, episodes)["optimality_gap"] == pytest.approx(1, abs=1e-5)
+    expert = evaluator.env.demonstrations
+    copied = dataclasses.replace(
+        episodes, qpos=expert.qpos[motion, 1 : HORIZON + 1], qvel=expert.qvel[motion, 1 : HORIZON + 1]
+    )
+    assert summary(evaluator, copied)["optimality_gap"] == pytest.approx(0, abs=1e-5)  # the expert has the same joints
+
+
+def test_a_controller_is_exported(hardware_run, tmp_path, capsys):
+    prepare_export(ExportConfig(str(hardware_run), str(tmp_path / "controller"), "controller"))()
+    bundle = load_bundle(tmp_path / "controller")
+    assert bundle.mode == "joint_velocity" and bundle.ticks == HORIZON and bundle.joint_names[6] == "joint7"
+    robot = FakeRobot(bundle.start_poses[0], bundle.limits, bundle.parameters.inertia, 1.0)
+    assert run_controller(robot, bundle, policy=LocalPolicy(bundle, 0)).is_complete
+    assert "results: " in capsys.readouterr().out
+
+
+def test_a_run_without_an_inner_loop_has_no_controller(rejected, paper_run):
+    error = rejected("export", f"run={paper_run}", "format=controller", "out=new")
+    assert "format=controller: expected a run of trainer=ppo with an inner loop" in error
+
+
+def test_what_does_not_fit_is_rejected(rejected, hardware_run, tmp_path):
+    run = f"run={hardware_run}"
+    cases = [
+        (["robot=panda"], "robot: expected one of virtual_panda, virtual_robot, got 'panda'"),
+        (["edges=true"], "robot_world, edges: expected only with robot="),
+        (["robot=virtual_panda", "robot_world=mars"], "robot_world: expected one of paper, nominal, hardware"),
+        (["robot=virtual_panda", "controller=pd"], "expected none with robot="),
+        (["robot=virtual_panda", "mass=1.2"], "expected none with robot="),
+        (["robot=virtual_panda", "episodes=0"], "episodes: expected a whole number from 1"),
+    ]
+    for arguments, message in cases:
+        assert message in rejected("evaluate", run, "compilation_cache=", *arguments)
+        (tmp_path / "empty").rmdir()
+
+
+def test_a_mapper_has_no_robot(rejected, tmp_path):
+    (tmp_path / "run" / "checkpoints" / "0").mkdir(parents=True)
+    save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda4dof"), PoseMapperConfig()))
+    error = rejected("evaluate", f"run={tmp_path / 'run'}", "robot=virtual_panda", "compilation_cache=")
+    assert "robot: expected a run of trainer=ppo with one learner" in error

@@ -1,0 +1,92 @@
+"""Controller bundles: what is written is read, and what does not fit is rejected in one line."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from mimic.control.joint_control import Reference
+from mimic.deploy.bundle import load_bundle
+from mimic.deploy.sessions import Clearance, Policy
+from tests.helpers import bundles
+
+
+@pytest.fixture
+def bundle(tmp_path):
+    return bundles.make_bundle(tmp_path / "bundle")
+
+
+def test_a_bundle_is_read(bundle):
+    assert (bundle.mode, bundle.ticks, bundle.periods, bundle.action_size) == ("joint_velocity", bundles.TICKS, 50, 7)
+    np.testing.assert_allclose(bundle.parameters.stiffness, bundles.parameters().stiffness)
+    assert bundle.limits.velocity[0] == 2.175 and bundle.joint_names[0] == "joint1"
+    assert bundle.motion_index("motion 1") == bundle.motion_index(1) == 1
+    with pytest.raises(ValueError, match="motion: expected a number from 0 to 1 or a name such as 'motion 0', got 2"):
+        bundle.motion_index(2)
+
+
+def test_a_policy_observes_what_it_was_exported_for(bundle, monkeypatch):
+    """Its last actions, the newest first, and the expert at the next ticks, the last one repeated at the end."""
+    feeds = []
+
+    class Spy:
+        def run(self, names, feed):
+            feeds.append(feed)
+            return [np.full((2, 7), len(feeds), np.float32)]
+
+    policy = Policy(bundle, [1, 0])
+    monkeypatch.setattr(policy, "_session", Spy())
+    rows = np.zeros((2, 7))
+    for tick in (0, 1, bundle.ticks):
+        action = policy.act(tick, rows + 1, rows + 2, Reference(rows + 3, rows + 4, rows))
+    assert action.shape == (2, 7) and action[0, 0] == 3
+    last = feeds[-1]
+    assert [last[name][0, 0] for name in ("qpos", "qvel", "reference_qpos", "reference_qvel")] == [1, 2, 3, 4]
+    np.testing.assert_array_equal(last["past_actions"][0, ::7], [2, 1, 0])
+    phases = [feed["expert"][0].reshape(3, 84)[:, 0] for feed in feeds]
+    step = 2 * np.pi * bundles.CONTROL_DT
+    np.testing.assert_allclose(phases[1], step * np.array([1, 2, 3]), rtol=1e-6)
+    np.testing.assert_allclose(phases[2], step * bundle.ticks, rtol=1e-6)
+
+
+def test_the_clearance_is_that_of_the_arm(bundle):
+    clearance = Clearance(bundle)
+    home, on_floor, folded = clearance(np.stack([bundle.start_pose, bundles.ON_FLOOR, bundles.FOLDED]))
+    assert 0.05 < home < 0.2 and on_floor < -0.1 and folded < -0.02
+
+
+def changed(folder, **changes):
+    path = folder / "controller.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, **changes}))
+
+
+BROKEN = {
+    "no folder": (lambda folder: (folder / "policy.onnx").unlink(), "expected a folder of mimic.export"),
+    "no JSON": (lambda folder: (folder / "controller.json").write_text("{"), "controller.json: expected JSON"),
+    "no key": (lambda folder: (folder / "controller.json").write_text("{}"), "missing format, mimic_version"),
+    "another format": (lambda folder: changed(folder, format=2), "format: expected 1, got 2"),
+    "another network": (lambda folder: (folder / "policy.onnx").write_bytes(b"x"), "policy.onnx: expected the file"),
+    "no motions": (lambda folder: (folder / "motions.npz").write_bytes(b"x"), "motions.npz: "),
+    "a mode": (lambda folder: changed(folder, mode="flying"), "mode: expected one of torque, joint_position"),
+    "a tick": (lambda folder: changed(folder, control_dt=0.0505), "control_dt: expected a multiple of 0.001 s"),
+    "joints": (lambda folder: changed(folder, joint_names=["one"]), "expected the shape"),
+    "a number": (lambda folder: changed(folder, start_pose=[float("nan")] * 7), "start_pose: expected finite numbers"),
+    "parameters": (lambda folder: changed(folder, parameters={}), "expected numbers and names of a controller"),
+    "links": (lambda folder: changed(folder, expert_links=6), "expert: expected the shape"),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), BROKEN.values(), ids=BROKEN)
+def test_a_broken_bundle_is_rejected_in_one_line(bundle, damage, message):
+    damage(bundle.folder)
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        load_bundle(bundle.folder)
+    assert "\n" not in str(error.value)
+
+
+def test_a_network_with_other_inputs_is_rejected(bundle, tmp_path):
+    other = bundles.make_bundle(tmp_path / "other", clearance=(bundle.folder / "policy.onnx").read_bytes())
+    with pytest.raises(ValueError, match="clearance.onnx: inputs: expected qpos \\[7\\], got expert"):
+        Clearance(other)

@@ -1,0 +1,59 @@
+"""The predicted path of a reference is that of the inner loop."""
+
+import numpy as np
+import pytest
+
+from mimic.control import joint_control
+from mimic.control.joint_control import JointParameters, Reference
+from mimic.deploy.path import PathPrediction
+from tests.helpers.bundles import parameters
+
+DELAY, HOLD, ROBOTS, TICKS = 20, 70, 30, 20
+
+
+@pytest.mark.parametrize("mode", ["joint_velocity", "joint_position"])
+def test_a_path_is_that_of_the_inner_loop(mode):
+    """On random targets, from references in motion; the bound is the one that the margin covers."""
+    joints = JointParameters(*(x[:, None] for x in parameters()))
+    size, rng = (7, ROBOTS), np.random.default_rng(0)
+    reference = Reference(rng.uniform(joints.lower, joints.upper, size), np.zeros(size), np.zeros(size))
+    is_position = mode == "joint_position"
+    prediction = PathPrediction(joints, is_position, DELAY, HOLD, ROBOTS)
+    target, left = (reference.qpos.copy() if is_position else np.zeros(size)), np.full(ROBOTS, HOLD)
+    largest = 0.0
+    for _ in range(TICKS):
+        action = rng.choice([-1.0, 1.0, 0.3, 0.0], size)
+
+        def new_target(at, action=action):
+            return np.array(joint_control.action_target(mode, action, at, joints, np).value)
+
+        prediction.begin(reference, target, left)
+        assert prediction.advance(10**6, new_target)
+        path, after = exact_path(mode, joints, reference, target, left, new_target, len(prediction.path))
+        largest = max(largest, float(np.abs(path - prediction.path).max()))
+        reference, target = after
+        for period in range(50):
+            reference = joint_control.next_reference(mode, reference, target, joints, np)
+            assert period < HOLD
+        left = rng.integers(0, HOLD, ROBOTS)
+    assert 1e-4 < largest < PathPrediction.ERROR
+    assert np.abs(path[-1] - path[-2]).max() < 1e-4  # it ends at rest
+
+
+def exact_path(mode, joints, reference, target, left, new_target, samples):
+    """The angles after each 10 ms from the delay on, and the reference and target when the new one begins to act."""
+    zero, path = np.zeros_like(target), []
+    for period in range(DELAY):
+        held = joint_control.next_reference(mode, reference, target, joints, np)
+        braking = joint_control.next_reference("joint_velocity", reference, zero, joints, np)
+        reference = Reference(*(np.where(left > period, x, y) for x, y in zip(held, braking, strict=True)))
+    after = reference, new_target(reference)
+    path.append(reference.qpos)
+    for period in range(10 * (samples - 1)):
+        is_held = period < HOLD
+        reference = joint_control.next_reference(
+            mode if is_held else "joint_velocity", reference, after[1] if is_held else zero, joints, np
+        )
+        if (period + 1) % 10 == 0:
+            path.append(reference.qpos)
+    return np.array(path), after

@@ -1,0 +1,172 @@
+"""Runs on a fake robot: a whole motion, without JAX and MuJoCo, and what happens where the policy dies or stops."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from mimic.deploy.driver import RobotAbort
+from mimic.deploy.fake_robot import FakeRobot
+from mimic.deploy.policy_process import LocalPolicy, PolicyProcess
+from mimic.deploy.runner import run_controller
+from mimic.deploy.safety import COLLISION, INVALID, LATE, REPEATED
+from tests.helpers import bundles
+from tests.helpers.repository import REPOSITORY
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    return bundles.make_bundle(tmp_path_factory.mktemp("bundles") / "bundle")
+
+
+def robot(bundle, **settings):
+    return FakeRobot(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0, **settings)
+
+
+def trace(fake):
+    """Angles, velocities and accelerations of a fake robot."""
+    qpos, qvel = (np.array([getattr(state, name) for state in fake.states]) for name in ("qpos", "qvel"))
+    return qpos, qvel, np.diff(qvel, axis=0) / 1e-3
+
+
+def test_a_motion_is_run_in_simulated_time(bundle):
+    fake = robot(bundle)
+    report = run_controller(fake, bundle, "motion 1", policy=LocalPolicy(bundle, 1))
+    qpos, qvel, _ = trace(fake)
+    assert report.is_complete and not report.aborted and report.ticks == bundles.TICKS
+    assert not any(report.interventions.values()) and report.tracking_error < 0.02
+    assert np.ptp(qpos, axis=0).min() > 0.1  # every joint moved
+    assert np.abs(qvel[-1]).max() < 1e-3
+    assert json.loads(json.dumps(report.as_dict()))["is_complete"]
+
+
+def test_the_runtime_needs_neither_jax_nor_mujoco(bundle):
+    """A whole motion, with the policy in its own process, where imports of all other packages fail."""
+    code = """
+        import sys
+        class Block:
+            def find_spec(self, name, path=None, target=None):
+                if name.partition(".")[0] in ("jax", "jaxlib", "mujoco", "brax", "mink", "flax", "optax", "omegaconf"):
+                    raise ImportError(f"blocked: {name}")
+        sys.meta_path.insert(0, Block())
+        import mimic.deploy
+        bundle = mimic.deploy.load_bundle(sys.argv[1])
+        robot = mimic.deploy.FakeRobot(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0, is_paced=True)
+        report = mimic.deploy.run_controller(robot, bundle)
+        assert report.ticks == bundle.ticks and not report.cause, report
+        assert max(abs(state.qpos - bundle.start_pose).max() for state in robot.states) > 0.05
+        blocked = {"jax", "mujoco", "brax", "scipy", "hydra"} & {name.partition(".")[0] for name in sys.modules}
+        assert not blocked, blocked
+    """
+    command = [sys.executable, "-c", textwrap.dedent(code), str(bundle.folder)]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    result = subprocess.run(command, capture_output=True, text=True, check=False, cwd="/", env=environment)
+    assert result.returncode == 0, result.stderr[-2000:]
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_policy_that_dies_or_stops_makes_the_arm_brake_and_hold(tmp_path, number):
+    """In real time, in the middle of a fast motion."""
+    bundle = bundles.make_bundle(tmp_path / "fast", bundles.constant(0.8, -0.3, 0, 0, 0.8, 0, 0), ticks=60)
+    fake, policy = robot(bundle, is_paced=True), PolicyProcess(bundle, 0)
+    timer = threading.Timer(0.8, os.kill, (policy.pid, number))
+    timer.start()
+    report = run_controller(fake, bundle, policy=policy)
+    qpos, qvel, qacc = trace(fake)
+    fastest = int(np.abs(qvel[:, 0]).argmax())
+    assert qvel[fastest, 0] > 1.0 and report.interventions[LATE] > 5 and not report.is_complete
+    assert not report.aborted and report.interventions[REPEATED] >= 2
+    assert np.all(np.abs(qvel[-100:]).max(axis=0) < 1e-2)  # it holds
+    assert np.abs(qpos[-1] - qpos[-100]).max() < 1e-3
+    assert np.all(np.abs(qacc) < bundle.limits.acceleration + 1)  # 1 rad/s^2: of the tracking error
+    assert qvel[fastest:, 0].min() > -0.1  # it brakes, and does not turn round
+
+
+class Scripted:
+    """A policy of given answers: {tick: action}; others are missing."""
+
+    def __init__(self, actions):
+        self._actions, self._tick = actions, -1
+
+    def send(self, tick, qpos, qvel, reference):
+        self._tick = tick
+
+    def receive(self):
+        action, tick = self._actions.get(self._tick), self._tick
+        return None if action is None else (tick, np.full(7, action))
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("actions", "kind"), [({0: 0.2}, LATE), ({0: 0.2, 1: np.nan}, INVALID)], ids=["no answer", "not a number"]
+)
+def test_a_policy_without_valid_answers_is_counted(bundle, actions, kind):
+    report = run_controller(robot(bundle), bundle, policy=Scripted(actions))
+    assert report.interventions[kind] > 0 and not report.is_complete and not report.cause
+
+
+def test_actions_of_an_earlier_tick_are_not_used(bundle):
+    class Late(Scripted):
+        def receive(self):
+            return self._tick - 1, np.ones(7)
+
+    fake = robot(bundle)
+    run_controller(fake, bundle, policy=Late({}))
+    assert np.abs(trace(fake)[1]).max() == 0
+
+
+def test_a_motion_into_the_floor_ends_in_front_of_it(tmp_path):
+    bundle = bundles.make_bundle(tmp_path / "down", bundles.constant(0, 1, 0, 0, 0, 0, 0))
+    report = run_controller(robot(bundle), bundle, policy=LocalPolicy(bundle, 0))
+    assert report.interventions[COLLISION] > 10 and report.clearance > 0.01 and not report.cause
+
+
+def test_an_arm_far_from_the_start_pose_is_not_moved(bundle):
+    fake = FakeRobot(bundle.start_pose + 0.2, bundle.limits, bundle.parameters.inertia)
+    report = run_controller(fake, bundle, policy=LocalPolicy(bundle, 0))
+    assert report.cause == "start pose" and len(fake.states) == 1 and report.ticks == 0
+
+
+def test_a_robot_that_aborts_is_reported(bundle):
+    class Aborting(FakeRobot):
+        def read(self):
+            if len(self.states) > 300:
+                raise RobotAbort("reflex")
+            return super().read()
+
+    fake = Aborting(bundle.start_pose, bundle.limits, bundle.parameters.inertia)
+    report = run_controller(fake, bundle, policy=LocalPolicy(bundle, 0))
+    assert report.cause == "reflex" and report.aborted and not report.is_complete
+
+
+def test_the_fake_robot_aborts_beyond_its_limits(bundle):
+    fake = robot(bundle)
+    fake.read()
+    with pytest.raises(RobotAbort, match="torque rate"):
+        fake.write(np.full(7, 2.0))
+    for period in range(3000):
+        try:
+            fake.write(np.full(7, min(11.0, period)))
+            fake.read()
+        except RobotAbort as abort:
+            assert abort.cause in ("joint velocity limit", "joint position limit")
+            return
+    pytest.fail("no abort")
+
+
+def test_a_policy_that_cannot_start_is_an_error(tmp_path):
+    bundle = bundles.make_bundle(tmp_path / "bundle")
+    (tmp_path / "bundle" / "policy.onnx").write_bytes(b"x")
+    started = time.monotonic()
+    with pytest.raises(RuntimeError, match="policy: expected its process to be ready"):
+        PolicyProcess(bundle, 0)
+    assert time.monotonic() - started < 25  # as soon as it has ended

@@ -1,0 +1,65 @@
+"""The clearance as a graph: the distances of the retargeting costs, of C MuJoCo, and of its ONNX model."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.capsules import fit_capsules
+from mimic.retargeting.clearance import make_clearance
+from mimic.retargeting.costs import capsule_axes, changing_pairs, pair_distances
+from tests.virtual_robot.cases import model
+
+CONFIGS = {"panda": ArmConfig(), "locked": ArmConfig(locked=[3, 6, 7]), "two arms": ArmConfig(model="panda_pair")}
+
+
+def poses(arm, count=500, seed=0):
+    lower, upper = np.asarray(arm.joint_range).T
+    return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_it_is_the_distance_of_the_costs(config):
+    arm, capsules = build_arm(config, "hardware").embodiment, fit_capsules(config, "hardware")
+    is_changing, moves = changing_pairs(arm, capsules), np.flatnonzero(~np.array(capsules.near_base))
+
+    def expected(qpos):
+        start, end = capsule_axes(arm, capsules, qpos)
+        height = jnp.minimum(start[moves, 2], end[moves, 2]) - capsules.radius[moves].astype(np.float32)
+        return jnp.minimum(pair_distances(capsules, start, end)[np.flatnonzero(is_changing)].min(), height.min())
+
+    qpos = poses(arm)
+    clearance = jax.jit(jax.vmap(make_clearance(arm, capsules)))(qpos)[:, 0]
+    assert np.ptp(clearance) > 0.1
+    # The costs smooth distances by 0.1 mm where axes cross; there is none otherwise.
+    np.testing.assert_allclose(clearance, jax.vmap(expected)(qpos), atol=2e-4)
+
+
+def test_it_is_that_of_mujocos_geoms():
+    """The geoms of the virtual robot, by MuJoCo's own function."""
+    robot = model().model
+    data = mujoco.MjData(robot)
+    arm = build_arm(ArmConfig(), "hardware").embodiment
+    clearance = jax.jit(jax.vmap(make_clearance(arm, fit_capsules(ArmConfig(), "hardware"))))
+    rows = poses(arm, 100, seed=1)
+    expected = []
+    for qpos in rows:
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(robot, data)
+        pairs = zip(robot.pair_geom1, robot.pair_geom2, strict=True)
+        expected.append(min(mujoco.mj_geomDistance(robot, data, i, j, 10.0, None) for i, j in pairs))
+    # Intersecting capsules: MuJoCo and we may differ by how deep; only the sign counts.
+    expected, value = np.array(expected), np.asarray(clearance(rows)[:, 0])
+    apart = expected > 1e-3
+    assert 10 < apart.sum() < 95
+    np.testing.assert_allclose(value[apart], expected[apart], atol=1e-5)
+    assert np.all(value[~apart] < 2e-3)
+
+
+def test_the_floor_may_be_lower():
+    arm, capsules = build_arm(ArmConfig(), "hardware").embodiment, fit_capsules(ArmConfig(), "hardware")
+    pose = jnp.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])
+    low, high = (float(make_clearance(arm, capsules, height)(pose)[0]) for height in (-0.1, 0.0))
+    assert low == pytest.approx(high + 0.1, abs=1e-6)
