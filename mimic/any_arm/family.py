@@ -18,6 +18,7 @@ from mimic.any_arm.sampler import (
 )
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.config import EnvConfig, ObservationConfig, RandomizationConfig, RewardConfig
+from mimic.envs.world import WorldConfig
 
 SEEN, UNSEEN = "seen", "unseen"
 _RANDOM_ARMS = 16  # in a report
@@ -55,6 +56,8 @@ def check_family(config: EnvConfig) -> None:
         "physics": ("auto", "fused"),
         "start": ("home",),
         "preview": (1,),
+        "control": ("torque",),
+        "world": (WorldConfig(),),
         "randomization": (RandomizationConfig(),),
         "reward": (RewardConfig(),),
         "observation": (ObservationConfig(),),

@@ -23,7 +23,7 @@ ROBOT_WORLDS = ("paper", "nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "searched")
 ARM_SIDES = ("left", "right")
-CONTROLLER = "controller"
+CONTROLLER = "controller"  # a format of a folder, see mimic/commands/export_controller.py
 EXPORT_FORMATS = ("onnx", "jax", CONTROLLER)
 DATASET_FORMATS = ("lerobot", "rosbag2")
 
@@ -175,8 +175,8 @@ class ExportConfig:
 
     Attributes:
       run: run directory.
-      out: exported file, or for "controller" the folder; must not exist.
-      format: "onnx", "jax", or "controller" for a policy with an inner loop, which `mimic.deploy` runs.
+      out: exported file, or folder of a controller; must not exist.
+      format: "onnx", "jax", or "controller": a policy with an inner loop and what a robot needs beside it.
       learner: name of the environment that the run's arms must equal; for a pose mapper to any arm, an arm whose
         description is written to `out` instead. Default "": not checked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mimic.commands.config import DatasetConfig
-from mimic.commands.dataset_sources import command_quantity, file_episodes, rollout_episodes
+from mimic.commands.dataset_sources import file_episodes, rollout_episodes
 from mimic.commands.progress import is_animated
 from mimic.compilation import use_compilation_cache
 from mimic.config import new_folder
@@ -85,7 +85,6 @@ def _prepare_rollouts(config: DatasetConfig) -> Callable[[Console], _Computed]:
     """Restores the policy of a run; the returned function computes its rollouts."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
     _check_time_step(config.format, trained.env.control_dt)
-    command_quantity(trained.env.control)
     trainer = make_ppo_trainer(trained, run_dir)
     steps, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
     splits = [config.split] if config.split else SPLITS

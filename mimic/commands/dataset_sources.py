@@ -5,24 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from mimic.datasets.episodes import TORQUE, ArmMotions, Episodes, Quantity
+from mimic.datasets.episodes import ANGLE, TORQUE, VELOCITY, ArmMotions, Episodes
 from mimic.envs.demonstrations import Demonstrations
 from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
 
-# What a policy commands, by `env.control`. Another mode is added here once `Rollouts` has its targets.
-_COMMANDS = {"torque": TORQUE}
-
-
-def command_quantity(control: str) -> Quantity:
-    """What the commands in the rollouts of an environment are, one for each joint.
-
-    Raises:
-      ValueError: rollouts do not have the commands of this mode of control.
-    """
-    if control not in _COMMANDS:
-        raise ValueError(f"run: expected a run with env.control={' or '.join(_COMMANDS)}, got {control}")
-    return _COMMANDS[control]
+# What a policy commands, by `env.control`. The stiffness of joint_impedance is not written.
+_COMMANDS = {"torque": TORQUE, "joint_position": ANGLE, "joint_velocity": VELOCITY, "joint_impedance": ANGLE}
 
 
 def rollout_episodes(
@@ -40,7 +29,7 @@ def rollout_episodes(
     labels = np.repeat(list(indices), [len(index) for index in indices.values()])
     numbers = np.concatenate([np.arange(len(index)) for index in indices.values()])
     start = np.asarray(env.start_poses)[chosen][:, None]
-    qpos, qvel, command = (np.asarray(values)[chosen] for values in (rollouts.qpos, rollouts.qvel, rollouts.torque))
+    qpos, qvel, command = (np.asarray(values)[chosen] for values in (rollouts.qpos, rollouts.qvel, rollouts.command))
     steps = steps_before_runaway(qvel, env.config.speed_bound)
     kept = np.flatnonzero(steps)
     learner = ArmMotions(
@@ -49,7 +38,7 @@ def rollout_episodes(
         np.concatenate([start, qpos], axis=1)[kept],
         np.concatenate([np.zeros_like(start), qvel], axis=1)[kept],
         command[kept],
-        command_quantity(env.config.control),
+        _COMMANDS[env.config.control],
     )
     shown = demonstrations.of_length(horizon).select(chosen[kept].tolist())
     expert = _arm_motions(shown)

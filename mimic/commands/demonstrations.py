@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from mimic.arms.arm import Arm, build_arm
+from mimic.arms.capsules import fit_capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
@@ -20,6 +21,7 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort
 from mimic.envs.importing import import_demonstrations
 from mimic.envs.recording import record_demonstrations
+from mimic.envs.self_collision import smallest_clearances, touching_line
 
 _PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 
@@ -54,6 +56,7 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
         plot_demonstrations(demonstrations, arm.embodiment, plot, title=title)
         console.print(_table(demonstrations, arm.embodiment))
         console.print(_limits_line(arm.embodiment), soft_wrap=True, highlight=False)
+        _print_clearance(console, env, arm, demonstrations)
         console.print(f"goals redrawn because a limit was exceeded: {redrawn}", highlight=False)
         console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
@@ -80,10 +83,21 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
             f"{source.name}: {imported.count} demonstrations, {length}; velocities: {velocities}", soft_wrap=True
         )
         console.print(f"all stay within the velocity limits of {arm.embodiment.name}; torques are unknown")
+        _print_clearance(console, env, arm, imported)
         console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
+
+
+def _print_clearance(console: Console, env: EnvConfig, arm: Arm, demonstrations: Demonstrations) -> None:
+    """Prints which demonstrations have links that touch; nothing for an arm without shapes."""
+    try:
+        capsules = fit_capsules(env.expert, env.limits)
+    except ValueError:  # no geoms
+        return
+    clearances = smallest_clearances(arm.embodiment, capsules, demonstrations.qpos)
+    console.print(touching_line(clearances), soft_wrap=True, highlight=False)
 
 
 def _check_unused(config: RecordingConfig, *keys: str) -> None:
@@ -121,7 +135,7 @@ def _record(arm: Arm, env: EnvConfig, console: Console) -> tuple[Demonstrations,
             seed=config.seed,
             horizon=env.horizon,
             dt=env.control_dt,
-            substeps=env.substeps,
+            substeps=env.recording_substeps,
             on_recorded=on_recorded,
         )
     return demonstrations, redrawn

@@ -16,7 +16,8 @@ from rich.console import Console
 from mimic.any_arm.description import SIZE, SUFFIXES, described_arm, description_layout, save_description
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.embodiment import Embodiment
-from mimic.commands.config import CONTROLLER, ExportConfig
+from mimic.commands.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
+from mimic.commands.export_controller import prepare_controller
 from mimic.config import check_choice, new_file, new_folder
 from mimic.distribution import VERSION, install_command
 from mimic.envs import env_config
@@ -30,7 +31,7 @@ from mimic.trainers.ppo import training
 from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
 
-_PACKAGES = {"onnx": "onnx", "jax": "flatbuffers"}  # the package that writes each format
+_PACKAGES = {"onnx": "onnx", "jax": "flatbuffers", CONTROLLER: "onnx"}  # the package that writes each format
 _JAX_PLATFORMS = ("cpu", "cuda")
 
 
@@ -55,7 +56,7 @@ def export_run(
     run: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
-    format: Literal["onnx", "jax"] = "onnx",
+    format: Literal["onnx", "jax", "controller"] = "onnx",
     learner: str = "",
     checkpoint: int | None = None,
 ) -> Path:
@@ -72,7 +73,8 @@ def export_run(
     Args:
       run: run directory.
       out: exported file; must not exist.
-      format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json".
+      format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json";
+        or "controller", a folder for `mimic.deploy`, see `export_controller`.
       learner: name of the environment that the run's arms must equal. Default "": not checked. For a pose mapper to any
         arm, an arm (see `AnyArmMapper`) whose description is written to `out`, a .json or .npz file, instead of the
         network.
@@ -86,8 +88,8 @@ def export_run(
         format is unknown, or a package that it needs is not installed.
     """
     config = ExportConfig(os.fspath(run), os.fspath(out), format, learner, checkpoint)
-    if describe := _description_writer(config):
-        describe()
+    if export := _folder_writer(config) or _description_writer(config):
+        export()
     else:
         _write(exported_function(config), _file(config), format)
     return Path(out).expanduser()
@@ -99,10 +101,8 @@ def prepare_export(config: ExportConfig) -> Callable[[], None]:
     Raises:
       ValueError: see `export_run`.
     """
-    if config.format == CONTROLLER:
-        return _controller_writer(config)
-    if describe := _description_writer(config):
-        return describe
+    if export := _folder_writer(config) or _description_writer(config):
+        return export
     out = _file(config)
     exported = exported_function(config)
 
@@ -118,41 +118,48 @@ def prepare_export(config: ExportConfig) -> Callable[[], None]:
     return run
 
 
-def _controller_writer(config: ExportConfig) -> Callable[[], None]:
-    """Writes the controller of a run, see `mimic.commands.export_controller`."""
-    from mimic.commands.export_controller import check_run, export_controller
-
-    if not config.run:
-        raise ValueError("run: expected the run directory to export, as in run=runs/NAME")
-    out, run_dir = new_folder("out", config.out), Path(config.run).expanduser()
-    _import_package("onnx", CONTROLLER)
-    check_run(load_config(run_dir))
-    steps = check_checkpoint(run_dir, config.checkpoint)
+def _folder_writer(config: ExportConfig) -> Callable[[], None] | None:
+    """Writes the controller of a run; None for another format."""
+    if config.format != CONTROLLER:
+        return None
+    _check_package(config.format)
+    out, run_dir = new_folder("out", config.out), _run_dir(config)
+    if config.learner:
+        _check_arms(config.learner, *load_config(run_dir).env.build_arms().embodiments)
+    write = prepare_controller(run_dir, config.checkpoint)
 
     def run() -> None:
-        export_controller(run_dir, out, steps)
+        write(out)
         Console().print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
 
 
+def _run_dir(config: ExportConfig) -> Path:
+    if not config.run:
+        raise ValueError("run: expected the run directory to export, as in run=runs/NAME")
+    return Path(config.run).expanduser()
+
+
+def _check_package(format: str) -> None:
+    """Raises a `ValueError` where the package that writes a format is not installed."""
+    package = _PACKAGES[format]
+    try:
+        importlib.import_module(package)
+    except ImportError as error:
+        raise ValueError(f"format={format} needs the package {package}: {install_command('export')}") from error
+
+
 def _file(config: ExportConfig) -> Path:
     """The new file of the export."""
-    check_choice("format", config.format, tuple(_PACKAGES))
+    check_choice("format", config.format, EXPORT_FORMATS)
     out = new_file("out", config.out)
     if config.format == "jax":
         new_file("out", str(_metadata_file(out)))
     if not os.access(out.parent, os.W_OK):
         raise ValueError(f"out: {str(out)!r}: the folder cannot be written to")
-    _import_package(_PACKAGES[config.format], config.format)
+    _check_package(config.format)
     return out
-
-
-def _import_package(package: str, format: str) -> None:
-    try:
-        importlib.import_module(package)
-    except ImportError as error:
-        raise ValueError(f"format={format} needs the package {package}: {install_command('export')}") from error
 
 
 def _metadata_file(out: Path) -> Path:
@@ -162,10 +169,10 @@ def _metadata_file(out: Path) -> Path:
 
 def exported_function(config: ExportConfig) -> ExportedFunction:
     """The function of a run's network."""
-    if not config.run:
-        raise ValueError("run: expected the run directory to export, as in run=runs/NAME")
-    run_dir = Path(config.run).expanduser()
+    run_dir = _run_dir(config)
     trained = load_config(run_dir)
+    if trained.env.has_inner_loop:
+        raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
     steps = check_checkpoint(run_dir, config.checkpoint)
     if _is_of_any_arm(trained):
         return _any_arm_mapper(AnyArmMapper.load(run_dir, steps), trained, steps)

@@ -3,6 +3,7 @@
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -20,7 +21,7 @@ from mimic.hardware.env import SENT_ACTIONS, HardwareEnv, control_observation
 from mimic.metric.kinematics import LinkStates
 from mimic.retargeting.clearance import make_clearance
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
-from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
@@ -39,40 +40,42 @@ def export_controller(run_dir: Path, out: Path, checkpoint: int | None = None) -
     Raises:
       ValueError: a run of another kind, or a checkpoint that does not exist.
     """
+    prepare_controller(run_dir, checkpoint)(out)
+
+
+def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable[[Path], None]:
+    """Restores a run; the returned function writes its controller, see `export_controller`."""
     trained = load_config(run_dir)
-    config = check_run(trained)
-    steps = check_checkpoint(run_dir, checkpoint)
-    env = cast(HardwareEnv, run_environment(trained.env, run_dir)[0])
-    settings = config.resolve()
-    params = load_checkpoint(run_dir, training.params_template(settings, env.observation_size, env.action_size), steps)[
-        1
-    ]
-    policy = training.make_controller(settings, env.observation_size, env.action_size)(jax.device_get(params))
-    partial = Path(tempfile.mkdtemp(prefix=".mimic-", dir=out.absolute().parent))
-    try:
-        write_bundle(
-            partial / "bundle",
-            policy=_policy_graph(env, policy),
-            clearance=_clearance_graph(env),
-            controller=_description(env, steps),
-            expert=expert_table(env),
-            start_poses=np.asarray(env.start_poses, float),
-            names=[f"demonstration {index}" for index in range(env.demonstrations.count)],
-        )
-        os.rename(partial / "bundle", out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-
-
-def check_run(trained: TrainConfig) -> PPOConfig:
-    """The trainer's config; raises a `ValueError` for a run without a controller."""
     config = trained.trainer
-    if not isinstance(config, PPOConfig) or not trained.env.has_inner_loop:
+    if not isinstance(config, PPOConfig) or not trained.env.has_inner_loop or trained.env.arms.are_drawn:
         raise ValueError(
             "format=controller: expected a run of trainer=ppo with an inner loop, as of world=hardware, got one of "
             f"trainer={config.name} with control={trained.env.control} in the world of the paper"
         )
-    return config
+    steps = check_checkpoint(run_dir, checkpoint)
+    env = cast(HardwareEnv, run_environment(trained.env, run_dir)[0])
+    settings = config.resolve()  # saved with all values resolved
+    template = training.params_template(settings, env.observation_size, env.action_size)
+    params = load_checkpoint(run_dir, template, steps)[1]
+    policy = training.make_controller(settings, env.observation_size, env.action_size)(jax.device_get(params))
+
+    def write(out: Path) -> None:
+        partial = Path(tempfile.mkdtemp(prefix=".mimic-", dir=out.absolute().parent))
+        try:
+            write_bundle(
+                partial / "bundle",
+                policy=_policy_graph(env, policy),
+                clearance=_clearance_graph(env),
+                controller=_description(env, steps),
+                expert=expert_table(env),
+                start_poses=np.asarray(env.start_poses, float),
+                names=[f"demonstration {index}" for index in range(env.demonstrations.count)],
+            )
+            os.rename(partial / "bundle", out)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+
+    return write
 
 
 def expert_table(env: HardwareEnv) -> np.ndarray:
@@ -86,7 +89,7 @@ def _policy_graph(env: HardwareEnv, policy: Any) -> bytes:
     from mimic.commands.onnx_graph import to_onnx  # needs the extra "export"
 
     joints = env.learner.num_joints
-    inputs: dict[str, int] = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
+    inputs = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
     inputs["past_actions"] = SENT_ACTIONS * env.action_size
     inputs["expert"] = (env.config.preview + 1) * _NUMBERS * env.expert.num_links
 

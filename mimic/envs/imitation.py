@@ -223,6 +223,11 @@ class ImitationEnv(Env):
         del state
         return action * self.torque_scale
 
+    def command(self, before: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
+        """What an action in [-1, 1] commands in a state: torques [N m]."""
+        del before
+        return action * self.torque_scale
+
     def restart_done(self, states: State) -> State:
         """Starts a new episode, on a random demonstration, for each arm of a batch whose episode is done."""
         arms = arm_state(states)

@@ -41,12 +41,15 @@ class Rollouts:
       qvel: [demonstrations, T, joints] its joint velocities after each step [rad/s].
       torque: [demonstrations, T, joints] the controller's torques, within their range and without noise [N m].
       distance: [demonstrations, T] embodiment distance after each step.
+      command: [demonstrations, T, joints] what the controller commanded: the torque, or with an inner loop the target,
+        see `ImitationEnv.command`. None where it was not recorded.
     """
 
     qpos: Float[Array, "demonstrations time joints"]
     qvel: Float[Array, "demonstrations time joints"]
     torque: Float[Array, "demonstrations time joints"]
     distance: Float[Array, "demonstrations time"]
+    command: Float[Array, "demonstrations time joints"] | None = None
 
 
 class Evaluator:
@@ -89,6 +92,11 @@ class Evaluator:
         """Embodiment distance at each step of a learner that stays at rest in its start pose."""
         return self._references().hold
 
+    @property
+    def nearest_poses(self) -> Motions:
+        """The poses of the kinematic bound [rad]."""
+        return self._references().motions["nearest_poses"]
+
     def only(self, index: int) -> "Evaluator":
         """An evaluator of one of the demonstrations, whose references take a fraction of the time; it is held out."""
         demonstrations = self.env.demonstrations
@@ -111,8 +119,8 @@ class Evaluator:
             action = jnp.clip(action, -1.0, 1.0)
             state = env.step(carry[0], action)
             after: Any = state.pipeline_state
-            torque = env.commanded_torque(after, action)
-            rollouts = Rollouts(after.qpos, after.qvel, torque, state.metrics["distance"])
+            torque, command = env.commanded_torque(after, action), env.command(carry[0].pipeline_state, action)
+            rollouts = Rollouts(after.qpos, after.qvel, torque, state.metrics["distance"], command)
             return (state, memory), rollouts
 
         # `vmap` is inside the loop: around the loop, JAX would trace a step twice, without and with the batch.

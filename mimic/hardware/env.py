@@ -149,6 +149,11 @@ class HardwareEnv(ImitationEnv):
         del action
         return cast(Any, state).torque
 
+    def command(self, before: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
+        """The target angles [rad], velocities [rad/s] or torques [N m] of an action that arrives at once."""
+        reference = cast(Reference, cast(HardwareState, before).reference)
+        return joint_control.action_target(self.config.control, action, reference, self._parameters, jnp).value
+
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """See the class, and `control_observation`."""
         state = cast(HardwareState, state)

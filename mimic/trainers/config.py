@@ -62,9 +62,15 @@ _OF_DRAWN_ARMS = {
     "entropy_cost": 0.0,
     "final_entropy_cost": 1.0,
 }
-_ONE_ARM, _DRAWN_ARMS = ("cpu", "gpu"), ("any_arm_cpu", "any_arm")  # presets, in the order of the backends cpu and gpu
+# With an inner loop: a third of the learning rate leaves a fourth of the gap (measured), and delays need a longer
+# horizon.
+_OF_INNER_LOOP = {"learning_rate": 3e-4, "discounting": 0.9, "entropy_cost": 0.02}
+# Presets in the order of the backends cpu and gpu.
+_ONE_ARM, _DRAWN_ARMS, _INNER_LOOP = ("cpu", "gpu"), ("any_arm_cpu", "any_arm"), ("inner_loop_cpu", "inner_loop")
 PRESETS |= {name: {**PRESETS[base], **_OF_DRAWN_ARMS} for name, base in zip(_DRAWN_ARMS, _ONE_ARM, strict=True)}
+PRESETS |= {name: {**PRESETS[base], **_OF_INNER_LOOP} for name, base in zip(_INNER_LOOP, _ONE_ARM, strict=True)}
 PRESETS["any_arm_cpu"] |= {"num_timesteps": 1_000_000, "evaluations": 5}  # the controller takes most of a step's time
+PRESETS["inner_loop"] |= {"num_timesteps": 120_000_000}
 # Factor on the number of evaluations with a target gap, so that training ends soon after the gap is reached: an
 # evaluation takes less time than the steps between two evaluations.
 _TARGET_GAP_EVALUATIONS = 5
@@ -102,8 +108,8 @@ class PPOConfig(TrainerConfig):
 
     Attributes:
       name: "ppo".
-      preset: "cpu" or "gpu", where the learner is drawn for each episode "any_arm_cpu" or "any_arm", or "auto", which
-        follows JAX's backend.
+      preset: "cpu" or "gpu"; where the learner is drawn for each episode "any_arm_cpu" or "any_arm"; with an inner loop
+        (`env.control`, `world`) "inner_loop_cpu" or "inner_loop"; or "auto", which follows JAX's backend.
       num_timesteps: environment steps of the training, rounded up to whole training epochs; a training epoch is the
         training between two evaluations.
       num_envs: number of arms that are simulated in parallel.
@@ -170,18 +176,20 @@ class PPOConfig(TrainerConfig):
             check_choice("trainer.network", self.network, NETWORKS)
         check_ranges(self, "trainer.")
 
-    def resolve(self, backend: str = "cpu", devices: int = 1, *, drawn_arms: bool = False) -> "PPOSettings":
+    def resolve(self, backend: str = "cpu", devices: int = 1, *, env: EnvConfig | None = None) -> "PPOSettings":
         """Returns the settings: every field has a value, and `preset` is never "auto".
 
         Args:
           backend: JAX's backend; it chooses the preset where that is "auto".
           devices: number of devices that environments and batches are distributed over.
-          drawn_arms: whether the environment draws its learner (`env.arms`).
+          env: the environment, which chooses the preset too; one learner and the world of the paper where None.
 
         Raises:
           ValueError: numbers out of range, or batch sizes that PPO cannot divide.
         """
-        presets = _DRAWN_ARMS if drawn_arms else _ONE_ARM
+        presets = _ONE_ARM
+        if env is not None and (env.arms.are_drawn or env.has_inner_loop):
+            presets = _DRAWN_ARMS if env.arms.are_drawn else _INNER_LOOP
         name = self.preset if self.preset != "auto" else presets[backend != "cpu"]
         preset = PRESETS[name]
         if self.target_gap > 0:
@@ -608,7 +616,7 @@ class TrainConfig:
         """
         drawn_arms = self.env.arms.are_drawn
         if isinstance(self.trainer, PPOConfig):
-            return self.trainer.resolve(backend, devices, drawn_arms=drawn_arms)
+            return self.trainer.resolve(backend, devices, env=self.env)
         if isinstance(self.trainer, PoseMapperConfig) and drawn_arms:
             return self.trainer.resolve_any_arm(backend)
         return self.trainer.resolve()

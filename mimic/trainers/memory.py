@@ -51,7 +51,7 @@ def _demonstration_bytes(config: TrainConfig, expert: Embodiment) -> dict[str, f
 def _ppo_bytes(config: TrainConfig, trainer: PPOConfig, expert: Embodiment, learner: Embodiment) -> dict[str, float]:
     """Networks; observations of a batch and of the environments; hidden units of a minibatch."""
     drawn_arms = config.env.arms.are_drawn
-    settings = trainer.resolve(jax.default_backend(), jax.device_count(), drawn_arms=drawn_arms)
+    settings = trainer.resolve(jax.default_backend(), jax.device_count(), env=config.env)
     observation = 12 * (learner.num_links + (config.env.preview + 1) * expert.num_links)
     if drawn_arms:
         observation = observation_size(expert.num_links)

@@ -17,10 +17,11 @@ from mimic import cli
 from mimic.commands import dataset as command
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset import prepare_dataset
-from mimic.commands.dataset_sources import command_quantity, file_episodes, steps_before_runaway
-from mimic.control.joint_control import MODES
-from mimic.datasets.episodes import TORQUE
-from mimic.envs.imitation import make_env
+from mimic.commands.dataset_sources import file_episodes, rollout_episodes, steps_before_runaway
+from mimic.datasets.episodes import ANGLE, VELOCITY
+from mimic.evaluation.evaluator import Evaluator
+from mimic.evaluation.labels import SPLITS
+from mimic.making import make_env
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.run_config import save_config
 from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run
@@ -195,11 +196,24 @@ def test_rollouts_that_a_runaway_cuts_short_are_counted(run_dir, tmp_path, monke
     assert [row["length"] for row in rows] == [HORIZON, 3, *[HORIZON] * 3]
 
 
-def test_what_a_policy_commands_is_known_or_rejected():
-    assert command_quantity("torque") == TORQUE
-    for mode in set(MODES) - {"torque"}:
-        with pytest.raises(ValueError, match=f"run: expected a run with env.control=torque, got {mode}"):
-            command_quantity(mode)
+@pytest.mark.parametrize(("control", "quantity"), [("joint_velocity", VELOCITY), ("joint_position", ANGLE)])
+def test_rollouts_with_an_inner_loop_have_its_targets(control, quantity):
+    """A target angle is where the reference goes, and a target velocity the one that it takes on."""
+    env = mimic.make(
+        "panda4dof", world="nominal", control=control, demonstrations={"count": 1, "held_out": 1}, horizon=6
+    )
+    evaluator = Evaluator(env, env.demonstrations)
+    action = jnp.linspace(-0.2, 0.2, env.action_size)
+    rollouts = jax.jit(lambda: evaluator.rollout(lambda state: action))()
+    episodes, _ = rollout_episodes(evaluator, rollouts, SPLITS, "", {})
+    assert episodes.robot.quantity == quantity
+    command, parameters = episodes.robot.command[0], env.plant.constants.parameters
+    if control == "joint_velocity":
+        np.testing.assert_allclose(command, np.tile(action * parameters.velocity[:4], (6, 1)), rtol=1e-5)
+    else:
+        np.testing.assert_allclose(command[0], env.start_poses[0] + action * parameters.reach[:4], rtol=1e-5)
+    moved = episodes.robot.qpos[0, -1] - episodes.robot.qpos[0, 0]
+    assert np.all(np.sign(moved) == np.sign(action))
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -14,10 +14,15 @@ def test_a_run_with_a_target_evaluates_more_often():
     assert PPOConfig(target_gap=0.02, evaluations=3).resolve("cpu").evaluations == 3
 
 
-def test_presets_follow_the_backend_and_whether_the_learner_is_drawn():
+def test_presets_follow_the_backend_and_the_environment():
     config = PPOConfig()
-    names = [config.resolve(backend, drawn_arms=drawn).preset for drawn in (False, True) for backend in ("cpu", "gpu")]
-    assert names == ["cpu", "gpu", "any_arm_cpu", "any_arm"]
+    envs = (
+        mimic.env_config("panda4dof"),
+        mimic.env_config("panda_family"),
+        mimic.env_config("panda4dof", world="nominal"),
+    )
+    names = [config.resolve(backend, env=env).preset for env in envs for backend in ("cpu", "gpu")]
+    assert names == ["cpu", "gpu", "any_arm_cpu", "any_arm", "inner_loop_cpu", "inner_loop"]
     family = TrainConfig(mimic.env_config("panda_family"), PPOConfig())
     assert family.resolved_trainer().network == "joints"  # type: ignore[attr-defined] - the settings of PPO
     mapper = TrainConfig(mimic.env_config("panda_family"), PoseMapperConfig())

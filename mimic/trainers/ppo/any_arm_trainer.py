@@ -53,7 +53,7 @@ class AnyArmPPOTrainer(Trainer):
     def __init__(self, config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None):
         assert isinstance(config.trainer, PPOConfig)
         self._name, self._seed = config.env.name, config.seed
-        self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count(), drawn_arms=True)
+        self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count(), env=config.env)
         self.total_steps = self.settings.total_steps
         training, held_out = training_and_held_out(with_saved_demonstrations(config.env, run_dir))
         self._demonstrations = concatenate(training, held_out)

@@ -67,7 +67,7 @@ class PPOTrainer(Trainer):
     ):
         assert isinstance(config.trainer, PPOConfig)
         self._name, self._seed, self._shared = config.env.name, config.seed, shared
-        self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count())
+        self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count(), env=config.env)
         if self.settings.network != "mlp" and shared is None:
             raise ValueError(
                 f"trainer.network: expected mlp for one learner, got {self.settings.network} (preset "

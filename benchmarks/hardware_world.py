@@ -1,0 +1,121 @@
+"""Policies of the hardware world: in training's physics, on MJX, and on virtual robots in C MuJoCo.
+
+    python -m benchmarks.hardware_world RUN [RUN ...] [--out FILE] [--episodes 1000] [--edge-episodes 200]
+
+Each run is one of `python -m mimic.train world=hardware`. The gap is that of held-out demonstrations, relative to the
+kinematic bound and to holding the start pose. `tracking` is a baseline without learning in the same world: it knows
+the poses of the bound, which an optimiser computes beforehand, and commands the velocity to the pose that comes `lead`
+ticks later; the best of several leads is shown. `edges` has each range of the world at its ends, one after the other,
+and all together.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import Row, collect
+from mimic.evaluation.evaluator import Evaluator
+from mimic.hardware.env import HardwareEnv
+from mimic.runs.checkpoints import load_checkpoint
+from mimic.trainers.ppo.trainer import PPOTrainer
+from mimic.trainers.run_config import load_config
+
+LEADS = range(1, 8)  # ticks
+COLUMNS = (
+    "run seed fused:.2% mjx:.2% tracking:.2% lead virtual:.2% aborts contacts edges_worst:.2% edges_together:.2% "
+    "centre_line:.4f centre_line_bound:.4f centre_line_hold:.4f"
+)
+
+
+def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
+    """The row of a run."""
+    trained = load_config(run)
+    trainer = PPOTrainer(trained, run)
+    steps, params = load_checkpoint(run, trainer.params_template())
+    fused = trainer.evaluate(params)
+    mjx = trainer.cross_check(params)["mjx"]["optimality_gap"]
+    tracking = {lead: _tracking_gap(trainer.evaluator, lead) for lead in LEADS}
+    lead = min(tracking, key=lambda lead: tracking[lead])
+    similarity = {
+        name: table["centre_line_distance"]["held_out"]
+        for name, table in trainer.evaluator.similarity_summary(fused, "policy").items()
+    }
+    (whole,) = _virtual(run, episodes).values()
+    edges = _virtual(run, edge_episodes, "edges=true")
+    single = {name: case["optimality_gap"] for name, case in edges.items() if not name.startswith("all")}
+    together = [case["optimality_gap"] for name, case in edges.items() if name.startswith("all:")]
+    return {
+        "run": trained.env.name,
+        "seed": trained.seed,
+        "env_steps": steps,
+        "control": trained.env.control,
+        "fused": trainer.metrics(fused)["optimality_gap"]["held_out"],
+        "mjx": mjx["held_out"],
+        "tracking": tracking[lead],
+        "lead": lead,
+        "virtual": whole["optimality_gap"],
+        "aborts": sum(whole["aborts"].values()),
+        "contacts": whole["self_contacts"],
+        "edges_worst": max(single.values()),
+        "edges_together": max(together),
+        "centre_line": similarity["policy"],
+        "centre_line_bound": similarity["nearest_poses"],
+        "centre_line_hold": similarity["hold_home"],
+        "similarity": similarity,
+        "virtual_robot": whole,
+        "edges": edges,
+    }
+
+
+def _tracking_gap(evaluator: Evaluator, lead: int) -> float:
+    """Held-out gap of commanding the velocity to the bound's pose some ticks later."""
+    env = cast(HardwareEnv, evaluator.env)
+    poses = jnp.asarray(evaluator.nearest_poses, jnp.float32)  # after each tick
+    limit = jnp.asarray(env.plant.constants.parameters.velocity[: env.learner.num_joints], jnp.float32)
+
+    def controller(state: Any) -> jax.Array:
+        episode = state.pipeline_state
+        index = jnp.clip(episode.step + lead - 1, 0, poses.shape[1] - 1)
+        change = poses[episode.demonstration, index] - episode.reference.qpos
+        return jnp.clip(change / (lead * env.config.control_dt) / limit, -1, 1)
+
+    rollouts = jax.jit(lambda: evaluator.rollout(controller))()
+    return evaluator.summary(jax.device_get(rollouts))["optimality_gap"]["held_out"]
+
+
+def _virtual(run: Path, episodes: int, *options: str) -> dict[str, Any]:
+    """The cases of an evaluation on virtual robots."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "report"
+        command = [sys.executable, "-m", "mimic.evaluate", f"run={run}", "robot=virtual_panda", f"out={out}"]
+        subprocess.run([*command, f"episodes={episodes}", *options], check=True, stdout=subprocess.DEVNULL)
+        return json.loads((out / "report.json").read_text())["cases"]
+
+
+def rows(options: argparse.Namespace) -> Iterator[Row]:
+    """The rows of all runs."""
+    for run in options.runs:
+        yield measure(run, options.episodes, options.edge_episodes)
+
+
+def main() -> None:
+    """Measures and prints."""
+    parser = make_parser("hardware_world", __doc__)
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--episodes", type=int, default=1000)
+    parser.add_argument("--edge-episodes", type=int, default=200)
+    options = parser.parse_args()
+    collect(options, rows(options), "runs", COLUMNS)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""`HardwareEnv`: delays, losses and noise as its config says, and MJX as another physics."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.envs.imitation import ImitationEnv
+from mimic.envs.world import WorldConfig
+from mimic.hardware.env import HardwareEnv, control_observation, expert_vector
+from mimic.making import make_env
+
+FEW = {"count": 3, "held_out": 1}
+TICKS = 6
+
+
+def make(**fields) -> HardwareEnv:
+    env = mimic.make("panda4dof", demonstrations=FEW, **{"world": "nominal", **fields})
+    assert isinstance(env, HardwareEnv)
+    return env
+
+
+def with_world(env: HardwareEnv, **world) -> HardwareEnv:
+    config = dataclasses.replace(env.config, world=dataclasses.replace(env.config.world, **world))
+    result = make_env(config, env.demonstrations)
+    assert isinstance(result, HardwareEnv)
+    return result
+
+
+def roll(env, actions, key: int = 0):
+    """States after each action."""
+    state, states = env.reset(jax.random.PRNGKey(key)), []
+    step = jax.jit(env.step)
+    for action in actions:
+        state = step(state, action)
+        states.append(state)
+    return states
+
+
+@pytest.fixture(scope="module")
+def nominal() -> HardwareEnv:
+    return make()
+
+
+@pytest.fixture(scope="module")
+def actions(nominal):
+    return jax.random.uniform(jax.random.PRNGKey(1), (TICKS, nominal.action_size), minval=-1.0, maxval=1.0)
+
+
+@pytest.fixture(scope="module")
+def undelayed(nominal, actions):
+    return roll(nominal, actions)
+
+
+def test_without_a_world_it_is_the_environment_of_the_paper():
+    assert type(mimic.make("panda4dof", demonstrations=FEW, world="paper")) is ImitationEnv
+    assert mimic.env_config("panda4dof", world="paper") == mimic.env_config("panda4dof")
+    assert mimic.env_config("panda4dof", world="hardware").has_inner_loop
+
+
+@pytest.mark.parametrize("delay", [1, 3])
+def test_a_delayed_action_acts_that_many_ticks_later(nominal, actions, undelayed, delay):
+    """The first ticks have the action 0, which holds the start pose: the same motion, later."""
+    late = roll(with_world(nominal, action_delay=[delay, delay]), actions)
+    start = nominal.start_poses[0]
+    np.testing.assert_allclose(late[delay - 1].pipeline_state.reference.qpos, start, atol=1e-6)
+    for early, state in zip(undelayed, late[delay:], strict=False):
+        np.testing.assert_allclose(state.pipeline_state.qpos, early.pipeline_state.qpos, atol=1e-5)
+
+
+@pytest.mark.parametrize("delay", [1, 3])
+def test_a_delayed_observation_has_old_measurements_and_new_actions(nominal, actions, undelayed, delay):
+    env = with_world(nominal, observation_delay=[delay, delay])
+    late, joints = roll(env, actions), nominal.learner.num_joints
+    old, new = undelayed[TICKS - 1 - delay], late[-1]
+    expert = [env.expert_at(new.pipeline_state.demonstration, TICKS + k) for k in range(env.config.preview + 1)]
+    measured = old.pipeline_state.measured[0]
+    sent = jnp.concatenate(list(actions[::-1][:3]))
+    np.testing.assert_allclose(new.obs, control_observation(env, measured, sent, expert_vector(expert)), atol=1e-5)
+    np.testing.assert_allclose(measured[:joints], old.pipeline_state.qpos, atol=1e-7)  # nominal: no noise, no bias
+    np.testing.assert_allclose(new.pipeline_state.qpos, undelayed[-1].pipeline_state.qpos, atol=1e-6)
+
+
+def test_a_lost_action_is_replaced_by_the_one_before(nominal, actions):
+    env = with_world(nominal, packet_loss=0.5)
+    arrived, lost = jnp.zeros(env.action_size), 0
+    for action, state in zip(actions, roll(env, actions, key=3), strict=True):
+        current = state.pipeline_state.arrived[0]
+        assert np.allclose(current, action) or np.allclose(current, arrived)
+        lost += not np.allclose(current, action)
+        arrived = current
+    assert 0 < lost < TICKS
+
+
+def test_what_is_drawn_lies_in_its_ranges_and_changes_the_motion(nominal, actions, undelayed):
+    config = mimic.env_config("panda4dof", demonstrations=FEW, world="hardware")
+    env = make_env(config)
+    starts = jax.vmap(env.start)(jax.random.split(jax.random.PRNGKey(0), 500))
+    draw, world = starts.draw, config.world
+    for name, values in {
+        "payload": draw.payload, "payload_lever": draw.payload_lever, "gravity_error": draw.gravity_error,
+        "link_mass": draw.link_mass, "friction": draw.friction, "motor_gain": draw.gain,
+        "observation_delay": draw.observation_delay, "action_delay": draw.action_delay,
+    }.items():  # fmt: skip
+        low, high = getattr(world, name)
+        width = high - low
+        assert low <= values.min() < low + 0.05 * width + 1e-9 and high - 0.05 * width - 1e-9 < values.max() <= high
+    assert np.abs(draw.bias).max() <= world.position_bias
+    assert 0 < np.abs(starts.qpos - env.start_poses[0]).max() <= world.start_noise + 1e-6
+    heavy = roll(with_world(nominal, payload=[3.0, 3.0], gravity_error=[0.05, 0.05]), actions)
+    difference = np.abs(heavy[-1].pipeline_state.qpos - undelayed[-1].pipeline_state.qpos).max()
+    assert 1e-4 < difference < 0.1  # the inner loop holds the arm near its reference
+
+
+@pytest.mark.parametrize("control", ["torque", "joint_position", "joint_velocity", "joint_impedance"])
+def test_each_mode_moves_the_arm_within_its_limits(control):
+    env = make(control=control)
+    actions = (0.02 if control == "torque" else 0.3) * jnp.ones((TICKS, env.action_size))
+    state = roll(env, actions)[-1].pipeline_state
+    moved = np.asarray(state.qpos) - env.start_poses[0]
+    assert np.all(moved > 0.001)
+    lower, upper = np.asarray(env.learner.joint_range).T
+    assert np.all((state.qpos > lower) & (state.qpos < upper))
+
+
+def test_mjx_agrees_with_the_fused_loop():
+    """With all of the hardware world but contacts, which do not occur here; MJX has MuJoCo's own stops."""
+    env = mimic.make("panda4dof", demonstrations=FEW, world="hardware")
+    actions = 0.5 * jax.random.uniform(jax.random.PRNGKey(2), (TICKS, env.action_size), minval=-1.0, maxval=1.0)
+    fused, mjx = (roll(version, actions, key=5)[-1] for version in (env, env.on_mjx()))
+    np.testing.assert_allclose(mjx.pipeline_state.qpos, fused.pipeline_state.qpos, atol=1e-4)
+    np.testing.assert_allclose(mjx.obs, fused.obs, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"control_dt": 0.0505}, "control_dt: expected a multiple of 0.001 s"),
+        ({"observation": {"terms": ["distance_gradient"]}}, "observation.terms: expected none with an inner loop"),
+        ({"randomization": {"torque_noise": 0.1}}, "randomization.torque_noise: expected 0 with an inner loop"),
+        ({"control": "velocity"}, "control: expected one of torque, joint_position"),
+        ({"learner": "panda_pair", "expert": "panda_pair"}, "expected a serial arm"),
+    ],
+)
+def test_what_does_not_fit_is_rejected(fields, message):
+    with pytest.raises(ValueError, match=message):
+        make(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"payload": [2.0, 1.0]}, r"world.payload: expected \[minimum, maximum\], got \[2.0, 1.0\]"),
+        ({"gravity_error": [0.0, 0.1]}, "world: expected gravity=true with gravity_error or contacts"),
+        ({"action_delay": [0, 4]}, "world.action_delay: expected"),
+    ],
+)
+def test_worlds_out_of_range_are_rejected(fields, message):
+    with pytest.raises(ValueError, match=message):
+        WorldConfig(**fields)
