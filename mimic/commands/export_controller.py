@@ -89,7 +89,7 @@ def _policy_graph(env: HardwareEnv, policy: Any) -> bytes:
     from mimic.commands.onnx_graph import to_onnx  # needs the extra "export"
 
     joints = env.learner.num_joints
-    inputs = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
+    inputs: dict[str, int] = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
     inputs["past_actions"] = SENT_ACTIONS * env.action_size
     inputs["expert"] = (env.config.preview + 1) * _NUMBERS * env.expert.num_links
 
