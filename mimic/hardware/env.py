@@ -97,21 +97,16 @@ class HardwareEnv(ImitationEnv):
         actions = jnp.zeros((MAX_DELAY + 1, self.action_size))
         reference = Reference(qpos, zero, zero)
         fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
-        begun = HardwareState(
-            **{**fields, "qpos": qpos, "load": None}
-        ).replace(  # type: ignore[attr-defined]
-            reference=reference, torque=zero, sent=actions[:SENT_ACTIONS], arrived=actions, draw=draw
-        )
-        measured = self._measure(begun)
-        return dataclasses.replace(begun, measured=jnp.tile(measured, (MAX_DELAY + 1, 1)))
+        fields |= {"qpos": qpos, "load": None, "reference": reference, "torque": zero, "draw": draw}
+        measured = self._measure(LoopState(qpos, zero, reference, zero), draw, state.key, state.step)
+        history = jnp.tile(measured, (MAX_DELAY + 1, 1))
+        return HardwareState(**fields, sent=actions[:SENT_ACTIONS], arrived=actions, measured=history)
 
     def _simulate(
         self, before: ArmState, command: Float[Array, " numbers"]
     ) -> tuple[HardwareState, Float[Array, " joints"]]:
         """See `ImitationEnv`; the torque is that of the last period."""
         state = cast(HardwareState, before)
-        assert state.reference is not None and state.arrived is not None and state.draw is not None
-        assert state.sent is not None and state.measured is not None and (torque := state.torque) is not None
         step = state.step + 1
         arrived = command
         if self.config.world.packet_loss:
@@ -121,7 +116,7 @@ class HardwareEnv(ImitationEnv):
         history = _pushed(state.arrived, arrived)
         acting = history[state.draw.action_delay]
         target = joint_control.action_target(self.config.control, acting, state.reference, self._parameters, jnp)
-        loop = self._inner_loop(state.draw, LoopState(state.qpos, state.qvel, state.reference, torque), target)
+        loop = self._inner_loop(state.draw, LoopState(state.qpos, state.qvel, state.reference, state.torque), target)
         after = dataclasses.replace(
             state,
             qpos=loop.qpos,
@@ -131,15 +126,14 @@ class HardwareEnv(ImitationEnv):
             torque=loop.torque,
             sent=_pushed(state.sent, command),
             arrived=history,
+            measured=_pushed(state.measured, self._measure(loop, state.draw, state.key, step)),
         )
-        after = dataclasses.replace(after, measured=_pushed(state.measured, self._measure(after)))
         return after, loop.torque
 
-    def _measure(self, state: HardwareState) -> Float[Array, " numbers"]:
+    def _measure(self, state: LoopState, draw: Draw, key: Array, step: Array) -> Float[Array, " numbers"]:
         """Measured angles and velocities, and those of the reference."""
-        world, reference, draw = self.config.world, state.reference, state.draw
-        assert reference is not None and draw is not None
-        key = jax.random.fold_in(jax.random.fold_in(state.key, _MEASURE), state.step)
+        world, reference = self.config.world, state.reference
+        key = jax.random.fold_in(jax.random.fold_in(key, _MEASURE), step)
         noise = jax.random.normal(key, (2, len(state.qpos)))
         qpos = state.qpos + draw.bias + world.position_noise * noise[0]
         return jnp.concatenate([qpos, state.qvel + world.velocity_noise * noise[1], reference.qpos, reference.qvel])
@@ -151,13 +145,12 @@ class HardwareEnv(ImitationEnv):
 
     def command(self, before: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
         """The target angles [rad], velocities [rad/s] or torques [N m] of an action that arrives at once."""
-        reference = cast(Reference, cast(HardwareState, before).reference)
+        reference = cast(HardwareState, before).reference
         return joint_control.action_target(self.config.control, action, reference, self._parameters, jnp).value
 
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """See the class, and `control_observation`."""
         state = cast(HardwareState, state)
-        assert state.measured is not None and state.draw is not None and state.sent is not None
         measured = state.measured[state.draw.observation_delay]
         expert = [self.expert_at(state.demonstration, state.step + k) for k in range(self.config.preview + 1)]
         return control_observation(self, measured, state.sent.ravel(), expert_vector(expert))

@@ -8,7 +8,7 @@ from mimic.envs.arm_state import ArmState
 from mimic.hardware.plant import Draw
 
 
-@struct.dataclass
+@struct.dataclass(kw_only=True)
 class HardwareState(ArmState):
     """The state of an episode with an inner loop. Rows of a history are ticks, the newest first.
 
@@ -21,9 +21,9 @@ class HardwareState(ArmState):
       draw: what was drawn for the episode.
     """
 
-    reference: Reference | None = None
-    torque: Float[Array, " joints"] | None = None
-    sent: Float[Array, "ticks numbers"] | None = None
-    arrived: Float[Array, "ticks numbers"] | None = None
-    measured: Float[Array, "ticks numbers"] | None = None
-    draw: Draw | None = None
+    reference: Reference
+    torque: Float[Array, " joints"]
+    sent: Float[Array, "ticks numbers"]
+    arrived: Float[Array, "ticks numbers"]
+    measured: Float[Array, "ticks numbers"]
+    draw: Draw

@@ -207,7 +207,7 @@ def test_rollouts_with_an_inner_loop_have_its_targets(control, quantity):
     rollouts = jax.jit(lambda: evaluator.rollout(lambda state: action))()
     episodes, _ = rollout_episodes(evaluator, rollouts, SPLITS, "", {})
     assert episodes.robot.quantity == quantity
-    command, parameters = episodes.robot.command[0], env.plant.constants.parameters
+    command, parameters = np.asarray(episodes.robot.command)[0], env.plant.constants.parameters
     if control == "joint_velocity":
         np.testing.assert_allclose(command, np.tile(action * parameters.velocity[:4], (6, 1)), rtol=1e-5)
     else:

@@ -76,7 +76,9 @@ def test_a_delayed_observation_has_old_measurements_and_new_actions(nominal, act
     env = with_world(nominal, observation_delay=[delay, delay])
     late, joints = roll(env, actions), nominal.learner.num_joints
     old, new = undelayed[TICKS - 1 - delay], late[-1]
-    expert = [env.expert_at(new.pipeline_state.demonstration, TICKS + k) for k in range(env.config.preview + 1)]
+    expert = [
+        env.expert_at(new.pipeline_state.demonstration, jnp.asarray(TICKS + k)) for k in range(env.config.preview + 1)
+    ]
     measured = old.pipeline_state.measured[0]
     sent = jnp.concatenate(list(actions[::-1][:3]))
     np.testing.assert_allclose(new.obs, control_observation(env, measured, sent, expert_vector(expert)), atol=1e-5)
@@ -97,7 +99,7 @@ def test_a_lost_action_is_replaced_by_the_one_before(nominal, actions):
 
 def test_what_is_drawn_lies_in_its_ranges_and_changes_the_motion(nominal, actions, undelayed):
     config = mimic.env_config("panda4dof", demonstrations=FEW, world="hardware")
-    env = make_env(config)
+    env = make(world="hardware")
     starts = jax.vmap(env.start)(jax.random.split(jax.random.PRNGKey(0), 500))
     draw, world = starts.draw, config.world
     for name, values in {

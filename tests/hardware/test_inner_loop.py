@@ -40,13 +40,13 @@ def arm_and_plant(request):
 def draw_for(joints: int, seed: int = 0) -> Draw:
     rng = np.random.default_rng(seed)
     return Draw(
-        link_mass=rng.uniform(0.8, 1.2, joints),
+        link_mass=jnp.asarray(rng.uniform(0.8, 1.2, joints)),
         payload=jnp.asarray(2.0),
         payload_lever=jnp.asarray(0.07),
         gravity_error=jnp.asarray(1.0),  # no compensation: all of gravity
-        friction=rng.uniform(0.5, 1.5, joints),
-        gain=rng.uniform(0.9, 1.1, joints),
-        bias=rng.uniform(-0.01, 0.01, joints),
+        friction=jnp.asarray(rng.uniform(0.5, 1.5, joints)),
+        gain=jnp.asarray(rng.uniform(0.9, 1.1, joints)),
+        bias=jnp.asarray(rng.uniform(-0.01, 0.01, joints)),
         observation_delay=jnp.asarray(0),
         action_delay=jnp.asarray(0),
         load=Load(jnp.asarray(1.1), jnp.asarray(1.3)),
