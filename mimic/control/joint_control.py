@@ -21,7 +21,7 @@ BRAKING_FRACTION = (
 APPROACH_RATE = 12.0  # 1/s: near its target angle a reference approaches it exponentially
 VELOCITY_RATE = 50.0  # 1/s: the same for velocities; above 4 APPROACH_RATE, so that nothing overshoots
 REACTION_FRACTION = 1.0  # of the time in which a reference reaches its full acceleration
-MIN_STIFFNESS = 1 / 16  # of joint_impedance, as a fraction of the stiffness of the other modes
+MIN_STIFFNESS = 0.5  # of joint_impedance, as a fraction of that of the other modes: softer arms leave their path
 
 
 class Reference(NamedTuple):
