@@ -47,6 +47,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, by the commands that tests start too
 
+    importlib.import_module("absl.logging")  # now: Hydra closes the stderr that this module finds
     from mimic import compat  # importing mimic after the hook is in place, and before JAX starts
 
     compat.prepare_cpu()

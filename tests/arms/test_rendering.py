@@ -19,7 +19,7 @@ def test_a_missing_graphics_library_is_reported_when_something_is_drawn(error, t
     """PyOpenGL fails in these ways where there is no libEGL, and no libGL."""
     (tmp_path / "OpenGL").mkdir()
     (tmp_path / "OpenGL" / "__init__.py").write_text(f"import ctypes\nraise {error}")
-    code = "import mimic, mujoco.mjx; from mimic import ArmScene; ArmScene([mimic.ArmConfig()])"
+    code = "from mimic import ArmConfig, ArmScene; import mujoco.mjx; ArmScene([ArmConfig()])"
     found = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}", "MUJOCO_GL": "egl"}
     ended = subprocess.run([sys.executable, "-c", code], env=found, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
