@@ -1,11 +1,11 @@
 """Policies of the hardware world: in training's physics, on MJX, and on virtual robots in C MuJoCo.
 
-    python -m benchmarks.hardware_world RUN [RUN ...] [--out FILE] [--episodes 1000] [--edge-episodes 200]
+    python -m benchmarks.hardware_world RUN [RUN ...] [--out FILE] [--episodes 1000] [--edge-episodes 200 or 0]
 
 Each run is one of `python -m mimic.train world=hardware`. The gap is that of held-out demonstrations, relative to the
 kinematic bound and to holding the start pose. `tracking` is a baseline without learning in the same world: it knows
 the poses of the bound, which an optimiser computes beforehand, and commands the velocity to the pose that comes `lead`
-ticks later; the best of several leads is shown. `edges` has each range of the world at its ends, one after the other,
+ticks later; the best of several leads is shown, chosen on the same demonstrations. `edges` has each range of the world at its ends, one after the other,
 and all together.
 """
 
@@ -50,7 +50,7 @@ def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
         for name, table in trainer.evaluator.similarity_summary(fused, "policy").items()
     }
     (whole,) = _virtual(run, episodes).values()
-    edges = _virtual(run, edge_episodes, "edges=true")
+    edges = _virtual(run, edge_episodes, "edges=true") if edge_episodes else {}
     single = {name: case["optimality_gap"] for name, case in edges.items() if not name.startswith("all")}
     together = [case["optimality_gap"] for name, case in edges.items() if name.startswith("all:")]
     return {
@@ -65,8 +65,7 @@ def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
         "virtual": whole["optimality_gap"],
         "aborts": sum(whole["aborts"].values()),
         "contacts": whole["self_contacts"],
-        "edges_worst": max(single.values()),
-        "edges_together": max(together),
+        **({"edges_worst": max(single.values()), "edges_together": max(together)} if edges else {}),
         "centre_line": similarity["policy"],
         "centre_line_bound": similarity["nearest_poses"],
         "centre_line_hold": similarity["hold_home"],

@@ -85,10 +85,10 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         return np.array(state.obs), {}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advances each arm by one control step of constant torque.
+        """Advances each arm by one control step.
 
         Args:
-          actions: [num_envs, joints] torques in [-1, 1].
+          actions: [num_envs, numbers] in [-1, 1]: torques, or what `env.control` says.
 
         Returns:
           Observations, rewards, terminations, truncations (all False), and infos.
@@ -171,10 +171,10 @@ class Env(gymnasium.Env):
         return np.array(state.obs), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Advances the arm by one control step of constant torque.
+        """Advances the arm by one control step.
 
         Args:
-          action: [joints] torques in [-1, 1].
+          action: [numbers] in [-1, 1]: torques, or what `env.control` says.
 
         Returns:
           Observation, reward, terminated, truncated (always False), and the metrics of the environment.

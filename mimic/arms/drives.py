@@ -15,6 +15,8 @@ FRICTION_LEVEL, FRICTION_RATE = "friction_level", "friction_rate"
 # Where a model states no friction: a fifth of the viscous friction at the velocity limit, as a Panda has.
 _FRICTION_FRACTION, _FRICTION_RATE = 0.2, 5.0
 _UNLIMITED_TORQUE = 1e3  # N m, for joints without a torque limit
+_UNLIMITED_ANGLE = 1e3  # rad, for joints whose range is a full rotation: they have no stops
+_FULL_TURN = 2 * np.pi * (1 - 1e-6)
 
 
 class JointFriction(NamedTuple):
@@ -51,8 +53,10 @@ def drives_of(config: ArmConfig, arm: Arm) -> Drives:
         return np.array(model.numeric(numeric).data, float)[joints] if numeric >= 0 else None
 
     torque = np.minimum(arm.embodiment.torque_limit, _UNLIMITED_TORQUE)
+    position = np.asarray(arm.embodiment.joint_range, float)
+    is_unlimited = np.ptp(position, axis=1, keepdims=True) >= _FULL_TURN
     limits = joint_limits(
-        np.asarray(arm.embodiment.joint_range),
+        np.where(is_unlimited, _UNLIMITED_ANGLE * np.array([-1.0, 1.0]), position),
         finite_velocity_limit(arm.embodiment),
         torque,
         *(stated(name) for name in (ACCELERATION_LIMIT, JERK_LIMIT, TORQUE_RATE_LIMIT)),

@@ -28,7 +28,7 @@ def rollout_episodes(
     chosen = np.concatenate(list(indices.values()))
     labels = np.repeat(list(indices), [len(index) for index in indices.values()])
     numbers = np.concatenate([np.arange(len(index)) for index in indices.values()])
-    start = np.asarray(env.start_poses)[chosen][:, None]
+    start = np.asarray(env.start_poses if rollouts.start is None else rollouts.start)[chosen][:, None]
     qpos, qvel, command = (np.asarray(values)[chosen] for values in (rollouts.qpos, rollouts.qvel, rollouts.command))
     steps = steps_before_runaway(qvel, env.config.speed_bound)
     kept = np.flatnonzero(steps)

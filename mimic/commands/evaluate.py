@@ -116,6 +116,11 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
                 f"trainer=ppo, got one of {trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)
+    if trained.env.has_inner_loop and config.controller not in ("policy", "hold"):
+        raise ValueError(
+            f"controller: expected policy or hold for a run with an inner loop, got {config.controller}, which "
+            "commands torques"
+        )
     if config.controller == "searched" and trained.env.metric.link_distance:
         raise ValueError(
             "controller=searched: expected a metric of weighted parts, got a run with "

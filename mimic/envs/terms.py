@@ -23,8 +23,8 @@ class Transition(NamedTuple):
     Attributes:
       before: state of the episode before the step.
       after: state after the step.
-      action: [joints] the action, in [-1, 1].
-      torque: [joints] constant torque in the step [N m].
+      action: [numbers] the action, in [-1, 1].
+      torque: [joints] constant torque in the step [N m]; with an inner loop that of its last period.
       learner_states: link states of the learner after the step.
       expert_states: link states of the expert at the same time.
     """

@@ -28,7 +28,8 @@ class WorldConfig:
       friction: range of the factor on the joints' friction, another one for each joint, see `JointFriction`.
       motor_gain: range of the ratio of the torque that acts to the commanded one; another one for each joint.
       position_bias: maximum of the constant error of each measured angle [rad].
-      position_noise, velocity_noise: standard deviation of each measured angle [rad] and velocity [rad/s].
+      position_noise, velocity_noise: standard deviation of each angle [rad] and velocity [rad/s] that the policy
+        observes; on the virtual robot, also of those that the inner loop measures.
       observation_delay: range of the age of a measurement when the policy observes it, in ticks.
       action_delay: range of the time from an observation to the moment when its action acts, in ticks.
       packet_loss: probability that an action does not arrive; the one before is then used again.

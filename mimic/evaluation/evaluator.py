@@ -2,6 +2,7 @@
 
 import copy
 import csv
+import dataclasses
 import functools
 import io
 from collections.abc import Callable, Iterable, Sequence
@@ -43,6 +44,7 @@ class Rollouts:
       distance: [demonstrations, T] embodiment distance after each step.
       command: [demonstrations, T, joints] what the controller commanded: the torque, or with an inner loop the target,
         see `ImitationEnv.command`. None where it was not recorded.
+      start: [demonstrations, joints] joint angles before the first step [rad]. None where they were not recorded.
     """
 
     qpos: Float[Array, "demonstrations time joints"]
@@ -50,6 +52,7 @@ class Rollouts:
     torque: Float[Array, "demonstrations time joints"]
     distance: Float[Array, "demonstrations time"]
     command: Float[Array, "demonstrations time joints"] | None = None
+    start: Float[Array, "demonstrations joints"] | None = None
 
 
 class Evaluator:
@@ -126,7 +129,9 @@ class Evaluator:
         # `vmap` is inside the loop: around the loop, JAX would trace a step twice, without and with the batch.
         start = jax.vmap(begin)(jnp.arange(env.demonstrations.count))
         _, over_time = jax.lax.scan(lambda carry, _: jax.vmap(step)(carry), start, None, length=env.config.horizon)
-        return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), over_time)
+        rollouts = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), over_time)
+        first: Any = start[0].pipeline_state
+        return dataclasses.replace(rollouts, start=first.qpos)
 
     @property
     def parts(self) -> dict[str, slice]:

@@ -38,7 +38,8 @@ class RolloutFrames:
     def __init__(self, evaluator: Evaluator, rollouts: Rollouts, index: int, frames_per_second: int):
         env, demonstrations = evaluator.env, evaluator.env.demonstrations
         horizon, dt = env.config.horizon, env.config.control_dt
-        start = env.start_poses[index][None]
+        starts = env.start_poses if rollouts.start is None else np.asarray(rollouts.start)
+        start = starts[index][None]
         qpos = np.concatenate([start, np.asarray(rollouts.qpos[index])])
         qvel = np.concatenate([0 * start, np.asarray(rollouts.qvel[index])])
         span = slice(0, horizon + 1)

@@ -41,6 +41,7 @@ class HardwareEnv(ImitationEnv):
 
     Attributes:
       plant: the learner, as the inner loop simulates it.
+      torque_scale: [joints] maximum torque [N m].
       action_size: length of an action.
 
     Raises:
@@ -63,6 +64,7 @@ class HardwareEnv(ImitationEnv):
             world = mujoco_world(arm, config.world, capsules)
             self._inner_loop = make_mjx_loop(config.control, self.plant, world, periods)
         parameters = self.plant.constants.parameters
+        self.torque_scale = jnp.asarray(parameters.torque[:joints], jnp.float32)
         self._parameters = JointParameters(*(jnp.asarray(x[:joints], jnp.float32) for x in parameters))
 
     def _fused_loop(self, loop: InnerLoop) -> MjxLoop:
@@ -95,7 +97,7 @@ class HardwareEnv(ImitationEnv):
         draw = draw_episode(self.config, joints, jax.random.fold_in(key, _DRAW))
         zero = jnp.zeros_like(qpos)
         actions = jnp.zeros((MAX_DELAY + 1, self.action_size))
-        reference = Reference(qpos, zero, zero)
+        reference = Reference(qpos + draw.bias, zero, zero)  # where the arm seems to be
         fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
         fields |= {"qpos": qpos, "load": None, "reference": reference, "torque": zero, "draw": draw}
         measured = self._measure(LoopState(qpos, zero, reference, zero), draw, state.key, state.step)
@@ -142,6 +144,10 @@ class HardwareEnv(ImitationEnv):
         """The torque of the last period [N m], in addition to gravity compensation."""
         del action
         return cast(Any, state).torque
+
+    def expert_at(self, demonstration: Array, step: Array) -> LinkStates:
+        """See `ImitationEnv`; after the horizon the expert stays where it is, as in an exported controller."""
+        return super().expert_at(demonstration, jnp.minimum(step, self.config.horizon))
 
     def command(self, before: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
         """The target angles [rad], velocities [rad/s] or torques [N m] of an action that arrives at once."""

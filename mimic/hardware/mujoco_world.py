@@ -13,6 +13,8 @@ from mimic.arms.simulation_model import simulation_spec
 from mimic.control.joint_control import PERIOD
 from mimic.envs.world import WorldConfig
 from mimic.hardware.plant import GRAVITY, end_of_last_link
+from mimic.retargeting.costs import changing_pairs
+from mimic.retargeting.pose import pose_limits
 
 PAYLOAD, FLOOR = "payload", "floor"
 _NO_MASS = 1e-6  # kg, of the body of a payload before its mass is set; MuJoCo needs one
@@ -52,9 +54,10 @@ def mujoco_world(arm: Arm, world: WorldConfig, capsules: Capsules | None = None)
     disabled = 0 if world.stops or world.contacts else mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     spec.option.disableflags = int(disabled) | (0 if world.contacts else int(mujoco.mjtDisableBit.mjDSBL_CONTACT))
     if world.stops:
-        for name, (minimum, maximum) in zip(arm.embodiment.joint_names, arm.embodiment.joint_range, strict=True):
-            joint = spec.joint(name)
-            joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [minimum, maximum]
+        limits = np.stack(pose_limits(arm.embodiment, float), axis=1)
+        for name, limit in zip(arm.embodiment.joint_names, limits, strict=True):
+            if np.all(np.isfinite(limit)):  # the others rotate without end
+                spec.joint(name).limited, spec.joint(name).range = mujoco.mjtLimited.mjLIMITED_TRUE, limit
     tip, along = _tip_in_last_body(arm)
     last = [body for body in spec.bodies if body.name != "world"][-1]
     payload = last.add_body(name=PAYLOAD, pos=tip)
@@ -80,7 +83,7 @@ def _tip_in_last_body(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules) -> None:
-    """Adds the capsules as geoms, their pairs, and a floor that all but those of the base touch."""
+    """Adds the capsules as geoms, pairs whose distance joints change, and a floor for all but those near the base."""
     pose, data = base_in_world(arm), mujoco.MjData(arm.model)
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(arm.model, data)
@@ -96,8 +99,9 @@ def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules) -> None:
     spec.worldbody.add_geom(
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[_FLOOR_SIZE, _FLOOR_SIZE, 0.1], **_NO_CONTACT
     )
-    for i, j in capsules.pairs:
-        spec.add_pair(geomname1=f"capsule{i}", geomname2=f"capsule{j}")
+    for (i, j), changes in zip(capsules.pairs, changing_pairs(arm.embodiment, capsules), strict=True):
+        if changes:
+            spec.add_pair(geomname1=f"capsule{i}", geomname2=f"capsule{j}")
     for index, is_near_base in enumerate(capsules.near_base):
         if not is_near_base:
             spec.add_pair(geomname1=FLOOR, geomname2=f"capsule{index}")

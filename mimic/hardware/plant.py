@@ -19,7 +19,6 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.physics import Load
 from mimic.envs.world import WorldConfig
 from mimic.hardware.inner_loop import Episode, JointConstants, padded
-from mimic.retargeting.pose import pose_limits
 
 GRAVITY = 9.81  # m/s^2
 # Mechanical stops as critically damped springs: stiff, and slow enough for steps of 1 ms.
@@ -162,7 +161,7 @@ def _largest_inertia(arm: Arm, world: WorldConfig) -> Float[np.ndarray, " joints
     tip, along = end_of_last_link(arm)
     pose = base_in_world(arm)
     point = pose[:3, :3] @ (tip + max(world.payload_lever) * along) + pose[:3, 3]
-    lower, upper = pose_limits(arm.embodiment, float)
+    lower, upper = np.asarray(arm.embodiment.joint_range, float).T  # a full rotation where a joint has no limits
     poses = np.random.default_rng(0).uniform(lower, upper, (_RANDOM_POSES, arm.model.nv))
     return np.max([joint_inertia(arm.model, qpos, max(world.payload), point) for qpos in poses], axis=0)
 

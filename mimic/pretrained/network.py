@@ -76,9 +76,9 @@ class Pretrained:
     def env(self) -> "ImitationEnv":
         """The environment, with its training demonstrations."""
         compat.import_mjx()
-        from mimic.envs.imitation import ImitationEnv  # imports brax and MJX, which takes seconds
+        from mimic.making import make_env  # imports brax and MJX, which takes seconds
 
-        return ImitationEnv(self.config.env)
+        return make_env(self.config.env)
 
     @functools.cached_property
     def _arms(self) -> tuple[Embodiment, Embodiment]:

@@ -101,7 +101,7 @@ class Channel:
 
     def __init__(self, world: World, size: int, seed: int):
         self._observation_delay, self._action_delay = world.observation_delay, world.action_delay
-        self._loss, self._rng = world.packet_loss, np.random.default_rng(seed)
+        self._loss, self._rng = world.packet_loss, np.random.default_rng([seed, 1])
         self._observations: list[np.ndarray] = []
         self._actions: list[np.ndarray] = []
         self._robots, self._size = np.arange(len(world.action_delay)), size

@@ -10,6 +10,7 @@ import pytest
 import mimic
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.world import WorldConfig
+from mimic.evaluation.evaluator import Evaluator
 from mimic.hardware.env import HardwareEnv, control_observation, expert_vector
 from mimic.making import make_env
 
@@ -163,3 +164,47 @@ def test_what_does_not_fit_is_rejected(fields, message):
 def test_worlds_out_of_range_are_rejected(fields, message):
     with pytest.raises(ValueError, match=message):
         WorldConfig(**fields)
+
+
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [
+        ("planar4dof", {"world": "hardware"}),
+        ("panda4dof", {"control": "joint_position"}),  # in the zero pose, with joints that rotate without end
+        ("panda4dof", {"world": "nominal", "limits": "none", "physics": "mjx"}),
+    ],
+)
+def test_joints_without_limits_have_no_stops(name, fields):
+    env = mimic.make(name, demonstrations=FEW, **fields)
+    state = roll(env, jnp.full((TICKS, env.action_size), 0.2))[-1]
+    assert np.all(np.isfinite(state.obs)) and np.abs(state.pipeline_state.qvel).max() > 1e-3
+
+
+def test_an_episode_starts_where_the_robot_measures_itself():
+    env = make(world="hardware")
+    states = jax.vmap(env.start)(jax.random.split(jax.random.PRNGKey(0), 50))
+    error = states.reference.qpos - states.qpos
+    np.testing.assert_allclose(error, states.draw.bias, atol=1e-6)
+    assert np.abs(error).max() > 1e-3
+
+
+def test_the_last_observations_show_the_expert_as_an_exported_controller_does():
+    """Demonstrations may be longer than an episode; what comes after it is unknown to both."""
+    from mimic.commands.export_controller import expert_table
+
+    env = make(horizon=8)
+    short = make_env(dataclasses.replace(env.config, horizon=6), env.demonstrations)
+    table = expert_table(short)
+    for step in (5, 6):
+        states = [short.expert_at(jnp.asarray(0), jnp.asarray(step + k)) for k in range(3)]
+        rows = [table[0, min(step + k, 6)] for k in range(3)]
+        np.testing.assert_allclose(expert_vector(states), np.concatenate(rows), atol=1e-6)
+
+
+def test_rollouts_start_where_the_episodes_do():
+    env = make(world="hardware", horizon=3)
+    evaluator = Evaluator(env, env.demonstrations)
+    rollouts = jax.jit(lambda: evaluator.rollout(lambda state: jnp.zeros(env.action_size)))()
+    deviation = np.abs(np.asarray(rollouts.start) - env.start_poses[0])
+    assert 1e-3 < deviation.max() <= env.config.world.start_noise
+    np.testing.assert_allclose(rollouts.qpos[:, 0], rollouts.start, atol=5e-3)  # the action 0 holds the arm
