@@ -5,8 +5,8 @@
 Each run is one of `python -m mimic.train world=hardware`. The gap is that of held-out demonstrations, relative to the
 kinematic bound and to holding the start pose. `tracking` is a baseline without learning in the same world: it knows
 the poses of the bound, which an optimiser computes beforehand, and commands the velocity to the pose that comes `lead`
-ticks later; the best of several leads is shown, chosen on the same demonstrations. `edges` has each range of the world at its ends, one after the other,
-and all together.
+ticks later; the best of several leads is shown, chosen on the same demonstrations. `edges` has each range of the
+world at its ends, one after the other, and all together.
 """
 
 import argparse

@@ -125,6 +125,12 @@ def test_a_run_without_an_inner_loop_has_no_controller(rejected, paper_run):
     assert "format=controller: expected a run of trainer=ppo with an inner loop" in error
 
 
+@pytest.mark.parametrize("controller", ["pd", "computed_torque", "nearest_pose", "searched"])
+def test_controllers_of_torques_do_not_fit_an_inner_loop(rejected, hardware_run, controller):
+    error = rejected("evaluate", f"run={hardware_run}", f"controller={controller}")
+    assert f"controller: expected policy or hold for a run with an inner loop, got {controller}" in error
+
+
 def test_what_does_not_fit_is_rejected(rejected, hardware_run, tmp_path):
     run = f"run={hardware_run}"
     cases = [

@@ -76,8 +76,13 @@ def test_a_policy_that_dies_or_stops_makes_the_arm_brake_and_hold(tmp_path, numb
     """In real time, in the middle of a fast motion."""
     bundle = bundles.make_bundle(tmp_path / "fast", bundles.constant(0.8, -0.3, 0, 0, 0.8, 0, 0), ticks=60)
     fake, policy = robot(bundle, is_paced=True), PolicyProcess(bundle, 0)
-    timer = threading.Timer(0.8, os.kill, (policy.pid, number))
-    timer.start()
+
+    def end_policy():
+        while not fake.states or fake.states[-1].qvel[0] < 1.2:  # not by the clock: a process may take seconds to start
+            time.sleep(0.002)
+        os.kill(policy.pid, number)
+
+    threading.Thread(target=end_policy, daemon=True).start()
     report = run_controller(fake, bundle, policy=policy)
     qpos, qvel, qacc = trace(fake)
     fastest = int(np.abs(qvel[:, 0]).argmax())
