@@ -1,5 +1,7 @@
 """The inner loop on MJX against C MuJoCo: stops, and contacts of links with the floor and with each other."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -60,7 +62,9 @@ def case():
         "payload": jnp.zeros(()),
         "payload_lever": jnp.zeros(()),
     }
-    draw = draw.replace(**nominal, gravity_error=jnp.zeros(()), load=type(draw.load)(jnp.ones(()), jnp.ones(())))
+    draw = dataclasses.replace(
+        draw, **nominal, gravity_error=jnp.zeros(()), load=type(draw.load)(jnp.ones(()), jnp.ones(()))
+    )
     draw = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), draw)
     return arm, plant, world, draw, jax.jit(make_mjx_loop("torque", plant, world, PERIODS))
 
