@@ -9,15 +9,10 @@ Array = Any
 
 MODES = ("torque", "joint_position", "joint_velocity", "joint_impedance")
 PERIOD = 0.001  # s, of the inner loop: that of the robots' interfaces, such as libfranka's
-# The working limits are these fractions of the manufacturer's: a reference may exceed a working limit slightly, because
-# its jerk is limited too.
+# The working limits are these fractions of the manufacturer's: the arm itself exceeds its reference's speed and torque.
 VELOCITY_FRACTION, ACCELERATION_FRACTION, JERK_FRACTION, TORQUE_FRACTION = 0.95, 0.4, 0.9, 0.95
-POSITION_MARGIN = (
-    0.03  # rad: a reference stays this far inside the joint range, and an arm that lags behind it does too
-)
-BRAKING_FRACTION = (
-    0.7  # of the working acceleration and jerk, with which a reference slows down before a target or limit
-)
+POSITION_MARGIN = 0.03  # rad: a reference stays this far inside the joint range
+BRAKING_FRACTION = 0.7  # of the working acceleration and jerk, with which a reference slows down before a target
 APPROACH_RATE = 12.0  # 1/s: near its target angle a reference approaches it exponentially
 VELOCITY_RATE = 50.0  # 1/s: the same for velocities; above 4 APPROACH_RATE, so that nothing overshoots
 REACTION_FRACTION = 1.0  # of the time in which a reference reaches its full acceleration
