@@ -18,7 +18,7 @@ from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.physics import PhysicsChoice
 from mimic.envs.world import MAX_DELAY
-from mimic.hardware.inner_loop import InnerLoop, LoopState, make_inner_loop
+from mimic.hardware.inner_loop import LoopState, make_inner_loop
 from mimic.hardware.mjx_loop import MjxLoop, make_mjx_loop
 from mimic.hardware.mujoco_world import mujoco_world
 from mimic.hardware.plant import Draw, draw_episode, make_plant
@@ -55,21 +55,23 @@ class HardwareEnv(ImitationEnv):
     def _set_physics(self, physics: PhysicsChoice) -> None:
         config, arm = self.config, self.arm
         self.physics, self.config = physics, dataclasses.replace(config, physics=physics.name)
-        self.plant = make_plant(config, arm)
-        periods, joints = round(config.control_dt / PERIOD), self.learner.num_joints
-        if physics.name == "fused":
-            self._inner_loop = self._fused_loop(make_inner_loop(config.control, self.plant.constants, periods))
-        else:
-            capsules = self.capsules if config.world.contacts else None
-            world = mujoco_world(arm, config.world, capsules)
-            self._inner_loop = make_mjx_loop(config.control, self.plant, world, periods)
+        self.plant, joints = make_plant(config, arm), self.learner.num_joints
+        make = self._make_fused_loop if physics.name == "fused" else self._make_mjx_loop
+        waiting = round(config.world.action_latency / PERIOD)
+        self._waiting_loop = make(waiting) if waiting else None
+        self._acting_loop = make(round(config.control_dt / PERIOD) - waiting)
         parameters = self.plant.constants.parameters
         self.torque_scale = jnp.asarray(parameters.torque[:joints], jnp.float32)
         self._parameters = JointParameters(*(jnp.asarray(x[:joints], jnp.float32) for x in parameters))
 
-    def _fused_loop(self, loop: InnerLoop) -> MjxLoop:
+    def _make_mjx_loop(self, periods: int) -> MjxLoop:
+        world = self.config.world
+        model = mujoco_world(self.arm, world, self.capsules if world.contacts else None)
+        return make_mjx_loop(self.config.control, self.plant, model, periods)
+
+    def _make_fused_loop(self, periods: int) -> MjxLoop:
         """The fused loop on vectors without empty slots."""
-        joints = self.learner.num_joints
+        joints, loop = self.learner.num_joints, make_inner_loop(self.config.control, self.plant.constants, periods)
 
         def run(draw: Draw, state: LoopState, target: Target) -> LoopState:
             state, target = jax.tree.map(lambda x: jnp.pad(x, (0, MAX_JOINTS - joints)), (state, target))
@@ -102,7 +104,11 @@ class HardwareEnv(ImitationEnv):
         fields |= {"qpos": qpos, "load": None, "reference": reference, "torque": zero, "draw": draw}
         measured = self._measure(LoopState(qpos, zero, reference, zero), draw, state.key, state.step)
         history = jnp.tile(measured, (MAX_DELAY + 1, 1))
-        return HardwareState(**fields, sent=actions[:SENT_ACTIONS], arrived=actions, measured=history)
+        is_angle = self.config.control in ("joint_position", "joint_impedance")
+        target = Target(reference.qpos if is_angle else zero, jnp.ones_like(qpos))  # the arm stays where it is
+        return HardwareState(
+            **fields, sent=actions[:SENT_ACTIONS], arrived=actions, target=target, measured=history
+        )
 
     def _simulate(
         self, before: ArmState, command: Float[Array, " numbers"]
@@ -117,8 +123,11 @@ class HardwareEnv(ImitationEnv):
             arrived = jnp.where(is_lost, state.arrived[0], command)
         history = _pushed(state.arrived, arrived)
         acting = history[state.draw.action_delay]
-        target = joint_control.action_target(self.config.control, acting, state.reference, self._parameters, jnp)
-        loop = self._inner_loop(state.draw, LoopState(state.qpos, state.qvel, state.reference, state.torque), target)
+        loop = LoopState(state.qpos, state.qvel, state.reference, state.torque)
+        if self._waiting_loop is not None:
+            loop = self._waiting_loop(state.draw, loop, state.target)
+        target = joint_control.action_target(self.config.control, acting, loop.reference, self._parameters, jnp)
+        loop = self._acting_loop(state.draw, loop, target)
         after = dataclasses.replace(
             state,
             qpos=loop.qpos,
@@ -128,6 +137,7 @@ class HardwareEnv(ImitationEnv):
             torque=loop.torque,
             sent=_pushed(state.sent, command),
             arrived=history,
+            target=target,
             measured=_pushed(state.measured, self._measure(loop, state.draw, state.key, step)),
         )
         return after, loop.torque
@@ -171,6 +181,12 @@ def _check(config: EnvConfig) -> None:
     periods = config.control_dt / PERIOD
     if abs(periods - round(periods)) > 1e-6:
         raise ValueError(f"control_dt: expected a multiple of {PERIOD} s with an inner loop, got {config.control_dt}")
+    latency = config.world.action_latency
+    if abs(latency / PERIOD - round(latency / PERIOD)) > 1e-6 or latency >= config.control_dt:
+        raise ValueError(
+            f"world.action_latency: expected a multiple of {PERIOD} s below control_dt = {config.control_dt} s, got "
+            f"{latency}"
+        )
     if config.observation.terms:
         raise ValueError(f"observation.terms: expected none with an inner loop, got {config.observation.terms}")
     if config.randomization.torque_noise:

@@ -3,7 +3,7 @@
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.control.joint_control import Reference
+from mimic.control.joint_control import Reference, Target
 from mimic.envs.arm_state import ArmState
 from mimic.hardware.plant import Draw
 
@@ -17,6 +17,7 @@ class HardwareState(ArmState):
       torque: [joints] torque of the last period [N m].
       sent: [ticks, numbers] the policy's last actions, which it observes.
       arrived: [ticks, numbers] the last actions that arrived at the robot.
+      target: [joints] that acts at the end of the last tick.
       measured: [ticks, 4 * joints] measured angles and velocities, and angles and velocities of the reference.
       draw: what was drawn for the episode.
     """
@@ -25,5 +26,6 @@ class HardwareState(ArmState):
     torque: Float[Array, " joints"]
     sent: Float[Array, "ticks numbers"]
     arrived: Float[Array, "ticks numbers"]
+    target: Target
     measured: Float[Array, "ticks numbers"]
     draw: Draw

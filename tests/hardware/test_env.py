@@ -72,6 +72,19 @@ def test_a_delayed_action_acts_that_many_ticks_later(nominal, actions, undelayed
         np.testing.assert_allclose(state.pipeline_state.qpos, early.pipeline_state.qpos, atol=1e-5)
 
 
+def test_the_latency_shifts_actions_within_a_tick(actions):
+    """The same motion as with five times as many ticks, in which each action is repeated and comes two of them later."""
+    long = make()
+    world = {**dataclasses.asdict(long.config.world), "action_latency": 0.0}
+    fields = {"limits": "hardware", "control": "joint_velocity", "control_dt": 0.01, "horizon": 5 * TICKS}
+    short = make(**fields, world=world)
+    repeated = jnp.concatenate([jnp.zeros_like(actions[:2]), jnp.repeat(actions, 5, axis=0)])[: 5 * TICKS]
+    for at_end, state in zip(roll(short, repeated)[4::5], roll(long, actions), strict=True):
+        np.testing.assert_allclose(state.pipeline_state.qpos, at_end.pipeline_state.qpos, atol=1e-5)
+        np.testing.assert_allclose(state.pipeline_state.reference.qvel, at_end.pipeline_state.reference.qvel, atol=1e-5)
+        assert np.abs(state.pipeline_state.qvel).max() > 0
+
+
 @pytest.mark.parametrize("delay", [1, 3])
 def test_a_delayed_observation_has_old_measurements_and_new_actions(nominal, actions, undelayed, delay):
     env = with_world(nominal, observation_delay=[delay, delay])
@@ -142,6 +155,7 @@ def test_mjx_agrees_with_the_fused_loop():
     ("fields", "message"),
     [
         ({"control_dt": 0.0505}, "control_dt: expected a multiple of 0.001 s"),
+        ({"control_dt": 0.02}, "world.action_latency: expected a multiple of 0.001 s below control_dt = 0.02 s, got 0.02"),
         ({"observation": {"terms": ["distance_gradient"]}}, "observation.terms: expected none with an inner loop"),
         ({"randomization": {"torque_noise": 0.1}}, "randomization.torque_noise: expected 0 with an inner loop"),
         ({"control": "velocity"}, "control: expected one of torque, joint_position"),
