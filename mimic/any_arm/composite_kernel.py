@@ -1,0 +1,247 @@
+"""Steps of any arm in one GPU kernel: the equations of mimic/any_arm/dynamics.py for all joints, without loops.
+
+The compile time of a Triton kernel is almost that of its pass `coalesce`: the number of loads and stores times the
+square of the number of operations. So loops load the numbers and store the result: there are 7 loads and stores instead
+of 170. Nothing else is a loop over the joints. An evaluation of the dynamics has 2100 instructions, a loop over the
+joints 1200 for each of them, most of which move values of the joints between registers and compute addresses.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.experimental.pallas import triton
+from jaxtyping import Array
+
+from mimic.any_arm import dynamics
+from mimic.any_arm.arrays import MAX_JOINTS
+from mimic.any_arm.dynamics import PLANE, JointNumbers, Motion
+from mimic.any_arm.trigonometry import RECIPROCALS, SINES
+from mimic.envs.dynamics import acceleration_field
+from mimic.envs.physics import runge_kutta
+from mimic.metric import fused_kernel
+from mimic.metric.spatial import ZERO, Scalar, Vector, add, minus, plus, times
+
+LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2, sample_axis=1)
+
+
+class Form(NamedTuple):
+    """Forms of the same computation.
+
+    Attributes:
+      sines: see `SINES` of mimic/any_arm/trigonometry.py.
+      is_interleaved: whether a joint is eliminated as soon as its row of the inertia matrix is known.
+      rows_in_loops: whether loops load and store the rows of the joints.
+      reciprocal: see `RECIPROCALS` of mimic/any_arm/trigonometry.py.
+      has_barriers: whether the warps of a block wait for each other at each evaluation, so that they share instructions
+        in the cache.
+    """
+
+    sines: str = "polynomial"
+    is_interleaved: bool = True
+    rows_in_loops: bool = True
+    reciprocal: str = "exact"
+    has_barriers: bool = False
+
+
+FORM = Form()
+
+
+def gpu_kernel(
+    timestep: float, substeps: int, *, launch: fused_kernel.LaunchConfig = LAUNCH, form: Form = FORM
+) -> Callable[..., tuple[Array, ...]]:
+    """A Pallas kernel of Runge-Kutta steps: (numbers, qpos, qvel, torque, load) -> (qpos, qvel).
+
+    Its arguments are arrays [samples, width]: `dynamics.joint_numbers`, angles [rad], velocities [rad/s] and torques
+    [N m] of the 8 slots of joints, and the factors on masses and damping.
+
+    Args:
+      timestep: duration of a step [s].
+      substeps: steps per call.
+      launch: launch configuration of the kernel.
+      form: of the computation.
+    """
+
+    def body(inputs: Sequence[fused_kernel.Columns], outputs: Sequence[fused_kernel.Columns]) -> None:
+        *of_joints, load = inputs
+        ((mass,), (damping,)) = _read(load, load.width, form.rows_in_loops)
+        rows = read_rows(of_joints, form.rows_in_loops)
+        joints, force = [], []
+        for row in rows:
+            joint = loaded(dynamics.joint_of(row[: dynamics.NUMBERS]), mass, damping)
+            joints.append(joint)
+            force.append(row[-1] / mass)
+
+        def qacc(qpos: tuple[Scalar, ...], qvel: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+            if form.has_barriers:
+                triton.debug_barrier()
+            return acceleration(joints, qpos, qvel, force, form=form)
+
+        qpos, qvel = (tuple(row[dynamics.NUMBERS + k] for row in rows) for k in range(2))
+        qpos, qvel = runge_kutta(qacc, qpos, qvel, timestep, substeps)
+        write_rows(outputs, tuple(zip(qpos, qvel, strict=True)), form.rows_in_loops)
+
+    return fused_kernel.by_columns(body, (MAX_JOINTS, MAX_JOINTS), launch=launch)
+
+
+Rows = tuple[tuple[Scalar, ...], ...]  # values of each joint
+
+
+def read_rows(arrays: Sequence[fused_kernel.Columns], in_loop: bool = True) -> Rows:
+    """The columns of each joint of several arrays, whose columns are those of the first joint, of the second, ..."""
+    rows = [_read(columns, MAX_JOINTS, in_loop) for columns in arrays]
+    return tuple(tuple(x for row in of_joint for x in row) for of_joint in zip(*rows, strict=True))
+
+
+def _read(columns: fused_kernel.Columns, count: int, in_loop: bool) -> Rows:
+    """The columns of an array as `count` rows."""
+    width = columns.width // count
+    if not in_loop:
+        return tuple(tuple(columns.read(jnp.asarray(width * i + k)) for k in range(width)) for i in range(count))
+    empty = (jnp.zeros(columns.mask.shape, columns.ref.dtype),) * width
+
+    def read_row(index: Array, rows: Rows) -> Rows:
+        def read(k: Array, row: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+            return (*row[1:], columns.read(width * index + k))
+
+        row = jax.lax.fori_loop(0, width, read, empty) if width > 1 else read(jnp.asarray(0), empty)
+        return (*rows[1:], row)
+
+    return jax.lax.fori_loop(0, count, read_row, (empty,) * count)
+
+
+def write_rows(arrays: Sequence[fused_kernel.Columns], rows: Rows, in_loop: bool = True) -> None:
+    """Writes the values of each joint: to each array one of them."""
+
+    def write(index: Array, rows: Rows) -> Rows:
+        for columns, value in zip(arrays, rows[0], strict=True):
+            columns.write(index, value)
+        return (*rows[1:], rows[0])
+
+    if in_loop:
+        jax.lax.fori_loop(0, MAX_JOINTS, write, rows)
+    else:
+        for index in range(MAX_JOINTS):
+            write(jnp.asarray(index), rows[index:])
+
+
+def loaded(joint: JointNumbers, mass: Scalar, damping: Scalar) -> JointNumbers:
+    """The numbers of a joint under a load, over the factor on masses: dividing these few is cheaper than multiplying.
+
+    The armature of a locked joint is infinite, so that its acceleration is 0.
+
+    Args:
+      joint: the joint.
+      mass: factor on the masses and inertias of all bodies.
+      damping: factor on the damping of all joints.
+    """
+    armature = jnp.where(joint.is_free > 0, joint.armature / mass, math.inf)
+    return joint._replace(armature=armature, damping=joint.damping * damping / mass)
+
+
+def acceleration(
+    joints: Sequence[JointNumbers],
+    qpos: Sequence[Scalar],
+    qvel: Sequence[Scalar],
+    torque: Sequence[Scalar],
+    base: Vector | None = None,
+    form: Form = FORM,
+) -> tuple[Scalar, ...]:
+    """Forward dynamics: joint accelerations [rad/s^2] under joint torques; 0 for locked joints.
+
+    Args:
+      joints: from `loaded`.
+      qpos: joint angles [rad].
+      qvel: joint velocities [rad/s]; those of locked joints are 0.
+      torque: joint torques over the factor on masses [N m].
+      base: acceleration of the base, in the frame of the first joint at angle 0 [m/s^2]: minus gravity. 0 where None.
+      form: of the computation.
+    """
+    # The angle of the first joint has no effect where the base is at rest.
+    turns = [(1.0, 0.0)] if base is None else []
+    for joint, angle in list(zip(joints, qpos, strict=True))[len(turns) :]:
+        turns.append(SINES[form.sines](angle + joint.reference))
+    wrenches = _wrenches(joints, turns, qvel, base)
+    rows = _inertia_and_bias(joints, turns, wrenches)
+    elimination = Elimination(len(joints), RECIPROCALS[form.reciprocal])
+    rows = rows if form.is_interleaved else list(rows)
+    for k, (row, bias) in zip(reversed(range(len(joints))), rows, strict=True):
+        elimination.add(k, row, joints[k].armature, torque[k] - joints[k].damping * qvel[k] - bias)
+    return elimination.solution()
+
+
+def _wrenches(
+    joints: Sequence[JointNumbers], turns: Sequence[PLANE], qvel: Sequence[Scalar], base: Vector | None
+) -> list[tuple[Vector, Vector]]:
+    """Force and moment that accelerate each body at zero joint acceleration."""
+    motion: Motion = (ZERO, ZERO, ZERO if base is None else base)
+    field = ZERO, ZERO, ZERO
+    wrenches = []
+    for joint, turn, speed in zip(joints, turns, qvel, strict=True):
+        motion = dynamics.child_motion(joint, turn, speed, motion, field)
+        field = acceleration_field(motion[0], motion[1])
+        wrenches.append(dynamics.inertial_wrench(joint, motion[2], field))
+    return wrenches
+
+
+def _inertia_and_bias(joints: Sequence[JointNumbers], turns: Sequence[PLANE], wrenches: Any) -> Any:
+    """Yields rows of the inertia's lower triangle, and the bias torque, of each joint from the last to the first."""
+    masses: Any = (ZERO, (ZERO, ZERO, ZERO))
+    total = ZERO, ZERO  # wrench of the distal bodies
+    for i in reversed(range(len(joints))):
+        masses = dynamics.composite(joints[i], *masses)
+        unit = dynamics.unit_wrench(*masses)
+        total = add(total[0], wrenches[i][0]), add(total[1], wrenches[i][1])
+        row, bias = [unit[1][2]], total[1][2]
+        for j in reversed(range(1, i + 1)):  # to the frames of the joints before it
+            unit = dynamics.wrench_to_parent(joints[j], turns[j], *unit)
+            row.insert(0, unit[1][2])
+        yield row, bias
+        if i > 0:
+            total = dynamics.wrench_to_parent(joints[i], turns[i], *total)
+            masses = dynamics.moments_to_parent(joints[i], turns[i], *masses)
+
+
+class Elimination:
+    """Solves (M + armature) x = b by elimination from the last row to the first, when these become known.
+
+    A row with an infinite pivot has no effect on the others, and its x is 0.
+    """
+
+    def __init__(self, size: int, reciprocal: Callable[[Scalar], Scalar]) -> None:
+        """Makes the changes of an empty system."""
+        self._reciprocal = reciprocal
+        self._matrix: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(size)]  # decrease of each entry
+        self._values: list[Scalar] = [0.0] * size
+        self._factors: list[list[Scalar]] = [[] for _ in range(size)]
+        self._scaled: list[Scalar] = [0.0] * size
+
+    def add(self, k: int, row: Sequence[Scalar], armature: Scalar, value: Scalar) -> None:
+        """Eliminates x[k].
+
+        Args:
+          k: index of the row.
+          row: of M, up to the diagonal.
+          armature: added to the diagonal.
+          value: entry of b.
+        """
+        row = [minus(x, change) for x, change in zip(row, self._matrix[k], strict=True)]
+        value = minus(value, self._values[k])
+        inverse = self._reciprocal(plus(row[k], armature))
+        self._factors[k] = [times(inverse, x) for x in row[:k]]
+        self._scaled[k] = times(inverse, value)
+        for i, factor in enumerate(self._factors[k]):
+            self._values[i] = plus(self._values[i], times(factor, value))
+            for j in range(i + 1):
+                self._matrix[i][j] = plus(self._matrix[i][j], times(factor, row[j]))
+
+    def solution(self) -> tuple[Scalar, ...]:
+        """X, after all rows."""
+        solution: list[Scalar] = []
+        for value, factors in zip(self._scaled, self._factors, strict=True):
+            for factor, x in zip(factors, solution, strict=True):
+                value = minus(value, times(factor, x))
+            solution.append(value)
+        return tuple(solution)
