@@ -1,15 +1,19 @@
-"""The physics of any arm on a GPU: compile time and physics steps per second of forms of the kernel.
+"""The kernels that simulate any arm, on a GPU: compile time, steps per second, and error.
 
-    python -m benchmarks.any_arm_kernel [--out FILE] [--variants loops composite ...] [--arms 65536 524288]
+    python -m benchmarks.any_arm_kernel [--out FILE] [--kernels physics panda7dof panda4dof] [--arms 65536 524288]
 
-A physics step is one of Runge-Kutta with four evaluations of the dynamics, and a call of `--substeps` steps is one
-dispatch. Each sample has an arm of its own: random arms, of which `DRAWN` are drawn and repeated. `largest_error` is
-that of the joint velocities of these arms after a call, against double precision, relative to 1 rad/s plus the arm's
-largest velocity.
+`physics`: Runge-Kutta steps of random arms, each with numbers of its own. A step has four evaluations of the dynamics,
+and a call of `--substeps` steps is one dispatch. The others are the inner loop of an environment with world=hardware,
+each arm with an episode of its own. A step is 1 ms with one period of the controller and one evaluation, and a call is
+a tick of `--periods` ms.
+
+`DRAWN` samples are drawn and repeated. `largest_error` is that of their joint velocities after a call, against the
+equations for CPUs in double precision, relative to 1 rad/s plus the arm's largest velocity. `array_error` is that of
+the equations for CPUs in single precision.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,101 +22,117 @@ import numpy as np
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect, failure
 from benchmarks.common.timing import time_program
-from mimic.any_arm import articulated_kernel, dynamics
+from mimic.any_arm import composite_kernel, dynamics, physics
 from mimic.any_arm.arrays import MAX_JOINTS
-from mimic.any_arm.composite_kernel import LAUNCH, Form, gpu_kernel
-from mimic.any_arm.physics import make_advance
 from mimic.any_arm.sampler import random_arm
-from mimic.envs.physics import Load
-from mimic.metric.fused_kernel import LaunchConfig
+from mimic.arms.arm import build_arm
+from mimic.control.joint_control import JointParameters, Reference, Target, action_target
+from mimic.envs import env_config
+from mimic.hardware import inner_loop
+from mimic.hardware.plant import draw_episode, make_plant
 
-TIMESTEP = 0.01  # s
+TIMESTEP = 0.01  # s, of the physics
 DRAWN = 512
-COLUMNS = "variant arms compile_s:.1f steps_per_s:.3g spread:.1% largest_error:.1e"
-Kernel = Callable[..., tuple[jax.Array, ...]]
+COLUMNS = "kernel arms compile_s:.1f steps_per_s:.3g calls_per_s:.3g spread:.1% largest_error:.1e array_error:.1e"
+Outputs = tuple[Any, ...]
 
 
-def _composite(launch: LaunchConfig = LAUNCH, **form: Any) -> Callable[[int], Kernel]:
-    return lambda substeps: gpu_kernel(TIMESTEP, substeps, launch=launch, form=Form(**form))
+class Case(NamedTuple):
+    """A kernel with its arguments.
+
+    Attributes:
+      kernel: takes and returns arrays [samples, width].
+      arrays: the same equations on arrays [width, samples].
+      inputs: arguments of the kernel for the drawn samples.
+      velocities: joint velocities in the kernel's results [samples, joints].
+      steps: in a call.
+    """
+
+    kernel: Callable[..., Outputs]
+    arrays: Callable[..., Outputs]
+    inputs: list[np.ndarray]
+    velocities: Callable[[Outputs], Any]
+    steps: int
 
 
-# The last one compiles for long.
-VARIANTS: dict[str, Callable[[int], Kernel]] = {
-    "composite": _composite(),
-    "loops": lambda substeps: articulated_kernel.gpu_kernel(TIMESTEP, substeps),
-    "registers_128": _composite(LaunchConfig(512, 16, 1)),
-    "two_samples": _composite(LaunchConfig(128, 2, 1)),
-    "rows_first": _composite(LaunchConfig(64, 2, 0)),
-    "block_32": _composite(LaunchConfig(32, 1, 1)),
-    "block_128": _composite(LaunchConfig(128, 4, 1)),
-    "block_256": _composite(LaunchConfig(256, 8, 1)),
-    "barriers": _composite(LaunchConfig(256, 8, 1), has_barriers=True),
-    "late_elimination": _composite(is_interleaved=False),
-    "reciprocal": _composite(reciprocal="hardware"),
-    "hardware": _composite(sines="hardware", reciprocal="hardware"),
-    "exact_sines": _composite(sines="exact"),
-    "direct_loads": _composite(rows_in_loops=False),
-}
-
-
-def random_inputs(count: int) -> list[np.ndarray]:
-    """The arguments of a kernel for the first arms: numbers, qpos, qvel, torque and load, each [count, width]."""
+def of_physics(substeps: int) -> Case:
+    """Random arms in random motion, under random torques and loads."""
     rng = np.random.default_rng(0)
-    with jax.default_device(jax.devices("cpu")[0]):
-        arms = jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(0), count))
-        numbers = np.asarray(jax.vmap(dynamics.joint_numbers)(arms), np.float32)
-    is_free = np.asarray(arms.is_free)
-    qpos, qvel, torque = rng.uniform(-1, 1, (3, count, MAX_JOINTS)) * np.array([3.0, 1.0, 1.0])[:, None, None]
-    load = rng.uniform(0.8, 1.2, (count, 2))
-    return [numbers, *(x.astype(np.float32) for x in (qpos, qvel * is_free, torque, load))]
-
-
-def reference(inputs: list[np.ndarray], substeps: int) -> np.ndarray:
-    """Velocities after a call in double precision, by the equations for CPUs."""
-    with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
-        arms = _numbers_as_arms(inputs[0].astype(float))
-        states = (x.astype(float) for x in inputs[1:4])
-        load = Load(*inputs[4].astype(float).T)
-        return np.asarray(jax.jit(jax.vmap(make_advance(TIMESTEP, substeps)))(arms, *states, load)[1])
-
-
-def _numbers_as_arms(numbers: np.ndarray) -> Any:
-    """Arms with these numbers, see `dynamics.joint_numbers`; what has no effect on the dynamics is 0."""
-    arms = jax.eval_shape(jax.vmap(random_arm), jax.random.split(jax.random.PRNGKey(0), len(numbers)))
-    arms = jax.tree.map(lambda x: np.zeros(x.shape), arms)
-    joints = dynamics.joint_of(np.moveaxis(numbers.reshape(len(numbers), MAX_JOINTS, -1), -1, 0))
-    return arms.replace(
-        twist=np.stack(joints.twist, -1),
-        offset=np.stack(joints.offset, -1),
-        reference=joints.reference,
-        first_moment=np.stack(joints.first, -1),
-        second_moment=np.stack(joints.second, -1),
-        armature=joints.armature - (1 - joints.is_free),
-        damping=joints.damping,
-        is_free=joints.is_free,
+    arms = jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(0), DRAWN))
+    qpos, qvel, torque = rng.uniform(-1, 1, (3, DRAWN, MAX_JOINTS)) * np.array([3.0, 1.0, 1.0])[:, None, None]
+    load = rng.uniform(0.8, 1.2, (DRAWN, 2))
+    inputs = [jax.vmap(dynamics.joint_numbers)(arms), qpos, qvel * np.asarray(arms.is_free), torque, load]
+    return Case(
+        composite_kernel.gpu_kernel(TIMESTEP, substeps),
+        physics.array_step(TIMESTEP, substeps),
+        [np.asarray(x, np.float32) for x in inputs],
+        lambda outputs: outputs[1],
+        substeps,
     )
 
 
-def run(kernel: Kernel, inputs: list[jax.Array], expected: np.ndarray, substeps: int) -> Row:
-    """Measures a kernel."""
-    timing = time_program(kernel, *inputs)
-    actual = np.asarray(timing.result[1][: len(expected)], float)
-    expected = expected[: len(actual)]
-    errors = np.abs(actual - expected).max(axis=1) / (1 + np.abs(expected).max(axis=1))
-    steps_per_s = len(inputs[0]) * substeps / timing.median
-    return {**timing.summary(), "steps_per_s": steps_per_s, "largest_error": float(errors.max())}
+def of_inner_loop(name: str, periods: int) -> Case:
+    """Random episodes of an environment near its start pose, with random targets."""
+    config, rng = env_config(name, world="hardware"), np.random.default_rng(0)
+    arm = build_arm(config.learner, config.limits)
+    plant, home = make_plant(config, arm), np.asarray(arm.embodiment.home)
+
+    def draw(key: jax.Array) -> inner_loop.Episode:
+        return plant.episode(draw_episode(config, len(home), key))
+
+    episodes = jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(0), DRAWN))
+    qpos, qvel, qacc, torque, action = rng.uniform(-1, 1, (5, DRAWN, len(home)))
+    reference = Reference(home + 0.1 * qpos, 0.1 * qvel, 0.1 * qacc)
+    state = inner_loop.LoopState(reference.qpos, reference.qvel, reference, torque)
+    parameters = JointParameters(*map(jnp.asarray, plant.constants.parameters))
+
+    def aim(action: jax.Array, reference: Reference) -> Target:
+        return action_target(config.control, action, reference, parameters, jnp)
+
+    state, target = jax.tree.map(jnp.asarray, (state, jax.vmap(aim)(action, reference)))
+    inputs = jax.vmap(inner_loop.flattened)(episodes, state, target)
+    arguments = config.control, plant.constants, periods
+    return Case(
+        inner_loop.gpu_kernel(*arguments),
+        inner_loop.array_loop(*arguments),
+        [np.asarray(x, np.float32) for x in inputs],
+        lambda outputs: outputs[0].reshape(len(outputs[0]), len(home), -1)[:, :, 1],
+        periods,
+    )
 
 
-def rows(variants: list[str], counts: list[int], substeps: int) -> Iterator[Row]:
-    """Measures variants one after the other, first all of them for the first number of arms."""
-    drawn = random_inputs(DRAWN)
-    expected = reference(drawn, substeps)
-    for arms in counts:
-        inputs = [jnp.asarray(np.resize(x, (arms, x.shape[1]))) for x in drawn]
-        for name in variants:
-            row: Row = {"variant": name, "arms": arms}
+def on_arrays(case: Case, dtype: Any) -> np.ndarray:
+    """Velocities of the drawn samples by the equations for CPUs."""
+    with jax.enable_x64(dtype == np.float64):
+        outputs = jax.jit(case.arrays)(*(jnp.asarray(x.T, dtype) for x in case.inputs))
+        return np.asarray(case.velocities(tuple(x.T for x in outputs)), float)
+
+
+def largest_error(actual: np.ndarray, expected: np.ndarray) -> float:
+    """Relative to 1 rad/s plus the largest velocity of each arm."""
+    return float((np.abs(actual - expected).max(axis=1) / (1 + np.abs(expected).max(axis=1))).max())
+
+
+def measure(case: Case, arms: int, expected: np.ndarray) -> Row:
+    """The row of a kernel."""
+    count = min(arms, DRAWN)
+    timing = time_program(case.kernel, *(jnp.asarray(np.resize(x, (arms, x.shape[1]))) for x in case.inputs))
+    actual = np.asarray(case.velocities(timing.result)[:count], float)
+    rates = {"steps_per_s": arms * case.steps / timing.median, "calls_per_s": arms / timing.median}
+    return {**timing.summary(), **rates, "largest_error": largest_error(actual, expected[:count])}
+
+
+def rows(kernels: list[str], counts: list[int], substeps: int, periods: int) -> Iterator[Row]:
+    """Measures the kernels one after the other."""
+    for name in kernels:
+        with jax.default_device(jax.devices("cpu")[0]):
+            case = of_physics(substeps) if name == "physics" else of_inner_loop(name, periods)
+            expected = on_arrays(case, np.float64)
+            array_error = largest_error(on_arrays(case, np.float32), expected)
+        for arms in counts:
+            row: Row = {"kernel": name, "arms": arms, "array_error": array_error}
             try:
-                row |= run(VARIANTS[name](substeps), inputs, expected, substeps)
+                row |= measure(case, arms, expected)
             except Exception as error:  # of compilers
                 row |= failure(error)
             print(row, flush=True)
@@ -122,11 +142,16 @@ def rows(variants: list[str], counts: list[int], substeps: int) -> Iterator[Row]
 def main() -> None:
     """Runs the benchmark."""
     options = make_parser(
-        "any_arm_kernel", __doc__, variants=VARIANTS, arms=[65_536, 524_288], substeps=10
+        "any_arm_kernel",
+        __doc__,
+        kernels=("physics", "panda7dof", "panda4dof"),
+        arms=[65_536, 524_288],
+        substeps=10,
+        periods=50,
     ).parse_args()
-    note = "physics steps of RK4; each arm has its own numbers; a call is a dispatch"
-    measured = rows(options.variants, options.arms, options.substeps)
-    collect(options, measured, "results", COLUMNS, note=note, timestep=TIMESTEP, substeps=options.substeps)
+    measured = rows(options.kernels, options.arms, options.substeps, options.periods)
+    settings = {"timestep": TIMESTEP, "substeps": options.substeps, "periods": options.periods}
+    collect(options, measured, "results", COLUMNS, **settings)
 
 
 if __name__ == "__main__":

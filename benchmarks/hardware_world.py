@@ -79,7 +79,7 @@ def _tracking_gap(evaluator: Evaluator, lead: int) -> float:
     """Held-out gap of commanding the velocity to the bound's pose some ticks later."""
     env = cast(HardwareEnv, evaluator.env)
     poses = jnp.asarray(evaluator.nearest_poses, jnp.float32)  # after each tick
-    limit = jnp.asarray(env.plant.constants.parameters.velocity[: env.learner.num_joints], jnp.float32)
+    limit = jnp.asarray(env.plant.constants.parameters.velocity, jnp.float32)
 
     def controller(state: Any) -> jax.Array:
         episode = state.pipeline_state

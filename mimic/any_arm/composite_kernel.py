@@ -8,49 +8,28 @@ joints 1200 for each of them, most of which move values of the joints between re
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.pallas import triton
 from jaxtyping import Array
 
 from mimic.any_arm import dynamics
 from mimic.any_arm.arrays import MAX_JOINTS
 from mimic.any_arm.dynamics import PLANE, JointNumbers, Motion
-from mimic.any_arm.trigonometry import RECIPROCALS, SINES
+from mimic.any_arm.trigonometry import cosine_and_sine
 from mimic.envs.dynamics import acceleration_field
 from mimic.envs.physics import runge_kutta
 from mimic.metric import fused_kernel
 from mimic.metric.spatial import ZERO, Scalar, Vector, add, minus, plus, times
 
-LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2, sample_axis=1)
+LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest measured on an H100
 
-
-class Form(NamedTuple):
-    """Forms of the same computation.
-
-    Attributes:
-      sines: see `SINES` of mimic/any_arm/trigonometry.py.
-      is_interleaved: whether a joint is eliminated as soon as its row of the inertia matrix is known.
-      rows_in_loops: whether loops load and store the rows of the joints.
-      reciprocal: see `RECIPROCALS` of mimic/any_arm/trigonometry.py.
-      has_barriers: whether the warps of a block wait for each other at each evaluation, so that they share instructions
-        in the cache.
-    """
-
-    sines: str = "polynomial"
-    is_interleaved: bool = True
-    rows_in_loops: bool = True
-    reciprocal: str = "exact"
-    has_barriers: bool = False
-
-
-FORM = Form()
+Rows = tuple[tuple[Scalar, ...], ...]  # values of each joint
 
 
 def gpu_kernel(
-    timestep: float, substeps: int, *, launch: fused_kernel.LaunchConfig = LAUNCH, form: Form = FORM
+    timestep: float, substeps: int, *, launch: fused_kernel.LaunchConfig = LAUNCH
 ) -> Callable[..., tuple[Array, ...]]:
     """A Pallas kernel of Runge-Kutta steps: (numbers, qpos, qvel, torque, load) -> (qpos, qvel).
 
@@ -61,70 +40,59 @@ def gpu_kernel(
       timestep: duration of a step [s].
       substeps: steps per call.
       launch: launch configuration of the kernel.
-      form: of the computation.
     """
 
     def body(inputs: Sequence[fused_kernel.Columns], outputs: Sequence[fused_kernel.Columns]) -> None:
-        *of_joints, load = inputs
-        ((mass,), (damping,)) = _read(load, load.width, form.rows_in_loops)
-        rows = read_rows(of_joints, form.rows_in_loops)
-        joints, force = [], []
-        for row in rows:
-            joint = loaded(dynamics.joint_of(row[: dynamics.NUMBERS]), mass, damping)
-            joints.append(joint)
-            force.append(row[-1] / mass)
+        numbers, *states, torque, load = inputs
+        ((mass, damping),) = read_rows(load, 1)
+        joints = [loaded(dynamics.joint_of(row), mass, damping) for row in read_rows(numbers)]
+        force = [x / mass for (x,) in read_rows(torque)]
 
         def qacc(qpos: tuple[Scalar, ...], qvel: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-            if form.has_barriers:
-                triton.debug_barrier()
-            return acceleration(joints, qpos, qvel, force, form=form)
+            return acceleration(joints, qpos, qvel, force)
 
-        qpos, qvel = (tuple(row[dynamics.NUMBERS + k] for row in rows) for k in range(2))
-        qpos, qvel = runge_kutta(qacc, qpos, qvel, timestep, substeps)
-        write_rows(outputs, tuple(zip(qpos, qvel, strict=True)), form.rows_in_loops)
+        qpos, qvel = (tuple(x for (x,) in read_rows(columns)) for columns in states)
+        for columns, values in zip(outputs, runge_kutta(qacc, qpos, qvel, timestep, substeps), strict=True):
+            write_rows(columns, [(x,) for x in values])
 
     return fused_kernel.by_columns(body, (MAX_JOINTS, MAX_JOINTS), launch=launch)
 
 
-Rows = tuple[tuple[Scalar, ...], ...]  # values of each joint
+def read_rows(columns: fused_kernel.Columns, count: int = MAX_JOINTS) -> Rows:
+    """The columns of an array as rows: those of the first joint, of the second, ...
 
-
-def read_rows(arrays: Sequence[fused_kernel.Columns], in_loop: bool = True) -> Rows:
-    """The columns of each joint of several arrays, whose columns are those of the first joint, of the second, ..."""
-    rows = [_read(columns, MAX_JOINTS, in_loop) for columns in arrays]
-    return tuple(tuple(x for row in of_joint for x in row) for of_joint in zip(*rows, strict=True))
-
-
-def _read(columns: fused_kernel.Columns, count: int, in_loop: bool) -> Rows:
-    """The columns of an array as `count` rows."""
+    Args:
+      columns: of the array.
+      count: of the joints.
+    """
     width = columns.width // count
-    if not in_loop:
-        return tuple(tuple(columns.read(jnp.asarray(width * i + k)) for k in range(width)) for i in range(count))
     empty = (jnp.zeros(columns.mask.shape, columns.ref.dtype),) * width
 
     def read_row(index: Array, rows: Rows) -> Rows:
         def read(k: Array, row: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
             return (*row[1:], columns.read(width * index + k))
 
-        row = jax.lax.fori_loop(0, width, read, empty) if width > 1 else read(jnp.asarray(0), empty)
-        return (*rows[1:], row)
+        return (*rows[1:], _loop(width, read, empty))
 
-    return jax.lax.fori_loop(0, count, read_row, (empty,) * count)
+    return _loop(count, read_row, (empty,) * count)
 
 
-def write_rows(arrays: Sequence[fused_kernel.Columns], rows: Rows, in_loop: bool = True) -> None:
-    """Writes the values of each joint: to each array one of them."""
+def write_rows(columns: fused_kernel.Columns, rows: Sequence[Sequence[Scalar]]) -> None:
+    """Writes the values of each joint, the inverse of `read_rows`."""
+    width = len(rows[0])
 
-    def write(index: Array, rows: Rows) -> Rows:
-        for columns, value in zip(arrays, rows[0], strict=True):
-            columns.write(index, value)
-        return (*rows[1:], rows[0])
+    def write_row(index: Array, rows: Rows) -> Rows:
+        def write(k: Array, row: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+            columns.write(width * index + k, row[0])
+            return (*row[1:], row[0])
 
-    if in_loop:
-        jax.lax.fori_loop(0, MAX_JOINTS, write, rows)
-    else:
-        for index in range(MAX_JOINTS):
-            write(jnp.asarray(index), rows[index:])
+        return (*rows[1:], _loop(width, write, rows[0]))
+
+    _loop(len(rows), write_row, tuple(tuple(row) for row in rows))
+
+
+def _loop(count: int, step: Callable[[Array, Any], Any], start: Any) -> Any:
+    return jax.lax.fori_loop(0, count, step, start) if count > 1 else step(jnp.asarray(0), start)
 
 
 def loaded(joint: JointNumbers, mass: Scalar, damping: Scalar) -> JointNumbers:
@@ -147,7 +115,6 @@ def acceleration(
     qvel: Sequence[Scalar],
     torque: Sequence[Scalar],
     base: Vector | None = None,
-    form: Form = FORM,
 ) -> tuple[Scalar, ...]:
     """Forward dynamics: joint accelerations [rad/s^2] under joint torques; 0 for locked joints.
 
@@ -157,16 +124,14 @@ def acceleration(
       qvel: joint velocities [rad/s]; those of locked joints are 0.
       torque: joint torques over the factor on masses [N m].
       base: acceleration of the base, in the frame of the first joint at angle 0 [m/s^2]: minus gravity. 0 where None.
-      form: of the computation.
     """
     # The angle of the first joint has no effect where the base is at rest.
     turns = [(1.0, 0.0)] if base is None else []
     for joint, angle in list(zip(joints, qpos, strict=True))[len(turns) :]:
-        turns.append(SINES[form.sines](angle + joint.reference))
+        turns.append(cosine_and_sine(angle + joint.reference))
     wrenches = _wrenches(joints, turns, qvel, base)
     rows = _inertia_and_bias(joints, turns, wrenches)
-    elimination = Elimination(len(joints), RECIPROCALS[form.reciprocal])
-    rows = rows if form.is_interleaved else list(rows)
+    elimination = _Elimination(len(joints))
     for k, (row, bias) in zip(reversed(range(len(joints))), rows, strict=True):
         elimination.add(k, row, joints[k].armature, torque[k] - joints[k].damping * qvel[k] - bias)
     return elimination.solution()
@@ -204,15 +169,14 @@ def _inertia_and_bias(joints: Sequence[JointNumbers], turns: Sequence[PLANE], wr
             masses = dynamics.moments_to_parent(joints[i], turns[i], *masses)
 
 
-class Elimination:
+class _Elimination:
     """Solves (M + armature) x = b by elimination from the last row to the first, when these become known.
 
     A row with an infinite pivot has no effect on the others, and its x is 0.
     """
 
-    def __init__(self, size: int, reciprocal: Callable[[Scalar], Scalar]) -> None:
+    def __init__(self, size: int) -> None:
         """Makes the changes of an empty system."""
-        self._reciprocal = reciprocal
         self._matrix: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(size)]  # decrease of each entry
         self._values: list[Scalar] = [0.0] * size
         self._factors: list[list[Scalar]] = [[] for _ in range(size)]
@@ -229,7 +193,7 @@ class Elimination:
         """
         row = [minus(x, change) for x, change in zip(row, self._matrix[k], strict=True)]
         value = minus(value, self._values[k])
-        inverse = self._reciprocal(plus(row[k], armature))
+        inverse = 1.0 / plus(row[k], armature)
         self._factors[k] = [times(inverse, x) for x in row[:k]]
         self._scaled[k] = times(inverse, value)
         for i, factor in enumerate(self._factors[k]):

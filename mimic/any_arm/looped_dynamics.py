@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.any_arm import dynamics
-from mimic.any_arm.arrays import MAX_JOINTS
 from mimic.envs.dynamics import acceleration_field
 from mimic.metric.spatial import add, vector
 
@@ -37,7 +36,7 @@ def acceleration(
       torque: joint torques [N m].
       mass: factor on the masses and inertias of all bodies.
       damping: factor on the damping of all joints.
-      base: three components of the base's acceleration, see mimic/any_arm/articulated_kernel.py; 0 where None.
+      base: three components of the base's acceleration, see mimic/any_arm/composite_kernel.py; 0 where None.
     """
     joints = dynamics.joint_of(jnp.moveaxis(numbers, 1, 0))
     angles = qpos + joints.reference
@@ -69,7 +68,8 @@ def _mass_matrix_and_bias(
 ) -> tuple[Float[Array, "joints joints *batch"], Joints]:
     """The inertia M without armature, as M[k, i] in entry [i, k >= i], and the Coriolis and centrifugal torques."""
     zero = jnp.zeros_like(turns[0][0])
-    is_own = jnp.eye(MAX_JOINTS, dtype=bool).reshape(MAX_JOINTS, MAX_JOINTS, *[1] * zero.ndim)
+    joints = len(numbers)
+    is_own = jnp.eye(joints, dtype=bool).reshape(joints, joints, *[1] * zero.ndim)
 
     def inward(carry: Any, joint: Any) -> Any:
         # Wrenches [joints, *batch] of unit accelerations about the distal joints, and the wrench of the bias forces.
@@ -93,16 +93,17 @@ def _mass_matrix_and_bias(
 
 def _solve(matrix: Float[Array, "joints joints *batch"], armature: Joints, values: Joints, is_free: Joints) -> Joints:
     """X of (M + armature) x = b by elimination from the last joint to the first; 0 for locked joints."""
-    matrix = matrix.at[jnp.arange(MAX_JOINTS), jnp.arange(MAX_JOINTS)].add(armature)
+    indices = jnp.arange(len(armature))
+    matrix = matrix.at[indices, indices].add(armature)
     scaled, factors = [], []  # pivots are divided by once, and locked joints have a factor of 0
-    for k in reversed(range(MAX_JOINTS)):
+    for k in reversed(range(len(armature))):
         inverse, column = is_free[k] / matrix[k, k], matrix[:k, k]
         factors.insert(0, inverse * column)
         scaled.insert(0, inverse * values[k])
         values = values[:k] - factors[0] * values[k]
         matrix = matrix[:k, :k] - factors[0][:, None] * column
     solution: list[Array] = []
-    for k in range(MAX_JOINTS):
+    for k in range(len(armature)):
         value = scaled[k]
         for i in range(k):
             value = value - factors[k][i] * solution[i]

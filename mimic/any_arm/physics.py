@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm import articulated_kernel, dynamics, looped_dynamics
+from mimic.any_arm import composite_kernel, dynamics, looped_dynamics
 from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays
 from mimic.envs.physics import Load, runge_kutta
 from mimic.metric import fused_kernel
@@ -25,8 +25,8 @@ def make_advance(timestep: float, substeps: int) -> AdvanceAny:
       timestep: duration of a step [s].
       substeps: steps per call.
     """
-    kernel = articulated_kernel.gpu_kernel(timestep, substeps)
-    plain = jax.jit(_array_step(timestep, substeps))
+    kernel = composite_kernel.gpu_kernel(timestep, substeps)
+    plain = jax.jit(array_step(timestep, substeps))
     step = fused_kernel.batched_by(kernel, plain, fused_kernel.with_batch_last(plain))
 
     def advance(
@@ -44,7 +44,7 @@ def make_advance(timestep: float, substeps: int) -> AdvanceAny:
     return advance
 
 
-def _array_step(timestep: float, substeps: int) -> Callable[..., tuple[Array, ...]]:
+def array_step(timestep: float, substeps: int) -> Callable[..., tuple[Array, ...]]:
     """The steps on arrays [size, *batch], for other devices and for derivatives."""
 
     def step(numbers: Array, qpos: Array, qvel: Array, torque: Array, load: Array) -> tuple[Array, ...]:

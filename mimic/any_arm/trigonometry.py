@@ -5,11 +5,9 @@ angles at a time, and an arm's angles are far below 1e5 rad.
 """
 
 import math
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.pallas import triton
 
 from mimic.metric.spatial import Scalar
 
@@ -20,38 +18,15 @@ _SINE = -0.1666665709647155, 0.008333017290777003, -0.00019806615145773416, 2.60
 _COSINE = -0.5, 0.041666655773129904, -0.0013888569161145678, 2.4769304194813876e-05, -2.619381425997269e-07
 
 
-def exact(angle: Scalar) -> tuple[Scalar, Scalar]:
-    """Cosine and sine of the library."""
-    return jnp.cos(angle), jnp.sin(angle)
-
-
-def polynomial(angle: Scalar) -> tuple[Scalar, Scalar]:
+def cosine_and_sine(angle: Scalar) -> tuple[Scalar, Scalar]:
     """Cosine and sine by polynomials in single precision, to 1.2e-7 for angles up to 1e5 rad; else of the library."""
     if angle.dtype != jnp.float32:
-        return exact(angle)
+        return jnp.cos(angle), jnp.sin(angle)
     rest, sign = _rest(angle)
     square = rest * rest
     cosine = 1.0 + square * _horner(_COSINE, square)
     sine = rest + rest * (square * _horner(_SINE, square))
     return _signed(cosine, sign), _signed(sine, sign)
-
-
-def hardware(angle: Scalar) -> tuple[Scalar, Scalar]:
-    """Cosine and sine of the GPU's special function unit, to 5e-7; for kernels alone."""
-    rest, sign = _rest(angle)
-    cosine, sine = (_instruction(name, rest) for name in ("cos.approx.f32", "sin.approx.f32"))
-    return _signed(cosine, sign), _signed(sine, sign)
-
-
-SINES: dict[str, Callable[[Scalar], tuple[Scalar, Scalar]]] = {
-    "exact": exact,
-    "polynomial": polynomial,
-    "hardware": hardware,
-}
-RECIPROCALS: dict[str, Callable[[Scalar], Scalar]] = {
-    "exact": lambda x: 1.0 / x,
-    "hardware": lambda x: _instruction("rcp.approx.ftz.f32", x),  # to one unit in the last place; for kernels alone
-}
 
 
 def _rest(angle: Scalar) -> tuple[Scalar, Scalar]:
@@ -72,9 +47,3 @@ def _horner(coefficients: tuple[float, ...], x: Scalar) -> Scalar:
     for coefficient in coefficients[-2::-1]:
         result = coefficient + x * result
     return result
-
-
-def _instruction(name: str, angle: Scalar) -> Scalar:
-    shape = jax.ShapeDtypeStruct(angle.shape, angle.dtype)
-    asm = f"{name} $0, $1;"
-    return triton.elementwise_inline_asm(asm, args=[angle], constraints="=f,f", pack=1, result_shape_dtypes=[shape])[0]

@@ -113,9 +113,9 @@ def _clearance_graph(env: HardwareEnv) -> bytes:
 
 def _description(env: HardwareEnv, steps: int) -> dict[str, Any]:
     """What `controller.json` has, see `mimic.deploy.bundle.Bundle`."""
-    config, joints = env.config, env.learner.num_joints
+    config = env.config
     assert config.control in joint_control.MODES
-    parameters = JointParameters(*(np.asarray(x, float)[:joints] for x in env.plant.constants.parameters))
+    parameters = JointParameters(*(np.asarray(x, float) for x in env.plant.constants.parameters))
     return {
         "mimic_version": VERSION,
         "env": config.name,

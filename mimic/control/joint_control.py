@@ -203,7 +203,9 @@ def friction_torque(qvel: Array, level: Array, rate: Array, xp: Any) -> Array:
       rate: [s/rad].
       xp: array library.
     """
-    return level * xp.tanh(rate * qvel)
+    # The tanh of CUDA's library has a branch. The bound keeps the exponential finite, where tanh is 1.
+    growth = xp.exp(2.0 * _bounded(rate * qvel, 20.0, xp))
+    return level * (1.0 - 2.0 / (1.0 + growth))
 
 
 def _bounded(value: Array, bound: Array, xp: Any) -> Array:

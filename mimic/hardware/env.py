@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mimic.any_arm.arrays import MAX_JOINTS
 from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
 from mimic.envs.arm_state import ArmState
@@ -55,14 +54,14 @@ class HardwareEnv(ImitationEnv):
     def _set_physics(self, physics: PhysicsChoice) -> None:
         config, arm = self.config, self.arm
         self.physics, self.config = physics, dataclasses.replace(config, physics=physics.name)
-        self.plant, joints = make_plant(config, arm), self.learner.num_joints
+        self.plant = make_plant(config, arm)
         make = self._make_fused_loop if physics.name == "fused" else self._make_mjx_loop
         waiting = round(config.world.action_latency / PERIOD)
         self._waiting_loop = make(waiting) if waiting else None
         self._acting_loop = make(round(config.control_dt / PERIOD) - waiting)
         parameters = self.plant.constants.parameters
-        self.torque_scale = jnp.asarray(parameters.torque[:joints], jnp.float32)
-        self._parameters = JointParameters(*(jnp.asarray(x[:joints], jnp.float32) for x in parameters))
+        self.torque_scale = jnp.asarray(parameters.torque, jnp.float32)
+        self._parameters = JointParameters(*(jnp.asarray(x, jnp.float32) for x in parameters))
 
     def _make_mjx_loop(self, periods: int) -> MjxLoop:
         world = self.config.world
@@ -70,12 +69,10 @@ class HardwareEnv(ImitationEnv):
         return make_mjx_loop(self.config.control, self.plant, model, periods)
 
     def _make_fused_loop(self, periods: int) -> MjxLoop:
-        """The fused loop on vectors without empty slots."""
-        joints, loop = self.learner.num_joints, make_inner_loop(self.config.control, self.plant.constants, periods)
+        loop = make_inner_loop(self.config.control, self.plant.constants, periods)
 
         def run(draw: Draw, state: LoopState, target: Target) -> LoopState:
-            state, target = jax.tree.map(lambda x: jnp.pad(x, (0, MAX_JOINTS - joints)), (state, target))
-            return jax.tree.map(lambda x: x[:joints], loop(self.plant.episode(draw), state, target))
+            return loop(self.plant.episode(draw), state, target)
 
         return run
 
@@ -106,9 +103,7 @@ class HardwareEnv(ImitationEnv):
         history = jnp.tile(measured, (MAX_DELAY + 1, 1))
         is_angle = self.config.control in ("joint_position", "joint_impedance")
         target = Target(reference.qpos if is_angle else zero, jnp.ones_like(qpos))  # the arm stays where it is
-        return HardwareState(
-            **fields, sent=actions[:SENT_ACTIONS], arrived=actions, target=target, measured=history
-        )
+        return HardwareState(**fields, sent=actions[:SENT_ACTIONS], arrived=actions, target=target, measured=history)
 
     def _simulate(
         self, before: ArmState, command: Float[Array, " numbers"]

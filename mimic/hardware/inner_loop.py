@@ -10,16 +10,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.any_arm import articulated_kernel, dynamics, looped_dynamics
-from mimic.any_arm.arrays import MAX_JOINTS
+from mimic.any_arm import composite_kernel, dynamics, looped_dynamics
+from mimic.any_arm.composite_kernel import read_rows, write_rows
 from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
 from mimic.metric import fused_kernel
-
-_NO_LOAD = (1.0, 1.0)  # factors of `articulated_kernel.acceleration`: the numbers have the masses of the episode
 
 
 class JointConstants(NamedTuple):
@@ -79,28 +76,33 @@ InnerLoop = Callable[[Episode, LoopState, Target], LoopState]
 def make_inner_loop(mode: str, constants: JointConstants, periods: int) -> InnerLoop:
     """Makes a function (episode, state, target) -> state after `periods` ms.
 
-    It takes one sample, and is a single kernel on NVIDIA GPUs if it is batched by `jax.vmap`. All vectors have a number
-    for each of the 8 slots of a joint.
+    It takes one sample, and is a single kernel on NVIDIA GPUs if it is batched by `jax.vmap`.
 
     Args:
       mode: one of `joint_control.MODES`.
       constants: of the joints.
       periods: duration [ms].
     """
-    plain = jax.jit(_array_loop(mode, constants, periods))
+    plain = jax.jit(array_loop(mode, constants, periods))
     kernel = gpu_kernel(mode, constants, periods)
     function = fused_kernel.batched_by(kernel, plain, fused_kernel.with_batch_last(plain))
 
     def inner_loop(episode: Episode, state: LoopState, target: Target) -> LoopState:
-        motion = jnp.concatenate([state.qpos, state.qvel, *state.reference, state.torque])
-        drive = jnp.concatenate([episode.gain, episode.friction, episode.bias])
-        (after,) = function(episode.numbers, episode.base, drive, motion, jnp.concatenate(target))
-        return _state_of(jnp.split(after, len(motion) // MAX_JOINTS))
+        (after,) = function(*flattened(episode, state, target))
+        return _state_of(after.reshape(-1, _ROWS).T)
 
     return inner_loop
 
 
-def _state_of(rows: Sequence[Any]) -> LoopState:
+def flattened(episode: Episode, state: LoopState, target: Target) -> tuple[Array, ...]:
+    """The arguments of a sample as vectors, with the numbers of each joint together, as `gpu_kernel` takes them."""
+    drive = episode.gain, episode.friction, episode.bias
+    motion = state.qpos, state.qvel, *state.reference, state.torque
+    by_joint = (jnp.stack(arrays, axis=1).ravel() for arrays in (drive, motion, target))
+    return episode.numbers, episode.base, *by_joint
+
+
+def _state_of(rows: Any) -> LoopState:
     qpos, qvel, *reference, torque = rows
     return LoopState(qpos, qvel, Reference(*reference), torque)
 
@@ -142,25 +144,27 @@ def stop_torque(qpos: Any, qvel: Any, constants: JointConstants) -> Any:
     return -constants.stop_stiffness * beyond - damping * qvel
 
 
-def _array_loop(mode: str, constants: JointConstants, periods: int) -> Callable[..., tuple[Array]]:
+def array_loop(mode: str, constants: JointConstants, periods: int) -> Callable[..., tuple[Array]]:
     """The loop on arrays [size, *batch], for CPUs and for derivatives."""
+    joints = len(constants.minimum)
 
     def loop(numbers: Array, base: Array, drive: Array, motion: Array, target: Array) -> tuple[Array]:
         batch = numbers.shape[1:]
-        by_joint = numbers.reshape(MAX_JOINTS, dynamics.NUMBERS, *batch)
-        drives, targets = (list(x.reshape(-1, MAX_JOINTS, *batch)) for x in (drive, target))
-        by_row = jax.tree.map(lambda x: jnp.asarray(x, motion.dtype).reshape(MAX_JOINTS, *[1] * len(batch)), constants)
+        by_joint = numbers.reshape(-1, dynamics.NUMBERS, *batch)
+        by_row = (jnp.moveaxis(x.reshape(joints, -1, *batch), 1, 0) for x in (drive, motion, target))
+        drives, motions, targets = map(list, by_row)
+        parameters = jax.tree.map(lambda x: jnp.asarray(x, motion.dtype).reshape(joints, *[1] * len(batch)), constants)
         one = jnp.ones((), motion.dtype)
 
         def period(_: Any, state: LoopState) -> LoopState:
-            reference, torque, acting = control(mode, by_row, state, Target(*targets), drives)
+            reference, torque, acting = control(mode, parameters, state, Target(*targets), drives)
             qacc = looped_dynamics.acceleration(by_joint, state.qpos, state.qvel, acting, one, one, tuple(base))
             qvel = state.qvel + PERIOD * qacc
             return LoopState(state.qpos + PERIOD * qvel, qvel, reference, torque)
 
-        state = _state_of(list(motion.reshape(_ROWS, MAX_JOINTS, *batch)))
-        after = jax.lax.fori_loop(0, periods, period, state)
-        return (jnp.concatenate([after.qpos, after.qvel, *after.reference, after.torque]),)
+        after = jax.lax.fori_loop(0, periods, period, _state_of(motions))
+        rows = jnp.stack([after.qpos, after.qvel, *after.reference, after.torque], axis=1)
+        return (rows.reshape(motion.shape),)
 
     return loop
 
@@ -169,60 +173,37 @@ def gpu_kernel(
     mode: str,
     constants: JointConstants,
     periods: int,
-    launch: fused_kernel.LaunchConfig = articulated_kernel.LAUNCH,
+    launch: fused_kernel.LaunchConfig = composite_kernel.LAUNCH,
 ) -> Callable[..., tuple[Array, ...]]:
-    """The loop as a Pallas kernel on arrays [samples, width], with loops over the joints."""
-    leaves, structure = jax.tree.flatten(constants)
-    table = np.stack([np.asarray(leaf, float) for leaf in leaves], axis=1).ravel()  # the numbers of a joint together
+    """The loop as a Pallas kernel on arrays [samples, width]: (numbers, base, drive, motion, target) -> (motion,).
 
-    def body(inputs: Sequence[Any], outputs: Sequence[Any], bound_ref: Any, table_ref: Any) -> None:
-        numbers, base, drive, motion, target = inputs
-        loop = articulated_kernel.rotating_rows(bound_ref[jnp.asarray(0)], 1)
-        base_acceleration = tuple(base.read(jnp.asarray(k)) for k in range(3))
+    See `flattened`. As in mimic/any_arm/composite_kernel.py only loading and storing are loops over the joints. What is
+    the same in all episodes is part of the code, and what is constant in an episode is loaded once.
+    """
+    count = len(constants.minimum)
+    by_joint = [jax.tree.map(lambda x, joint=joint: float(x[joint]), constants) for joint in range(count)]
 
-        def joint_at(index: Array) -> dynamics.JointNumbers:
-            return dynamics.joint_of([numbers.read(dynamics.NUMBERS * index + k) for k in range(dynamics.NUMBERS)])
+    def body(inputs: Sequence[fused_kernel.Columns], outputs: Sequence[fused_kernel.Columns]) -> None:
+        numbers, base, *of_joints = inputs
+        (base_acceleration,) = read_rows(base, 1)
+        joints = [dynamics.joint_of(row) for row in read_rows(numbers, count)]
+        joints = [composite_kernel.loaded(joint, 1.0, 1.0) for joint in joints]  # they have the masses of the episode
+        drives, motions, targets = (read_rows(columns, count) for columns in of_joints)
 
-        def controlled(index: Array, carry: Any, row: tuple[Any, ...]) -> Any:
-            of_joint = jax.tree.unflatten(structure, [table_ref[len(leaves) * index + k] for k in range(len(leaves))])
-            drives = [drive.read(MAX_JOINTS * k + index) for k in range(3)]
-            targets = Target(target.read(index), target.read(MAX_JOINTS + index))
-            state = _state_of(row[:_ROWS])
-            reference, torque, acting = control(mode, of_joint, state, targets, drives)
-            return carry, (state.qpos, state.qvel, *reference, torque, acting)
+        def period(_: Any, states: tuple[LoopState, ...]) -> tuple[LoopState, ...]:
+            controlled = []
+            for joint, state, target, drive in zip(by_joint, states, targets, drives, strict=True):
+                controlled.append(control(mode, joint, state, Target(*target), drive))
+            qpos, qvel, *_ = zip(*states, strict=True)
+            acting = [torque for _, _, torque in controlled]
+            qacc = composite_kernel.acceleration(joints, qpos, qvel, acting, base_acceleration)
+            after = []
+            for state, (reference, torque, _), a in zip(states, controlled, qacc, strict=True):
+                speed = state.qvel + PERIOD * a
+                after.append(LoopState(state.qpos + PERIOD * speed, speed, reference, torque))
+            return tuple(after)
 
-        def period(_: Any, rows: Any) -> Any:
-            _, rows = loop(controlled, jnp.zeros_like(rows[0][0]), rows, extra=1)
-            qpos, qvel, acting = (tuple(row[k] for row in rows) for k in (0, 1, _ROWS))
-            qacc = articulated_kernel.acceleration(joint_at, loop, qpos, qvel, acting, _NO_LOAD, base_acceleration)
-            return tuple(_moved(row, a) for row, a in zip(rows, qacc, strict=True))
+        states = jax.lax.fori_loop(0, periods, period, tuple(_state_of(row) for row in motions))
+        write_rows(outputs[0], [jax.tree.leaves(state) for state in states])
 
-        rows = tuple(
-            tuple(motion.read(jnp.asarray(MAX_JOINTS * k + joint)) for k in range(_ROWS)) for joint in range(MAX_JOINTS)
-        )
-        for joint, row in enumerate(jax.lax.fori_loop(0, periods, period, rows)):
-            for k, value in enumerate(row):
-                outputs[0].write(jnp.asarray(MAX_JOINTS * k + joint), value)
-
-    # A bound that is loaded keeps the compiler from unrolling the loops over the joints.
-    bound = np.full(1, MAX_JOINTS, np.int32)
-    return fused_kernel.by_columns(body, (_ROWS * MAX_JOINTS,), bound, table, launch=launch)
-
-
-def _moved(row: tuple[Any, ...], qacc: Any) -> tuple[Any, ...]:
-    """The rows of a joint after the step of the arm, without the acting torque."""
-    qpos, qvel, *others = row[:_ROWS]
-    qvel = qvel + PERIOD * qacc
-    return (qpos + PERIOD * qvel, qvel, *others)
-
-
-def padded(constants: JointConstants) -> JointConstants:
-    """The constants with harmless numbers in the empty slots: 1, and -1 for minima."""
-
-    def fill(values: Any, empty: float = 1.0) -> np.ndarray:
-        values = np.asarray(values, float)
-        return np.concatenate([values, np.full(MAX_JOINTS - len(values), empty)])
-
-    filled = jax.tree.map(fill, constants)
-    parameters = filled.parameters._replace(lower=fill(constants.parameters.lower, -1.0))
-    return filled._replace(parameters=parameters, minimum=fill(constants.minimum, -1.0))
+    return fused_kernel.by_columns(body, (_ROWS * count,), launch=launch)

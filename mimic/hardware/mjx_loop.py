@@ -4,12 +4,13 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 from mujoco import mjx
 
 from mimic.control import joint_control
 from mimic.control.joint_control import Target
-from mimic.hardware.inner_loop import JointConstants, LoopState, control
+from mimic.hardware.inner_loop import LoopState, control
 from mimic.hardware.mujoco_world import MujocoWorld
 from mimic.hardware.plant import Draw, Plant
 
@@ -17,7 +18,7 @@ MjxLoop = Callable[[Draw, LoopState, Target], LoopState]
 
 
 def make_mjx_loop(mode: str, plant: Plant, world: MujocoWorld, periods: int) -> MjxLoop:
-    """Makes a function (draw, state, target) -> state after `periods` ms; vectors are [joints], without empty slots.
+    """Makes a function (draw, state, target) -> state after `periods` ms; vectors are [joints].
 
     Args:
       mode: one of `joint_control.MODES`.
@@ -26,12 +27,9 @@ def make_mjx_loop(mode: str, plant: Plant, world: MujocoWorld, periods: int) -> 
       periods: duration [ms].
     """
     assert mode in joint_control.MODES
-    joints = world.model.nv
-    constants: JointConstants = jax.tree.map(lambda x: x[:joints], plant.constants)
     # The stops are those of MuJoCo.
-    constants = constants._replace(
-        stop_stiffness=0.0 * constants.stop_stiffness, stop_damping=0.0 * constants.stop_damping
-    )
+    none = np.zeros(world.model.nv)
+    constants = plant.constants._replace(stop_stiffness=none, stop_damping=none)
     device = jax.local_devices()[0]
     parts = jax.device_get((mjx.put_model(world.model, device=device), mjx.make_data(world.model, device=device)))
 

@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays, base_in_world, body_moments, moments_of_joints
+from mimic.any_arm.arrays import ArmArrays, arm_arrays, base_in_world, body_moments, moments_of_joints
 from mimic.any_arm.dynamics import NUMBERS, joint_numbers
 from mimic.arms.arm import Arm, torque_scale
 from mimic.arms.drives import drives_of
@@ -18,7 +18,7 @@ from mimic.control.limits import joint_parameters
 from mimic.envs.config import EnvConfig
 from mimic.envs.physics import Load
 from mimic.envs.world import WorldConfig
-from mimic.hardware.inner_loop import Episode, JointConstants, padded
+from mimic.hardware.inner_loop import Episode, JointConstants
 
 GRAVITY = 9.81  # m/s^2
 # Mechanical stops as critically damped springs: stiff, and slow enough for steps of 1 ms.
@@ -85,17 +85,17 @@ class Plant:
     """An arm with its drives, as the inner loop simulates it.
 
     Attributes:
-      constants: of the joints, with empty slots.
-      numbers: [slots, numbers] `joint_numbers` without masses.
-      moments: [joints + 3, slots, 7] moments of mass of each joint for a body of factor 1, and for the payload: for its
-        mass, mass times lever, and mass times the square of the lever.
+      constants: of the joints.
+      numbers: [joints, numbers] `joint_numbers` without masses.
+      moments: [joints + 3, joints, 7] moments of mass of each joint for a body of factor 1, and for the payload: for
+        its mass, mass times lever, and mass times the square of the lever.
       upward: [3] the vertical in the frame of the first joint at angle 0.
       friction: [joints] friction torque at high speed [N m].
     """
 
     constants: JointConstants
-    numbers: Float[np.ndarray, "slots numbers"]
-    moments: Float[np.ndarray, "bodies slots moments"]
+    numbers: Float[np.ndarray, "joints numbers"]
+    moments: Float[np.ndarray, "bodies joints moments"]
     upward: Float[np.ndarray, "3"]
     friction: Float[np.ndarray, " joints"]
 
@@ -110,13 +110,12 @@ class Plant:
         numbers = jnp.asarray(self.numbers, factors.dtype)
         damping = draw.load.damping * numbers[:, 13]
         numbers = numbers.at[:, 5:12].set(moments).at[:, 13].set(damping).at[:, 12].add(PERIOD * damping)
-        slots = MAX_JOINTS - len(draw.gain)
         return Episode(
             numbers=numbers.ravel(),
             base=GRAVITY * draw.gravity_error * jnp.asarray(self.upward, factors.dtype),
-            gain=jnp.pad(draw.gain, (0, slots)),
-            friction=jnp.pad(draw.friction * self.friction, (0, slots)).astype(factors.dtype),
-            bias=jnp.pad(draw.bias, (0, slots)),
+            gain=draw.gain,
+            friction=(draw.friction * self.friction).astype(factors.dtype),
+            bias=draw.bias,
         )
 
 
@@ -148,8 +147,8 @@ def make_plant(config: EnvConfig, arm: Arm) -> Plant:
     )
     vertical = base_in_world(arm)[2, :3]  # in the base frame
     return Plant(
-        constants=padded(constants),
-        numbers=np.asarray(joint_numbers(arrays), float).reshape(MAX_JOINTS, NUMBERS),
+        constants=constants,
+        numbers=np.asarray(joint_numbers(arrays), float).reshape(-1, NUMBERS)[: len(inertia)],
         moments=_moments(arm, arrays),
         upward=np.asarray(arrays.base_rotation).T @ vertical,
         friction=np.asarray(drives.friction.level, float),
@@ -181,8 +180,7 @@ def _moments(arm: Arm, arrays: ArmArrays) -> np.ndarray:
             of_body[index] = masses[index]
         else:
             of_body[-1] = payloads[index - len(masses)]
-        moments = np.concatenate(moments_of_joints(of_body, rotations, origins), axis=1)
-        bodies.append(np.pad(moments, ((0, MAX_JOINTS - len(moments)), (0, 0))))
+        bodies.append(np.concatenate(moments_of_joints(of_body, rotations, origins), axis=1))
     return np.stack(bodies)
 
 

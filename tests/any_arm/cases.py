@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mimic.any_arm import articulated_kernel, dynamics, looped_dynamics
+from mimic.any_arm import composite_kernel, dynamics, looped_dynamics
 from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.arms.arm import Arm
 from mimic.arms.embodiment import load_arm
@@ -65,20 +65,10 @@ def looped(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: A
     return looped_dynamics.acceleration(numbers, qpos, qvel, torque, jnp.asarray(mass), jnp.asarray(damping), base)
 
 
-def articulated(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: Any = None):
+def unrolled(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: Any = None):
     """Accelerations of an arm by the equations of the GPU kernel."""
-    numbers = dynamics.joint_numbers(arm).reshape(MAX_JOINTS, dynamics.NUMBERS)
-    return jnp.stack(
-        articulated_kernel.acceleration(
-            lambda index: dynamics.joint_of(numbers[index]),
-            articulated_kernel.rotating_rows(MAX_JOINTS, 1),
-            tuple(qpos),
-            tuple(qvel),
-            tuple(torque),
-            (mass, damping),
-            base,
-        )
-    )
+    joints = [composite_kernel.loaded(joint, mass, damping) for joint in dynamics.unpacked(dynamics.joint_numbers(arm))]
+    return jnp.stack(composite_kernel.acceleration(joints, tuple(qpos), tuple(qvel), tuple(torque / mass), base))
 
 
 def padded(values) -> Any:

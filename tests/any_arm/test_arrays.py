@@ -11,7 +11,7 @@ from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints,
 from mimic.any_arm.dynamics import torque_of_arm
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.arm import ArmConfig, build_arm
-from tests.any_arm.cases import acceleration, arm_of, articulated, assert_near, looped, padded, random_motion
+from tests.any_arm.cases import acceleration, arm_of, assert_near, looped, padded, random_motion, unrolled
 from tests.helpers import random_arms
 
 _BODY = '<inertial pos="0.1 0.02 -0.03" mass="{}" diaginertia="0.002 0.003 0.004"/>'
@@ -53,7 +53,7 @@ HARD_AXES = {
 }
 
 
-FORMS = [jax.jit(form) for form in (articulated, looped)]  # of all cases, so that each is compiled once
+FORMS = [jax.jit(form) for form in (unrolled, looped)]  # of all cases, so that each is compiled once
 
 
 @pytest.mark.parametrize("name", HARD_AXES)

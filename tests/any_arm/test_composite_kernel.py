@@ -1,32 +1,41 @@
-"""The unrolled GPU kernel of any arm, interpreted on the CPU."""
+"""The GPU kernel of any arm, interpreted on the CPU."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.any_arm import composite_kernel, trigonometry
-from mimic.any_arm.arrays import MAX_JOINTS
+from mimic.any_arm.arrays import MAX_JOINTS, lock_joints
+from mimic.any_arm.composite_kernel import gpu_kernel
 from mimic.any_arm.dynamics import joint_numbers
 from mimic.any_arm.physics import make_advance
+from mimic.any_arm.trigonometry import cosine_and_sine
+from mimic.envs.physics import Load
 from mimic.metric.fused_kernel import LaunchConfig
-from tests.any_arm.test_articulated_kernel import SUBSTEPS, TIMESTEP, batch  # noqa: F401
-from tests.helpers.lowering import gpu_program
+from tests.any_arm.cases import Batch, random_source
 
-LAUNCHES = [LaunchConfig(block=32, warps=1, sample_axis=axis) for axis in (0, 1)]
-FORMS = [
-    composite_kernel.Form(is_interleaved=True),
-    composite_kernel.Form(is_interleaved=False),
-    composite_kernel.Form(rows_in_loops=False),
-]
+TIMESTEP, SUBSTEPS = 0.005, 2
+COUNT = 40  # of arms: one full block of 32 and a partial one
+BY_ROWS, BY_COLUMNS = (LaunchConfig(block=32, warps=1, sample_axis=axis) for axis in (0, 1))
 
 
-@pytest.mark.parametrize(("launch", "form"), [(LAUNCHES[0], FORMS[0]), *((LAUNCHES[1], form) for form in FORMS)])
-def test_the_kernel_equals_the_looped_form(x64, interpreted, batch, launch, form):  # noqa: F811
+@pytest.fixture(scope="module")
+def batch():
+    """Random arms of 1 to 8 joints, a third of which are locked, in light motion, and the load of each."""
+    with jax.enable_x64(True):
+        batch, rng = Batch([random_source(seed) for seed in range(COUNT)]), np.random.default_rng(0)
+        arms = jax.vmap(lock_joints)(batch.arrays, rng.random((COUNT, MAX_JOINTS)) < 1 / 3)
+        arms = jax.tree.map(np.asarray, arms)
+        is_free = arms.is_free
+        torque, load = rng.normal(size=(COUNT, MAX_JOINTS)), rng.uniform(0.5, 2, (2, COUNT))
+        return arms, batch.qpos, 0.3 * batch.qvel * is_free, 0.3 * torque, Load(*load)
+
+
+def test_the_kernel_equals_the_looped_form(x64, interpreted, batch):
     arms, qpos, qvel, torque, load = batch
     assert (np.asarray(arms.is_free).sum(axis=1) < MAX_JOINTS).any() and (arms.is_free[:, 0] == 0).any()
-    kernel = composite_kernel.gpu_kernel(TIMESTEP, SUBSTEPS, launch=launch, form=form)
-    actual = jax.jit(kernel)(jax.vmap(joint_numbers)(arms), *map(jnp.asarray, (qpos, qvel, torque)), np.stack(load, 1))
+    kernel = jax.jit(gpu_kernel(TIMESTEP, SUBSTEPS, launch=BY_COLUMNS))
+    actual = kernel(jax.vmap(joint_numbers)(arms), *map(jnp.asarray, (qpos, qvel, torque)), np.stack(load, 1))
     expected = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(*batch)
     for values, reference in zip(actual, expected, strict=True):
         scale = 1 + np.abs(reference).max(axis=1, keepdims=True)
@@ -37,31 +46,23 @@ def test_the_kernel_equals_the_looped_form(x64, interpreted, batch, launch, form
     assert not np.asarray(actual[1])[rests].any()
 
 
-def test_single_precision(interpreted, batch):  # noqa: F811
+def test_single_precision(interpreted, batch):
     """With polynomials for cosines and sines, against double precision."""
     with jax.enable_x64(True):
         expected = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(*batch)
     arms, qpos, qvel, torque, load = jax.tree.map(lambda x: np.asarray(x, np.float32), batch)
-    kernel = composite_kernel.gpu_kernel(TIMESTEP, SUBSTEPS, launch=LAUNCHES[1])
-    actual = jax.jit(kernel)(jax.vmap(joint_numbers)(arms), qpos, qvel, torque, np.stack(load, 1))
+    kernel = jax.jit(gpu_kernel(TIMESTEP, SUBSTEPS, launch=BY_ROWS))
+    actual = kernel(jax.vmap(joint_numbers)(arms), qpos, qvel, torque, np.stack(load, 1))
     for values, reference in zip(actual, expected, strict=True):
         scale = 1 + np.abs(reference).max(axis=1, keepdims=True)
         np.testing.assert_allclose(values / scale, reference / scale, rtol=0, atol=1e-3)
-
-
-def test_forms_for_gpus_alone_lower(batch):  # noqa: F811
-    """They use instructions that the CPU lacks."""
-    form = composite_kernel.Form("hardware", reciprocal="hardware", has_barriers=True)
-    arms, *states, load = jax.tree.map(lambda x: np.asarray(x, np.float32), batch)
-    kernel = jax.jit(composite_kernel.gpu_kernel(TIMESTEP, SUBSTEPS, form=form))
-    assert "triton" in gpu_program(kernel, jax.vmap(joint_numbers)(arms), *states, np.stack(load, 1))
 
 
 @pytest.mark.parametrize("largest", [4.0, 1e3, 1e5])
 def test_polynomials(largest):
     angle = np.random.default_rng(0).uniform(-largest, largest, 100_000).astype(np.float32)
     angle[:9] = np.pi / 2 * np.arange(-4, 5)
-    actual = jax.jit(trigonometry.polynomial)(angle)
+    actual = jax.jit(cosine_and_sine)(angle)
     exact = angle.astype(np.float64)
     for values, reference in zip(actual, (np.cos(exact), np.sin(exact)), strict=True):
         np.testing.assert_allclose(values, reference, rtol=0, atol=1.5e-7)

@@ -13,12 +13,12 @@ import pytest
 from mimic.any_arm import dynamics
 from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, base_in_world, lock_joints, stack_arms
 from mimic.arms.arm import ArmConfig, build_arm
-from tests.any_arm.cases import Batch, acceleration, articulated, assert_near, looped, padded, random_source
+from tests.any_arm.cases import Batch, acceleration, assert_near, looped, padded, random_source, unrolled
 
 COUNT, FEW = 500, 64
 
 
-FORMS = {name: jax.jit(jax.vmap(function)) for name, function in {"kernel": articulated, "looped": looped}.items()}
+FORMS = {name: jax.jit(jax.vmap(function)) for name, function in {"kernel": unrolled, "looped": looped}.items()}
 
 
 def both_forms(*arguments):
@@ -57,7 +57,7 @@ def test_gravity_is_that_of_mujoco(x64, batch):
         base_in_world(arm)[:3, :3] @ frame for arm, frame in zip(batch.arms, batch.arrays.base_rotation, strict=True)
     ]
     base = tuple(np.stack([rotation.T @ -gravity for rotation in to_world]).T)
-    for form in (looped, articulated):
+    for form in (looped, unrolled):
         actual = jax.jit(jax.vmap(lambda *x, form=form: form(*x[:4], base=x[4])))(
             batch.arrays, batch.qpos, batch.qvel, batch.torque, base
         )

@@ -9,15 +9,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.any_arm.arrays import MAX_JOINTS
 from mimic.arms.arm import build_arm
 from mimic.control import joint_control
 from mimic.control.joint_control import MODES, PERIOD, JointParameters, Reference, Target
 from mimic.envs import env_config
 from mimic.envs.physics import Load
-from mimic.hardware.inner_loop import LoopState, gpu_kernel, make_inner_loop
+from mimic.hardware.inner_loop import LoopState, flattened, gpu_kernel, make_inner_loop
 from mimic.hardware.plant import GRAVITY, Draw, end_of_last_link, make_plant
 from mimic.metric.fused_kernel import LaunchConfig
+from tests.helpers.lowering import gpu_program
 
 PERIODS = 50
 FIELDS = {"limits": "hardware", "control_dt": 0.05, "world": {"gravity": True, "stops": True}}
@@ -89,7 +89,7 @@ def mujoco_model(arm, draw: Draw) -> mujoco.MjModel:
 def simulate_in_mujoco(arm, plant, draw: Draw, mode: str, targets) -> np.ndarray:
     """Angles after each tick, by C MuJoCo and the controller in NumPy."""
     model, joints = mujoco_model(arm, draw), arm.embodiment.num_joints
-    constants = jax.tree.map(lambda x: np.asarray(x)[:joints], plant.constants)
+    constants = plant.constants
     data = mujoco.MjData(model)
     data.qpos[:] = arm.embodiment.home
     reference = Reference(data.qpos.copy(), np.zeros(joints), np.zeros(joints))
@@ -111,7 +111,7 @@ def simulate_in_mujoco(arm, plant, draw: Draw, mode: str, targets) -> np.ndarray
 
 
 def start_of(arm, dtype) -> LoopState:
-    home = np.pad(np.asarray(arm.embodiment.home, dtype), (0, MAX_JOINTS - arm.embodiment.num_joints))
+    home = np.asarray(arm.embodiment.home, dtype)
     zero = np.zeros_like(home)
     return LoopState(home, zero, Reference(home, zero, zero), zero)
 
@@ -119,7 +119,7 @@ def start_of(arm, dtype) -> LoopState:
 def targets_for(arm, plant, mode: str, ticks: int):
     """Random targets of one second, far from the stops."""
     joints, rng = arm.embodiment.num_joints, np.random.default_rng(3)
-    parameters = JointParameters(*(np.asarray(x)[:joints] for x in plant.constants.parameters))
+    parameters = JointParameters(*map(np.asarray, plant.constants.parameters))
     home = np.asarray(arm.embodiment.home)
     reference = Reference(home, np.zeros(joints), np.zeros(joints))
     scale = 0.1 if mode == "torque" else 0.4
@@ -127,8 +127,8 @@ def targets_for(arm, plant, mode: str, ticks: int):
     return [joint_control.action_target(mode, action, reference, parameters, np) for action in actions]
 
 
-def padded_target(target: Target, dtype) -> Target:
-    return jax.tree.map(lambda x: jnp.asarray(np.pad(x, (0, MAX_JOINTS - len(x))), dtype), target)
+def as_arrays(target: Target, dtype) -> Target:
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), target)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -143,8 +143,8 @@ def test_a_second_is_that_of_c_mujoco(arm_and_plant, mode):
     loop, state, rows = jax.jit(make_inner_loop(mode, plant.constants, PERIODS)), start_of(arm, np.float32), []
     episode = jax.jit(plant.episode)(draw)
     for target in targets:
-        state = loop(episode, state, padded_target(target, jnp.float32))
-        rows.append(state.qpos[: arm.embodiment.num_joints])
+        state = loop(episode, state, as_arrays(target, jnp.float32))
+        rows.append(state.qpos)
     lower, upper = np.asarray(arm.embodiment.joint_range).T
     assert np.all((expected > lower) & (expected < upper))
     assert np.abs(expected - np.asarray(arm.embodiment.home)).max() > 0.1
@@ -159,33 +159,36 @@ def test_in_double_precision_only_rounding_is_left(name, x64):
     loop, state = jax.jit(make_inner_loop("joint_position", plant.constants, PERIODS)), start_of(arm, np.float64)
     episode = plant.episode(jax.tree.map(jnp.asarray, draw))
     for target in targets:
-        state = loop(episode, state, padded_target(target, jnp.float64))
-    np.testing.assert_allclose(state.qpos[: arm.embodiment.num_joints], expected[-1], rtol=0, atol=1e-12)
+        state = loop(episode, state, as_arrays(target, jnp.float64))
+    np.testing.assert_allclose(state.qpos, expected[-1], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("mode", ["torque", "joint_velocity"])
-def test_the_kernel_equals_the_arrays(arm_and_plant, mode, interpreted):
+@pytest.mark.parametrize(("mode", "sample_axis"), [("torque", 1), ("joint_velocity", 0)])
+def test_the_kernel_equals_the_arrays(arm_and_plant, mode, sample_axis, interpreted):
     """The GPU kernel, interpreted, on a batch with a partial block."""
     arm, plant = arm_and_plant
-    count, periods, rng = 40, 3, np.random.default_rng(0)
-    draws = [draw_for(arm.embodiment.num_joints, seed) for seed in range(count)]
+    count, joints, periods, rng = 40, arm.embodiment.num_joints, 3, np.random.default_rng(0)
+    draws = [draw_for(joints, seed) for seed in range(count)]
     batch = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y, jnp.float32) for y in x]), *draws)
-    episodes = jax.vmap(plant.episode)(batch)
-    home = np.asarray(start_of(arm, np.float32).qpos)
-    motion = np.concatenate([np.tile(home, (count, 1)), rng.normal(size=(count, 5 * MAX_JOINTS)) * 0.1], axis=1)
-    motion[:, 2 * MAX_JOINTS : 3 * MAX_JOINTS] += home
-    targets = 0.1 * rng.normal(size=(count, 2 * MAX_JOINTS)) + np.repeat([0.0, 1.0], MAX_JOINTS)
-    motion, targets = motion.astype(np.float32), targets.astype(np.float32)
-    kernel = gpu_kernel(mode, plant.constants, periods, LaunchConfig(block=32, warps=1, sample_axis=1))
-    drive = jnp.concatenate([episodes.gain, episodes.friction, episodes.bias], axis=1)
-    (actual,) = jax.jit(kernel)(episodes.numbers, episodes.base, drive, motion, targets)
-    parts = jnp.split(jnp.asarray(motion), 6, axis=1)
-    states = LoopState(parts[0], parts[1], Reference(*parts[2:5]), parts[5])
-    expected = jax.jit(jax.vmap(make_inner_loop(mode, plant.constants, periods)))(
-        episodes, states, Target(*jnp.split(jnp.asarray(targets), 2, axis=1))
-    )
-    rows = jnp.concatenate([expected.qpos, expected.qvel, *expected.reference, expected.torque], axis=1)
-    np.testing.assert_allclose(actual, rows, rtol=2e-4, atol=2e-4)  # float32, sums in another order
+    home = np.asarray(arm.embodiment.home)
+    qpos, qvel, *reference, torque = (0.1 * rng.normal(size=(6, count, joints))).astype(np.float32)
+    state = LoopState(home + qpos, qvel, Reference(home + reference[0], *reference[1:]), torque)
+    target = Target(*0.1 * rng.normal(size=(2, count, joints)) + np.array([0.0, 1.0])[:, None, None])
+    arguments = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (jax.vmap(plant.episode)(batch), state, target))
+    kernel = gpu_kernel(mode, plant.constants, periods, LaunchConfig(block=32, warps=1, sample_axis=sample_axis))
+    (actual,) = jax.jit(kernel)(*jax.vmap(flattened)(*arguments))
+    expected = jax.jit(jax.vmap(make_inner_loop(mode, plant.constants, periods)))(*arguments)
+    rows = np.moveaxis(np.asarray(actual).reshape(count, joints, 6), -1, 0)
+    for values, reference in zip(rows, jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(values, reference, rtol=2e-4, atol=2e-4)  # float32, sums in another order
+
+
+def test_the_kernel_lowers_without_a_gpu(arm_and_plant):
+    arm, plant = arm_and_plant
+    home, episode = start_of(arm, np.float32), plant.episode(draw_for(arm.embodiment.num_joints))
+    target = Target(home.qvel, 1 + home.qvel)
+    batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x, jnp.float32)] * 2), (episode, home, target))
+    assert "triton" in gpu_program(jax.jit(jax.vmap(make_inner_loop("joint_velocity", plant.constants, 2))), *batch)
 
 
 def test_stops_hold_an_arm_that_is_driven_into_them(arm_and_plant):
@@ -193,11 +196,11 @@ def test_stops_hold_an_arm_that_is_driven_into_them(arm_and_plant):
     arm, plant = arm_and_plant
     joints = arm.embodiment.num_joints
     draw = dataclasses.replace(draw_for(joints), gravity_error=jnp.asarray(0.0))
-    torque = np.asarray(plant.constants.parameters.torque)[:joints] * 0.3
+    torque = np.asarray(plant.constants.parameters.torque) * 0.3
     loop, state = jax.jit(make_inner_loop("torque", plant.constants, PERIODS)), start_of(arm, np.float32)
-    target, episode = padded_target(Target(torque, np.ones(joints)), jnp.float32), plant.episode(draw)
+    target, episode = as_arrays(Target(torque, np.ones(joints)), jnp.float32), plant.episode(draw)
     for _ in range(60):
         state = loop(episode, state, target)
-    beyond = np.asarray(state.qpos)[:joints] - np.asarray(arm.embodiment.joint_range)[:, 1]
+    beyond = np.asarray(state.qpos) - np.asarray(arm.embodiment.joint_range)[:, 1]
     assert np.all(np.abs(np.asarray(state.qvel)) < 0.1)
     assert beyond.max() > 0 and beyond.max() < 0.02
