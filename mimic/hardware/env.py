@@ -106,9 +106,7 @@ class HardwareEnv(ImitationEnv):
         history = jnp.tile(measured, (MAX_DELAY + 1, 1))
         is_angle = self.config.control in ("joint_position", "joint_impedance")
         target = Target(reference.qpos if is_angle else zero, jnp.ones_like(qpos))  # the arm stays where it is
-        return HardwareState(
-            **fields, sent=actions[:SENT_ACTIONS], arrived=actions, target=target, measured=history
-        )
+        return HardwareState(**fields, sent=actions[:SENT_ACTIONS], arrived=actions, target=target, measured=history)
 
     def _simulate(
         self, before: ArmState, command: Float[Array, " numbers"]

@@ -73,7 +73,7 @@ def test_a_delayed_action_acts_that_many_ticks_later(nominal, actions, undelayed
 
 
 def test_the_latency_shifts_actions_within_a_tick(actions):
-    """The same motion as with five times as many ticks, in which each action is repeated and comes two of them later."""
+    """The same motion as with five times as many ticks, where each action is repeated, and comes two of them later."""
     long = make()
     world = {**dataclasses.asdict(long.config.world), "action_latency": 0.0}
     fields = {"limits": "hardware", "control": "joint_velocity", "control_dt": 0.01, "horizon": 5 * TICKS}
@@ -155,7 +155,10 @@ def test_mjx_agrees_with_the_fused_loop():
     ("fields", "message"),
     [
         ({"control_dt": 0.0505}, "control_dt: expected a multiple of 0.001 s"),
-        ({"control_dt": 0.02}, "world.action_latency: expected a multiple of 0.001 s below control_dt = 0.02 s, got 0.02"),
+        (
+            {"control_dt": 0.02},
+            "world.action_latency: expected a multiple of 0.001 s below control_dt = 0.02 s, got 0.02",
+        ),
         ({"observation": {"terms": ["distance_gradient"]}}, "observation.terms: expected none with an inner loop"),
         ({"randomization": {"torque_noise": 0.1}}, "randomization.torque_noise: expected 0 with an inner loop"),
         ({"control": "velocity"}, "control: expected one of torque, joint_position"),
