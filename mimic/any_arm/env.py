@@ -72,8 +72,8 @@ class AnyArmEnv(Env):
 
     Reward, as `config.arms.reward` says. "distance": minus the embodiment distance to the expert after the step,
     divided by the mean distance of holding the home pose. "relative": how much nearer the arm is than with zero actions
-    since the start of the episode, see `relative_reward`; then the controller, which is simulated too, has the return 0 on
-    every arm, and all arms count alike. Action: for each joint slot a change of its acceleration in [-1, 1], see
+    since the start of the episode, see `relative_reward`; then the controller, which is simulated too, has the return 0
+    on every arm, and all arms count alike. Action: for each joint slot a change of its acceleration in [-1, 1], see
     `planned_torque`. Observation: see `mimic.any_arm.observation.observe`.
 
     Args:
