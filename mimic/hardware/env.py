@@ -64,6 +64,11 @@ class HardwareEnv(ImitationEnv):
         self.torque_scale = jnp.asarray(parameters.torque[:joints], jnp.float32)
         self._parameters = JointParameters(*(jnp.asarray(x[:joints], jnp.float32) for x in parameters))
 
+    def _start_poses_of(self, demonstrations: Demonstrations) -> Float[np.ndarray, "demonstrations joints"]:
+        """See `ImitationEnv`; within the joint ranges of the inner loop, which end before those of the robot."""
+        lower, upper = np.asarray(self._parameters.lower), np.asarray(self._parameters.upper)
+        return np.clip(super()._start_poses_of(demonstrations), lower, upper)
+
     def _make_mjx_loop(self, periods: int) -> MjxLoop:
         world = self.config.world
         model = mujoco_world(self.arm, world, self.capsules if world.contacts else None)
