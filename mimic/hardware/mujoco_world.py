@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mimic.any_arm.arrays import base_in_world
 from mimic.arms.arm import Arm
 from mimic.arms.capsules import Capsules
 from mimic.arms.simulation_model import simulation_spec
@@ -74,7 +73,7 @@ def mujoco_world(arm: Arm, world: WorldConfig, capsules: Capsules | None = None)
 def _tip_in_last_body(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
     """End and direction of the last link in the frame of the last body."""
     tip, along = end_of_last_link(arm)
-    pose, data = base_in_world(arm), mujoco.MjData(arm.model)
+    pose, data = arm.T_world_base, mujoco.MjData(arm.model)
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(arm.model, data)
     rotation, origin = data.xmat[-1].reshape(3, 3), data.xpos[-1]
@@ -84,7 +83,7 @@ def _tip_in_last_body(arm: Arm) -> tuple[np.ndarray, np.ndarray]:
 
 def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules) -> None:
     """Adds the capsules as geoms, pairs whose distance joints change, and a floor for all but those near the base."""
-    pose, data = base_in_world(arm), mujoco.MjData(arm.model)
+    pose, data = arm.T_world_base, mujoco.MjData(arm.model)
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(arm.model, data)
     bodies = [spec.worldbody, *(spec.joint(name).parent for name in arm.embodiment.joint_names)]
