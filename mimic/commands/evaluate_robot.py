@@ -111,8 +111,7 @@ def _task(
     held_out = evaluator.parts["held_out"]
     first, count = held_out.start, evaluator.env.demonstrations.count - held_out.start
     motion = first + np.arange(config.episodes) % count
-    joints = robot.model.nv
-    drawn = draw_world(world, config.episodes, joints, len(robot.links), np.random.default_rng(config.seed), edge)
+    drawn = draw_world(world, config.episodes, robot.num_joints, np.random.default_rng(config.seed), edge)
     return Task(robot, policy, drawn, motion, np.asarray(evaluator.env.start_poses)[motion], config.seed)
 
 

@@ -39,7 +39,7 @@ def test_it_is_the_distance_of_the_costs(config):
 
 def test_it_is_that_of_mujocos_geoms():
     """The geoms of the virtual robot, by MuJoCo's own function."""
-    robot = model().model
+    robot = model().simulated.model
     data = mujoco.MjData(robot)
     arm = build_arm(ArmConfig(), "hardware").embodiment
     clearance = jax.jit(jax.vmap(make_clearance(arm, fit_capsules(ArmConfig(), "hardware"))))
