@@ -20,7 +20,6 @@ from mimic.retargeting.costs import changing_pairs
 from mimic.retargeting.pose import pose_limits
 
 PAYLOAD, FLOOR = "payload", "floor"
-_NO_MASS = 1e-6  # kg and kg m^2, of the body of a payload before its mass is set
 _SPHERE = 1e-6  # m, of the axis of a capsule
 _FLOOR_SIZE = 5.0  # m, as drawn
 _NO_CONTACT = {"contype": 0, "conaffinity": 0, "mass": 0.0}  # only the pairs that are named touch
@@ -145,8 +144,7 @@ def _add_payload(spec: mujoco.MjSpec, arm: Arm, places: list[_Place]) -> np.ndar
     joint = arm.embodiment.link_joint[-1]
     place = places[joint + 1]
     body = _body(spec, arm, joint).add_body(name=PAYLOAD, pos=_in_body(arm, place, tip))
-    body.explicitinertial, body.mass, body.ipos = True, _NO_MASS, [0.0] * 3
-    body.inertia = [_NO_MASS] * 3
+    body.explicitinertial, body.mass, body.ipos, body.inertia = True, 0.0, [0.0] * 3, [0.0] * 3
     return place[0].T @ arm.T_world_base[:3, :3] @ along
 
 

@@ -133,7 +133,5 @@ def _loaded_model(robot: RobotModel, world: World, index: int) -> mujoco.MjModel
     model.opt.disableflags = disabled(gravity=world.gravity, stops=world.stops, contacts=world.contacts)
     model.opt.gravity[:] = fields.gravity
     model.body_mass[:], model.body_inertia[:], model.body_ipos[:] = fields[1:]
-    if not payload:
-        model.body_inertia[simulated.payload] = 0.0
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
