@@ -42,6 +42,7 @@ class HardwareEnv(ImitationEnv):
     Attributes:
       plant: the learner, as the inner loop simulates it.
       torque_scale: [joints] maximum torque [N m].
+      parameters: of the inner loop, [joints] each.
       action_size: length of an action.
 
     Raises:
@@ -64,8 +65,8 @@ class HardwareEnv(ImitationEnv):
             world = mujoco_world(arm, config.world, capsules)
             self._inner_loop = make_mjx_loop(config.control, self.plant, world, periods)
         parameters = self.plant.constants.parameters
-        self.torque_scale = jnp.asarray(parameters.torque[:joints], jnp.float32)
-        self._parameters = JointParameters(*(jnp.asarray(x[:joints], jnp.float32) for x in parameters))
+        self.parameters = JointParameters(*(jnp.asarray(x[:joints], jnp.float32) for x in parameters))
+        self.torque_scale = self.parameters.torque
 
     def _fused_loop(self, loop: InnerLoop) -> MjxLoop:
         """The fused loop on vectors without empty slots."""
@@ -93,7 +94,7 @@ class HardwareEnv(ImitationEnv):
         state, joints = super().start(key, demonstration), self.learner.num_joints
         deviation = self.config.world.start_noise
         noise = jax.random.uniform(jax.random.fold_in(key, _START), (joints,), minval=-deviation, maxval=deviation)
-        qpos = jnp.clip(state.qpos + noise, self._parameters.lower, self._parameters.upper) if deviation else state.qpos
+        qpos = jnp.clip(state.qpos + noise, self.parameters.lower, self.parameters.upper) if deviation else state.qpos
         draw = draw_episode(self.config, joints, jax.random.fold_in(key, _DRAW))
         zero = jnp.zeros_like(qpos)
         actions = jnp.zeros((MAX_DELAY + 1, self.action_size))
@@ -117,7 +118,7 @@ class HardwareEnv(ImitationEnv):
             arrived = jnp.where(is_lost, state.arrived[0], command)
         history = _pushed(state.arrived, arrived)
         acting = history[state.draw.action_delay]
-        target = joint_control.action_target(self.config.control, acting, state.reference, self._parameters, jnp)
+        target = joint_control.action_target(self.config.control, acting, state.reference, self.parameters, jnp)
         loop = self._inner_loop(state.draw, LoopState(state.qpos, state.qvel, state.reference, state.torque), target)
         after = dataclasses.replace(
             state,
@@ -152,7 +153,7 @@ class HardwareEnv(ImitationEnv):
     def command(self, before: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
         """The target angles [rad], velocities [rad/s] or torques [N m] of an action that arrives at once."""
         reference = cast(HardwareState, before).reference
-        return joint_control.action_target(self.config.control, action, reference, self._parameters, jnp).value
+        return joint_control.action_target(self.config.control, action, reference, self.parameters, jnp).value
 
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """See the class, and `control_observation`."""
