@@ -21,7 +21,8 @@ from mimic.trainers.config import trainers
 
 ROBOT_WORLDS = ("paper", "nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
-CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "searched")
+CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "tracking", "searched")
+ROBOT_CONTROLLERS = ("policy", "tracking")
 ARM_SIDES = ("left", "right")
 CONTROLLER = "controller"  # a format of a folder, see mimic/commands/export_controller.py
 EXPORT_FORMATS = ("onnx", "jax", CONTROLLER)
@@ -53,8 +54,8 @@ class EvaluateConfig:
       physics: see `EnvConfig`. Default "": that of the run.
       mass, damping, torque_noise: deviation of the arm from its model, see `RandomizationConfig`. Default None: as in
         training.
-      robot: "virtual_panda": the policy controls virtual Pandas in C MuJoCo, which abort as real ones do;
-        "virtual_robot": the same for another learner. Default "": the environment of the run.
+      robot: "virtual_panda": the policy, or "tracking", controls virtual Pandas in C MuJoCo, which abort as real ones
+        do; "virtual_robot": the same for another learner. Default "": the environment of the run.
       episodes: number of episodes of `robot`, of each case with `edges`.
       robot_world: preset of the world of `robot`: "paper", "nominal" or "hardware". Default "": that of the run.
       edges: whether there are also cases with each range of the world at its ends.
@@ -100,11 +101,15 @@ class EvaluateConfig:
         check_choice("robot", self.robot, ROBOTS)
         if self.robot_world:
             check_choice("robot_world", self.robot_world, ROBOT_WORLDS)
-        others = self.learner, self.physics, self.mass, self.damping, self.torque_noise
-        if self.controller != "policy" or any(value not in ("", None) for value in others):
+        if self.controller not in ROBOT_CONTROLLERS:
             raise ValueError(
-                "controller, learner, physics, mass, damping, torque_noise: expected none with robot=, whose world has "
-                "ranges of them"
+                f"controller: expected {' or '.join(ROBOT_CONTROLLERS)} with robot=, got {self.controller}"
+            )
+        others = self.learner, self.physics, self.mass, self.damping, self.torque_noise
+        if any(value not in ("", None) for value in others):
+            raise ValueError(
+                "learner, physics, mass, damping, torque_noise: expected none with robot=, whose world has ranges of "
+                "them"
             )
 
 
