@@ -35,6 +35,13 @@ from tests.mocap.bodies import bvh_text, person
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),
         (["run=a", "expert=panda"], "expected neither with run= or mapper="),
+        (["mapper=any_arm", "learner=panda"], "mapper=any_arm takes learners=[NAME,...]"),
+        (["learners=[panda]"], "learners: expected with mapper=, as in mapper=any_arm learners=[panda,ur5e.xml]"),
+        (["mapper=planar4dof", "learners=[panda]"], "learners: expected none with mapper=planar4dof, which has one"),
+        (["mapper=any_arm", "checkpoint=5"], "checkpoint: expected none with mapper=any_arm, which comes with mimic"),
+        (["mapper=any_arm", "learners=[a.xml]"], "learners: expected panda, an MJCF file, or an environment (any_arm,"),
+        (["mapper=any_arm", "learners=[panda,panda]"], "learners: expected arms of different names, got panda, panda"),
+        (["mapper=any_arm", "learners=[bimanual]"], "expected a serial arm, got a tree of 2 chains"),
         (["source=missing.bvh"], "source: no file at 'missing.bvh'"),
         (["source=a.bvh", "expert=panda"], "expert, run, mapper: expected none with source="),
         (["arm=left"], "arm, capture: expected only with source="),
@@ -73,7 +80,8 @@ def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
 
 
 def test_only_the_page_of_the_view_imports_viser():
-    names = "html", "live_session", "playback", "meshes", "follower", "history", "newest_checkpoint", "captured"
+    names = ["html", "live_session", "playback", "meshes", "follower", "history", "newest_checkpoint", "captured"]
+    names.append("any_learner")
     code = f"import sys; sys.modules['viser'] = None; import {', '.join(f'mimic.viewer.{name}' for name in names)}"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 

@@ -205,7 +205,10 @@ def test_locking_the_last_joint_is_rejected_and_undone():
 
 def test_settings_that_differ_only_in_weights_share_functions(env):
     settings = initial_settings(env)
-    assert settings.locked == dict.fromkeys(("joint3", "joint6", "joint7"), 0.0) and settings.correspondence == "arc_length"
+    assert (
+        settings.locked == dict.fromkeys(("joint3", "joint6", "joint7"), 0.0)
+        and settings.correspondence == "arc_length"
+    )
     assert dataclasses.replace(settings, rotation=0.3).compilation_key == settings.compilation_key
     assert dataclasses.replace(settings, correspondence="hard").compilation_key != settings.compilation_key
     with pytest.raises(ValueError, match="expected one of arc_length, overlap, hard, soft"):
