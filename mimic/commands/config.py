@@ -396,7 +396,7 @@ class ViewConfig:
       mapper: pose mapper that moves the learner instead of the optimiser: a run directory, or the name of one that
         comes with mimic, such as "any_arm". Its arms are used.
       learners: with a pose mapper to any arm, the learners to choose from on the page, each as `learner`. The first one
-        is shown first. Default []: panda, panda4dof, panda3dof.
+        is shown first. Default []: the one of its environment, panda, panda4dof and panda3dof.
       run: run directory of a policy to play. Its arms and demonstrations are used.
       source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
         that takes points as lines of JSON.
@@ -462,8 +462,11 @@ class ViewConfig:
         env = dataclasses.replace(self.env, **arms)
         return dataclasses.replace(env, arms=ArmsConfig()) if "learner" in arms else env
 
-    def resolve_learners(self) -> dict[str, ArmConfig]:
-        """The arms in `learners`, by the name that the page shows.
+    def resolve_learners(self, own: ArmConfig) -> dict[str, ArmConfig]:
+        """The arms to choose from, by the name that the page shows.
+
+        Args:
+          own: learner of the environment of the mapper.
 
         Raises:
           ValueError: an arm does not exist, or two have the same name.
@@ -472,7 +475,7 @@ class ViewConfig:
         arms = {Path(name).stem if name.endswith(_MODEL_FILES) else name: _arm("learners", name) for name in names}
         if len(arms) < len(names):
             raise ValueError(f"learners: expected arms of different names, got {', '.join(names)}")
-        return arms
+        return arms if self.learners else {Path(own.model).stem: own, **arms}
 
 
 def _without_none(values: dict[str, Any]) -> dict[str, Any]:

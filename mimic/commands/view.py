@@ -113,7 +113,7 @@ def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
         if config.learners:
             raise ValueError(f"learners: expected none with mapper={config.mapper}, which has one learner")
         return _prepare_live(config, env, LiveSession(env, mapper))
-    named = config.resolve_learners()
+    named = config.resolve_learners(env.learner)
     learners, presets = read_learners(named, env.limits, env.metric.links)
     env = dataclasses.replace(env, arms=ArmsConfig(), learner=next(iter(named.values())))
     names = [shown_preset(presets, index, {}).name for index in range(len(learners))]

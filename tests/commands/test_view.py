@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 
-from mimic.arms.arm import build_arm
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands import view, view_capture
 from mimic.commands.capture import fixed_fraction
 from mimic.commands.config import ViewConfig
@@ -89,6 +89,15 @@ def test_only_the_page_of_the_view_imports_viser():
 def test_arms_can_be_named_by_their_environment():
     arms = ViewConfig(expert="planar4dof", learner="planar4dof").resolve_env()
     assert len(arms.expert.link_lengths) == 7 and len(arms.learner.link_lengths) == 4
+
+
+def test_a_mapper_to_any_arm_has_its_own_learner_and_the_pandas_to_choose_from():
+    default = ViewConfig(mapper="any_arm")
+    assert list(default.resolve_learners(ArmConfig())) == ["panda", "panda4dof", "panda3dof"]
+    planar = ArmConfig(model="planar", link_lengths=[0.3, 0.3])
+    assert next(iter(default.resolve_learners(planar).items())) == ("planar", planar)
+    named = ViewConfig(mapper="any_arm", learners=["panda3dof"]).resolve_learners(planar)
+    assert list(named) == ["panda3dof"] and named["panda3dof"].locked
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def choices(mapper, tmp_path_factory):
     """Two arms, a Panda and one with six joints, and their presets."""
     path = tmp_path_factory.mktemp("arms") / "six.xml"
     path.write_text(ur_like(gripper=""))
-    named = ViewConfig(mapper="any_arm", learners=["panda4dof", str(path)]).resolve_learners()
+    named = ViewConfig(mapper="any_arm", learners=["panda4dof", str(path)]).resolve_learners(ArmConfig())
     return read_learners(named, mapper.env.limits, mapper.env.metric.links)
 
 
