@@ -50,7 +50,8 @@ class LearnerControls:
         for arm, boxes in enumerate(self._locks):
             for name, box in boxes.items():
                 box.visible, box.value = arm == settings.arm, name in settings.locked
-        locked = ", ".join(f"{name} at {angle:.2f} rad" for name, angle in settings.locked.items())
+        angles = {name: settings.locked[name] for name in self._starts[settings.arm] if name in settings.locked}
+        locked = ", ".join(f"{name} at {angle:z.2f} rad" for name, angle in angles.items())
         where = "where it is" if self._session.takes_any_arm else "at its angle in the start pose"
         self._note.content = f"Locked: {locked}." if locked else f"A joint is locked {where}."
         if self._presets:
