@@ -316,7 +316,7 @@ def address(host: str, port: int) -> str:
 def _title(config: ViewConfig, env: EnvConfig) -> str:
     policy = f"{'newest policy' if config.follow else 'policy'} of {Path(config.run).name}"
     controller = policy if config.run else "pose mapper" if config.mapper else "optimiser"
-    return f"{env.name or 'mimic'}: the learner is moved by the {controller}"
+    return f"{env.name or 'mimic'}: the {controller} moves the learner"
 
 
 def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:

@@ -25,7 +25,7 @@ from mimic.trainers.pose_mapper.any_arm_training import random_pose
 from mimic.viewer.follower import CompiledFunctions, PoseComparison, Preset, Settings, compiled
 
 # The kinematic bound: Newton steps from random poses, home and the mapper's pose. On Pandas with locked joints and on
-# four real arms it is at most 0.01 above that of 200 poses and 24 steps, and in the mean less than 1e-4.
+# four real arms it is at most 0.01 above that of 200 poses and 24 steps, in the mean at most 3e-4.
 _GUESSES, _STEPS = 32, 12
 
 

@@ -1,6 +1,5 @@
 """The learner's controls on a page: which boxes are shown, and which arm is drawn."""
 
-import dataclasses
 import importlib.util
 import socket
 
@@ -14,29 +13,28 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands import view
 from mimic.commands.config import ViewConfig
 from mimic.envs import env_config
-from mimic.viewer.follower import Preset, initial_settings
+from mimic.viewer.follower import Preset
 from mimic.viewer.learner_controls import LearnerControls
-from mimic.viewer.live_session import Frame
+from mimic.viewer.live_session import Frame, LiveSession
 
 ARMS = {"panda": ArmConfig(), "planar": ArmConfig(model="planar", link_lengths=[0.3, 0.3, 0.3])}
 PRESETS = Preset("panda", 0, {}), Preset("bent", 0, {"joint2": 0.5}), Preset("planar", 1, {})
 
 
-class Session:
-    """A session that only keeps what it is told."""
+class NoFunctions:
+    """A source of functions that never compiles any."""
 
-    by_optimiser, takes_any_arm = False, True
+    def get(self, settings):
+        return None
 
-    def __init__(self, env):
-        self.settings, self.started = initial_settings(env), []
+    def is_complete(self, settings):
+        return False
 
-    def lock(self, joint, is_locked):
-        locked = {**self.settings.locked, joint: 0.25} if is_locked else {}
-        self.settings = dataclasses.replace(self.settings, locked=locked)
+    def wait(self, settings):
+        raise NotImplementedError
 
-    def choose(self, arm, locked, start):
-        self.started.append(start)
-        self.settings = dataclasses.replace(self.settings, arm=arm, locked=locked)
+    def finish(self):
+        return None
 
 
 def frame(arm, locked=()):
@@ -55,7 +53,7 @@ def shown():
         done = []
 
         def show(page, times):
-            session = Session(config.env)
+            session = LiveSession(config.env, any_arm=NoFunctions())
             controls = LearnerControls(session, page.starts, PRESETS)
             controls.add_widgets(page.server)
             check(page, controls, session)
@@ -74,13 +72,13 @@ def test_the_boxes_are_those_of_the_chosen_arm(shown):
     def check(page, controls, session):
         assert list(map(len, visible(controls))) == [7, 0]
         controls._lock("joint3", True)
-        assert controls._locks[0]["joint3"].value and "joint3 at 0.25 rad" in controls._note.content
+        assert controls._locks[0]["joint3"].value and "joint3 at 0.00 rad" in controls._note.content
         assert controls._arm.value == "panda"  # with locks of its own
         controls._choose("bent")
         assert [name for name, box in controls._locks[0].items() if box.value] == ["joint2"]
         assert controls._arm.value == "bent" and "joint2 at 0.50 rad" in controls._note.content
         controls._choose("planar")
-        assert list(map(len, visible(controls))) == [0, 3] and session.started[-1] == page.starts[1]
+        assert list(map(len, visible(controls))) == [0, 3] and session.settings.arm == 1
         assert "locked where it is" in controls._note.content
 
     shown(check)
