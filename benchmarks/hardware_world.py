@@ -3,10 +3,11 @@
     python -m benchmarks.hardware_world RUN [RUN ...] [--out FILE] [--episodes 1000] [--edge-episodes 200 or 0]
 
 Each run is one of `python -m mimic.train world=hardware`. The gap is that of held-out demonstrations, relative to the
-kinematic bound and to holding the start pose. `tracking` is a baseline without learning in the same world: it knows
-the poses of the bound, which an optimiser computes beforehand, and commands the velocity to the pose that comes `lead`
-ticks later; the best of several leads is shown, chosen on the same demonstrations. `edges` has each range of the
-world at its ends, one after the other, and all together.
+kinematic bound and to holding the start pose. `tracking` is `python -m mimic.evaluate controller=tracking`, a baseline
+without learning in the same world: it knows the poses of the bound, which an optimiser computes beforehand, and the
+reference of the inner loop, and commands the velocity to the pose that comes `lead` ticks later. `late` is the same if
+it knows the reference only as late as a policy observes it. `edges` has each range of the world at its ends, one after
+the other, and all together.
 """
 
 import argparse
@@ -16,22 +17,18 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
-
-import jax
-import jax.numpy as jnp
+from typing import Any
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
-from mimic.evaluation.evaluator import Evaluator
-from mimic.hardware.env import HardwareEnv
+from mimic.evaluation.tracking_controllers import run_tracking
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import load_config
 
-LEADS = range(1, 8)  # ticks
 COLUMNS = (
-    "run seed fused:.2% mjx:.2% tracking:.2% lead virtual:.2% aborts contacts edges_worst:.2% edges_together:.2% "
+    "run seed fused:.2% mjx:.2% virtual:.2% tracking:.2% lead late:.2% late_lead tracking_virtual:.2% aborts contacts "
+    "edges_worst:.2% edges_together:.2% "
     "centre_line:.4f centre_line_bound:.4f centre_line_hold:.4f"
 )
 
@@ -43,13 +40,15 @@ def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
     steps, params = load_checkpoint(run, trainer.params_template())
     fused = trainer.evaluate(params)
     mjx = trainer.cross_check(params)["mjx"]["optimality_gap"]
-    tracking = {lead: _tracking_gap(trainer.evaluator, lead) for lead in LEADS}
-    lead = min(tracking, key=lambda lead: tracking[lead])
+    (tracking, lead), (late, late_lead) = (
+        run_tracking(trainer.evaluator, is_delayed=is_delayed) for is_delayed in (False, True)
+    )
     similarity = {
         name: table["centre_line_distance"]["held_out"]
         for name, table in trainer.evaluator.similarity_summary(fused, "policy").items()
     }
     (whole,) = _virtual(run, episodes).values()
+    (tracked,) = _virtual(run, episodes, "controller=tracking").values()
     edges = _virtual(run, edge_episodes, "edges=true") if edge_episodes else {}
     single = {name: case["optimality_gap"] for name, case in edges.items() if not name.startswith("all")}
     together = [case["optimality_gap"] for name, case in edges.items() if name.startswith("all:")]
@@ -60,8 +59,11 @@ def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
         "control": trained.env.control,
         "fused": trainer.metrics(fused)["optimality_gap"]["held_out"],
         "mjx": mjx["held_out"],
-        "tracking": tracking[lead],
+        "tracking": trainer.metrics(tracking)["optimality_gap"]["held_out"],
         "lead": lead,
+        "late": trainer.metrics(late)["optimality_gap"]["held_out"],
+        "late_lead": late_lead,
+        "tracking_virtual": tracked["optimality_gap"],
         "virtual": whole["optimality_gap"],
         "aborts": sum(whole["aborts"].values()),
         "contacts": whole["self_contacts"],
@@ -71,24 +73,9 @@ def measure(run: Path, episodes: int, edge_episodes: int) -> Row:
         "centre_line_hold": similarity["hold_home"],
         "similarity": similarity,
         "virtual_robot": whole,
+        "virtual_robot_tracking": tracked,
         "edges": edges,
     }
-
-
-def _tracking_gap(evaluator: Evaluator, lead: int) -> float:
-    """Held-out gap of commanding the velocity to the bound's pose some ticks later."""
-    env = cast(HardwareEnv, evaluator.env)
-    poses = jnp.asarray(evaluator.nearest_poses, jnp.float32)  # after each tick
-    limit = jnp.asarray(env.plant.constants.parameters.velocity, jnp.float32)
-
-    def controller(state: Any) -> jax.Array:
-        episode = state.pipeline_state
-        index = jnp.clip(episode.step + lead - 1, 0, poses.shape[1] - 1)
-        change = poses[episode.demonstration, index] - episode.reference.qpos
-        return jnp.clip(change / (lead * env.config.control_dt) / limit, -1, 1)
-
-    rollouts = jax.jit(lambda: evaluator.rollout(controller))()
-    return evaluator.summary(jax.device_get(rollouts))["optimality_gap"]["held_out"]
 
 
 def _virtual(run: Path, episodes: int, *options: str) -> dict[str, Any]:

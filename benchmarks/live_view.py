@@ -121,7 +121,7 @@ class Counter(Client):
 
 
 def _moves_learner(message: dict) -> bool:
-    return message["type"] == "SetOrientationMessage" and str(message.get("name", "")).startswith("/learner/body")
+    return message["type"] == "SetOrientationMessage" and str(message.get("name", "")).startswith("/learner0/body")
 
 
 async def watch(address: str, seconds: float) -> list[float]:

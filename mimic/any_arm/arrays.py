@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Float, Int
 
 from mimic.arms.arm import Arm, ArmConfig, build_arm, finite_velocity_limit
-from mimic.arms.embodiment import Embodiment, snap_to_units
+from mimic.arms.embodiment import snap_to_units
 from mimic.envs.dynamics import pseudo_inertia
 from mimic.metric.spatial import array_library
 
@@ -142,7 +142,7 @@ def body_moments(
     """Moments of mass of each joint's body in its frame, see `pseudo_inertia`; and the frames, see `joint_frames`."""
     embodiment = arm.embodiment
     rotations, origins = joint_frames(np.asarray(embodiment.joint_axis), np.asarray(embodiment.joint_anchor))
-    return _masses(arm.model, embodiment, rotations, origins), rotations, origins
+    return _masses(arm, rotations, origins), rotations, origins
 
 
 def moments_of_joints(
@@ -275,16 +275,15 @@ def without_mass_on_axes(
 
 
 def _masses(
-    model: mujoco.MjModel,
-    embodiment: Embodiment,
+    arm: Arm,
     rotations: Float[np.ndarray, "joints 3 3"],
     origins: Float[np.ndarray, "joints 3"],
 ) -> Float[np.ndarray, "joints 4 4"]:
     """Moments of mass of the body of each joint in its frame."""
+    model, to_world = arm.model, arm.T_world_base
     data = mujoco.MjData(model)
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(model, data)
-    to_world = _rigid_transform(embodiment, data)
     last_joint = {int(body): joint for joint, body in enumerate(model.jnt_bodyid)}
     masses = np.zeros((len(rotations), 4, 4))
     for joint, (rotation, origin) in enumerate(zip(rotations, origins, strict=True)):
@@ -293,28 +292,3 @@ def _masses(
             frame = to_world[:3, :3] @ rotation
             masses[joint] = pseudo_inertia(model, data, body, frame, to_world[:3, :3] @ origin + to_world[:3, 3])
     return masses
-
-
-def base_in_world(arm: Arm) -> Float[np.ndarray, "4 4"]:
-    """Pose of the arm's base frame in the world of its model, whose z-axis is vertical."""
-    data = mujoco.MjData(arm.model)
-    data.qpos[:] = 0.0
-    mujoco.mj_kinematics(arm.model, data)
-    return _rigid_transform(arm.embodiment, data)
-
-
-def _rigid_transform(embodiment: Embodiment, data: mujoco.MjData) -> Float[np.ndarray, "4 4"]:
-    """Maps the embodiment's base frame into the world of the model, by the lines of the joints (Kabsch)."""
-    unit = float(embodiment.chain_length)
-    ours, theirs = (
-        np.concatenate([anchor, anchor + unit * axis])
-        for anchor, axis in ((embodiment.joint_anchor, embodiment.joint_axis), (data.xanchor, data.xaxis))
-    )
-    left, _, right = np.linalg.svd((ours - ours.mean(axis=0)).T @ (theirs - theirs.mean(axis=0)))
-    signs = np.array([1.0, 1.0, np.linalg.det(left @ right)])
-    transform = np.eye(4)
-    transform[:3, :3] = (left * signs @ right).T
-    transform[:3, 3] = theirs.mean(axis=0) - transform[:3, :3] @ ours.mean(axis=0)
-    residual = np.abs(ours @ transform[:3, :3].T + transform[:3, 3] - theirs).max()
-    assert residual < 1e-6 * unit, residual
-    return transform

@@ -74,11 +74,11 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
         goals = next_goals(problem, goals, qpos, now.key, now.step)
         plan = make_plan(arm, qpos, qvel, goals.goal, speed, dt)
         if policy is None:
-            action = jnp.zeros(MAX_JOINTS + 1)
+            action = jnp.zeros(MAX_JOINTS)
         else:
             action = policy(observe(arm, own_states, qpos, qvel, goals, max_torque, plan, dt))
-        torque = planned_torque(arm, plan, action[:MAX_JOINTS], max_torque, dt)
-        return torque[places] / env.torque_scale, chosen_goal(goals, action[MAX_JOINTS])
+        torque = planned_torque(arm, plan, action, max_torque, dt)
+        return torque[places] / env.torque_scale, chosen_goal(goals)
 
     return ControllerWithMemory(start, act)
 

@@ -3,7 +3,7 @@
 An action does not set torques: the same torque means something else on every arm. It changes accelerations. Those
 without it lead to one of the poses nearest to the expert's, see `next_goals`. Inverse
 dynamics turns accelerations into torques within the arm's limits, see `planned_torque`. So the zero action is
-already a controller of any arm, and a policy learns what it lacks: to leave local minima, and to look ahead.
+already a controller of any arm, and a policy learns what it lacks.
 """
 
 import copy
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mimic import compat
 from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
@@ -40,6 +40,7 @@ from mimic.metric.kinematics import LinkStates
 
 _HOLD_SAMPLES = 5  # steps of a demonstration at which the distance of holding the home pose is computed
 _RUNAWAY = 3.0  # distance charged for each step after a runaway, as a multiple of that of holding the home pose
+_EXCESS = 0.01  # added to the excess of both distances in a relative reward, in units of holding the home pose
 _MIN_HOLD = 1e-3  # distance; below it, an arm that rests is already where the expert is
 
 
@@ -54,6 +55,7 @@ class AnyArmState(ArmState):
       followed: the local minima at the last step, after the choice of the goal.
       goals: the local minima that the controller follows, which `with_plan` derives from `followed`.
       plan: what the controller does in the next step; from `with_plan`.
+      baseline: the same episode with zero actions, which a relative reward compares with; otherwise None.
     """
 
     arm: ArmArrays = None  # type: ignore[assignment] - fields after one with a default need one too
@@ -62,15 +64,17 @@ class AnyArmState(ArmState):
     followed: Goals = None  # type: ignore[assignment]
     goals: Goals = None  # type: ignore[assignment]
     plan: Plan = None  # type: ignore[assignment]
+    baseline: "AnyArmState | None" = None
 
 
 class AnyArmEnv(Env):
     """Arms of a sampler that imitate the demonstrations of one expert; a brax environment.
 
-    Reward: minus the embodiment distance to the expert after the step, divided by the mean distance of holding the
-    home pose, so that all arms count alike. Action: for each joint slot a change of its acceleration in [-1, 1], see
-    `planned_torque`, and last the preference for another goal, see `chosen_goal`. Observation: see
-    `mimic.any_arm.observation.observe`.
+    Reward, as `config.arms.reward` says. "distance": minus the embodiment distance to the expert after the step,
+    divided by the mean distance of holding the home pose. "relative": how much nearer the arm is than with zero actions
+    since the start of the episode, see `relative_reward`; then the controller, which is simulated too, has the return 0
+    on every arm, and all arms count alike. Action: for each joint slot a change of its acceleration in [-1, 1], see
+    `planned_torque`. Observation: see `mimic.any_arm.observation.observe`.
 
     Args:
       config: expert, metric, demonstrations and time steps; its learner is not used.
@@ -141,10 +145,20 @@ class AnyArmEnv(Env):
             goals=first_goals(arm.home),
             plan=Plan(zeros, jnp.zeros((MAX_JOINTS, MAX_JOINTS)), zeros),
         )
+        if self.config.arms.reward == "relative":
+            state = dataclasses.replace(state, baseline=state)
         return self.with_plan(state)
 
     def with_plan(self, state: AnyArmState) -> AnyArmState:
         """The state with its goals at the next step, and the plan to move to the first of them; again, the same."""
+        if state.baseline is None:
+            return self._planned(state)
+        both = jax.tree.map(lambda *x: jnp.stack(x), dataclasses.replace(state, baseline=None), state.baseline)
+        both = jax.vmap(self._planned)(both)  # one function for both compiles faster
+        own, baseline = (jax.tree.map(lambda x, i=i: x[i], both) for i in range(2))
+        return dataclasses.replace(own, baseline=baseline)
+
+    def _planned(self, state: AnyArmState) -> AnyArmState:
         expert = self.expert_at(state.demonstration, state.step + 1)
         matrix, dt = correspondence(self._expert_arrays, state.arm), self.config.control_dt
         problem = Problem(state.arm, self._weights, matrix, expert, dt)
@@ -155,7 +169,8 @@ class AnyArmEnv(Env):
 
     def at_step(self, state: AnyArmState, step: Array) -> AnyArmState:
         """A state of `start` at another step of its demonstration."""
-        return self.with_plan(dataclasses.replace(state, step=step))
+        baseline = None if state.baseline is None else dataclasses.replace(state.baseline, step=step)
+        return self.with_plan(dataclasses.replace(state, step=step, baseline=baseline))
 
     def metric_of(self, arm: ArmArrays) -> Metric:
         """The metric between the expert and an arm."""
@@ -179,25 +194,44 @@ class AnyArmEnv(Env):
         if action.shape != (self.action_size,):
             raise ValueError(f"action: expected shape ({self.action_size},), got {action.shape}")
         before = any_arm_state(state)
-        torque = self.torque(before, action)
-        qpos, qvel = self._advance(before.arm, before.qpos, before.qvel, torque, Load())
-        followed = chosen_goal(before.goals, action[MAX_JOINTS])
-        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1, followed=followed)
-        expert = self.expert_at(after.demonstration, after.step)
-        runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
-        distance = self.metric_of(after.arm)(expert, link_states(after.arm, qpos, qvel))
-        distance = jnp.where(runaway, _RUNAWAY * after.hold, distance)
+        after, distance, runaway = self._moved(before, action)
+        if before.baseline is None:
+            reward = -distance / after.hold
+        else:
+            baseline, own, _ = self._moved(before.baseline, jnp.zeros(self.action_size))
+            after = dataclasses.replace(after, baseline=baseline)
+            reward = relative_reward(distance, own, self._nearest(before), after.hold)
         # A runaway is charged for all remaining steps, so that ending an episode early is never better.
         steps = jnp.where(runaway, 1.0 + (self.config.horizon - after.step), 1.0)
         done = (runaway | (after.step >= self.config.horizon)).astype(jnp.float32)
         metrics = {**state.metrics, "distance": distance, "runaway": runaway.astype(jnp.float32)}
         after = self.with_plan(after)
-        reward = -steps * distance / after.hold
-        return state.replace(pipeline_state=after, obs=self.observe(after), reward=reward, done=done, metrics=metrics)
+        observation = self.observe(after)
+        return state.replace(pipeline_state=after, obs=observation, reward=steps * reward, done=done, metrics=metrics)
+
+    def _moved(
+        self, before: AnyArmState, action: Float[Array, " actions"]
+    ) -> tuple[AnyArmState, Float[Array, ""], Bool[Array, ""]]:
+        """The state after a step, without its plan; the distance there; and whether the arm runs away."""
+        torque = self.torque(before, action)
+        qpos, qvel = self._advance(before.arm, before.qpos, before.qvel, torque, Load())
+        followed = chosen_goal(before.goals)
+        after = dataclasses.replace(before, qpos=qpos, qvel=qvel, step=before.step + 1, followed=followed)
+        expert = self.expert_at(after.demonstration, after.step)
+        runaway = ~jnp.all(jnp.abs(qvel) < self.config.speed_bound)  # True for NaN too
+        distance = self.metric_of(after.arm)(expert, link_states(after.arm, qpos, qvel))
+        return after, jnp.where(runaway, _RUNAWAY * after.hold, distance), runaway
+
+    def _nearest(self, before: AnyArmState) -> Float[Array, ""]:
+        """The distance after the next step of an arm that is exactly in its goal, or in that of the baseline."""
+        assert before.baseline is not None
+        expert, metric = self.expert_at(before.demonstration, before.step + 1), self.metric_of(before.arm)
+        goals = before.goals.goal, before.baseline.goals.goal
+        return jnp.minimum(*(metric(expert, link_states(before.arm, goal.qpos, goal.qvel)) for goal in goals))
 
     def torque(self, state: AnyArmState, action: Float[Array, " actions"]) -> Float[Array, " joints"]:
         """The torque of an action [N m]."""
-        return planned_torque(state.arm, state.plan, action[:MAX_JOINTS], state.max_torque, self.config.control_dt)
+        return planned_torque(state.arm, state.plan, action, state.max_torque, self.config.control_dt)
 
     def restart_done(self, states: State) -> State:
         """Starts a new episode of a new arm for each arm of a batch whose episode is done."""
@@ -232,13 +266,31 @@ class AnyArmEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """Length of an action: one number for each joint slot, and the preference for another goal."""
-        return MAX_JOINTS + 1
+        """Length of an action: one number for each joint slot."""
+        return MAX_JOINTS
 
     @property
     def backend(self) -> str:
         """Name of the physics backend, for brax."""
         return self.physics.name
+
+
+def relative_reward(
+    distance: Float[Array, ""], baseline: Float[Array, ""], nearest: Float[Array, ""], hold: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The logarithm of the ratio of the baseline's excess over the nearest distance to that of the arm.
+
+    Arms that are near their best motion and arms that are far from it count alike: with plain differences of the
+    distance, a training follows the latter and does harm to the former.
+
+    Args:
+      distance: of the arm.
+      baseline: of the same arm with zero actions since the start of the episode.
+      nearest: of the nearest pose that is known.
+      hold: of holding the home pose, the unit.
+    """
+    own, other = (jnp.maximum(x - nearest, 0.0) / hold + _EXCESS for x in (distance, baseline))
+    return jnp.log(other / own)
 
 
 def any_arm_state(state: State) -> AnyArmState:

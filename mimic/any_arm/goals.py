@@ -84,14 +84,9 @@ def first_goals(qpos: Float[Array, " joints"]) -> Goals:
     return Goals(here, jnp.tile(qpos, (_OTHERS, 1)), here, -jnp.ones((), qpos.dtype))
 
 
-def chosen_goal(goals: Goals, preference: Float[Array, ""]) -> Goals:
-    """The goals after the decision whether to change to the best of the others.
-
-    Args:
-      goals: before.
-      preference: of a policy, added to the advantage.
-    """
-    changes = goals.advantage + preference > MIN_ADVANTAGE
+def chosen_goal(goals: Goals) -> Goals:
+    """The goals after the decision whether to change to the best of the others."""
+    changes = goals.advantage > MIN_ADVANTAGE
     goal = jax.tree.map(lambda new, old: jnp.where(changes, new, old), goals.best, goals.goal)
     return goals._replace(goal=goal)
 

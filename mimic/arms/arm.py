@@ -16,6 +16,7 @@ from mimic.arms.embodiment import Embodiment, Limits, load_arm, panda_path, plan
 from mimic.arms.ignored_elements import ignored_elements
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.arms.model_files import read_spec
+from mimic.arms.mujoco_chain import base_pose
 from mimic.arms.named_arms import BUILT_IN, is_arm_name, named_arm
 from mimic.arms.simulation_model import effective_inertia, simulation_model
 from mimic.config import suggestion
@@ -96,12 +97,14 @@ class Arm:
       embodiment: its free joints and links.
       model: MuJoCo model of the free joints only.
       locked: angle [rad] of the locked joints, by name.
+      T_world_base: [4, 4] pose of the base frame in the world of the model, whose z-axis is vertical.
       notes: elements of its file that the model ignores, one line each.
     """
 
     embodiment: Embodiment
     model: mujoco.MjModel
     locked: Mapping[str, float]
+    T_world_base: Float[np.ndarray, "4 4"]
     notes: tuple[str, ...] = ()
 
 
@@ -150,9 +153,7 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
             limits=cast(Limits, limits),
             home=config.home,
         )
-        return with_minimum_armature(
-            Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles), config
-        )
+        return with_minimum_armature(_arm(embodiment, source, angles, base_pose(source)), config)
     embodiment, source, angles = load_arm(
         config.model if config.is_file else panda_path(config.model),
         name=None if config.is_file else config.model,
@@ -165,9 +166,18 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         base_segment=config.base_segment,
     )
     notes = () if not config.is_file else ignored_elements(source, config.base, config.tip)
-    return with_minimum_armature(
-        Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, notes), config
-    )
+    pose = base_pose(source, config.base, config.tip)
+    return with_minimum_armature(_arm(embodiment, source, angles, pose, notes), config)
+
+
+def _arm(
+    embodiment: Embodiment,
+    source: mujoco.MjModel,
+    angles: Mapping[str, float],
+    pose: np.ndarray,
+    notes: tuple[str, ...] = (),
+) -> Arm:
+    return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, pose, notes)
 
 
 def with_minimum_armature(arm: Arm, config: ArmConfig) -> Arm:

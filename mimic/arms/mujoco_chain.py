@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
 from mimic.arms.compile_check import VELOCITY_LIMIT
@@ -194,6 +195,16 @@ def _geom_ends(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) ->
         half = data.geom_xmat[geom].reshape(3, 3)[:, 2] * (model.geom_size[geom, 1] if is_rod else 0)
         points += [data.geom_xpos[geom] + half, data.geom_xpos[geom] - half]
     return points
+
+
+def base_pose(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) -> Float[np.ndarray, "4 4"]:
+    """Pose of the base frame of an arm in the world of its model, in the zero pose; see `find_chain`."""
+    body, data = find_chain(model, base, tip).base, mujoco.MjData(model)
+    data.qpos[:] = zero_pose(model)
+    mujoco.mj_kinematics(model, data)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
+    return pose
 
 
 def zero_pose(model: mujoco.MjModel) -> np.ndarray:

@@ -10,7 +10,8 @@ from rich.console import Console
 
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
-from mimic.commands.config import CaptureConfig, RecordingConfig
+from mimic.commands.config import ROBOT_WORLDS, CaptureConfig, RecordingConfig
+from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.metric.kinematics import link_state_table
 from mimic.mocap.arms import SIDES, find_arms
@@ -135,12 +136,19 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
         console.print(f"results: {out}, {model}", soft_wrap=True, highlight=False)
         command = (
             f"python -m mimic.train env={env.name} env.expert={model} env.demonstrations.path={out} "
-            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out} env.start=nearest "
-            "'env.observation.terms=[distance_gradient]'"
+            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out} "
         )
-        console.print(f"train on it: {command}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"train on it: {command}{train_options(env)}", soft_wrap=True, highlight=False, markup=False)
 
     return run
+
+
+def train_options(env: EnvConfig) -> str:
+    """What a training on a person's motion needs else. A robot starts in its ready pose, and must not touch itself."""
+    if not env.has_inner_loop:
+        return "env.start=nearest 'env.observation.terms=[distance_gradient]'"
+    world = next((name for name in ROBOT_WORLDS if env_config(env.name, world=name).world == env.world), "hardware")
+    return f"world={world} 'env.reward.terms={{self_collision: 2}}'"
 
 
 def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | None) -> Callable[[], None]:

@@ -21,7 +21,8 @@ from mimic.trainers.config import trainers
 
 ROBOT_WORLDS = ("paper", "nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
-CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "searched")
+CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "tracking", "searched")
+ROBOT_CONTROLLERS = ("policy", "tracking")
 ARM_SIDES = ("left", "right")
 CONTROLLER = "controller"  # a format of a folder, see mimic/commands/export_controller.py
 EXPORT_FORMATS = ("onnx", "jax", CONTROLLER)
@@ -53,8 +54,8 @@ class EvaluateConfig:
       physics: see `EnvConfig`. Default "": that of the run.
       mass, damping, torque_noise: deviation of the arm from its model, see `RandomizationConfig`. Default None: as in
         training.
-      robot: "virtual_panda": the policy controls virtual Pandas in C MuJoCo, which abort as real ones do;
-        "virtual_robot": the same for another learner. Default "": the environment of the run.
+      robot: "virtual_panda": the policy, or "tracking", controls virtual Pandas in C MuJoCo, which abort as real ones
+        do; "virtual_robot": the same for another learner. Default "": the environment of the run.
       episodes: number of episodes of `robot`, of each case with `edges`.
       robot_world: preset of the world of `robot`: "paper", "nominal" or "hardware". Default "": that of the run.
       edges: whether there are also cases with each range of the world at its ends.
@@ -100,11 +101,15 @@ class EvaluateConfig:
         check_choice("robot", self.robot, ROBOTS)
         if self.robot_world:
             check_choice("robot_world", self.robot_world, ROBOT_WORLDS)
-        others = self.learner, self.physics, self.mass, self.damping, self.torque_noise
-        if self.controller != "policy" or any(value not in ("", None) for value in others):
+        if self.controller not in ROBOT_CONTROLLERS:
             raise ValueError(
-                "controller, learner, physics, mass, damping, torque_noise: expected none with robot=, whose world has "
-                "ranges of them"
+                f"controller: expected {' or '.join(ROBOT_CONTROLLERS)} with robot=, got {self.controller}"
+            )
+        others = self.learner, self.physics, self.mass, self.damping, self.torque_noise
+        if any(value not in ("", None) for value in others):
+            raise ValueError(
+                "learner, physics, mass, damping, torque_noise: expected none with robot=, whose world has ranges of "
+                "them"
             )
 
 
@@ -381,6 +386,10 @@ class RetargetConfig:
             raise ValueError("costs: expected none with a mapper, which does not minimise them")
 
 
+_LEARNERS = "panda", "panda4dof", "panda3dof"  # to choose from in a view
+_MODEL_FILES = ".xml", ".urdf"
+
+
 @dataclasses.dataclass(frozen=True)
 class ViewConfig:
     """Config of a live view of two arms.
@@ -389,7 +398,10 @@ class ViewConfig:
       env: environment that defines the arms and the metric.
       expert, learner: replace the arms of the environment: "panda", the name of an environment or of an arm (see
         `named_arm`), or an MJCF file.
-      mapper: run directory of a pose mapper that moves the learner instead of the optimiser. Its arms are used.
+      mapper: pose mapper that moves the learner instead of the optimiser: a run directory, or the name of one that
+        comes with mimic, such as "any_arm". Its arms are used.
+      learners: with a pose mapper to any arm, the learners to choose from on the page, each as `learner`. The first one
+        is shown first. Default []: the one of its environment, panda, panda4dof and panda3dof.
       run: run directory of a policy to play. Its arms and demonstrations are used.
       source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
         that takes points as lines of JSON.
@@ -407,6 +419,7 @@ class ViewConfig:
     expert: str = ""
     learner: str = ""
     mapper: str = ""
+    learners: list[str] = dataclasses.field(default_factory=list)
     run: str = ""
     source: str = ""
     arm: str = ""
@@ -429,7 +442,12 @@ class ViewConfig:
                 f"got run={self.run!r} and checkpoint={self.checkpoint}"
             )
         if (self.run or self.mapper) and (self.expert or self.learner):
-            raise ValueError("expert, learner: expected neither with run= or mapper=, whose arms are used")
+            raise ValueError(
+                "expert, learner: expected neither with run= or mapper=, whose arms are used; "
+                "mapper=any_arm takes learners=[NAME,...]"
+            )
+        if self.learners and not self.mapper:
+            raise ValueError("learners: expected with mapper=, as in mapper=any_arm learners=[panda,ur5e.xml]")
         if self.source and (self.run or self.mapper or self.expert):
             raise ValueError("expert, run, mapper: expected none with source=, whose person is the expert")
         if not self.source and (self.arm or self.capture != CaptureConfig()):
@@ -449,6 +467,21 @@ class ViewConfig:
         env = dataclasses.replace(self.env, **arms)
         return dataclasses.replace(env, arms=ArmsConfig()) if "learner" in arms else env
 
+    def resolve_learners(self, own: ArmConfig) -> dict[str, ArmConfig]:
+        """The arms to choose from, by the name that the page shows.
+
+        Args:
+          own: learner of the environment of the mapper.
+
+        Raises:
+          ValueError: an arm does not exist, or two have the same name.
+        """
+        names = self.learners or list(_LEARNERS)
+        arms = {Path(name).stem if name.endswith(_MODEL_FILES) else name: _arm("learners", name) for name in names}
+        if len(arms) < len(names):
+            raise ValueError(f"learners: expected arms of different names, got {', '.join(names)}")
+        return arms if self.learners else {Path(own.model).stem: own, **arms}
+
 
 def _without_none(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
@@ -458,7 +491,7 @@ def _arm(role: str, name: str) -> ArmConfig:
     if name == "panda":
         return ArmConfig()
     if name in environments():
-        return getattr(env_config(name), role)
+        return getattr(env_config(name), role.removesuffix("s"))
     if is_arm_name(name):
         return ArmConfig(model=name)
     if not Path(name).expanduser().is_file():

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from mimic.commands.config import EvaluateConfig
+from mimic.commands.config import CONTROLLERS, EvaluateConfig
 from mimic.commands.progress import SearchProgress
 from mimic.commands.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
@@ -26,6 +26,8 @@ from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.trainer import Trainer
 
 CONTROLLERS_OF_MANY = ("policy", "nearest_pose")
+TORQUE_CONTROLLERS = ("pd", "computed_torque", "nearest_pose", "searched")  # for actions that are torques
+TARGET_CONTROLLERS = ("tracking",)  # for actions that are other targets of an inner loop
 
 
 def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], None]:
@@ -116,17 +118,13 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
                 f"trainer=ppo, got one of {trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)
-    if trained.env.has_inner_loop and config.controller not in ("policy", "hold"):
-        raise ValueError(
-            f"controller: expected policy or hold for a run with an inner loop, got {config.controller}, which "
-            "commands torques"
-        )
     if config.controller == "searched" and trained.env.metric.link_distance:
         raise ValueError(
             "controller=searched: expected a metric of weighted parts, got a run with "
             f"metric.link_distance={trained.env.metric.link_distance}"
         )
     _check_arms(trained.env, config)
+    _check_commands(trained.env, config.controller)
     base = with_one_learner(trained.env, config.learner, config.locked) if config.learner else trained.env
     env = dataclasses.replace(
         base,
@@ -141,6 +139,17 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
         shared = make_any_arm_trainer(trained, run_dir).shared_policy() if config.learner else None
         trainer = make_ppo_trainer(evaluated, run_dir, unseen, shared)
     return dataclasses.replace(evaluated, env=trainer.env_config), trainer
+
+
+def _check_commands(env: EnvConfig, controller: str) -> None:
+    """Rejects controllers whose commands are not those of the run."""
+    has_targets = env.has_inner_loop and env.control != "torque"
+    unfit = [*(TORQUE_CONTROLLERS if env.has_inner_loop else ()), *(() if has_targets else TARGET_CONTROLLERS)]
+    if controller in unfit:
+        valid = [name for name in CONTROLLERS if name not in unfit]
+        loop = f"an inner loop and control={env.control}" if env.has_inner_loop else "no inner loop"
+        raise ValueError(f"controller: expected {', '.join(valid[:-1])} or {valid[-1]} for a run with {loop}, got "
+                         f"{controller}")  # fmt: skip
 
 
 def _check_arms(env: EnvConfig, config: EvaluateConfig) -> None:

@@ -22,6 +22,7 @@ from mimic.envs import env_config
 from mimic.envs.world import WorldConfig
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_metrics import gaps
+from mimic.evaluation.tracking_controllers import run_tracking
 from mimic.metric.kinematics import link_state_table, link_states
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import write_report
@@ -30,7 +31,7 @@ from mimic.trainers.config import TrainConfig
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.virtual_robot.arm_model import RobotModel, robot_model
 from mimic.virtual_robot.draws import draw_world, edge_cases
-from mimic.virtual_robot.episodes import Episodes, TorquePolicy
+from mimic.virtual_robot.episodes import Episodes, TorquePolicy, TrackingPolicy
 from mimic.virtual_robot.robots import LIMIT_CAUSES, SELF_CONTACT
 from mimic.virtual_robot.runs import Task, run_tasks
 
@@ -57,6 +58,8 @@ def prepare_robot_evaluation(
         console = Console()
         with tempfile.TemporaryDirectory(prefix="mimic-") as folder:
             policy = _policy(trained, trainer.evaluator, run_dir, steps, Path(folder))
+            if config.controller == "tracking":
+                policy = _tracking(trainer.evaluator, policy)
             cases = _cases(world, config)
             tasks = [_task(robot, policy, trainer.evaluator, case, config) for case in cases]
             results = _run(tasks, console)
@@ -67,6 +70,8 @@ def prepare_robot_evaluation(
             "env": trained.env.name,
             "env_steps": steps,
             "control": trained.env.control,
+            "controller": config.controller,
+            **({"lead_ticks": policy.lead} if isinstance(policy, TrackingPolicy) else {}),
             "world": dataclasses.asdict(world),
             "cases": rows,
             "hardware": hardware(),
@@ -101,7 +106,7 @@ def _cases(world: WorldConfig, config: EvaluateConfig) -> list[tuple[str, WorldC
 
 def _task(
     robot: RobotModel,
-    policy: Path | TorquePolicy,
+    policy: Path | TrackingPolicy | TorquePolicy,
     evaluator: Evaluator,
     case: tuple[str, WorldConfig, str],
     config: EvaluateConfig,
@@ -111,8 +116,7 @@ def _task(
     held_out = evaluator.parts["held_out"]
     first, count = held_out.start, evaluator.env.demonstrations.count - held_out.start
     motion = first + np.arange(config.episodes) % count
-    joints = robot.model.nv
-    drawn = draw_world(world, config.episodes, joints, len(robot.links), np.random.default_rng(config.seed), edge)
+    drawn = draw_world(world, config.episodes, robot.num_joints, np.random.default_rng(config.seed), edge)
     return Task(robot, policy, drawn, motion, np.asarray(evaluator.env.start_poses)[motion], config.seed)
 
 
@@ -141,6 +145,13 @@ def _policy(trained: TrainConfig, evaluator: Evaluator, run_dir: Path, steps: in
         names=np.array([f"motion {i}" for i in range(count)]),
     )
     return bundle
+
+
+def _tracking(evaluator: Evaluator, bundle: Path | TorquePolicy) -> TrackingPolicy:
+    """The controller "tracking", with the best lead in the environment of the run."""
+    assert isinstance(bundle, Path)
+    _, lead = run_tracking(evaluator)
+    return TrackingPolicy(bundle, np.asarray(evaluator.nearest_poses, float), lead)
 
 
 def _expert_table(evaluator: Evaluator) -> np.ndarray:

@@ -7,7 +7,7 @@ import io
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ import jax
 from rich.console import Console
 
 from mimic import compat
-from mimic.arms.arm import build_arm
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.config import ViewConfig
 from mimic.commands.view_capture import (
     CapturedExpert,
@@ -27,7 +27,7 @@ from mimic.commands.view_capture import (
     wait_for_arm,
 )
 from mimic.distribution import install_command
-from mimic.envs.config import EnvConfig
+from mimic.envs.config import ArmsConfig, EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.signals import Signals, noted_signals
 from mimic.trainers.run_config import load_config, policy_config, policy_run
@@ -36,8 +36,10 @@ from mimic.viewer.live_session import LiveSession
 from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
+    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
+    from mimic.viewer.follower import Mapper, Preset
     from mimic.viewer.newest_checkpoint import NewestCheckpoint
-    from mimic.viewer.page import Page
+    from mimic.viewer.page import LearnerShape, Page
     from mimic.viewer.playback import Playback
     from mimic.viewer.player import Player
     from mimic.viewer.recorder import Recorder
@@ -66,25 +68,79 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         return _prepare_training_view(config)
     if config.run:
         return _prepare_playback(config)
-    mapper, env = None, config.resolve_env()
-    if config.mapper:
-        from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper, one_learner
-
-        mapper = load_mapper(Path(config.mapper).expanduser(), config.checkpoint)
-        env = one_learner(load_config(Path(config.mapper).expanduser()).env)
     # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if config.source:
-        return _prepare_captured(config, env)
-    live = LiveSession(env, mapper)
+        return _prepare_captured(config, config.resolve_env())
+    if not config.mapper:
+        env = config.resolve_env()
+        return _prepare_live(config, env, LiveSession(env))
+    return _prepare_mapper(config)
+
+
+def _prepare_live(
+    config: ViewConfig,
+    env: EnvConfig,
+    session: LiveSession,
+    learners: Mapping[str, ArmConfig] | None = None,
+    presets: "Sequence[Preset]" = (),
+) -> Callable[[], int]:
+    """Prepares a view whose expert the user moves; `learners` as of `serve`, `presets` as of `LearnerControls`."""
 
     def follow(page: "Page", times: Iterator[float]) -> None:
+        from mimic.viewer.learner_controls import LearnerControls
         from mimic.viewer.live_page import show_live
         from mimic.viewer.manual_controls import ManualControls
 
-        show_live(page, times, live, env, ManualControls(live, env, page.expert), mapper is None)
+        expert = ManualControls(session, env, page.expert)
+        show_live(page, times, session, env, expert, LearnerControls(session, page.starts, presets))
 
-    return lambda: serve(config, env, follow, None, live.finish)
+    return lambda: serve(config, env, follow, None, session.finish, learners=learners)
+
+
+def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
+    """Prepares a view whose learner a pose mapper moves.
+
+    Raises:
+      ValueError: there is no such mapper, or a learner does not exist or does not fit it.
+    """
+    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
+    from mimic.viewer.any_learner import AnyLearnerFunctions, read_learners
+    from mimic.viewer.follower import shown_preset
+
+    mapper, env = _load_mapper(config)
+    if not isinstance(mapper, AnyArmMapper):
+        if config.learners:
+            raise ValueError(f"learners: expected none with mapper={config.mapper}, which has one learner")
+        return _prepare_live(config, env, LiveSession(env, mapper))
+    named = config.resolve_learners(env.learner)
+    learners, presets = read_learners(named, env.limits, env.metric.links)
+    env = dataclasses.replace(env, arms=ArmsConfig(), learner=next(iter(named.values())))
+    names = [shown_preset(presets, index, {}).name for index in range(len(learners))]
+    session = LiveSession(env, any_arm=AnyLearnerFunctions(mapper, learners))
+    drawn = dict(zip(names, (learner.config for learner in learners), strict=True))
+    return _prepare_live(config, env, session, drawn, presets)
+
+
+def _load_mapper(config: ViewConfig) -> "tuple[Mapper | AnyArmMapper, EnvConfig]":
+    """The mapper in `mapper`, and its environment.
+
+    Raises:
+      ValueError: see `PoseMapper.load` and `AnyArmMapper.load`.
+    """
+    from mimic.pretrained.network import Pretrained, load, pretrained_names
+    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
+    from mimic.trainers.pose_mapper.model import PoseMapper
+
+    run_dir = Path(config.mapper).expanduser()
+    if config.mapper in pretrained_names("pose_mapper") and not run_dir.exists():
+        if config.checkpoint is not None:
+            raise ValueError(f"checkpoint: expected none with mapper={config.mapper}, which comes with mimic")
+        network = load(config.mapper, "pose_mapper")
+        return (network.function, network.config.env) if isinstance(network, Pretrained) else (network, network.env)
+    env = load_config(run_dir).env
+    load_run = AnyArmMapper.load if env.arms.are_drawn else PoseMapper.load
+    return load_run(run_dir, config.checkpoint), env
 
 
 def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
@@ -94,9 +150,11 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
         live = LiveSession(expert.env)
 
         def follow(page: "Page", times: Iterator[float]) -> None:
+            from mimic.viewer.learner_controls import LearnerControls
             from mimic.viewer.live_page import show_live
 
-            show_live(page, times, live, expert.env, expert.controls(live), True, _NUMBERS_RATE)
+            learner = LearnerControls(live, page.starts)
+            show_live(page, times, live, expert.env, expert.controls(live), learner, _NUMBERS_RATE)
 
         return serve(config, expert.env, follow, None, live.finish, rate=CAPTURE_RATE)
 
@@ -194,10 +252,12 @@ def serve(
     before: Callable[[], None] | None = None,
     after: Callable[[], None] | None = None,
     rate: float = RATE,
+    learners: Mapping[str, ArmConfig] | None = None,
 ) -> int:
     """Serves a page until a signal, with a rate of frames [1/s].
 
-    Calls `before` before the server starts and `after` when it has ended.
+    Calls `before` before the server starts and `after` when it has ended. The page has the learners to choose from by
+    name; default None: the one of the environment.
     """
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
@@ -216,15 +276,11 @@ def serve(
     with noted_signals(signals, "view: ending; repeat to stop immediately"):
         server, gatekeeper = make_server(config.host, config.port)
         try:
-            free = build_arm(dataclasses.replace(env.learner, locked=()), env.limits)  # joints are locked in the view
-            match = env.metric.match_links(build_arm(env.expert, env.limits).embodiment, free.embodiment)
-            colours = match.expert_colours, match.learner_colours
-            shapes = [
-                ArmShape(arm, env.limits, links) for arm, links in zip((env.expert, env.learner), colours, strict=True)
-            ]
-            names = [build_arm(arm, env.limits).embodiment.name.partition("-")[0] for arm in (env.expert, env.learner)]
-            is_flat = all(arm.model == "planar" for arm in (env.expert, env.learner))
-            page = Page(server, shapes, names, _title(config, env), is_flat, match)
+            learners = learners or {_name(env.learner, env): env.learner}
+            is_flat = all(arm.model == "planar" for arm in (env.expert, *learners.values()))
+            shapes = [_learner_shape(name, arm, env) for name, arm in learners.items()]
+            expert = ArmShape(env.expert, env.limits, shapes[0].match.expert_colours)
+            page = Page(server, (_name(env.expert, env), expert), shapes, _title(config, env), is_flat)
             print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
             show(page, _recorded(Recorder(server), ticks(signals, rate)))
         finally:
@@ -238,6 +294,19 @@ def serve(
     return 0
 
 
+def _name(arm: ArmConfig, env: EnvConfig) -> str:
+    return build_arm(arm, env.limits).embodiment.name.partition("-")[0]
+
+
+def _learner_shape(name: str, learner: ArmConfig, env: EnvConfig) -> "LearnerShape":
+    from mimic.viewer.meshes import ArmShape
+    from mimic.viewer.page import LearnerShape
+
+    free = build_arm(dataclasses.replace(learner, locked=()), env.limits)  # joints are locked in the view
+    match = env.metric.match_links(build_arm(env.expert, env.limits).embodiment, free.embodiment)
+    return LearnerShape(name, ArmShape(learner, env.limits, match.learner_colours), match)
+
+
 def address(host: str, port: int) -> str:
     """The address to open in a browser on this machine."""
     name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
@@ -247,7 +316,7 @@ def address(host: str, port: int) -> str:
 def _title(config: ViewConfig, env: EnvConfig) -> str:
     policy = f"{'newest policy' if config.follow else 'policy'} of {Path(config.run).name}"
     controller = policy if config.run else "pose mapper" if config.mapper else "optimiser"
-    return f"{env.name or 'mimic'}: the learner is moved by the {controller}"
+    return f"{env.name or 'mimic'}: the {controller} moves the learner"
 
 
 def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:

@@ -108,6 +108,23 @@ def action_target(mode: str, action: Array, reference: Reference, joints: JointP
     return Target(position, MIN_STIFFNESS ** (0.5 * (1.0 - action[size:])))
 
 
+def action_towards(mode: str, displacement: Array, duration: Any, joints: JointParameters, xp: Any) -> Array:
+    """The action that moves a reference towards an angle, [..., numbers] in [-1, 1]: see `action_target`.
+
+    Args:
+      mode: one of `MODES` but "torque". "joint_velocity" commands the velocity that is there after `duration`; the
+        others command the angle, "joint_impedance" at full stiffness.
+      displacement: from the reference to the angle, [..., joints] [rad].
+      duration: [s].
+      joints: parameters, [joints] each.
+      xp: array library.
+    """
+    assert mode in MODES and mode != "torque", mode
+    reach = duration * joints.velocity if mode == "joint_velocity" else joints.reach
+    action = xp.clip(displacement / reach, -1.0, 1.0)
+    return xp.concatenate([action, xp.ones_like(action)], axis=-1) if mode == "joint_impedance" else action
+
+
 def approach_speed(distance: Array, acceleration: Array, rate: float, xp: Any) -> Array:
     """Speed at which a value may approach a point so that it can stop there; negative beyond the point.
 

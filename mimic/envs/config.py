@@ -115,6 +115,8 @@ class ArmsConfig:
       perturbed: weight of `models`, each drawn with another size, other masses, rotors, damping and velocity limits.
       models: arms to draw perturbed ones from: names or files, see `ArmConfig.model`.
       random: weight of random arms, see `random_arm` in mimic/any_arm/sampler.py.
+      reward: "relative": how much nearer the arm is than with the controller that the zero action is; or "distance",
+        without it. See `AnyArmEnv`.
       distinct: number of distinct arms in a training; 0 draws a new arm for each episode.
       evaluated: arms that the report shows too, as names or files. They should not be in `models`.
       armature, damping: minimum of each joint of `models` and `evaluated`, see `ArmConfig`; the default is the Panda's.
@@ -126,6 +128,7 @@ class ArmsConfig:
     perturbed: float = number(0.0, at_least=0.0, at_most=1e6)
     models: list[str] = dataclasses.field(default_factory=list)
     random: float = number(0.0, at_least=0.0, at_most=1e6)
+    reward: str = "relative"
     distinct: int = number(0, at_least=0, at_most=2**31 - 1)
     evaluated: list[str] = dataclasses.field(default_factory=list)
     armature: float = number(0.1, at_least=0.0, at_most=1e4)
@@ -133,6 +136,7 @@ class ArmsConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self, "arms.")
+        check_choice("arms.reward", self.reward, ("relative", "distance"))
         for text in self.unseen:
             if not all(number.isdecimal() and int(number) > 0 for number in text.split("+")):
                 raise ValueError(f"arms.unseen: expected numbers of joints from 1, as in 2 or 1+4, got {text!r:.80}")

@@ -32,8 +32,8 @@ class WorldConfig:
         observes; on the virtual robot, also of those that the inner loop measures.
       observation_delay: range of the age of a measurement when the policy observes it, in ticks.
       action_delay: range of the time from an observation to the moment when its action acts, in ticks.
-      action_latency: time from the arrival of an action until it acts, in addition to whole ticks [s]. The safety layer of
-        `mimic.deploy` takes 0.02 s to check a target; there the time is always that one.
+      action_latency: time from the arrival of an action until it acts, in addition to whole ticks [s]. The safety layer
+        of `mimic.deploy` takes 0.02 s to check a target; there the time is always that one.
       packet_loss: probability that an action does not arrive; the one before is then used again.
       start_noise: maximum deviation of each joint from the start pose [rad].
       stops: whether joints have mechanical stops at the ends of their ranges.

@@ -1,26 +1,32 @@
 """Controllers without learning: holding the start pose, and feedback control along optimal poses."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import State
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mimic.any_arm.controller import nearest_pose_controller
 from mimic.arms.simulation_model import effective_inertia
+from mimic.control.joint_control import action_towards
 from mimic.envs import dynamics
 from mimic.envs.imitation import ImitationEnv, arm_state
-from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
+from mimic.evaluation.evaluator import Controller, Evaluator, Motions, Rollouts
+from mimic.hardware.env import HardwareEnv
+from mimic.hardware.state import HardwareState
 from mimic.retargeting.motions import largest_jump, optimal_motions
 
 _FREQUENCIES = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)  # candidates [rad/s]; a torque is constant for 0.1 s
+_LEADS = range(1, 14)  # candidates [ticks]; delays of the hardware world are up to 6
 
 _Law = Callable[[Array, Array, Array], Array]  # (desired acceleration, qpos, qvel) -> torque
 
 
-def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, float]:
+def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, dict[str, float]]:
     """Runs a controller without learning on all demonstrations.
 
     - "hold": zero torque; the arm stays at rest in its home pose.
@@ -28,18 +34,21 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, float]:
       joint's effective inertia in the home pose. The controller has no other model of the dynamics.
     - "computed_torque": the same feedback through the arm's exact inverse dynamics, with feed-forward.
     - "nearest_pose": inverse dynamics to one of the poses nearest to the expert's at the next step, which are followed
-      from step to step. In contrast to "pd" and "computed_torque" it does not know the motion in advance, see
+      from step to step. In contrast to the others it does not know the motion in advance, see
       `nearest_pose_controller`.
+    - "tracking": targets of an inner loop along the poses of the kinematic bound, see `tracking_controller`.
 
-    "pd" and "computed_torque" are critically damped. Of several frequencies, the one with the smallest distance on the
-    training demonstrations is used.
+    "pd" and "computed_torque" are critically damped. Of several frequencies, and of several leads of "tracking", the
+    one with the smallest distance on the training demonstrations is used.
 
     Args:
       evaluator: evaluator of the environment and its demonstrations.
-      name: "hold", "pd", "computed_torque" or "nearest_pose".
+      name: "hold"; "pd", "computed_torque" or "nearest_pose" where actions are torques; "tracking" where they are other
+        targets of an inner loop.
 
     Returns:
-      Rollouts of the controller, and its frequency [rad/s], 0 for one that has none.
+      Rollouts of the controller, and its setting as an entry of the report: `frequency_rad_s`, 0 for one that has none,
+      or `lead_ticks`.
 
     Raises:
       ValueError: an arm or a metric that "nearest_pose" does not support.
@@ -47,14 +56,57 @@ def run_controller(evaluator: Evaluator, name: str) -> tuple[Rollouts, float]:
     env = evaluator.env
     if name == "hold":
         zero = jnp.zeros(env.action_size)
-        return jax.jit(lambda: evaluator.rollout(lambda state: zero))(), 0.0
+        return jax.jit(lambda: evaluator.rollout(lambda state: zero))(), {"frequency_rad_s": 0.0}
     if name == "nearest_pose":
         controller = nearest_pose_controller(env)
-        return jax.jit(lambda: evaluator.rollout(controller))(), 0.0
-    make_controller = _tracking(env, {"pd": _joint_law, "computed_torque": _inverse_dynamics_law}[name](env))
-    run = jax.jit(lambda frequency: evaluator.rollout(make_controller(frequency)))
-    candidates = [(run(frequency), frequency) for frequency in _FREQUENCIES]
-    part = evaluator.parts["train"]
+        return jax.jit(lambda: evaluator.rollout(controller))(), {"frequency_rad_s": 0.0}
+    if name == "tracking":
+        rollouts, lead = run_tracking(evaluator)
+        return rollouts, {"lead_ticks": lead}
+    make_controller = _feedback(env, {"pd": _joint_law, "computed_torque": _inverse_dynamics_law}[name](env))
+    rollouts, frequency = _best(evaluator, make_controller, _FREQUENCIES)
+    return rollouts, {"frequency_rad_s": frequency}
+
+
+def run_tracking(evaluator: Evaluator, *, is_delayed: bool = False) -> tuple[Rollouts, int]:
+    """Rollouts of `tracking_controller` with the best of several leads, and this lead [ticks]."""
+    env, poses = cast(HardwareEnv, evaluator.env), evaluator.nearest_poses
+    make = functools.partial(tracking_controller, env, poses, is_delayed=is_delayed)
+    rollouts, lead = _best(evaluator, make, _LEADS)
+    return rollouts, int(lead)
+
+
+def tracking_controller(
+    env: HardwareEnv, poses: Motions, lead: Int[Array, ""] | int, *, is_delayed: bool = False
+) -> Controller:
+    """A controller that moves the reference of the inner loop towards the pose that is `lead` ticks ahead.
+
+    See `action_towards`. It knows the poses of the whole motion, and the reference itself in place of a measurement.
+
+    Args:
+      env: the environment; its targets are not torques.
+      poses: poses of the learner after each tick [rad].
+      lead: ticks; more than 1 makes up for delays.
+      is_delayed: whether it knows the reference as late as a policy observes it.
+    """
+    table, mode = jnp.asarray(poses, jnp.float32), env.config.control
+
+    def controller(state: State) -> Array:
+        episode = cast(HardwareState, arm_state(state))
+        ahead = jnp.minimum(episode.step + lead, table.shape[1]) - 1
+        measured = episode.measured[episode.draw.observation_delay if is_delayed else 0]
+        displacement = table[episode.demonstration, ahead] - jnp.split(measured, 4)[2]
+        return action_towards(mode, displacement, lead * env.config.control_dt, env.parameters, jnp)
+
+    return controller
+
+
+def _best(
+    evaluator: Evaluator, make: Callable[[Array], Controller], settings: Sequence[float]
+) -> tuple[Rollouts, float]:
+    """The rollouts with the smallest distance on the training demonstrations, and the setting of their controller."""
+    run, part = jax.jit(lambda setting: evaluator.rollout(make(setting))), evaluator.parts["train"]
+    candidates = [(run(setting), setting) for setting in settings]
     return min(candidates, key=lambda candidate: float(np.asarray(candidate[0].distance)[part].mean()))
 
 
@@ -69,7 +121,7 @@ def reference_motions(
     return angles, np.gradient(angles, env.config.control_dt, axis=1)
 
 
-def _tracking(env: ImitationEnv, law: _Law) -> Callable[[Array], Controller]:
+def _feedback(env: ImitationEnv, law: _Law) -> Callable[[Array], Controller]:
     """A function from a frequency to a controller: feedback along the reference motion, and its acceleration."""
     dt = env.config.control_dt
     qpos, qvel = (jnp.asarray(x, jnp.float32) for x in reference_motions(env))

@@ -41,6 +41,7 @@ class HardwareEnv(ImitationEnv):
     Attributes:
       plant: the learner, as the inner loop simulates it.
       torque_scale: [joints] maximum torque [N m].
+      parameters: of the inner loop, [joints] each.
       action_size: length of an action.
 
     Raises:
@@ -60,8 +61,13 @@ class HardwareEnv(ImitationEnv):
         self._waiting_loop = make(waiting) if waiting else None
         self._acting_loop = make(round(config.control_dt / PERIOD) - waiting)
         parameters = self.plant.constants.parameters
-        self.torque_scale = jnp.asarray(parameters.torque, jnp.float32)
-        self._parameters = JointParameters(*(jnp.asarray(x, jnp.float32) for x in parameters))
+        self.parameters = JointParameters(*(jnp.asarray(x, jnp.float32) for x in parameters))
+        self.torque_scale = self.parameters.torque
+
+    def _start_poses_of(self, demonstrations: Demonstrations) -> Float[np.ndarray, "demonstrations joints"]:
+        """See `ImitationEnv`; within the joint ranges of the inner loop, which end before those of the robot."""
+        lower, upper = np.asarray(self.parameters.lower), np.asarray(self.parameters.upper)
+        return np.clip(super()._start_poses_of(demonstrations), lower, upper)
 
     def _make_mjx_loop(self, periods: int) -> MjxLoop:
         world = self.config.world
@@ -92,7 +98,7 @@ class HardwareEnv(ImitationEnv):
         state, joints = super().start(key, demonstration), self.learner.num_joints
         deviation = self.config.world.start_noise
         noise = jax.random.uniform(jax.random.fold_in(key, _START), (joints,), minval=-deviation, maxval=deviation)
-        qpos = jnp.clip(state.qpos + noise, self._parameters.lower, self._parameters.upper) if deviation else state.qpos
+        qpos = jnp.clip(state.qpos + noise, self.parameters.lower, self.parameters.upper) if deviation else state.qpos
         draw = draw_episode(self.config, joints, jax.random.fold_in(key, _DRAW))
         zero = jnp.zeros_like(qpos)
         actions = jnp.zeros((MAX_DELAY + 1, self.action_size))
@@ -121,7 +127,7 @@ class HardwareEnv(ImitationEnv):
         loop = LoopState(state.qpos, state.qvel, state.reference, state.torque)
         if self._waiting_loop is not None:
             loop = self._waiting_loop(state.draw, loop, state.target)
-        target = joint_control.action_target(self.config.control, acting, loop.reference, self._parameters, jnp)
+        target = joint_control.action_target(self.config.control, acting, loop.reference, self.parameters, jnp)
         loop = self._acting_loop(state.draw, loop, target)
         after = dataclasses.replace(
             state,
@@ -157,7 +163,7 @@ class HardwareEnv(ImitationEnv):
     def command(self, before: ArmState, action: Float[Array, " numbers"]) -> Float[Array, " joints"]:
         """The target angles [rad], velocities [rad/s] or torques [N m] of an action that arrives at once."""
         reference = cast(HardwareState, before).reference
-        return joint_control.action_target(self.config.control, action, reference, self._parameters, jnp).value
+        return joint_control.action_target(self.config.control, action, reference, self.parameters, jnp).value
 
     def observe(self, state: ArmState) -> Float[Array, " observation"]:
         """See the class, and `control_observation`."""

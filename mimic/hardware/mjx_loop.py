@@ -11,7 +11,7 @@ from mujoco import mjx
 from mimic.control import joint_control
 from mimic.control.joint_control import Target
 from mimic.hardware.inner_loop import LoopState, control
-from mimic.hardware.mujoco_world import MujocoWorld
+from mimic.hardware.mujoco_world import MujocoWorld, loaded_fields
 from mimic.hardware.plant import Draw, Plant
 
 MjxLoop = Callable[[Draw, LoopState, Target], LoopState]
@@ -53,13 +53,13 @@ def make_mjx_loop(mode: str, plant: Plant, world: MujocoWorld, periods: int) -> 
 
 def _with_draw(model: mjx.Model, world: MujocoWorld, draw: Draw) -> mjx.Model:
     """The model with the masses, the damping, the payload and the gravity of an episode."""
-    factors = jnp.ones(model.nbody).at[world.moving].set(draw.load.mass * draw.link_mass)
-    place = jnp.asarray(world.tip, jnp.float32) + draw.payload_lever * jnp.asarray(world.along, jnp.float32)
+    link_mass = draw.load.mass * draw.link_mass
+    fields = loaded_fields(world, draw.gravity_error, link_mass, draw.payload, draw.payload_lever, jnp)
     return model.replace(
-        opt=model.opt.replace(gravity=draw.gravity_error * model.opt.gravity),
-        body_mass=(factors * model.body_mass).at[world.payload].set(draw.payload),
-        body_inertia=factors[:, None] * model.body_inertia,
-        body_pos=model.body_pos.at[world.payload].set(place),
+        opt=model.opt.replace(gravity=fields.gravity),
+        body_mass=fields.body_mass,
+        body_inertia=fields.body_inertia,
+        body_ipos=fields.body_ipos,
         dof_damping=draw.load.damping * model.dof_damping,
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mimic.any_arm.arrays import ArmArrays, arm_arrays, base_in_world, body_moments, moments_of_joints
+from mimic.any_arm.arrays import ArmArrays, arm_arrays, body_moments, moments_of_joints
 from mimic.any_arm.dynamics import NUMBERS, joint_numbers
 from mimic.arms.arm import Arm, torque_scale
 from mimic.arms.drives import drives_of
@@ -145,7 +145,7 @@ def make_plant(config: EnvConfig, arm: Arm) -> Plant:
         stop_stiffness=inertia * STOP_FREQUENCY**2,
         stop_damping=2 * inertia * STOP_FREQUENCY,
     )
-    vertical = base_in_world(arm)[2, :3]  # in the base frame
+    vertical = arm.T_world_base[2, :3]  # in the base frame
     return Plant(
         constants=constants,
         numbers=np.asarray(joint_numbers(arrays), float).reshape(-1, NUMBERS)[: len(inertia)],
@@ -158,7 +158,7 @@ def make_plant(config: EnvConfig, arm: Arm) -> Plant:
 def _largest_inertia(arm: Arm, world: WorldConfig) -> Float[np.ndarray, " joints"]:
     """The largest `joint_inertia` of random poses with the largest payload of a world."""
     tip, along = end_of_last_link(arm)
-    pose = base_in_world(arm)
+    pose = arm.T_world_base
     point = pose[:3, :3] @ (tip + max(world.payload_lever) * along) + pose[:3, 3]
     lower, upper = np.asarray(arm.embodiment.joint_range, float).T  # a full rotation where a joint has no limits
     poses = np.random.default_rng(0).uniform(lower, upper, (_RANDOM_POSES, arm.model.nv))

@@ -36,7 +36,7 @@ def make_clearance(
     by_joint = [np.flatnonzero(np.array(capsules.joint) == joint) for joint in range(-1, arm.num_joints)]
     order = np.concatenate(by_joint)
     points = [_ends(capsules, indices) for indices in by_joint]
-    pairs = np.array(capsules.pairs).reshape(-1, 2)[changing_pairs(arm, capsules)]
+    pairs = np.array(capsules.pairs, int).reshape(-1, 2)[changing_pairs(arm, capsules)]
     selection, constants = _pair_constants(capsules, pairs, order)
     height = np.where(np.array(capsules.near_base), -_FAR, capsules.radius + floor_height)[order]
     heights = np.concatenate([height, height]).astype(np.float32)

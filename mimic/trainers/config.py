@@ -56,7 +56,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 # reward for noise, and a long horizon, because it pays off late to move to another minimum of the metric.
 _OF_DRAWN_ARMS = {
     "network": "joints",
-    "learning_rate": 1e-4,
+    "learning_rate": 3e-4,
     "final_learning_rate": 0.1,
     "discounting": 0.97,
     "entropy_cost": 0.0,

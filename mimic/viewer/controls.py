@@ -1,12 +1,12 @@
-"""The controls of a live view: those of the expert, and sliders and switches of the metric and of the learner."""
+"""The controls of a live view: those of the expert, of the metric and of the learner, each in a tab."""
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import viser
 
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import CORRESPONDENCES
-from mimic.viewer.follower import home_angles
+from mimic.viewer.learner_controls import LearnerControls
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.manual_controls import by_user
 
@@ -32,13 +32,18 @@ class LiveControls:
     Args:
       server: server that shows the widgets.
       session: session that the widgets control.
-      env: environment that defines the arms.
-      can_lock: whether the learner's joints can be locked; the joints of a trained pose mapper are fixed.
+      env: environment that defines the metric.
       expert: controls of the expert.
+      learner: controls of the learner.
     """
 
     def __init__(
-        self, server: viser.ViserServer, session: LiveSession, env: EnvConfig, can_lock: bool, expert: ExpertControls
+        self,
+        server: viser.ViserServer,
+        session: LiveSession,
+        env: EnvConfig,
+        expert: ExpertControls,
+        learner: LearnerControls,
     ):
         self._server, self._session, self._env = server, session, env
         tabs = server.gui.add_tab_group()
@@ -47,17 +52,15 @@ class LiveControls:
         with tabs.add_tab("Metric"):
             self._add_metric()
         with tabs.add_tab("Learner"):
-            self._add_learner(can_lock)
-
-    def undo_locks(self) -> None:
-        """Restores the checkboxes of the locked joints after an invalid choice."""
-        for name, box in self._locks.items():
-            box.value = name in self._session.settings.locked
+            learner.add_widgets(server)
 
     def _add_metric(self) -> None:
         gui, session, settings = self._server.gui, self._session, self._session.settings
-        choices = tuple(dict.fromkeys((*CORRESPONDENCES, settings.correspondence)))  # a run may have one of its own
-        correspondence = gui.add_dropdown("correspondence", choices, initial_value=settings.correspondence)
+        others = () if session.takes_any_arm else CORRESPONDENCES
+        choices = tuple(dict.fromkeys((*others, settings.correspondence)))  # a run may have one of its own
+        correspondence = gui.add_dropdown(
+            "correspondence", choices, initial_value=settings.correspondence, disabled=len(choices) == 1
+        )
         correspondence.on_update(by_user(lambda value: session.change(correspondence=value)))
         for term in ("rotation", "translation"):
             initial = getattr(settings, term)
@@ -67,23 +70,5 @@ class LiveControls:
                 hint="weight of this term of the distance",
             )  # fmt: skip
             weight.on_update(by_user(lambda value, term=term: session.change(**{term: float(value)})))
-        gui.add_markdown("A new correspondence, and a first weight on translation, take some seconds to compile.")
-
-    def _add_learner(self, can_lock: bool) -> None:
-        gui, session = self._server.gui, self._session
-        escape = gui.add_checkbox(
-            "leave local minima", session.escape, disabled=not can_lock,
-            hint="when the expert rests, continue to the best pose of many initial guesses",
-        )  # fmt: skip
-        escape.on_update(by_user(lambda value: setattr(session, "escape", value)))
-        self._locks = {
-            name: gui.add_checkbox(
-                f"lock {name}", name in session.settings.locked, disabled=not can_lock, hint=f"at {angle:.2f} rad"
-            )
-            for name, angle in home_angles(self._env).items()
-        }
-        for box in self._locks.values():
-            box.on_update(by_user(self._lock))
-
-    def _lock(self, _: Any) -> None:
-        self._session.change(locked=tuple(name for name, box in self._locks.items() if box.value))
+        if not session.takes_any_arm:
+            gui.add_markdown("A new correspondence, and a first weight on translation, take some seconds to compile.")

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -31,15 +31,17 @@ class Settings:
     """Settings that the user can change while the viewer runs.
 
     Attributes:
-      locked: locked joints of the learner.
+      locked: angle of each locked joint of the learner by name [rad].
       correspondence: see `MetricConfig`.
       translation, rotation: weights of the metric.
+      arm: index of the learner among the arms that can be chosen.
     """
 
-    locked: tuple[str, ...]
+    locked: Mapping[str, float]
     correspondence: str
     translation: float
     rotation: float
+    arm: int = 0
 
     def __post_init__(self) -> None:
         check_correspondence(self.correspondence)
@@ -48,9 +50,9 @@ class Settings:
                 raise ValueError(f"{name}: expected a finite weight of at least 0, got {weight}")
 
     @property
-    def compilation_key(self) -> tuple[tuple[str, ...], str, bool]:
+    def compilation_key(self) -> Hashable:
         """Settings with equal keys share functions: weights are arguments, except a translation weight of 0."""
-        return self.locked, self.correspondence, self.translation == 0
+        return tuple(sorted(self.locked.items())), self.correspondence, self.translation == 0
 
     @property
     def weights(self) -> Float[np.ndarray, "2"]:
@@ -60,9 +62,28 @@ class Settings:
 
 def initial_settings(env: EnvConfig) -> Settings:
     """The settings of an environment."""
-    metric = env.metric
-    locked = tuple(build_arm(env.learner, env.limits).locked)
+    metric, locked = env.metric, build_arm(env.learner, env.limits).locked
     return Settings(locked, metric.correspondence, metric.translation, metric.rotation)
+
+
+class Preset(NamedTuple):
+    """A choice of a learner on the page.
+
+    Attributes:
+      name: as shown.
+      arm: index of the arm.
+      locked: angles of its locked joints [rad].
+    """
+
+    name: str
+    arm: int
+    locked: Mapping[str, float]
+
+
+def shown_preset(presets: Sequence[Preset], arm: int, locked: Mapping[str, float]) -> Preset:
+    """The preset of these locks, or else that of the arm without locks."""
+    of_arm = [preset for preset in presets if preset.arm == arm]
+    return next((preset for preset in of_arm if preset.locked == locked), [p for p in of_arm if not p.locked][0])
 
 
 class PoseComparison(NamedTuple):
@@ -99,24 +120,24 @@ class CompiledFunctions:
     best: Callable[..., Any] | None
 
 
-def learner_arm(env: EnvConfig, locked: tuple[str, ...]) -> Arm:
-    """Builds the learner with these joints locked, at the angle in the environment's config or else in its start pose.
+def learner_arm(env: EnvConfig, locked: Mapping[str, float]) -> Arm:
+    """Builds the learner with these joints locked at these angles [rad].
 
     Raises:
       ValueError: a joint is unknown, or no joint is free.
     """
-    configured, home = build_arm(env.learner, env.limits).locked, home_angles(env)
-    locked_at = {name: configured.get(name, home[name]) for name in home if name in locked}
-    unknown = set(locked) - set(home)
-    if unknown:
-        raise ValueError(f"locked: expected some of {', '.join(home)}, got {', '.join(sorted(unknown))}")
-    return build_arm(dataclasses.replace(env.learner, locked=locked_at), env.limits, env.metric.links)
+    return build_arm(dataclasses.replace(env.learner, locked=dict(locked)), env.limits, env.metric.links)
 
 
 def home_angles(env: EnvConfig) -> Mapping[str, float]:
     """Angle of each of the learner's joints in its start pose [rad], base to tip."""
     free = build_arm(dataclasses.replace(env.learner, locked=()), env.limits).embodiment
     return dict(zip(free.joint_names, map(float, free.home), strict=True))
+
+
+def lock_angles(env: EnvConfig) -> Mapping[str, float]:
+    """Angle at which each of the learner's joints is locked [rad]: that of the config, or else of the start pose."""
+    return {**home_angles(env), **build_arm(env.learner, env.limits).locked}
 
 
 def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None = None) -> Iterator[CompiledFunctions]:
@@ -154,9 +175,9 @@ def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None 
 
     q, q_hat = (jax.ShapeDtypeStruct((n.num_joints,), np.float32) for n in (expert, learner))
     w = jax.ShapeDtypeStruct((2,), np.float32)
-    functions = CompiledFunctions(arm, _compiled(follow, q, q_hat, w), _compiled(compare, q, q_hat, w), None)
+    functions = CompiledFunctions(arm, compiled(follow, q, q_hat, w), compiled(compare, q, q_hat, w), None)
     yield functions
-    yield dataclasses.replace(functions, best=_compiled(best, q, w))
+    yield dataclasses.replace(functions, best=compiled(best, q, w))
 
 
 def _metric_of_weights(
@@ -175,7 +196,8 @@ def _metric_of_weights(
     return metric
 
 
-def _compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], *shapes: Any) -> Callable[..., Any]:
+    """The function, compiled for arguments of these shapes; it never compiles again."""
     return jax.jit(function).lower(*shapes).compile()
 
 

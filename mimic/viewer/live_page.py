@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from mimic.envs.config import EnvConfig
 from mimic.viewer.controls import ExpertControls, LiveControls
 from mimic.viewer.history import History
+from mimic.viewer.learner_controls import LearnerControls
 from mimic.viewer.live_session import Frame, LiveSession
 from mimic.viewer.page import Page
 
@@ -18,11 +19,11 @@ def show_live(
     live: LiveSession,
     env: EnvConfig,
     expert: ExpertControls,
-    can_lock: bool,
+    learner: LearnerControls,
     numbers_rate: float = math.inf,
 ) -> None:
     """Moves the arms at each tick, and shows numbers, chart and maps at a rate [1/s]."""
-    controls = LiveControls(page.server, live, env, can_lock, expert)
+    LiveControls(page.server, live, env, expert, learner)
     history, frame, was_compiling, since_numbers = History(), None, True, 0.0
     is_behind = False  # whether the numbers are older than the arms
     for dt in times:
@@ -34,7 +35,7 @@ def show_live(
             for client in page.server.get_clients().values():
                 client.add_notification("not possible", str(error), color="red", auto_close_seconds=6.0)
             new_frame = None
-            controls.undo_locks()
+            learner.update()  # a lock that is not possible has been undone
         compiling = live.is_compiling
         changed = new_frame is not None or (compiling != was_compiling and frame is not None)
         is_behind |= changed
@@ -42,7 +43,7 @@ def show_live(
             frame, was_compiling = new_frame or frame, compiling
         if frame is not None and is_behind and since_numbers * numbers_rate >= 1:
             history.add(frame)
-            page.show(frame, history.chart(), _note(frame, compiling, can_lock))
+            page.show(frame, history.chart(), _note(frame, compiling, live.by_optimiser))
             is_behind, since_numbers = False, 0.0
         elif frame is not None and changed:
             page.move(frame)

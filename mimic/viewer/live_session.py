@@ -4,7 +4,7 @@ import dataclasses
 import math
 import threading
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,7 @@ from mimic.viewer.follower import (
     Settings,
     home_angles,
     initial_settings,
+    lock_angles,
     step_towards,
 )
 from mimic.viewer.hand import pose_of_hand
@@ -43,6 +44,7 @@ class Frame:
       matrix: correspondence matrix W.
       links: weighted distance D' of every pair of links.
       similarity: measures of `mimic.metric.similarity` by name.
+      arm: index of the learner among the arms that can be chosen.
     """
 
     expert: Mapping[str, float]
@@ -55,6 +57,25 @@ class Frame:
     matrix: Float[np.ndarray, "expert learner"]
     links: Float[np.ndarray, "expert learner"]
     similarity: Mapping[str, float]
+    arm: int = 0
+
+
+class FunctionSource(Protocol):
+    """Functions that move the learner, by settings; see `FunctionCache`."""
+
+    def get(self, settings: Settings) -> CompiledFunctions | None:
+        """The functions; None until those that move the learner are compiled."""
+
+    def is_complete(self, settings: Settings) -> bool:
+        """Whether all functions are compiled, or their compilation has failed."""
+        ...
+
+    def wait(self, settings: Settings) -> CompiledFunctions:
+        """Waits for all functions and returns them."""
+        ...
+
+    def finish(self) -> None:
+        """Waits for a running compilation: a process must not end during it."""
 
 
 class LiveSession:
@@ -63,22 +84,28 @@ class LiveSession:
     Args:
       env: environment that defines the arms and the metric.
       mapper: pose mapper that moves the learner instead of the optimiser.
+      any_arm: functions of a pose mapper to any arm; with these, the learner can be changed, and a joint is locked
+        where it is instead of at its angle in the start pose.
 
     Attributes:
       expert: embodiment of the expert.
       settings: requested settings; they take effect as soon as their functions are compiled.
+      by_optimiser: whether the optimiser moves the learner, not a pose mapper.
+      takes_any_arm: whether the learner can be changed.
 
     Raises:
       ValueError: an arm is invalid.
     """
 
-    def __init__(self, env: EnvConfig, mapper: Mapper | None = None):
+    def __init__(self, env: EnvConfig, mapper: Mapper | None = None, any_arm: FunctionSource | None = None):
         self.expert: Embodiment = build_arm(env.expert, env.limits, env.metric.links).embodiment
         self.settings: Settings = initial_settings(env)
-        self._escape = mapper is None
-        self._functions = FunctionCache(env, mapper)
+        self.by_optimiser, self.takes_any_arm = mapper is None and any_arm is None, any_arm is not None
+        self._escape = self.by_optimiser
+        self._functions: FunctionSource = any_arm or FunctionCache(env, mapper)
+        self._lock_angles = None if self.takes_any_arm else lock_angles(env)  # None: a joint is locked where it is
         self._lock = threading.RLock()
-        self._angles = dict(home_angles(env))  # of all joints of the learner [rad]
+        self._angles = {**home_angles(env), **self.settings.locked}  # of all joints of the learner [rad]
         self._pose = np.array(self.expert.home, np.float32)
         self._motion: tuple[np.ndarray, np.ndarray] | None = None  # times [s] and poses [rad] of the expert
         self._time = 0.0  # s, since the start of the motion
@@ -164,6 +191,20 @@ class LiveSession:
             self.settings = dataclasses.replace(self.settings, **settings)
             self._goal = None
 
+    def lock(self, joint: str, is_locked: bool) -> None:
+        """Locks a joint of the learner, or frees it."""
+        with self._lock:
+            angle = (self._lock_angles or self._angles)[joint]
+            others = {name: at for name, at in self.settings.locked.items() if name != joint}
+            self.change(locked={**others, joint: angle} if is_locked else others)
+
+    def choose(self, arm: int, locked: Mapping[str, float], start: Mapping[str, float]) -> None:
+        """Changes the learner and its locks [rad]; another arm starts in the pose `start` with these locks."""
+        with self._lock:
+            if arm != self.settings.arm:
+                self._angles = {**start, **locked}
+            self.change(arm=arm, locked=locked)
+
     @property
     def is_compiling(self) -> bool:
         """Whether the functions of the requested settings are still being compiled, including the kinematic bound."""
@@ -227,7 +268,7 @@ class LiveSession:
         return Frame(
             expert=dict(zip(self.expert.joint_names, map(float, self._pose), strict=True)),
             learner=dict(self._angles),
-            locked=self._active.locked,
+            locked=tuple(self._active.locked),
             expert_links=self.expert.link_names,
             learner_links=functions.learner.embodiment.link_names,
             distance=distance,
@@ -235,6 +276,7 @@ class LiveSession:
             matrix=np.asarray(comparison.matrix),
             links=np.asarray(comparison.links),
             similarity={name: float(value) for name, value in comparison.similarity.items()},
+            arm=self._active.arm,
         )
 
     def _advance_expert(self, dt: float) -> None:

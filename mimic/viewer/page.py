@@ -1,18 +1,18 @@
 """The page of every view in viser: two arms in 3-D, numbers, heat maps and a chart."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import viser
 from jaxtyping import Float
 
+from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import LinkMatch
 from mimic.viewer import html
 from mimic.viewer.live_session import Frame
 from mimic.viewer.meshes import ArmShape, Part, along_z, capsule_mesh, places
 
-_ROLES = ("expert", "learner")
 _GRID = 0.1, 0.5  # m, sizes of a cell and of a section
 _STANCE = np.array([2.5, -0.1, 0.75])  # camera position relative to its target, in arm lengths
 _FROM_ABOVE = np.array([0.55, -0.01, 2.9])
@@ -22,41 +22,57 @@ _PANEL_WIDTH = 384.0  # pixels; the heat maps of two arms with seven joints fit
 _MIN_WIDTH, _MIN_FLAT_WIDTH = 1.9, 2.6  # arm lengths that a narrow window shows: both arms, with room for elbows
 
 
+class LearnerShape(NamedTuple):
+    """A learner that a page can show.
+
+    Attributes:
+      name: of the arm.
+      shape: its meshes.
+      match: which links of the expert and of this arm correspond.
+    """
+
+    name: str
+    shape: ArmShape
+    match: LinkMatch
+
+
 class Page:
     """The elements of the page that change with each `Frame`.
 
     Args:
       server: new server without elements.
-      shapes: meshes of expert and learner.
-      names: names of expert and learner.
+      expert: name and meshes of the expert.
+      learners: learners to choose from, see `Frame.arm`.
       title: title of the page.
       is_flat: whether the camera looks from above.
-      match: which links correspond.
 
     Attributes:
       server: the server.
       expert: meshes of the expert.
+      starts: start pose of each learner, all joints by name [rad].
     """
 
     def __init__(
         self,
         server: viser.ViserServer,
-        shapes: Sequence[ArmShape],
-        names: Sequence[str],
+        expert: tuple[str, ArmShape],
+        learners: Sequence[LearnerShape],
         title: str,
         is_flat: bool,
-        match: LinkMatch,
     ):
-        self.server, self.expert = server, shapes[0]
-        reach = max(shape.reach for shape in shapes)
+        self.server, self.expert = server, expert[1]
+        self.starts = [_start(learner.match.learner) for learner in learners]
+        largest = max((learner.shape for learner in learners), key=lambda shape: shape.reach)
+        reach = max(self.expert.reach, largest.reach)
         _set_stage(server, reach, is_flat)
         width = reach * (_MIN_FLAT_WIDTH if is_flat else _MIN_WIDTH)
         server.on_client_connect(lambda client: _keep_in_view(client.camera, server.initial_camera, width))
-        self._arms = [
-            _DrawnArm(server, f"/{role}", shape, place, f"{role}: {name}", -0.3 if is_flat else 0.3)
-            for role, shape, place, name in zip(_ROLES, shapes, places(shapes), names, strict=True)
+        (left, right), label_at = places([self.expert, largest]), -0.3 if is_flat else 0.3
+        self._expert = _DrawnArm(server, "/expert", self.expert, left, f"expert: {expert[0]}", label_at)
+        self._learners = [
+            _DrawnLearner(server, f"/learner{index}", learner, right, label_at)
+            for index, learner in enumerate(learners)
         ]
-        self._ghost = _Ghost(server, shapes[1], match)
         self._title = html.title(title)
         self._numbers = server.gui.add_html("")
         self.show_note("compiling …")
@@ -83,20 +99,28 @@ class Page:
             self._chart.content = chart
 
     def _move(self, frame: Frame) -> None:
-        self._arms[0].move_to(frame.expert, ())
-        self._arms[1].move_to(frame.learner, frame.locked)
-        self._ghost.move_to(frame)
+        self._expert.move_to(frame.expert, ())
+        for index, learner in enumerate(self._learners):
+            learner.show(frame, index == frame.arm)
+
+
+def _start(arm: Embodiment) -> Mapping[str, float]:
+    return dict(zip(arm.joint_names, map(float, arm.home), strict=True))
 
 
 class _DrawnArm:
-    """The meshes of an arm in the scene."""
+    """The meshes of an arm in the scene.
+
+    Attributes:
+      root: frame that contains everything.
+    """
 
     def __init__(
         self, server: viser.ViserServer, path: str, shape: ArmShape, place: np.ndarray, label: str, label_at: float
     ):
         self._shape = shape
         scene = server.scene
-        scene.add_frame(path, show_axes=False, position=place)
+        self.root = scene.add_frame(path, show_axes=False, position=place)
         place_of_label = (label_at * shape.reach, 0.0, 0.0)
         scene.add_label(f"{path}/label", label, position=place_of_label, anchor="top-center", font_screen_scale=1.1)
         bodies = sorted({part.body for part in shape.parts})
@@ -122,16 +146,32 @@ class _DrawnArm:
                 mark.visible = name in locked
 
 
+class _DrawnLearner:
+    """The meshes of a learner in the scene, and the expert over it."""
+
+    def __init__(self, server: viser.ViserServer, path: str, learner: LearnerShape, place: np.ndarray, label_at: float):
+        self._arm = _DrawnArm(server, path, learner.shape, place, f"learner: {learner.name}", label_at)
+        self._ghost = _Ghost(server, path, learner.shape, learner.match)
+
+    def show(self, frame: Frame, is_chosen: bool) -> None:
+        """Shows the learner in a frame, or hides it."""
+        if self._arm.root.visible != is_chosen:
+            self._arm.root.visible = is_chosen
+        if is_chosen:
+            self._arm.move_to(frame.learner, frame.locked)
+            self._ghost.move_to(frame)
+
+
 class _Ghost:
     """The expert, translucent and scaled, at the learner, with lines between corresponding links.
 
     The learner's links keep their number while its joints are locked, so that the lines stay where they are.
     """
 
-    def __init__(self, server: viser.ViserServer, shape: ArmShape, match: LinkMatch):
+    def __init__(self, server: viser.ViserServer, learner: str, shape: ArmShape, match: LinkMatch):
         self._match = match
         position, wxyz = shape.base_pose()
-        scene, path = server.scene, "/learner/ghost"
+        scene, path = server.scene, f"{learner}/ghost"
         scene.add_frame(path, show_axes=False, position=position, wxyz=wxyz)
         at_rest = match.ghost(np.zeros(match.expert.num_joints), np.zeros(match.learner.num_joints))
         self._num_links = match.expert.num_links

@@ -19,8 +19,7 @@ class World:
     Attributes:
       gravity, stops, contacts: whether there are any.
       gravity_error, payload, payload_lever: [episodes].
-      link_mass: [episodes, links].
-      friction, motor_gain, position_bias, start_offset: [episodes, joints].
+      link_mass, friction, motor_gain, position_bias, start_offset: [episodes, joints].
       position_noise, velocity_noise, packet_loss: numbers.
       observation_delay, action_delay: [episodes].
     """
@@ -49,19 +48,17 @@ class World:
         return dataclasses.replace(self, **selected)
 
 
-def draw_world(
-    config: WorldConfig, episodes: int, joints: int, links: int, rng: np.random.Generator, edge: str = ""
-) -> World:
+def draw_world(config: WorldConfig, episodes: int, joints: int, rng: np.random.Generator, edge: str = "") -> World:
     """Draws the numbers of some episodes.
 
     Args:
       config: the ranges.
-      episodes, joints, links: numbers of them.
+      episodes, joints: numbers of them.
       rng: random numbers.
       edge: "" draws uniformly; "minimum", "maximum" or "corners" put every number at an end of its range, for "corners"
         at a random one.
     """
-    shapes = {"link_mass": (episodes, links), "friction": (episodes, joints), "motor_gain": (episodes, joints)}
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("link_mass", "friction", "motor_gain"), (episodes, joints))
     fraction = {"": lambda shape: rng.uniform(size=shape), "minimum": np.zeros, "maximum": np.ones,
                 "corners": lambda shape: rng.integers(0, 2, shape).astype(float)}[edge]  # fmt: skip
 

@@ -1,11 +1,12 @@
 """Episodes of a controller on virtual robots in lockstep, and what is counted in them."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from mimic.control.joint_control import PERIOD, Reference
+from mimic.control.joint_control import PERIOD, Reference, action_towards
 from mimic.deploy.bundle import Bundle
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.safety import INTERVENTIONS, SafetyLayer
@@ -120,8 +121,54 @@ class Channel:
         return np.stack(self._actions)[np.maximum(ticks, 0), self._robots], (ticks >= 0) & ~is_lost
 
 
+class TickPolicy(Protocol):
+    """Gives the targets of an inner loop; all arrays are [robots, ...]."""
+
+    def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
+        """The actions of a tick, see `mimic.deploy.sessions.Policy`."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackingPolicy:
+    """Poses that a controller tracks in place of the policy of a bundle, see `tracking_controller`.
+
+    Attributes:
+      bundle: folder with inner loop and safety layer.
+      poses: [motions, ticks, joints] after each tick [rad].
+      lead: [ticks].
+    """
+
+    bundle: Path
+    poses: np.ndarray
+    lead: int
+
+
+class Tracker:
+    """A `TickPolicy` that tracks poses."""
+
+    def __init__(self, policy: TrackingPolicy, bundle: Bundle, motion: np.ndarray):
+        self._bundle, self._poses, self._lead = bundle, policy.poses[motion], policy.lead
+
+    def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
+        """See `TickPolicy`."""
+        bundle, ahead = self._bundle, min(tick + self._lead, self._poses.shape[1]) - 1
+        duration = self._lead * bundle.control_dt
+        return action_towards(bundle.mode, self._poses[:, ahead] - reference.qpos, duration, bundle.parameters, np)
+
+
 class SafeController:
-    """The policy of a bundle with its inner loop and the safety layer, as `mimic.deploy` runs them on a robot."""
+    """A policy with the inner loop and the safety layer of a bundle, as `mimic.deploy` runs them on a robot.
+
+    Args:
+      bundle: see `load_bundle`.
+      motion: [robots] index of the motion.
+      world: its delays and losses.
+      robots: to be controlled.
+      config: thresholds.
+      seed: of the losses.
+      policy: default None: that of the bundle.
+    """
 
     def __init__(
         self,
@@ -131,8 +178,9 @@ class SafeController:
         robots: VirtualRobots,
         config: SafetyConfig | None = None,
         seed: int = 0,
+        policy: TickPolicy | None = None,
     ):
-        self._policy = Policy(bundle, motion.tolist())
+        self._policy = policy or Policy(bundle, motion.tolist())
         self._layer = SafetyLayer(bundle, Clearance(bundle), len(motion), config)
         self._channel = Channel(world, bundle.action_size, seed)
         self.ticks, self.periods = bundle.ticks, bundle.periods

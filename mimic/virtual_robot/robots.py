@@ -8,8 +8,9 @@ import copy
 import mujoco
 import numpy as np
 
-from mimic.control.joint_control import PERIOD
-from mimic.virtual_robot.arm_model import FLOOR, PAYLOAD, RobotModel
+from mimic.control.joint_control import PERIOD, friction_torque
+from mimic.hardware.mujoco_world import FLOOR, disabled, loaded_fields
+from mimic.virtual_robot.arm_model import RobotModel
 from mimic.virtual_robot.draws import World
 
 START_POSE, POSITION, VELOCITY = "start pose invalid", "joint position limit", "joint velocity limit"
@@ -47,7 +48,7 @@ class VirtualRobots:
         self._data = [mujoco.MjData(model) for model in self._models]
         self._applied = [data.qfrc_applied for data in self._data]
         self._states = [(data.qpos, data.qvel) for data in self._data]
-        self._floor = mujoco.mj_name2id(robot.model, mujoco.mjtObj.mjOBJ_GEOM, FLOOR)
+        self._floor = robot.simulated.model.geom(FLOOR).id
         self._level = world.friction * robot.friction.level
         self._rng = np.random.default_rng(seed)
         self.qpos = np.asarray(start_poses, float) + world.start_offset
@@ -83,8 +84,8 @@ class VirtualRobots:
         self._abort(self._missing > MAX_MISSING, COMMUNICATION)
         self._check_command(torque)
         self.torque = torque
-        speed = self._robot.friction.rate * self.qvel
-        applied = self._world.motor_gain * torque - self._level * np.tanh(speed) + self.external_torque
+        friction = friction_torque(self.qvel, self._level, self._robot.friction.rate, np)
+        applied = self._world.motor_gain * torque - friction + self.external_torque
         for i in np.flatnonzero(self.cause == "").tolist():
             self._applied[i][:] = applied[i]
             mujoco.mj_step(self._models[i], self._data[i])
@@ -123,21 +124,14 @@ class VirtualRobots:
 
 def _loaded_model(robot: RobotModel, world: World, index: int) -> mujoco.MjModel:
     """The model of a robot in its world."""
-    model = copy.copy(robot.model)
-    payload = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, PAYLOAD)
-    factor = world.link_mass[index]
-    model.body_mass[robot.links] *= factor
-    model.body_inertia[robot.links] *= factor[:, None]
-    mass = world.payload[index]
-    model.body_mass[payload] = mass
-    if not mass:
-        model.body_inertia[payload] = 0.0
-    model.body_ipos[payload] = world.payload_lever[index] * robot.tip_direction
-    model.body_gravcomp[:] = 1.0 - world.gravity_error[index]
-    disabled = mujoco.mjtDisableBit
-    flags = [(world.gravity, disabled.mjDSBL_GRAVITY), (world.stops, disabled.mjDSBL_LIMIT),
-             (world.contacts, disabled.mjDSBL_CONTACT)]  # fmt: skip
-    for is_enabled, flag in flags:
-        model.opt.disableflags |= 0 if is_enabled else int(flag)
+    simulated = robot.simulated
+    gravity_error, link_mass, payload, lever = (
+        x[index] for x in (world.gravity_error, world.link_mass, world.payload, world.payload_lever)
+    )
+    fields = loaded_fields(simulated, gravity_error, link_mass, payload, lever, np)
+    model = copy.copy(simulated.model)
+    model.opt.disableflags = disabled(gravity=world.gravity, stops=world.stops, contacts=world.contacts)
+    model.opt.gravity[:] = fields.gravity
+    model.body_mass[:], model.body_inertia[:], model.body_ipos[:] = fields[1:]
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model

@@ -16,6 +16,8 @@ from mimic.virtual_robot.episodes import (
     SafeController,
     TorqueController,
     TorquePolicy,
+    Tracker,
+    TrackingPolicy,
     joined,
     run_episodes,
 )
@@ -30,7 +32,7 @@ class Task:
 
     Attributes:
       robot: the model.
-      policy: folder of a bundle, or a policy of torques.
+      policy: folder of a bundle, poses to track, or a policy of torques.
       world: of each episode.
       motion: [episodes] index of the motion.
       start_poses: [episodes, joints] [rad].
@@ -38,7 +40,7 @@ class Task:
     """
 
     robot: RobotModel
-    policy: Path | TorquePolicy
+    policy: Path | TrackingPolicy | TorquePolicy
     world: World
     motion: np.ndarray
     start_poses: np.ndarray
@@ -51,6 +53,12 @@ def run_task(task: Task) -> Episodes:
     if isinstance(task.policy, TorquePolicy):
         joints = task.start_poses.shape[1]
         controller = TorqueController(task.policy, task.motion, joints, task.world, task.seed)
+    elif isinstance(task.policy, TrackingPolicy):
+        bundle = load_bundle(task.policy.bundle)
+        tracker = Tracker(task.policy, bundle, task.motion)
+        # It knows the reference of the inner loop itself, without the delay of a measurement.
+        world = dataclasses.replace(task.world, observation_delay=np.zeros_like(task.world.observation_delay))
+        controller = SafeController(bundle, task.motion, world, robots, seed=task.seed, policy=tracker)
     else:
         bundle = load_bundle(task.policy)
         controller = SafeController(bundle, task.motion, task.world, robots, seed=task.seed)

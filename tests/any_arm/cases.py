@@ -10,6 +10,7 @@ from mimic.any_arm import composite_kernel, dynamics, looped_dynamics
 from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.arms.arm import Arm
 from mimic.arms.embodiment import load_arm
+from mimic.arms.mujoco_chain import base_pose
 from mimic.arms.simulation_model import simulation_model
 from tests.helpers.random_arms import random_arm
 
@@ -20,7 +21,7 @@ RTOL = 1e-9
 def arm_of(source):
     """The arm of a model, which then has neither gravity nor contacts itself."""
     embodiment, source, angles = load_arm(source)
-    arm = Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles)
+    arm = Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, base_pose(source))
     source.opt.disableflags = arm.model.opt.disableflags
     return arm
 

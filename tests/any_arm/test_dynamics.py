@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mimic.any_arm import dynamics
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, base_in_world, lock_joints, stack_arms
+from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.arms.arm import ArmConfig, build_arm
 from tests.any_arm.cases import Batch, acceleration, assert_near, looped, padded, random_source, unrolled
 
@@ -54,7 +54,7 @@ def test_gravity_is_that_of_mujoco(x64, batch):
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
         expected.append(padded(acceleration(model, qpos, qvel, torque)))
     to_world = [
-        base_in_world(arm)[:3, :3] @ frame for arm, frame in zip(batch.arms, batch.arrays.base_rotation, strict=True)
+        arm.T_world_base[:3, :3] @ frame for arm, frame in zip(batch.arms, batch.arrays.base_rotation, strict=True)
     ]
     base = tuple(np.stack([rotation.T @ -gravity for rotation in to_world]).T)
     for form in (looped, unrolled):

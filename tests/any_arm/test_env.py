@@ -1,5 +1,6 @@
 """The environment of any arm, and the controller of one arm that it contains."""
 
+import dataclasses
 from typing import Any, cast
 
 import jax
@@ -11,6 +12,7 @@ import mimic
 from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.any_arm.controller import nearest_pose_controller
 from mimic.any_arm.env import AnyArmEnv, any_arm_state
+from mimic.any_arm.kinematics import link_states
 from mimic.any_arm.sampler import lock_masks, lock_sampler, random_arm
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.imitation import training_and_held_out
@@ -28,6 +30,7 @@ def config():
         physics="fused",
         horizon=HORIZON,
         demonstrations={"count": COUNT, "held_out": HELD_OUT},
+        arms={"reward": "distance"},
     )
 
 
@@ -115,6 +118,33 @@ def test_rewards_are_distances_in_units_of_holding(zero_actions):
     assert not np.asarray(zero_actions.done)[:, :-1].any() and np.asarray(zero_actions.done)[:, -1].all()
 
 
+@pytest.fixture(scope="module")
+def compared(config, motions):
+    """An environment with the relative reward."""
+    arms = dataclasses.replace(config.arms, reward="relative")
+    return AnyArmEnv(dataclasses.replace(config, arms=arms), random_arm, motions[0])
+
+
+def test_a_relative_reward_compares_with_the_zero_action(compared, four_joints, zero_actions):
+    """The zero action itself has no reward; others have that of their distance and of that of `zero_actions`."""
+    step, still = jax.jit(compared.step), jnp.zeros(compared.action_size)
+    start = compared.begin(compared.start_of(four_joints, 0, jax.random.PRNGKey(0)))
+    at_rest = step(step(start, still), still)
+    assert at_rest.reward == 0
+    state, size = start, 0.0
+    for index in range(3):
+        before, state = any_arm_state(state), step(state, 0.3 * jnp.ones(compared.action_size))
+        own, baseline = state.metrics["distance"], zero_actions.metrics["distance"][0, index]
+        expert, metric = compared.expert_at(jnp.asarray(0), jnp.asarray(index + 1)), compared.metric_of(four_joints)
+        assert before.baseline is not None
+        goals = [before.goals.goal, before.baseline.goals.goal]
+        nearest = min(metric(expert, link_states(four_joints, goal.qpos, goal.qvel)) for goal in goals)
+        excess = [max(float(x - nearest), 0.0) / float(before.hold) + 0.01 for x in (own, baseline)]
+        assert float(state.reward) == pytest.approx(np.log(excess[1] / excess[0]), abs=1e-3)
+        size = max(size, abs(float(state.reward)))
+    assert size > 0.01
+
+
 def test_observations_have_their_size_and_are_bounded(env, zero_actions):
     observation = np.asarray(zero_actions.obs)
     assert observation.shape == (COUNT, HORIZON, env.observation_size)
@@ -195,8 +225,8 @@ def test_a_policy_moves_one_arm_as_it_moves_it_among_many(env, evaluator, four_j
 
 def test_an_action_of_another_length_is_rejected(env, four_joints):
     state = env.begin(env.start_of(four_joints, 0, jax.random.PRNGKey(0)))
-    with pytest.raises(ValueError, match=r"action: expected shape \(9,\), got \(8,\)"):
-        env.step(state, jnp.zeros(MAX_JOINTS))
+    with pytest.raises(ValueError, match=r"action: expected shape \(8,\), got \(7,\)"):
+        env.step(state, jnp.zeros(MAX_JOINTS - 1))
 
 
 def test_arms_that_are_not_done_go_on_as_without_a_restart(env, zero_actions):

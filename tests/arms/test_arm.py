@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -35,6 +36,25 @@ def test_no_action_exceeds_the_torque_limit(locked):
         free = torque_scale(unlimited, action_scale, 0.1)
         np.testing.assert_array_equal(torque_scale(arm, action_scale, 0.1), np.minimum(free, limit))
     assert np.all(torque_scale(arm, 100.0, 0.1) == limit)
+
+
+TILTED = """<mujoco><worldbody><body name="base" pos="1 2 3" quat="0.9 0.3 0.1 0.2"><body pos="0 0 .2">
+<joint name="a" axis="0 0 1"/><geom size=".1"/><body pos="0 0 .3"><joint name="b" axis="0 1 0" ref="0.5"/>
+<geom size=".1"/></body></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("locked", [[], ["a"], ["b"]])
+def test_the_base_frame_lies_where_the_joints_have_their_places_in_the_model(tmp_path, locked):
+    """One joint alone does not tell where it lies."""
+    (tmp_path / "tilted.xml").write_text(TILTED)
+    arm = build_arm(ArmConfig(model=str(tmp_path / "tilted.xml"), locked=locked))
+    rotation, origin = arm.T_world_base[:3, :3], arm.T_world_base[:3, 3]
+    data = mujoco.MjData(arm.model)
+    data.qpos[:] = 0.0
+    mujoco.mj_kinematics(arm.model, data)
+    np.testing.assert_allclose(origin, [1, 2, 3])
+    np.testing.assert_allclose(arm.embodiment.joint_anchor @ rotation.T + origin, data.xanchor, atol=1e-12)
+    np.testing.assert_allclose(arm.embodiment.joint_axis @ rotation.T, data.xaxis, atol=1e-12)
 
 
 def test_rotor_inertia_and_damping_by_joint():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands.capture import read_arm
+from mimic.commands.capture import read_arm, train_options
 from mimic.commands.config import CaptureConfig
 from mimic.mocap.clips import slow_down_for
 from mimic.mocap.link_motion import arm_motion
@@ -96,6 +96,13 @@ def test_the_printed_command_trains(request, arms):
     done = run(folder, "train", *arguments, *small, "env.physics=fused", f"run_dir={arms}")
     assert done.returncode == 0, done.stderr
     assert (folder / arms / "report.json").is_file()
+
+
+@pytest.mark.parametrize("world", ["nominal", "hardware"])
+def test_the_printed_command_has_the_world(world):
+    options = train_options(mimic.env_config("panda7dof", world=world))
+    assert options == f"world={world} 'env.reward.terms={{self_collision: 2}}'"
+    assert train_options(mimic.env_config("panda7dof")).startswith("env.start=nearest")
 
 
 def test_inspect_shows_what_a_clip_has(clip, tmp_path):

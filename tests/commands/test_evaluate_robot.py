@@ -128,7 +128,48 @@ def test_a_run_without_an_inner_loop_has_no_controller(rejected, paper_run):
 @pytest.mark.parametrize("controller", ["pd", "computed_torque", "nearest_pose", "searched"])
 def test_controllers_of_torques_do_not_fit_an_inner_loop(rejected, hardware_run, controller):
     error = rejected("evaluate", f"run={hardware_run}", f"controller={controller}")
-    assert f"controller: expected policy or hold for a run with an inner loop, got {controller}" in error
+    assert (
+        "controller: expected policy, hold or tracking for a run with an inner loop and control=joint_velocity, got "
+        f"{controller}"
+    ) in error
+
+
+@pytest.mark.parametrize("robot", [(), ("robot=virtual_panda",)])
+def test_tracking_needs_an_inner_loop(rejected, paper_run, robot):
+    error = rejected("evaluate", f"run={paper_run}", "controller=tracking", *robot)
+    assert (
+        "controller: expected policy, hold, pd, computed_torque, nearest_pose or searched for a run with no inner "
+        "loop, got tracking"
+    ) in error
+
+
+def test_tracking_needs_targets_other_than_torques(rejected, tmp_path):
+    run = untrained(tmp_path / "run", world="nominal", control="torque")
+    error = rejected("evaluate", f"run={run}", "controller=tracking")
+    assert "controller: expected policy or hold for a run with an inner loop and control=torque, got tracking" in error
+
+
+def test_tracking_on_virtual_robots(hardware_run, tmp_path):
+    """Much nearer than an untrained policy, which stays near the start pose."""
+    rows = {}
+    for controller in ("tracking", "policy"):
+        report = evaluate(hardware_run, tmp_path / controller, controller=controller, robot_world="nominal")
+        rows[controller], lead = report["cases"]["all ranges"], report.get("lead_ticks")
+        assert report["controller"] == controller and (lead is not None) == (controller == "tracking")
+    assert rows["tracking"]["completed"] == 4
+    assert rows["tracking"]["optimality_gap"] < 0.5 * rows["policy"]["optimality_gap"]
+
+
+def test_tracking_is_the_same_on_a_virtual_robot_as_in_the_environment(tmp_path):
+    """Of nominal worlds; on a virtual robot an action acts 20 ms later."""
+    run = untrained(tmp_path / "run", world="nominal", control="joint_position")
+    row = evaluate(run, tmp_path / "virtual", controller="tracking")["cases"]["all ranges"]
+    prepare_evaluation(
+        EvaluateConfig(str(run), controller="tracking", out=str(tmp_path / "env"), compilation_cache=""), 0.0
+    )()
+    report = json.loads((tmp_path / "env" / "report.json").read_text())
+    assert report["trainer"] == "tracking" and report["lead_ticks"] >= 1
+    assert row["mean_distance"] == pytest.approx(report["mean_distance"]["held_out"], abs=0.02)
 
 
 def test_what_does_not_fit_is_rejected(rejected, hardware_run, tmp_path):
@@ -137,7 +178,7 @@ def test_what_does_not_fit_is_rejected(rejected, hardware_run, tmp_path):
         (["robot=panda"], "robot: expected one of virtual_panda, virtual_robot, got 'panda'"),
         (["edges=true"], "robot_world, edges: expected only with robot="),
         (["robot=virtual_panda", "robot_world=mars"], "robot_world: expected one of paper, nominal, hardware"),
-        (["robot=virtual_panda", "controller=pd"], "expected none with robot="),
+        (["robot=virtual_panda", "controller=pd"], "controller: expected policy or tracking with robot=, got pd"),
         (["robot=virtual_panda", "mass=1.2"], "expected none with robot="),
         (["robot=virtual_panda", "episodes=0"], "episodes: expected a whole number from 1"),
     ]

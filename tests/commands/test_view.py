@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 
-from mimic.arms.arm import build_arm
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands import view, view_capture
 from mimic.commands.capture import fixed_fraction
 from mimic.commands.config import ViewConfig
@@ -35,6 +35,13 @@ from tests.mocap.bodies import bvh_text, person
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),
         (["run=a", "expert=panda"], "expected neither with run= or mapper="),
+        (["mapper=any_arm", "learner=panda"], "mapper=any_arm takes learners=[NAME,...]"),
+        (["learners=[panda]"], "learners: expected with mapper=, as in mapper=any_arm learners=[panda,ur5e.xml]"),
+        (["mapper=planar4dof", "learners=[panda]"], "learners: expected none with mapper=planar4dof, which has one"),
+        (["mapper=any_arm", "checkpoint=5"], "checkpoint: expected none with mapper=any_arm, which comes with mimic"),
+        (["mapper=any_arm", "learners=[a.xml]"], "learners: expected panda, an MJCF file, or an environment (any_arm,"),
+        (["mapper=any_arm", "learners=[panda,panda]"], "learners: expected arms of different names, got panda, panda"),
+        (["mapper=any_arm", "learners=[bimanual]"], "expected a serial arm, got a tree of 2 chains"),
         (["source=missing.bvh"], "source: no file at 'missing.bvh'"),
         (["source=a.bvh", "expert=panda"], "expert, run, mapper: expected none with source="),
         (["arm=left"], "arm, capture: expected only with source="),
@@ -73,7 +80,8 @@ def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
 
 
 def test_only_the_page_of_the_view_imports_viser():
-    names = "html", "live_session", "playback", "meshes", "follower", "history", "newest_checkpoint", "captured"
+    names = ["html", "live_session", "playback", "meshes", "follower", "history", "newest_checkpoint", "captured"]
+    names.append("any_learner")
     code = f"import sys; sys.modules['viser'] = None; import {', '.join(f'mimic.viewer.{name}' for name in names)}"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
@@ -81,6 +89,15 @@ def test_only_the_page_of_the_view_imports_viser():
 def test_arms_can_be_named_by_their_environment():
     arms = ViewConfig(expert="planar4dof", learner="planar4dof").resolve_env()
     assert len(arms.expert.link_lengths) == 7 and len(arms.learner.link_lengths) == 4
+
+
+def test_a_mapper_to_any_arm_has_its_own_learner_and_the_pandas_to_choose_from():
+    default = ViewConfig(mapper="any_arm")
+    assert list(default.resolve_learners(ArmConfig())) == ["panda", "panda4dof", "panda3dof"]
+    planar = ArmConfig(model="planar", link_lengths=[0.3, 0.3])
+    assert next(iter(default.resolve_learners(planar).items())) == ("planar", planar)
+    named = ViewConfig(mapper="any_arm", learners=["panda3dof"]).resolve_learners(planar)
+    assert list(named) == ["panda3dof"] and named["panda3dof"].locked
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,21 @@ def test_impedance_action_sets_the_stiffness() -> None:
     np.testing.assert_allclose(target.value, start().qpos)
 
 
+@pytest.mark.parametrize("mode", ["joint_velocity", "joint_position", "joint_impedance"])
+def test_an_action_towards_an_angle_has_the_target_that_leads_there(mode: str) -> None:
+    joints, reference, duration = parameters(), start(), 0.2
+    displacement = 0.05 * np.random.default_rng(0).uniform(-1, 1, len(reference.qpos))
+    action = joint_control.action_towards(mode, displacement, duration, joints, np)
+    target = joint_control.action_target(mode, action, reference, joints, np)
+    moved = target.value * duration if mode == "joint_velocity" else target.value - reference.qpos
+    np.testing.assert_allclose(moved, displacement, atol=1e-12)
+    np.testing.assert_array_equal(target.stiffness, 1.0)
+    many = np.stack([displacement, 100 * displacement])
+    actions = joint_control.action_towards(mode, many, duration, joints, np)
+    np.testing.assert_array_equal(actions[0], action)
+    assert np.abs(actions[1]).max() == 1.0
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_jax_and_numpy_agree(mode: str) -> None:
     """Both run the same code; float32 rounds an angle of 3 rad to 2e-7, which adds up, and gains multiply by 1600."""

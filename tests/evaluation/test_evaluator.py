@@ -222,9 +222,9 @@ def test_plots_show_all_values_and_name_the_controller(evaluator, monkeypatch, t
 
 def test_holding_the_start_pose_is_the_reference_of_the_gap(evaluator):
     """1e-6: float32, the same distances from another compiled function."""
-    ran, frequency = run_controller(evaluator, "hold")
+    ran, setting = run_controller(evaluator, "hold")
     np.testing.assert_allclose(ran.distance, evaluator.hold_distance, atol=1e-6)
-    assert frequency == 0 and not np.asarray(ran.torque).any()
+    assert setting == {"frequency_rad_s": 0} and not np.asarray(ran.torque).any()
 
 
 def test_exact_dynamics_track_better_than_none(evaluator):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import mimic
+from mimic.envs import imitation
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.world import WorldConfig
 from mimic.evaluation.evaluator import Evaluator
@@ -73,7 +74,7 @@ def test_a_delayed_action_acts_that_many_ticks_later(nominal, actions, undelayed
 
 
 def test_the_latency_shifts_actions_within_a_tick(actions):
-    """The same motion as with five times as many ticks, in which each action is repeated and comes two of them later."""
+    """The same motion as with five times as many ticks, where each action is repeated, and comes two of them later."""
     long = make()
     world = {**dataclasses.asdict(long.config.world), "action_latency": 0.0}
     fields = {"limits": "hardware", "control": "joint_velocity", "control_dt": 0.01, "horizon": 5 * TICKS}
@@ -155,7 +156,10 @@ def test_mjx_agrees_with_the_fused_loop():
     ("fields", "message"),
     [
         ({"control_dt": 0.0505}, "control_dt: expected a multiple of 0.001 s"),
-        ({"control_dt": 0.02}, "world.action_latency: expected a multiple of 0.001 s below control_dt = 0.02 s, got 0.02"),
+        (
+            {"control_dt": 0.02},
+            "world.action_latency: expected a multiple of 0.001 s below control_dt = 0.02 s, got 0.02",
+        ),
         ({"observation": {"terms": ["distance_gradient"]}}, "observation.terms: expected none with an inner loop"),
         ({"randomization": {"torque_noise": 0.1}}, "randomization.torque_noise: expected 0 with an inner loop"),
         ({"control": "velocity"}, "control: expected one of torque, joint_position"),
@@ -200,6 +204,18 @@ def test_an_episode_starts_where_the_robot_measures_itself():
     error = states.reference.qpos - states.qpos
     np.testing.assert_allclose(error, states.draw.bias, atol=1e-6)
     assert np.abs(error).max() > 1e-3
+
+
+def test_start_poses_are_within_the_ranges_of_the_inner_loop(nominal):
+    """The nearest pose may be at the end of the robot's range; an arm that starts there is rejected by its robot."""
+    joints = nominal.learner.num_joints
+    lower = nominal.plant.constants.parameters.lower[:joints]
+    beyond = np.full((nominal.demonstrations.count, joints), -3.0, np.float32)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(imitation, "nearest_poses", lambda *args: beyond)
+        env = make(start="nearest")
+    np.testing.assert_allclose(env.start_poses, np.tile(np.maximum(lower, -3.0), (len(beyond), 1)), atol=1e-6)
+    assert (env.start_poses > -3.0).any()
 
 
 def test_the_last_observations_show_the_expert_as_an_exported_controller_does():

@@ -1,5 +1,7 @@
 """The clearance as a graph: the distances of the retargeting costs, of C MuJoCo, and of its ONNX model."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -39,7 +41,7 @@ def test_it_is_the_distance_of_the_costs(config):
 
 def test_it_is_that_of_mujocos_geoms():
     """The geoms of the virtual robot, by MuJoCo's own function."""
-    robot = model().model
+    robot = model().simulated.model
     data = mujoco.MjData(robot)
     arm = build_arm(ArmConfig(), "hardware").embodiment
     clearance = jax.jit(jax.vmap(make_clearance(arm, fit_capsules(ArmConfig(), "hardware"))))
@@ -63,3 +65,10 @@ def test_the_floor_may_be_lower():
     pose = jnp.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])
     low, high = (float(make_clearance(arm, capsules, height)(pose)[0]) for height in (-0.1, 0.0))
     assert low == pytest.approx(high + 0.1, abs=1e-6)
+
+
+def test_an_arm_without_pairs_has_the_clearance_of_the_floor():
+    config = ArmConfig(locked=[1, 3, 4, 5, 6, 7])  # one body that moves, and the base
+    arm, capsules = build_arm(config, "hardware").embodiment, fit_capsules(config, "hardware")
+    no_pairs = dataclasses.replace(capsules, joint=(0,) * len(capsules.joint))
+    assert no_pairs.pairs == () and float(make_clearance(arm, no_pairs)(jnp.zeros(1))[0]) > 0

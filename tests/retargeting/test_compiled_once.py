@@ -1,6 +1,5 @@
 """A second call with equal arms, metric and shapes compiles nothing; calls inside transforms of the user work."""
 
-import contextlib
 from typing import Any
 
 import jax
@@ -15,17 +14,7 @@ from mimic.metric.distance import DistanceWeights
 from mimic.retargeting.kinematic_bound import closest_motion, kinematic_bound
 from mimic.retargeting.pose import imitate_pose
 from mimic.retargeting.trajectory import imitate_trajectory
-
-_COMPILATIONS = []  # names of JAX's events of this process; a listener cannot be removed by a public function
-jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: _COMPILATIONS.append(event))
-
-
-@contextlib.contextmanager
-def count_compilations():
-    """A list that holds the events of tracing and compilation within the context after it."""
-    before, events = len(_COMPILATIONS), []
-    yield events
-    events.extend(event for event in _COMPILATIONS[before:] if event.startswith("/jax/core/compile"))
+from tests.helpers.compilations import count_compilations
 
 
 def arms():

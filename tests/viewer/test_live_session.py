@@ -164,12 +164,16 @@ def test_the_view_goes_on_while_another_correspondence_is_compiled():
 
 
 def test_locked_joints_switch_the_learner(env):
-    fewer = learner_arm(env, ("joint3",))
-    assert fewer.embodiment.num_joints == 6 and fewer.locked == {"joint3": 0.0}
-    angled = dataclasses.replace(env, learner=ArmConfig(locked={"joint3": 0.4}))
-    assert learner_arm(angled, ("joint6", "joint3")).locked == {"joint3": 0.4, "joint6": 0.0}
+    session = LiveSession(dataclasses.replace(env, learner=ArmConfig(locked={"joint3": 0.4})))
+    session.lock("joint6", True)
+    assert session.settings.locked == {"joint3": 0.4, "joint6": 0.0}
+    session.lock("joint3", False)
+    fewer = learner_arm(env, session.settings.locked)
+    assert fewer.embodiment.num_joints == 6 and fewer.locked == {"joint6": 0.0}
+    session.lock("joint3", True)  # at the angle of the config again
+    assert session.settings.locked == {"joint6": 0.0, "joint3": 0.4}
     with pytest.raises(ValueError, match="joint9"):
-        learner_arm(env, ("joint9",))
+        learner_arm(env, {"joint9": 0.0})
 
 
 @pytest.mark.slow
@@ -191,7 +195,8 @@ def test_a_trained_mapper_moves_the_learner(tmp_path):
 def test_locking_the_last_joint_is_rejected_and_undone():
     session = LiveSession(env_config("planar4dof"))
     before = session.settings
-    session.change(locked=("joint1", "joint2", "joint3", "joint4"))
+    for joint in ("joint1", "joint2", "joint3", "joint4"):
+        session.lock(joint, True)
     with pytest.raises(ValueError, match="all 4 joints are locked"):
         while session.advance(TICK) is None:
             time.sleep(0.01)
@@ -200,11 +205,14 @@ def test_locking_the_last_joint_is_rejected_and_undone():
 
 def test_settings_that_differ_only_in_weights_share_functions(env):
     settings = initial_settings(env)
-    assert settings.locked == ("joint3", "joint6", "joint7") and settings.correspondence == "arc_length"
+    assert (
+        settings.locked == dict.fromkeys(("joint3", "joint6", "joint7"), 0.0)
+        and settings.correspondence == "arc_length"
+    )
     assert dataclasses.replace(settings, rotation=0.3).compilation_key == settings.compilation_key
     assert dataclasses.replace(settings, correspondence="hard").compilation_key != settings.compilation_key
     with pytest.raises(ValueError, match="expected one of arc_length, overlap, hard, soft"):
-        Settings((), "none", 0.0, 1.0)
+        Settings({}, "none", 0.0, 1.0)
 
 
 def test_a_joint_takes_the_shorter_way_around():

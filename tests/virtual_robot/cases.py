@@ -26,7 +26,7 @@ def hardware() -> WorldConfig:
 
 
 def world(config=IDEAL, robots=1, seed=0, edge=""):
-    return draw_world(config, robots, 7, len(model().links), np.random.default_rng(seed), edge)
+    return draw_world(config, robots, 7, np.random.default_rng(seed), edge)
 
 
 def home():

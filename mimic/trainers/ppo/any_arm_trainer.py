@@ -1,5 +1,6 @@
 """`trainer=ppo` where the learner is another arm in each episode: trains one policy for all of them."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,6 +16,7 @@ from mimic.any_arm.controller import ControllerWithMemory, nearest_pose_controll
 from mimic.any_arm.env import AnyArmEnv
 from mimic.any_arm.family import SEEN, UNSEEN, report_arms
 from mimic.compilation import Background, compiling
+from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS, ArmRollouts, ArmsEvaluator, ArmsOutcome
@@ -66,7 +68,9 @@ class AnyArmPPOTrainer(Trainer):
         arms = report_arms(config.env)
         evaluated = held_out.select(slice(0, EVALUATED_DEMONSTRATIONS))
         self.evaluator = ArmsEvaluator(
-            AnyArmEnv(self._env.config, self._env.sampler, evaluated), arms, lambda: self._controller_rollouts()
+            AnyArmEnv(_without_baseline(self._env.config), self._env.sampler, evaluated),
+            arms,
+            lambda: self._controller_rollouts(),
         )
         self.env_config = self._env.config
         self.headline = f"{self._name}: {training.count} demonstrations, {self.settings.num_envs} arms in parallel"
@@ -225,6 +229,11 @@ class AnyArmPPOTrainer(Trainer):
         plot_arms(self.evaluator.details(outcome), folder / "arms.png", **names)
         labels = {"train": "arms seen in training", "held_out": "unseen arms"}
         plots.plot_training(folder, "optimality_gap", "optimality gap [%]", labels=labels, title=self._name)
+
+
+def _without_baseline(config: EnvConfig) -> EnvConfig:
+    """The config without what only the reward needs."""
+    return dataclasses.replace(config, arms=dataclasses.replace(config.arms, reward="distance"))
 
 
 def _worst(arms: Mapping[str, Mapping[str, Any]]) -> str:

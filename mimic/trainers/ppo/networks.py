@@ -19,9 +19,9 @@ from mimic.any_arm.observation import JOINT_FEATURES
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.networks import Transformer
 
-# Standard deviations of an untrained policy, whose mean is the zero action: the controller is good from the start, and
+# Standard deviation of an untrained policy, whose mean is the zero action: the controller is good from the start, and
 # noise of the usual size would hide it.
-_JOINT_STD, _PREFERENCE_STD = 0.05, 0.03
+_JOINT_STD = 0.05
 _MIN_DEVIATION, _MAX_NORMALIZED = 0.1, 10.0  # of an observation of any arm, whose entries are of the order of 1
 
 
@@ -105,15 +105,6 @@ class JointPolicy(nn.Module):
         place = self.param("place", nn.initializers.normal(0.02), (MAX_JOINTS, self.width))
         tokens = nn.Dense(self.width)(of_joints) + place + whole[..., None, :]
         tokens = Transformer(self.width, self.layers)(tokens, is_free > 0)
-        joints = _action_parameters(tokens, _JOINT_STD, "joints")
-        weight = is_free[..., None] / jnp.maximum(is_free.sum(axis=-1)[..., None, None], 1)
-        preference = _action_parameters((weight * tokens).sum(axis=-2), _PREFERENCE_STD, "preference")
-        actions = jnp.concatenate([joints, preference[..., None, :]], axis=-2)
+        bias = jnp.array([0.0, np.log(np.expm1(_JOINT_STD))])  # mean and deviation, whatever the observation is
+        actions = nn.Dense(2, kernel_init=nn.initializers.zeros, bias_init=lambda *_: bias, name="joints")(tokens)
         return jnp.concatenate([actions[..., 0], actions[..., 1]], axis=-1)
-
-
-def _action_parameters(inputs: Array, std: float, name: str) -> Array:
-    """Mean 0 and this deviation of an action, whatever the inputs are, before training; [..., 2]."""
-    bias = jnp.array([0.0, np.log(np.expm1(std))])
-    layer = nn.Dense(2, kernel_init=nn.initializers.zeros, bias_init=lambda *_: bias, name=name)
-    return layer(inputs)

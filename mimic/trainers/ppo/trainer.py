@@ -201,8 +201,8 @@ class PPOTrainer(Trainer):
             return outcome, {"trainer": name, "search": dataclasses.asdict(search), "starts": starts}
         from mimic.evaluation.tracking_controllers import run_controller
 
-        outcome, frequency = run_controller(self.evaluator, name)
-        return outcome, {"trainer": name, "frequency_rad_s": frequency}
+        outcome, setting = run_controller(self.evaluator, name)
+        return outcome, {"trainer": name, **setting}
 
     def metrics(self, outcome: Rollouts) -> Metrics:
         """See `Evaluator.summary`."""
