@@ -7,9 +7,9 @@ import pytest
 
 from mimic.control.joint_control import PERIOD
 from mimic.deploy import measurements
+from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.safety import COLLISION, INVALID, LATE, MEASURED_CLEARANCE, REPEATED, SafetyLayer
-from mimic.deploy.sessions import Clearance
 from tests.helpers import bundles
 
 CONFIG = SafetyConfig()
