@@ -46,6 +46,13 @@ def velocity(joint, value):
     return np.where(np.arange(7) == joint, value, 0.0)
 
 
+def test_a_check_has_the_clearance_of_the_whole_path(layer):
+    run(layer, velocity(0, 0.5))
+    assert len(layer._path.path) == layer._path.samples == len(layer._path_clearance)
+    poses = layer._path.path[:, :, 0]
+    np.testing.assert_allclose(layer._path_clearance[:, 0], layer._clearance(poses), atol=1e-6)
+
+
 def test_an_accepted_target_moves_the_arm(layer):
     references = run(layer, velocity(0, 0.5), ticks=20)
     assert references[-1].qvel[0, 0] == pytest.approx(0.5 * bundles.parameters().velocity[0], rel=1e-3)
