@@ -1,9 +1,10 @@
 """Times of `mimic.deploy` on one core: `python -m benchmarks.deploy [--out FILE] [--bundle FOLDER] [--motions N]`.
 
 A period of the inner loop lasts 1 ms. What is timed is what it computes from a state to the end of the period: torque,
-checks of the measurement, and a part of the check of a target. Wall times include what other processes on the core
-cost; CPU times do not. The last row is a loop of Python alone, which is as long each time: what its p99.9 is above its
-p50 is the machine's.
+checks of the measurement, and a part of the check of a target. The policy is timed in its own process on the same core,
+from an observation to the answer, at the rate at which the inner loop asks it. Wall times include what other processes
+on the core cost; CPU times do not, but for what those evict from the caches. The last row is a loop of Python alone,
+which is as long each time: what its p99.9 is above its p50 is the machine's.
 """
 
 import dataclasses
@@ -17,15 +18,11 @@ import numpy as np
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
-from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import Bundle, load_bundle
 from mimic.deploy.fake_robot import FakeRobot
-from mimic.deploy.policy_process import LocalPolicy, PolicyProcess
+from mimic.deploy.policy_process import PolicyProcess
 from mimic.deploy.runner import missed_periods, run_controller
-from mimic.deploy.sessions import Policy
 
-_POLICY_CALLS = 400
-_TICK = 0.01  # s between two calls of the policy: the caches are then as cold as on a robot
 _PERCENTILES = (50, 99, 99.9)
 _COLUMNS = " ".join(
     ["what count", *(f"{kind}_{name}:.3f" for kind in ("cpu", "wall") for name in ("p50", "p99", "p999")), "missed"]
@@ -66,9 +63,21 @@ def _robot(bundle: Bundle) -> FakeRobot:
     return FakeRobot(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0, is_paced=True)
 
 
-def _row(what: str, wall: list[float], cpu: list[float], **more: int) -> Row:
-    names = ("p50", "p99", "p999")
-    wall_ms, cpu_ms = (1e3 * np.percentile(values, _PERCENTILES) for values in (wall, cpu))
+@dataclasses.dataclass
+class _Times:
+    """Wall and CPU times [s] of the same events."""
+
+    wall: list[float] = dataclasses.field(default_factory=list)
+    cpu: list[float] = dataclasses.field(default_factory=list)
+
+    def add(self, wall: list[float], cpu: list[float]) -> None:
+        self.wall += wall
+        self.cpu += cpu
+
+
+def _row(what: str, times: _Times, **more: int) -> Row:
+    names, wall = ("p50", "p99", "p999"), times.wall
+    wall_ms, cpu_ms = (1e3 * np.percentile(values, _PERCENTILES) for values in (wall, times.cpu))
     return {
         "what": what,
         "count": len(wall),
@@ -79,51 +88,36 @@ def _row(what: str, wall: list[float], cpu: list[float], **more: int) -> Row:
     }
 
 
-def periods(what: str, bundle: Bundle, motions: int, *, in_process: bool) -> Row:
-    """Periods of motions on a fake robot in real time."""
-    wall, cpu, missed, interventions = [], [], 0, 0
+def periods(bundle: Bundle, motions: int) -> Iterator[Row]:
+    """Periods of motions on a fake robot in real time, and the evaluations of the policy in its own process."""
+    loop, policy = _Times(), _Times()
+    missed, interventions = 0, 0
     for motion in range(motions):
         index = motion % len(bundle.expert)
-        robot, connection = _robot(bundle), (PolicyProcess if not in_process else LocalPolicy)(bundle, index)
+        robot, connection = _robot(bundle), PolicyProcess(bundle, index)
         report = run_controller(robot, bundle, index, policy=connection)
         assert not report.cause, report.cause
-        wall += report.wall_s
-        cpu += report.cpu_s
+        loop.add(report.wall_s, report.cpu_s)
+        policy.add(connection.wall_s[1:], connection.cpu_s[1:])  # the first has no tick before it
         missed += missed_periods(robot.states)
         interventions += sum(report.interventions.values())
-    return _row(what, wall, cpu, missed=missed, interventions=interventions)
-
-
-def policy_calls(bundle: Bundle) -> Row:
-    """Calls of the policy alone, at intervals."""
-    policy, rows = Policy(bundle, [0]), np.zeros((1, bundle.num_joints))
-    wall, cpu = [], []
-    for call in range(_POLICY_CALLS):
-        time.sleep(_TICK)
-        started, started_cpu = time.perf_counter(), time.thread_time()
-        policy.act(call % bundle.ticks, rows, rows, Reference(rows, rows, rows))
-        if call > 0:
-            wall.append(time.perf_counter() - started)
-            cpu.append(time.thread_time() - started_cpu)
-    return _row("policy alone", wall, cpu)
+    yield _row("period: inner loop and safety layer", loop, missed=missed, interventions=interventions)
+    yield _row("policy, in its own process", policy)
 
 
 def python_loop() -> Row:
     """A loop that does the same in each period."""
-    wall, cpu = [], []
+    times = _Times()
     for _ in range(_LOOPS):
         time.sleep(0.0005)
         started, started_cpu = time.perf_counter(), time.thread_time()
         sum(range(_LOOP))
-        wall.append(time.perf_counter() - started)
-        cpu.append(time.thread_time() - started_cpu)
-    return _row("loop of Python alone", wall, cpu)
+        times.add([time.perf_counter() - started], [time.thread_time() - started_cpu])
+    return _row("loop of Python alone", times)
 
 
 def measure(bundle: Bundle, motions: int) -> Iterator[Row]:
-    yield periods("period, policy in another process", bundle, motions, in_process=False)
-    yield periods("period, policy in the same process", bundle, motions, in_process=True)
-    yield policy_calls(bundle)
+    yield from periods(bundle, motions)
     yield python_loop()
 
 

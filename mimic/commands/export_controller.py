@@ -5,7 +5,6 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import jax
@@ -17,9 +16,10 @@ from mimic.control import joint_control
 from mimic.control.joint_control import JointParameters
 from mimic.deploy.bundle import write_bundle
 from mimic.distribution import VERSION
-from mimic.hardware.env import SENT_ACTIONS, HardwareEnv, control_observation
+from mimic.hardware.env import SENT_ACTIONS, HardwareEnv
 from mimic.metric.kinematics import LinkStates
-from mimic.retargeting.clearance import make_clearance
+from mimic.metric.matrix_kinematics import make_link_vector
+from mimic.retargeting.clearance import clearance_constants
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import training
@@ -57,16 +57,17 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
     settings = config.resolve()  # saved with all values resolved
     template = training.params_template(settings, env.observation_size, env.action_size)
     params = load_checkpoint(run_dir, template, steps)[1]
-    policy = training.make_controller(settings, env.observation_size, env.action_size)(jax.device_get(params))
 
     def write(out: Path) -> None:
         partial = Path(tempfile.mkdtemp(prefix=".mimic-", dir=out.absolute().parent))
         try:
+            features, policy = _policy_graphs(env, jax.device_get(params))
             write_bundle(
                 partial / "bundle",
-                policy=_policy_graph(env, policy),
-                clearance=_clearance_graph(env),
-                controller=_description(env, steps),
+                policy=policy,
+                features=features,
+                clearance=clearance_constants(env.learner, env.capsules),
+                controller=_description(env, steps) | {"features": settings.hidden_layers[0]},
                 expert=expert_table(env),
                 start_poses=np.asarray(env.start_poses, float),
                 names=[f"demonstration {index}" for index in range(env.demonstrations.count)],
@@ -85,30 +86,45 @@ def expert_table(env: HardwareEnv) -> np.ndarray:
     return np.concatenate(leaves, axis=-1).astype(np.float32)
 
 
-def _policy_graph(env: HardwareEnv, policy: Any) -> bytes:
+def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
+    """What the first layer adds up from the expert's link states, and the policy from that and its other observations.
+
+    The states of the expert are five sixths of an observation and known before a motion. The test of the export
+    compares with `control_observation` and the policy of `training.make_controller`.
+    """
     from mimic.commands.onnx_graph import to_onnx  # needs the extra "export"
 
-    joints = env.learner.num_joints
+    statistics, policy, *_ = params
+    layers = [policy["params"][f"hidden_{index}"] for index in range(len(policy["params"]))]
+    joints, own_links = env.learner.num_joints, _NUMBERS * env.learner.num_links
+    expert_size = (env.config.preview + 1) * _NUMBERS * env.expert.num_links
+    is_expert = np.zeros(env.observation_size, bool)
+    is_expert[own_links : own_links + expert_size] = True
+    link_vector, home = make_link_vector(env.learner), np.asarray(env.learner.home, np.float32)
+
+    def first_layer(part: np.ndarray, values: jax.Array) -> jax.Array:
+        return ((values - statistics.mean[part]) / statistics.std[part]) @ layers[0]["kernel"][part]
+
+    def features(expert: jax.Array) -> dict[str, jax.Array]:
+        return {"features": first_layer(is_expert, expert) + layers[0]["bias"]}
+
+    def action(*values: jax.Array) -> dict[str, jax.Array]:
+        qpos, qvel, reference_qpos, reference_qvel, past_actions, features = values
+        own = jnp.concatenate([link_vector(qpos, qvel), reference_qpos - home, reference_qvel, past_actions])
+        hidden = features + first_layer(~is_expert, own)
+        for layer in layers[1:-1]:
+            hidden = jax.nn.silu(hidden) @ layer["kernel"] + layer["bias"]
+        kernel, bias = (layers[-1][name][..., : env.action_size] for name in ("kernel", "bias"))  # no deviation
+        return {"action": jnp.clip(jnp.tanh(jax.nn.silu(hidden) @ kernel + bias), -1.0, 1.0)}
+
     inputs: dict[str, int] = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
-    inputs["past_actions"] = SENT_ACTIONS * env.action_size
-    inputs["expert"] = (env.config.preview + 1) * _NUMBERS * env.expert.num_links
-
-    def function(*parts: jax.Array) -> dict[str, jax.Array]:
-        *measured, past_actions, expert = parts
-        observation = control_observation(env, jnp.concatenate(measured), past_actions, expert)
-        return {"action": jnp.clip(policy(SimpleNamespace(obs=observation)), -1.0, 1.0)}
-
-    return to_onnx(function, name="policy", inputs=inputs, metadata={"mimic_version": VERSION}).SerializeToString()
-
-
-def _clearance_graph(env: HardwareEnv) -> bytes:
-    from mimic.commands.onnx_graph import to_onnx
-
-    clearance = make_clearance(env.learner, env.capsules)
-    inputs = {"qpos": env.learner.num_joints}
-    return to_onnx(
-        lambda qpos: {"clearance": clearance(qpos)}, name="clearance", inputs=inputs, metadata={}
-    ).SerializeToString()
+    inputs |= {"past_actions": SENT_ACTIONS * env.action_size, "features": len(layers[0]["bias"])}
+    metadata = {"mimic_version": VERSION}
+    graphs = (
+        to_onnx(features, name="features", inputs={"expert": expert_size}, metadata=metadata),
+        to_onnx(action, name="policy", inputs=inputs, metadata=metadata),
+    )
+    return graphs[0].SerializeToString(), graphs[1].SerializeToString()
 
 
 def _description(env: HardwareEnv, steps: int) -> dict[str, Any]:

@@ -169,12 +169,11 @@ class _Graph:
         return self.node("Reshape", value, ints([-1, *shape]))
 
     def _split(self, value: Value, shapes: list[tuple[int, ...]], axis: int) -> list[Value]:
-        parts, start = [], 0
-        for shape in shapes:
-            bounds = ints([start]), ints([start + shape[axis]])
-            parts.append(Tensor(self.node("Slice", value, *bounds, ints([axis + 1])), shape))
-            start += shape[axis]
-        return parts
+        self._names += 1
+        names = [f"Split_{self._names}_{part}" for part in range(len(shapes))]
+        inputs = [self.name(value), self.name(ints([shape[axis] for shape in shapes]))]
+        self.nodes.append(helper.make_node("Split", inputs, names, axis=axis + 1))
+        return [Tensor(name, shape) for name, shape in zip(names, shapes, strict=True)]
 
     def _integer_pow(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         return self.node("Pow", inputs[0], np.asarray(params["y"], np.float32))

@@ -64,6 +64,40 @@ class JointParameters(NamedTuple):
     reach: Array
 
 
+class Approach(NamedTuple):
+    """Constants of `approach_speed`, see `approach`.
+
+    Attributes:
+      slope: change of the squared speed with the distance.
+      offset: square of the speed where the exponential approach begins.
+      rate: of the exponential approach [1/s].
+    """
+
+    slope: Array
+    offset: Array
+    rate: Array
+
+
+class ReferenceLimits(NamedTuple):
+    """Limits of a reference, and what follows from them, one number for each joint.
+
+    Attributes:
+      lower, upper, velocity, acceleration: see `JointParameters`.
+      acceleration_change: maximum in a period [rad/s^2].
+      reaction: until the reference brakes, because its jerk is limited [s].
+      position, speed: of the approach to an angle, and to a velocity.
+    """
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    acceleration_change: Array
+    reaction: Array
+    position: Approach
+    speed: Approach
+
+
 class Target(NamedTuple):
     """What a policy commands for one of its ticks.
 
@@ -95,14 +129,14 @@ def action_target(mode: str, action: Array, reference: Reference, joints: JointP
       joints: parameters, [joints] each.
       xp: array library.
     """
-    action = xp.clip(action, -1.0, 1.0)
+    action = xp.maximum(xp.minimum(action, 1.0), -1.0)
     size = joints.lower.shape[0]
     value, full = action[:size], xp.ones_like(action[:size])
     if mode == "torque":
         return Target(value * joints.torque_scale, full)
     if mode == "joint_velocity":
         return Target(value * joints.velocity, full)
-    position = xp.clip(reference.qpos + value * joints.reach, joints.lower, joints.upper)
+    position = xp.maximum(xp.minimum(reference.qpos + value * joints.reach, joints.upper), joints.lower)
     if mode == "joint_position":
         return Target(position, full)
     return Target(position, MIN_STIFFNESS ** (0.5 * (1.0 - action[size:])))
@@ -125,25 +159,56 @@ def action_towards(mode: str, displacement: Array, duration: Any, joints: JointP
     return xp.concatenate([action, xp.ones_like(action)], axis=-1) if mode == "joint_impedance" else action
 
 
-def approach_speed(distance: Array, acceleration: Array, rate: float, xp: Any) -> Array:
+def reference_limits(joints: JointParameters, period: float = PERIOD) -> ReferenceLimits:
+    """The constants of `next_reference`.
+
+    Args:
+      joints: parameters.
+      period: [s].
+    """
+    return ReferenceLimits(
+        lower=joints.lower,
+        upper=joints.upper,
+        velocity=joints.velocity,
+        acceleration=joints.acceleration,
+        acceleration_change=joints.jerk * period,
+        reaction=REACTION_FRACTION * joints.acceleration / joints.jerk,
+        position=approach(BRAKING_FRACTION * joints.acceleration, APPROACH_RATE),
+        speed=approach(BRAKING_FRACTION * joints.jerk, VELOCITY_RATE),
+    )
+
+
+def approach(acceleration: Array, rate: float) -> Approach:
+    """The constants of `approach_speed`.
+
+    Args:
+      acceleration: deceleration.
+      rate: of the exponential approach [1/s].
+    """
+    return Approach(2.0 * acceleration, acceleration * acceleration / rate**2, rate)
+
+
+def approach_speed(distance: Array, approach: Approach, xp: Any) -> Array:
     """Speed at which a value may approach a point so that it can stop there; negative beyond the point.
 
     Exponential within the last acceleration / rate^2, a constant deceleration before, with the same slope where they
-    meet.
+    meet: so it is the smaller one of the two.
 
     Args:
       distance: to the point.
-      acceleration: deceleration.
-      rate: of the exponential approach [1/s].
+      approach: constants.
       xp: array library.
     """
-    near = acceleration / rate**2
-    far_speed = xp.sqrt(2.0 * acceleration * xp.maximum(distance - 0.5 * near, 0.5 * near))
-    return xp.where(distance < near, rate * distance, far_speed)
+    return xp.minimum(approach.rate * distance, _braking_speed(distance, approach, xp))
+
+
+def _braking_speed(distance: Array, approach: Approach, xp: Any) -> Array:
+    """Speed of a constant deceleration; near the point that where the exponential approach begins."""
+    return xp.sqrt(xp.maximum(approach.slope * distance - approach.offset, approach.offset))
 
 
 def next_reference(
-    mode: str, reference: Reference, target: Array, joints: JointParameters, xp: Any, period: float = PERIOD
+    mode: str, reference: Reference, target: Array, limits: ReferenceLimits, xp: Any, period: float = PERIOD
 ) -> Reference:
     """Moves a reference by one period, within the limits on angle, velocity, acceleration and jerk.
 
@@ -152,26 +217,24 @@ def next_reference(
         the mode "joint_velocity" and the target 0.
       reference: the last one.
       target: angle [rad] or velocity [rad/s].
-      joints: parameters.
+      limits: from `reference_limits`, of the same period.
       xp: array library.
       period: [s].
     """
-    braking = BRAKING_FRACTION * joints.acceleration
-    delay = REACTION_FRACTION * joints.acceleration / joints.jerk  # until the reference brakes: its jerk is limited
-    ahead = reference.qpos + delay * reference.qvel
+    position, velocity = limits.position, limits.speed
+    ahead = reference.qpos + limits.reaction * reference.qvel
     if mode == "joint_velocity":
-        speed = target
+        speed = _bounded(target, limits.velocity, xp)
     else:
         error = target - ahead
-        speed = approach_speed(xp.abs(error), braking, APPROACH_RATE, xp)
-        speed = xp.where(error < 0, -speed, speed)
-    speed = _bounded(speed, joints.velocity, xp)
-    speed = xp.minimum(speed, approach_speed(joints.upper - ahead, braking, APPROACH_RATE, xp))
-    speed = xp.maximum(speed, -approach_speed(ahead - joints.lower, braking, APPROACH_RATE, xp))
+        most = xp.minimum(_braking_speed(xp.abs(error), position, xp), limits.velocity)
+        speed = _bounded(position.rate * error, most, xp)
+    speed = xp.minimum(speed, approach_speed(limits.upper - ahead, position, xp))
+    speed = xp.maximum(speed, -approach_speed(ahead - limits.lower, position, xp))
     change = speed - reference.qvel
-    qacc = approach_speed(xp.abs(change), BRAKING_FRACTION * joints.jerk, VELOCITY_RATE, xp)
-    qacc = _bounded(xp.where(change < 0, -qacc, qacc), joints.acceleration, xp)
-    qacc = reference.qacc + _bounded(qacc - reference.qacc, joints.jerk * period, xp)
+    most = xp.minimum(_braking_speed(xp.abs(change), velocity, xp), limits.acceleration)
+    qacc = _bounded(velocity.rate * change, most, xp)
+    qacc = reference.qacc + _bounded(qacc - reference.qacc, limits.acceleration_change, xp)
     qvel = reference.qvel + period * qacc
     return Reference(reference.qpos + period * qvel, qvel, qacc)
 

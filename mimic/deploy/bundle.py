@@ -9,16 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import MODES, PERIOD, JointParameters, action_size
 from mimic.control.limits import JointLimits
 from mimic.npz import read_arrays
 
 FORMAT = 1
-POLICY, CLEARANCE, CONTROLLER, MOTIONS = "policy.onnx", "clearance.onnx", "controller.json", "motions.npz"
+POLICY, FEATURES = "policy.onnx", "features.onnx"
+CLEARANCE, CONTROLLER, MOTIONS = "clearance.npz", "controller.json", "motions.npz"
+_MODELS = POLICY, FEATURES, CLEARANCE
 LINK_NUMBERS = 12  # position, direction, linear and angular velocity
 _KEYS = (
     "format", "mimic_version", "mode", "period", "control_dt", "joint_names", "start_pose", "limits", "parameters",
-    "preview", "past_actions", "expert_links", "robot", "hashes",
+    "preview", "past_actions", "features", "expert_links", "robot", "hashes",
 )  # fmt: skip
 
 
@@ -37,10 +40,12 @@ class Bundle:
       parameters: of the inner loop, [joints] each.
       preview: number of later ticks whose expert states the policy observes.
       past_actions: number of its own actions that the policy observes.
+      features: number of those that it observes of the expert.
       expert_links: number of links of the expert.
       expert: [motions, ticks + 1, expert_links * 12] the expert's link states at each tick.
       start_poses: [motions, joints] where each motion starts [rad].
       names: of the motions.
+      clearance: constants of the clearance of a pose.
     """
 
     folder: Path
@@ -53,10 +58,12 @@ class Bundle:
     parameters: JointParameters
     preview: int
     past_actions: int
+    features: int
     expert_links: int
     expert: np.ndarray
     start_poses: np.ndarray
     names: tuple[str, ...]
+    clearance: ClearanceConstants
 
     @property
     def num_joints(self) -> int:
@@ -98,7 +105,8 @@ def write_bundle(
     folder: Path,
     *,
     policy: bytes,
-    clearance: bytes,
+    features: bytes,
+    clearance: ClearanceConstants,
     controller: Mapping[str, Any],
     expert: np.ndarray,
     start_poses: np.ndarray,
@@ -108,19 +116,21 @@ def write_bundle(
 
     Args:
       folder: must not exist.
-      policy, clearance: ONNX models.
+      policy, features: ONNX models: the action, of measured and reference motions, past actions and features; the
+        features, of the expert's link states at a tick and the later ticks of the preview.
       controller: what `controller.json` has, without `format`, `period`, `start_pose` and `hashes`.
-      expert, start_poses, names: see `Bundle`.
+      clearance, expert, start_poses, names: see `Bundle`.
     """
     folder.mkdir()
     (folder / POLICY).write_bytes(policy)
-    (folder / CLEARANCE).write_bytes(clearance)
+    (folder / FEATURES).write_bytes(features)
+    np.savez(folder / CLEARANCE, **clearance._asdict())
     content = {
         "format": FORMAT,
         **controller,
         "period": PERIOD,
         "start_pose": np.asarray(start_poses, float)[0].tolist(),
-        "hashes": {name: _sha256(folder / name) for name in (POLICY, CLEARANCE)},
+        "hashes": {name: _sha256(folder / name) for name in _MODELS},
     }
     np.savez(
         folder / MOTIONS,
@@ -138,20 +148,19 @@ def load_bundle(folder: str | Path) -> Bundle:
       ValueError: a file is missing, damaged or of another version, or does not fit the others; in one line.
     """
     folder = Path(folder).expanduser()
-    missing = [name for name in (CONTROLLER, POLICY, CLEARANCE, MOTIONS) if not (folder / name).is_file()]
+    missing = [name for name in (CONTROLLER, *_MODELS, MOTIONS) if not (folder / name).is_file()]
     if missing:
         raise ValueError(f"bundle: {str(folder)!r}: expected a folder of mimic.export with format=controller; it lacks "
                          f"{', '.join(missing)}")  # fmt: skip
     content = _controller(folder)
-    for name in (POLICY, CLEARANCE):
+    for name in _MODELS:
         if content["hashes"].get(name) != _sha256(folder / name):
             raise ValueError(f"bundle: {name}: expected the file that {CONTROLLER} was written for, got another one")
-    try:
-        motions = read_arrays(folder / MOTIONS, ("expert", "start_poses", "names"))
-    except ValueError as error:
-        raise ValueError(f"bundle: {MOTIONS}: {error}") from error
-    bundle = _parsed(folder, content, motions)
+    motions = _arrays(folder / MOTIONS, ("expert", "start_poses", "names"))
+    clearance = _arrays(folder / CLEARANCE, ClearanceConstants._fields)
+    bundle = _parsed(folder, content, motions, clearance)
     _check(bundle)
+    _check_clearance(bundle.clearance, bundle.num_joints)
     return bundle
 
 
@@ -169,7 +178,20 @@ def _controller(folder: Path) -> dict[str, Any]:
     return keys
 
 
-def _parsed(folder: Path, content: Mapping[str, Any], motions: Mapping[str, np.ndarray]) -> Bundle:
+def _arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    try:
+        arrays = read_arrays(path, names)
+    except ValueError as error:
+        raise ValueError(f"bundle: {path.name}: {error}") from error
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        raise ValueError(f"bundle: {path.name}: expected the arrays {', '.join(names)}; missing {', '.join(missing)}")
+    return arrays
+
+
+def _parsed(
+    folder: Path, content: Mapping[str, Any], motions: Mapping[str, np.ndarray], clearance: Mapping[str, np.ndarray]
+) -> Bundle:
     try:
         links = content["expert_links"]
         return Bundle(
@@ -185,10 +207,12 @@ def _parsed(folder: Path, content: Mapping[str, Any], motions: Mapping[str, np.n
             ),
             preview=int(content["preview"]),
             past_actions=int(content["past_actions"]),
+            features=int(content["features"]),
             expert_links=int(links) if isinstance(links, int) else len(links),
             expert=np.asarray(motions["expert"], np.float32),
             start_poses=np.asarray(motions["start_poses"], float),
             names=tuple(str(name) for name in motions["names"]),
+            clearance=ClearanceConstants(**{**clearance, "parent": clearance["parent"].tolist()}),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
@@ -220,6 +244,24 @@ def _check(bundle: Bundle) -> None:
             raise ValueError(f"bundle: {name}: expected the shape {shape} of {joints} joints, got {value.shape}")
         if value.dtype.kind == "f" and not np.all(np.isfinite(value)):
             raise ValueError(f"bundle: {name}: expected finite numbers")
+
+
+def _check_clearance(constants: ClearanceConstants, joints: int) -> None:
+    """Raises a `ValueError` where the constants are not those of an arm with this number of joints."""
+    pairs, points = constants.radii.size, constants.heights.size
+    columns = 4 * pairs + points
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(ClearanceConstants._fields, (pairs,))
+    shapes |= {"parent": (joints,), "constant": (16 * joints,), "factors": (2 * joints, 16 * joints)}
+    shapes |= {"moved": (4 * joints, columns), "fixed": (3, columns), "heights": (points,)}
+    for name, values in constants._asdict().items():
+        is_number = np.asarray(values).dtype.kind in "if"
+        if np.shape(values) != shapes[name] or not is_number or not np.all(np.isfinite(values)):
+            raise ValueError(
+                f"bundle: {CLEARANCE}: {name}: expected finite numbers of the shape {shapes[name]} of {joints} joints, "
+                f"got {np.shape(values)}"
+            )
+    if any(not -1 <= parent < joint for joint, parent in enumerate(constants.parent)) or not columns:
+        raise ValueError(f"bundle: {CLEARANCE}: expected parents before their children, and something to check")
 
 
 def _sha256(path: Path) -> str:

@@ -1,6 +1,7 @@
 """Predicts where a reference goes under a target and then brakes: `next_reference` with larger steps, in place."""
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,9 +13,10 @@ from mimic.control.joint_control import (
     VELOCITY_RATE,
     JointParameters,
     Reference,
+    approach,
 )
 
-HOLD, BRAKE = 2, 20  # periods of a step, while targets act and while the references brake
+HOLD, BRAKE = 2, 30  # periods of a step, while targets act and while the references brake
 SAMPLE = 10  # periods between two angles of a path; those in the middle of a step of braking are interpolated
 _PER_BRAKE = BRAKE // SAMPLE
 
@@ -31,28 +33,51 @@ class PathPrediction:
       delay: periods until the new target acts, a multiple of `HOLD`.
       hold: periods for which it acts, a multiple of `SAMPLE`.
       robots: number of robots.
+
+    Attributes:
+      steps: number of steps of a path.
+      samples: number of its angles.
     """
 
     ERROR = 0.008  # rad, maximum over the joints
 
     def __init__(self, joints: JointParameters, is_position: bool, delay: int, hold: int, robots: int = 1):
         self._delay_steps, self._hold_steps = delay // HOLD, (delay + hold) // HOLD
-        self._brake_steps = braking_steps(joints)
-        self.steps = self._hold_steps + self._brake_steps
+        brake_steps = braking_steps(joints)
+        self.steps = self._hold_steps + brake_steps
         size = joints.lower.shape[0], robots
-        self._path = np.zeros((1 + hold // SAMPLE + self._brake_steps * _PER_BRAKE, *size))
+        self._first_brake = 1 + hold // SAMPLE
+        self.samples = self._first_brake + brake_steps * _PER_BRAKE
+        self._path = np.zeros((self.samples, *size))
         self._qpos, self._qvel, self._qacc, self._speed, self._a, self._b = np.zeros((6, *size))
-        self._room, self._bound, self._far = np.zeros((3, 2, *size))
-        self._is_position, self._joints = is_position, joints
-        self._ends = np.stack([joints.upper, -joints.lower])
-        self._sign = np.array([1.0, -1.0])[:, None, None]
-        self._reaction = REACTION_FRACTION * joints.acceleration / joints.jerk
-        self._position = _Approach(BRAKING_FRACTION * joints.acceleration, APPROACH_RATE)
-        self._velocity = {n: _Approach(BRAKING_FRACTION * joints.jerk, _rate(n)) for n in (HOLD, BRAKE)}
-        self._swing_time = 1 / (2 * joints.jerk)
-        self._most, self._least = joints.acceleration, -joints.acceleration
-        self._target, self._left = np.zeros(size), np.zeros(robots, int)
-        self._count, self._samples = self.steps, 0
+        self._room = np.zeros((2, *size))
+        self._is_position = is_position
+
+        def full(values: Any, shape: tuple[int, ...] = size) -> np.ndarray:  # NumPy takes longer to broadcast
+            return np.array(np.broadcast_to(values, shape), float)
+
+        def approaching(acceleration: np.ndarray, rate: float, shape: tuple[int, ...] = size) -> _Approach:
+            return _Approach(*(full(x, shape) for x in approach(acceleration, rate)))
+
+        braking, pair = BRAKING_FRACTION * joints.acceleration, (2, *size)
+        self._lower, self._upper = full(joints.lower), full(joints.upper)
+        self._max_speeds = full(joints.velocity, pair)
+        self._max_qacc = full(joints.acceleration)
+        self._reaction = full(REACTION_FRACTION * joints.acceleration / joints.jerk)
+        self._position, self._ends = (approaching(braking, APPROACH_RATE, shape) for shape in (size, pair))
+        self._steps = {
+            periods: _Step(
+                full(periods * PERIOD),
+                full(0.5 * (periods * PERIOD + PERIOD)),
+                full(joints.jerk * periods * PERIOD),
+                full(-joints.jerk * periods * PERIOD),
+                approaching(BRAKING_FRACTION * joints.jerk, _rate(periods)),
+            )
+            for periods in (HOLD, BRAKE)
+        }
+        self._swing_time = full(1 / (2 * joints.jerk))
+        self._target, self._left, self._first_end = np.zeros(size), np.zeros(robots, int), 0
+        self._count, self._samples, self._filled = self.steps, 0, 0
 
     def begin(self, reference: Reference, target: np.ndarray, left: np.ndarray) -> None:
         """Starts the paths.
@@ -63,7 +88,8 @@ class PathPrediction:
           left: [robots] periods until its references brake.
         """
         self._qpos[:], self._qvel[:], self._qacc[:] = reference
-        self._target, self._left, self._count, self._samples = target, left.copy(), 0, 0
+        self._target, self._left, self._first_end = target, left.copy(), int(left.min())
+        self._count, self._samples, self._filled = 0, 0, 0
 
     def advance(self, steps: int, new_target: Callable[[Reference], np.ndarray]) -> bool:
         """Computes some more steps; returns whether the paths are complete.
@@ -75,19 +101,20 @@ class PathPrediction:
         for _ in range(min(steps, self.steps - self._count)):
             if self._count == self._delay_steps:
                 self._target = new_target(Reference(self._qpos, self._qvel, self._qacc))
-                self._sample()
+                self._sample(1)
             is_braking = self._count >= self._hold_steps
             if is_braking:
-                self._speed[:] = 0.0
+                self._brake()
             else:
                 self._follow()
-            self._step(BRAKE if is_braking else HOLD)
+            self._step(self._steps[BRAKE if is_braking else HOLD])
             self._count += 1
             since = HOLD * (self._count - self._delay_steps)
             if is_braking:
                 self._sample(_PER_BRAKE)
             elif since > 0 and since % SAMPLE == 0:
-                self._sample()
+                self._sample(1)
+        self._interpolate()
         return self._count == self.steps
 
     @property
@@ -95,76 +122,106 @@ class PathPrediction:
         """The angles when the new target begins to act and after each `SAMPLE`, [samples, joints, robots] [rad]."""
         return self._path[: self._samples]
 
-    def parts(self, count: int) -> list[np.ndarray]:
-        """The path in parts of about the same length."""
-        return np.array_split(self.path, count)
+    def _sample(self, count: int) -> None:
+        """Adds the present angles to the path as the last of some samples; those before are interpolated later."""
+        self._samples += count
+        self._path[self._samples - 1] = self._qpos
 
-    def _sample(self, count: int = 1) -> None:
-        """Adds the present angles to the path, and before them some that are interpolated."""
-        last = self._samples + count - 1
-        self._path[last] = self._qpos
-        for k in range(1, count):
-            before = self._path[self._samples - 1]
-            self._path[self._samples + k - 1] = before + k / count * (self._qpos - before)
-        self._samples = last + 1
+    def _interpolate(self) -> None:
+        """Fills the samples between the ends of the steps of braking that are new."""
+        first, last = max(self._filled, self._first_brake), self._samples
+        if first < last:
+            before, after = (
+                self._path[first - 1 : last - 1 : _PER_BRAKE],
+                self._path[first + _PER_BRAKE - 1 : last : _PER_BRAKE],
+            )
+            change = after - before
+            for k in range(1, _PER_BRAKE):
+                self._path[first + k - 1 : last : _PER_BRAKE] = before + k / _PER_BRAKE * change
+        self._filled = last
+
+    def _ahead(self) -> np.ndarray:
+        """Where the joints would stop."""
+        np.multiply(self._reaction, self._qvel, out=self._a)
+        self._a += self._qpos
+        return self._a
+
+    def _brake(self) -> None:
+        """The speed for the target 0: not 0 beyond the ends of the range, where joints return."""
+        speed, ahead = self._speed, self._ahead()
+        np.minimum(ahead, self._upper, out=speed)
+        np.maximum(speed, self._lower, out=speed)
+        speed -= ahead
+        speed *= self._position.rate
 
     def _follow(self) -> None:
-        """The speed for the target that acts, and for those that no longer act, 0."""
+        """The speed for the target that acts, or 0 where none acts any more, so that joints stop at their ends."""
+        speed, room, ahead = self._speed, self._room, self._ahead()
         if self._is_position:
-            error = self._target - self._qpos - self._reaction * self._qvel
-            np.copysign(self._position(np.abs(error)), error, out=self._speed)
+            error = np.subtract(self._target, ahead, out=self._b)
+            np.copysign(self._position(np.abs(error)), error, out=speed)
         else:
-            self._speed[:] = self._target
-        if self._count < self._delay_steps:
-            self._speed *= self._left > HOLD * self._count
+            speed[:] = self._target
+        if self._first_end <= HOLD * self._count < HOLD * self._delay_steps:
+            speed *= self._left > HOLD * self._count
+        np.subtract(self._upper, ahead, out=room[0])
+        np.subtract(ahead, self._lower, out=room[1])
+        bound = self._ends(room)
+        np.minimum(bound, self._max_speeds, out=bound)
+        np.minimum(speed, bound[0], out=speed)
+        np.maximum(speed, np.negative(bound[1], out=bound[1]), out=speed)
 
-    def _step(self, periods: int) -> None:
+    def _step(self, step: "_Step") -> None:
         """A step as in `next_reference`, towards `speed`."""
-        step, a, b = periods * PERIOD, self._a, self._b
-        change = self._bounded_speed()
-        change -= self._qvel
-        swing = self._velocity[periods](np.abs(change, out=a))
+        a, b = self._a, self._b
+        change = np.subtract(self._speed, self._qvel, out=self._speed)
+        swing = step.approach(np.abs(change, out=a))
+        np.minimum(swing, self._max_qacc, out=swing)
         np.copysign(swing, change, out=swing)
-        np.minimum(swing, self._most, out=swing)
-        np.maximum(swing, self._least, out=swing)
         swing -= self._qacc
-        most = self._joints.jerk * step
-        np.minimum(swing, most, out=swing)
-        np.maximum(swing, -most, out=swing)
+        np.minimum(swing, step.max_change, out=swing)
+        np.maximum(swing, step.min_change, out=swing)
         self._qacc += swing
-        np.multiply(self._qacc, step, out=a)
+        np.multiply(self._qacc, step.time, out=a)
         np.multiply(np.abs(swing, out=b), swing, out=b)  # the jerk limit delays a part of the change
         b *= self._swing_time
         a -= b
         # The angle moves at the mean of the velocities after each period.
-        self._qpos += np.multiply(self._qvel, step, out=b)
-        self._qpos += np.multiply(a, 0.5 * (step + PERIOD), out=b)
+        self._qpos += np.multiply(self._qvel, step.time, out=b)
+        self._qpos += np.multiply(a, step.mean_time, out=b)
         self._qvel += a
 
-    def _bounded_speed(self) -> np.ndarray:
-        """The speed within the velocity limit, and so that the joint stops before its ends."""
-        speed, room, bound = self._speed, self._room, self._bound
-        np.multiply(self._reaction, self._qvel, out=self._a)
-        self._a += self._qpos
-        np.multiply(self._sign, self._a, out=room)
-        np.subtract(self._ends, room, out=room)
-        bound[:] = np.minimum(self._position(room), self._joints.velocity)
-        np.minimum(speed, bound[0], out=speed)
-        return np.maximum(speed, np.negative(bound[1], out=bound[1]), out=speed)
 
+class _Approach(NamedTuple):
+    """`approach_speed` with its constants, in few operations."""
 
-class _Approach:
-    """`approach_speed` with its constants; its two pieces are the minimum of a line and of a root."""
-
-    def __init__(self, acceleration: np.ndarray, rate: float):
-        self._slope, self._offset, self._rate = 2 * acceleration, acceleration**2 / rate**2, rate
+    slope: np.ndarray
+    offset: np.ndarray
+    rate: np.ndarray
 
     def __call__(self, distance: np.ndarray) -> np.ndarray:
-        far = distance * self._slope
-        far -= self._offset
-        np.maximum(far, self._offset, out=far)
+        far = distance * self.slope
+        far -= self.offset
+        np.maximum(far, self.offset, out=far)
         np.sqrt(far, out=far)
-        return np.minimum(far, distance * self._rate, out=far)
+        return np.minimum(far, distance * self.rate, out=far)
+
+
+class _Step(NamedTuple):
+    """Constants of steps of one length, [joints, robots] each.
+
+    Attributes:
+      time: length [s].
+      mean_time: mean time for which a change of the velocity in the step acts [s].
+      max_change, min_change: of the acceleration in a step [rad/s^2].
+      approach: of a velocity.
+    """
+
+    time: np.ndarray
+    mean_time: np.ndarray
+    max_change: np.ndarray
+    min_change: np.ndarray
+    approach: _Approach
 
 
 def _rate(periods: int) -> float:

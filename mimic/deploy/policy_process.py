@@ -20,10 +20,14 @@ from mimic.deploy.bundle import Bundle, load_bundle
 from mimic.deploy.sessions import Policy
 
 _TICK = struct.Struct("<q")
+_ANSWER = struct.Struct("<qdd")  # the tick, and the wall and CPU time of its evaluation [s]; then the action follows
 _READY = -1  # the tick of the first message
 _MAX_MESSAGE = 65_536  # bytes
 _COMMAND = "import sys; from mimic.deploy.policy_process import main; main(*sys.argv[1:])"
 _WATCH = 1.0  # s between two looks whether the inner loop still lives
+# From some time before an observation is due [s], the network runs some times at intervals [s], so that it ends shortly
+# before: caches lose it in a tick, and the evaluation would take several times as long.
+_WARM_UP, _INTERVAL, _WARM_UPS = 0.002, 0.0002, 6
 
 
 class LocalPolicy:
@@ -55,6 +59,9 @@ class PolicyProcess:
       motion: index of the motion.
       start_s: maximum time until the process is ready [s].
 
+    Attributes:
+      wall_s, cpu_s: times of the evaluations whose actions were received [s].
+
     Raises:
       RuntimeError: the process did not become ready.
     """
@@ -68,6 +75,8 @@ class PolicyProcess:
                 [sys.executable, "-c", _COMMAND, *arguments], pass_fds=[other.fileno()], env=environment
             )
         self._size = bundle.action_size
+        self.wall_s: list[float] = []
+        self.cpu_s: list[float] = []
         self._wait(start_s)
         self._socket.setblocking(False)
 
@@ -88,9 +97,12 @@ class PolicyProcess:
         with contextlib.suppress(OSError):  # BlockingIOError: there is none
             while True:
                 message = self._socket.recv(_MAX_MESSAGE)
-        if message is None or len(message) != _TICK.size + 4 * self._size:
+        if message is None or len(message) != _ANSWER.size + 4 * self._size:
             return None
-        return _TICK.unpack_from(message)[0], np.frombuffer(message, np.float32, offset=_TICK.size).astype(float)
+        tick, wall, cpu = _ANSWER.unpack_from(message)
+        self.wall_s.append(wall)
+        self.cpu_s.append(cpu)
+        return tick, np.frombuffer(message, np.float32, offset=_ANSWER.size).astype(float)
 
     def close(self) -> None:
         """Ends the process, also a stopped one."""
@@ -114,22 +126,34 @@ def main(folder: str, motion: str, descriptor: str, parent: str) -> None:
     """The process of a policy: it answers each observation with an action, until the inner loop has ended."""
     bundle = load_bundle(Path(folder))
     joints, connection = bundle.num_joints, socket.socket(fileno=int(descriptor))
-    connection.settimeout(_WATCH)
     _warm_up(bundle)
     policy = Policy(bundle, [int(motion)])
     connection.send(_TICK.pack(_READY))
+    connection.settimeout(_WATCH)
+    warm_ups = 0
     while os.getppid() == int(parent):
         try:
             message = connection.recv(_MAX_MESSAGE)
         except TimeoutError:
+            policy.warm_up()
+            warm_ups += 1
+            connection.settimeout(_INTERVAL if warm_ups < _WARM_UPS else _WATCH)
             continue
         except OSError:
             return
-        values = np.frombuffer(message, np.float32, offset=_TICK.size).reshape(4, 1, joints)
-        (tick,) = _TICK.unpack_from(message)
-        action = policy.act(tick, values[0], values[1], Reference(values[2], values[3], values[3]))
         with contextlib.suppress(OSError):
-            connection.send(_TICK.pack(tick) + action.astype(np.float32).tobytes())
+            connection.send(_answer(policy, message, joints))
+        warm_ups = 0
+        connection.settimeout(max(bundle.control_dt - _WARM_UP, _INTERVAL))
+
+
+def _answer(policy: Policy, message: bytes, joints: int) -> bytes:
+    """The message with the action for an observation."""
+    wall, cpu = time.perf_counter(), time.thread_time()
+    values = np.frombuffer(message, np.float32, offset=_TICK.size).reshape(4, 1, joints)
+    (tick,) = _TICK.unpack_from(message)
+    action = policy.act(tick, values[0], values[1], Reference(values[2], values[3], values[3])).astype(np.float32)
+    return _ANSWER.pack(tick, time.perf_counter() - wall, time.thread_time() - cpu) + action.tobytes()
 
 
 def _warm_up(bundle: Bundle, calls: int = 20) -> None:

@@ -11,11 +11,11 @@ import numpy as np
 
 from mimic.control.joint_control import PERIOD, Reference
 from mimic.deploy.bundle import Bundle
+from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.driver import Driver, RobotAbort, RobotState
 from mimic.deploy.policy_process import PolicyProcess
 from mimic.deploy.safety import INTERVENTIONS, LATE, SafetyLayer
-from mimic.deploy.sessions import Clearance
 
 ENDED = "policy ended"
 _REST = 1e-3  # rad/s, of a reference that has stopped

@@ -18,6 +18,7 @@ from mimic.control.joint_control import (
     action_target,
     joint_torque,
     next_reference,
+    reference_limits,
 )
 from mimic.deploy.bundle import Bundle
 from mimic.deploy.config import SafetyConfig
@@ -28,8 +29,6 @@ from mimic.deploy.path import PathPrediction
 COLLISION, INVALID, REPEATED, LATE = "clearance", "invalid action", "repeated action", "late policy"
 INTERVENTIONS = (COLLISION, INVALID, REPEATED, LATE)
 MEASURED_CLEARANCE = "measured clearance"
-_CLEARANCE_PERIODS = 3  # of those of a check: a part of the path in each
-_REFRESH = 4  # periods of a check in which the clearance of the measured pose is computed once
 _SLOWING = 3.0  # of the damping of the inner loop
 _ACTION_TOLERANCE = 1e-3  # beyond [-1, 1]: float32 rounds a saturated tanh
 
@@ -51,8 +50,7 @@ class SafetyLayer:
       torque: of the last period [N m].
       cause: [robots] why the arm was stopped for good; empty while it is controlled.
       counts: [robots] number of interventions, by kind.
-      tracking_error: [robots] largest tracking error [rad].
-      clearance: [robots] smallest clearance of a measured pose [m], of one in several periods.
+      clearance: [robots] smallest clearance of a measured pose [m], of nearly every period.
     """
 
     def __init__(
@@ -75,16 +73,19 @@ class SafetyLayer:
                 f"together, got {bundle.control_dt} s and {config.grace} s"
             )
         self._mode, self._config, self._clearance, self._hold = bundle.mode, config, clearance, hold
-        self._actions = JointParameters(*(np.asarray(x, float)[:, None] for x in bundle.parameters))
+        # As large as the states: NumPy takes twice as long to broadcast.
+        self._actions = JointParameters(*(np.tile(np.asarray(x, float)[:, None], robots) for x in bundle.parameters))
         self._joints = self._actions._replace(
             velocity=config.velocity_scale * self._actions.velocity,
             acceleration=config.acceleration_scale * self._actions.acceleration,
         )
-        self._slow = config.slow_down * np.asarray(bundle.limits.velocity)[:, None]
+        self._limits = reference_limits(self._joints)
+        self._slow = config.slow_down * np.tile(np.asarray(bundle.limits.velocity, float)[:, None], robots)
         is_position = bundle.mode != "joint_velocity"
         self._path = PathPrediction(self._joints, is_position, config.check_periods, hold, robots)
-        self._path_periods = config.check_periods - _CLEARANCE_PERIODS
-        self._steps = -(-self._path.steps // (self._path_periods - self._path_periods // _REFRESH))  # in a period
+        self._steps = -(-self._path.steps // (config.check_periods - 1))  # in a period, all but the first of a check
+        self._no_path = self._path.path
+        self._path_clearance = np.zeros((self._path.samples, robots))
         self._start, self._measurements = StartCheck(bundle.limits, config), MeasurementCheck(bundle.limits, config)
         joints = bundle.num_joints
         self.torque, self._value = np.zeros((2, joints, robots))
@@ -96,8 +97,9 @@ class SafetyLayer:
         self.reference = Reference(*np.zeros((3, joints, robots)))
         self.cause = np.full(robots, "", object)
         self.counts = {name: np.zeros(robots, int) for name in INTERVENTIONS}
-        self.tracking_error, self.clearance = np.zeros(robots), np.full(robots, np.inf)
-        self._qpos, self._is_tracked = np.zeros((joints, robots)), np.ones(robots, bool)
+        self._largest_errors, self.clearance = np.zeros((joints, robots)), np.full(robots, np.inf)
+        self._qpos, self._rest = np.zeros((2, joints, robots))
+        self._is_tracked = np.ones(robots, bool)
 
     def start(self, qpos: np.ndarray, qvel: np.ndarray, start_pose: np.ndarray) -> np.ndarray:
         """Begins to control arms that are near their start poses and at rest; gives the cause for those that are not.
@@ -134,6 +136,12 @@ class SafetyLayer:
         self.counts[LATE] += is_missing & ~is_repeated
         self._pending = _Pending(is_active & (is_new | is_repeated) & self._has_action)
         self._path.begin(self.reference, self._value, self._left)
+        self._path_clearance[:] = -np.inf  # what has not been checked is not safe
+
+    @property
+    def tracking_error(self) -> np.ndarray:
+        """The largest tracking error [robots] [rad]."""
+        return self._largest_errors.max(axis=0)
 
     @property
     def is_checking(self) -> bool:
@@ -146,18 +154,20 @@ class SafetyLayer:
             self._accept(self._pending)
         self._qpos = qpos
         cause, error = self._measurements(qpos, qvel, self.reference, self.cause)
-        np.maximum(self.tracking_error, error, out=self.tracking_error, where=self._is_tracked)
+        np.maximum(self._largest_errors, error, out=self._largest_errors, where=self._is_tracked)
         if cause is not None:
             self._stop(cause)
         self._move_reference()
-        stiffness, is_lost = self._stiffness, self._measurements.is_lost
-        if is_lost.any():  # no torque where nothing is measured: the robot holds itself
+        stiffness = self._stiffness
+        if self._measurements.any_lost:  # no torque where nothing is measured: the robot holds itself
+            is_lost = self._measurements.is_lost
             stiffness = np.where(is_lost, 0.0, stiffness)
             qpos, qvel = np.where(is_lost, self.reference.qpos, qpos), np.where(is_lost, self.reference.qvel, qvel)
         target = Target(self._value, stiffness)
         torque = joint_torque("joint_position", qpos, qvel, self.reference, target, self.torque, self._joints, np)
-        excess = qvel - np.minimum(np.maximum(qvel, -self._slow), self._slow)
-        self.torque = self._slowed(torque, excess) if excess.any() else torque
+        if np.count_nonzero(np.abs(qvel) > self._slow):
+            torque = self._slowed(torque, qvel - np.minimum(np.maximum(qvel, -self._slow), self._slow))
+        self.torque = torque
         return self.torque
 
     def _slowed(self, torque: np.ndarray, excess: np.ndarray) -> np.ndarray:
@@ -168,19 +178,23 @@ class SafetyLayer:
         return self.torque + np.clip(braking - self.torque, -change, change)
 
     def work(self) -> None:
-        """Computes a part of the check that is under way, or the clearance of the measured pose."""
-        pending = self._pending
-        if pending is None or pending.periods >= self._config.check_periods:
-            self._check_clearance()
-            return
-        pending.periods += 1
-        part = pending.periods - self._path_periods
-        if part <= 0 and pending.periods % _REFRESH:
+        """Computes a part of the check that is under way, and the clearances of the measured pose and of that part.
+
+        Each period has about the same work, also without a check: code that has not run for some milliseconds takes
+        several times as long. Only the first period of a check has none: in it the policy is sent a state, and its
+        action is taken.
+        """
+        pending, first, path = self._pending, 0, self._no_path
+        if pending is not None and pending.periods < self._config.check_periods:
+            pending.periods += 1
+            if pending.periods == 1:
+                return
+            first = len(self._path.path)
             self._path.advance(self._steps, self._new_target)
-        elif part <= 0:  # in between, or the caches lose onnxruntime's code, and the next calls take 0.4 ms
-            self._check_clearance()
-        elif part <= _CLEARANCE_PERIODS:
-            pending.clearance.append(self._clearance_of(self._path.parts(_CLEARANCE_PERIODS)[part - 1]))
+            path = self._path.path[first:]
+        clearance = self._clearances(np.concatenate([self._qpos[None], path]))
+        self._check_clearance(clearance[0])
+        self._path_clearance[first : first + len(path)] = clearance[1:]
 
     def stop(self, cause: str) -> None:
         """Makes all arms that are controlled brake and hold, for good."""
@@ -191,12 +205,13 @@ class SafetyLayer:
         if np.any(robots & (self.cause != cause)):
             self.cause[robots], self._left[robots], self._is_tracked[robots] = cause, 0, False
 
-    def _check_clearance(self) -> None:
+    def _check_clearance(self, measured: np.ndarray) -> None:
         """Stops arms whose measured pose has no clearance left."""
-        clearance = np.nan_to_num(self._clearance(self._qpos.T), nan=np.inf)
+        clearance = np.where(np.isnan(measured), np.inf, measured)
         np.minimum(self.clearance, clearance, out=self.clearance, where=self._is_tracked)
-        if clearance.min() < self._config.measured_margin:
-            self._stop(np.where(clearance < self._config.measured_margin, MEASURED_CLEARANCE, ""))
+        is_near = clearance < self._config.measured_margin
+        if np.count_nonzero(is_near):
+            self._stop(np.where(is_near, MEASURED_CLEARANCE, ""))
 
     def _new_target(self, reference: Reference) -> np.ndarray:
         """The target of the pending actions, relative to the reference when they begin to act."""
@@ -206,10 +221,10 @@ class SafetyLayer:
         self._pending.target = Target(np.array(target.value), stiffness)
         return self._pending.target.value
 
-    def _clearance_of(self, path: np.ndarray) -> np.ndarray:
-        """The clearance [samples, robots] of a part of the paths."""
-        samples, joints, robots = path.shape
-        return self._clearance(path.transpose(0, 2, 1).reshape(-1, joints)).reshape(samples, robots)
+    def _clearances(self, poses: np.ndarray) -> np.ndarray:
+        """The clearances [samples, robots] of poses [samples, joints, robots]."""
+        samples, joints, robots = poses.shape
+        return self._clearance(poses.transpose(0, 2, 1).reshape(-1, joints)).reshape(samples, robots)
 
     def _is_safe(self, clearance: np.ndarray) -> np.ndarray:
         """Whether the clearance along each path is above the margin, or not less than where the path begins."""
@@ -220,7 +235,7 @@ class SafetyLayer:
     def _accept(self, pending: "_Pending") -> None:
         assert pending.target is not None
         self._pending = None
-        is_safe = self._is_safe(np.concatenate(pending.clearance))
+        is_safe = self._is_safe(self._path_clearance)
         is_accepted = pending.is_candidate & is_safe & (self.cause == "")
         self.counts[COLLISION] += pending.is_candidate & ~is_safe
         self._value = np.where(is_accepted, pending.target.value, self._value)
@@ -237,18 +252,14 @@ class SafetyLayer:
     def _move_reference(self) -> None:
         """One period of all references, towards their targets or to rest."""
         is_held = self._left > 0
-        all_held = bool(is_held.all())
-        held = braking = self.reference
-        if is_held.any():
-            held = next_reference(self._mode, self.reference, self._value, self._joints, np)
-        if not all_held:
-            zero = np.zeros_like(self._value)
-            braking = next_reference("joint_velocity", self.reference, zero, self._joints, np)
-        if all_held:
-            self.reference = held
-        else:
-            self.reference = Reference(*(np.where(is_held, x, y) for x, y in zip(held, braking, strict=True)))
-        np.maximum(self._left - 1, 0, out=self._left)
+        held, count = self.reference, np.count_nonzero(is_held)
+        if count:
+            held = next_reference(self._mode, self.reference, self._value, self._limits, np)
+        if count < len(is_held):
+            braking = next_reference("joint_velocity", self.reference, self._rest, self._limits, np)
+            held = Reference(*(np.where(is_held, x, y) for x, y in zip(held, braking, strict=True)))
+        self.reference = held
+        self._left -= is_held
 
 
 @dataclasses.dataclass
@@ -259,10 +270,8 @@ class _Pending:
       is_candidate: [robots] whether there is a target to check.
       periods: since it began.
       target: computed from the reference when it would begin to act.
-      clearance: [samples, robots] of the parts of the paths that were checked [m].
     """
 
     is_candidate: np.ndarray
     periods: int = 0
     target: Target | None = None
-    clearance: list[np.ndarray] = dataclasses.field(default_factory=list)

@@ -7,7 +7,7 @@ import numpy as np
 import onnxruntime
 
 from mimic.control.joint_control import Reference
-from mimic.deploy.bundle import CLEARANCE, POLICY, Bundle
+from mimic.deploy.bundle import FEATURES, POLICY, Bundle
 
 
 def open_session(path: Path | bytes, inputs: dict[str, int], outputs: dict[str, int]) -> onnxruntime.InferenceSession:
@@ -55,40 +55,47 @@ class Policy:
 
     def __init__(self, bundle: Bundle, motions: Sequence[int]):
         joints, size = bundle.num_joints, bundle.action_size
-        expert_size = (bundle.preview + 1) * bundle.expert.shape[-1]
+        self._features, self._row = _expert_features(bundle, motions)
         inputs = {name: joints for name in ("qpos", "qvel", "reference_qpos", "reference_qvel")}
-        inputs |= {"past_actions": bundle.past_actions * size, "expert": expert_size}
+        inputs |= {"past_actions": bundle.past_actions * size, "features": bundle.features}
         self._session = open_session(bundle.folder / POLICY, inputs, {"action": size})
-        self._expert = bundle.expert[list(motions)]
-        self._preview, self._last = bundle.preview, bundle.ticks
+        self._last, self._size = bundle.ticks, size
+        self._feed: dict[str, np.ndarray] = {}
         self._past = np.zeros((len(motions), bundle.past_actions * size), np.float32)
-        self._size = size
 
     def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
         """The actions [robots, numbers] at a tick, of measured and reference motions [robots, joints]."""
-        steps = np.minimum(np.arange(tick, tick + self._preview + 1), self._last)
         observation = {
             "qpos": qpos,
             "qvel": qvel,
             "reference_qpos": reference.qpos,
             "reference_qvel": reference.qvel,
             "past_actions": self._past,
-            "expert": self._expert[:, steps].reshape(len(self._past), -1),
+            "features": self._features[min(tick, self._last), self._row],
         }
-        feed = {name: np.ascontiguousarray(value, np.float32) for name, value in observation.items()}
-        (action,) = self._session.run(["action"], feed)
+        self._feed = {name: np.ascontiguousarray(value, np.float32) for name, value in observation.items()}
+        (action,) = self._session.run(["action"], self._feed)
         if self._past.size:
             self._past = np.concatenate([action, self._past[:, : -self._size]], axis=1)
         return np.asarray(action, float)
 
+    def warm_up(self) -> None:
+        """Runs the network on the last observation, after which the next `act` takes a fraction of the time."""
+        if self._feed:
+            self._session.run(["action"], self._feed)
 
-class Clearance:
-    """The clearance [m] of the arm of a bundle in poses [rows, joints]."""
 
-    def __init__(self, bundle: Bundle):
-        self._session = open_session(bundle.folder / CLEARANCE, {"qpos": bundle.num_joints}, {"clearance": 1})
+def _expert_features(bundle: Bundle, motions: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """What the policy computes from the expert alone, [ticks + 1, motions, numbers], and the motion of each robot.
 
-    def __call__(self, qpos: np.ndarray) -> np.ndarray:
-        """The clearances [rows]."""
-        (clearance,) = self._session.run(["clearance"], {"qpos": np.ascontiguousarray(qpos, np.float32)})
-        return clearance[:, 0]
+    At a tick these are the expert's states now and at the later ticks of the preview; its last state stays.
+    """
+    size = (bundle.preview + 1) * bundle.expert.shape[-1]
+    session = open_session(bundle.folder / FEATURES, {"expert": size}, {"features": bundle.features})
+    different, row = np.unique(motions, return_inverse=True)
+    ticks = np.arange(bundle.ticks + 1)
+    steps = np.minimum(ticks[:, None] + np.arange(bundle.preview + 1), bundle.ticks)
+    rows = [
+        session.run(["features"], {"expert": x[steps].reshape(len(ticks), -1)})[0] for x in bundle.expert[different]
+    ]
+    return np.stack(rows, axis=1), row

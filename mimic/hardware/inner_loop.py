@@ -129,7 +129,9 @@ def control(
     gain, friction, bias = drive
     reference, joints = state.reference, constants.parameters
     if mode != "torque":
-        reference = joint_control.next_reference(mode, reference, target.value, joints, jnp)
+        reference = joint_control.next_reference(
+            mode, reference, target.value, joint_control.reference_limits(joints), jnp
+        )
     torque = joint_control.joint_torque(
         mode, state.qpos + bias, state.qvel, reference, target, state.torque, joints, jnp
     )

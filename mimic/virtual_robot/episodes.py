@@ -8,9 +8,10 @@ import numpy as np
 
 from mimic.control.joint_control import PERIOD, Reference, action_towards
 from mimic.deploy.bundle import Bundle
+from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.safety import INTERVENTIONS, SafetyLayer
-from mimic.deploy.sessions import Clearance, Policy, open_session
+from mimic.deploy.sessions import Policy, open_session
 from mimic.virtual_robot.draws import World
 from mimic.virtual_robot.robots import VirtualRobots
 

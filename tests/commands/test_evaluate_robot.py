@@ -1,9 +1,14 @@
 """`python -m mimic.evaluate robot=`: policies on virtual robots, their gap, and what is counted."""
 
 import dataclasses
+import functools
 import json
+import shutil
+from types import SimpleNamespace
+from typing import cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,17 +17,21 @@ from mimic.commands.config import EvaluateConfig, ExportConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.commands.evaluate_robot import summary
 from mimic.commands.export import prepare_export
+from mimic.commands.export_controller import expert_table, export_controller
+from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import load_bundle
 from mimic.deploy.fake_robot import FakeRobot
 from mimic.deploy.policy_process import LocalPolicy
 from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import INTERVENTIONS
-from mimic.runs.checkpoints import save_checkpoint
+from mimic.deploy.sessions import Policy
+from mimic.hardware.env import SENT_ACTIONS, HardwareEnv, control_observation
+from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import initial_params
-from mimic.trainers.ppo.trainer import PPOTrainer
-from mimic.trainers.run_config import save_config
+from mimic.trainers.ppo.trainer import PPOTrainer, run_environment
+from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.run_models import save_models
 from mimic.virtual_robot.episodes import Episodes
 
@@ -118,6 +127,42 @@ def test_a_controller_is_exported(hardware_run, tmp_path, capsys):
     robot = FakeRobot(bundle.start_poses[0], bundle.limits, bundle.parameters.inertia, 1.0)
     assert run_controller(robot, bundle, policy=LocalPolicy(bundle, 0)).is_complete
     assert "results: " in capsys.readouterr().out
+
+
+def test_an_exported_policy_is_the_policy(hardware_run, tmp_path):
+    """On observations at random, with random weights and statistics, at each tick and beyond the end of a motion."""
+    trained = load_config(hardware_run)
+    env = cast(HardwareEnv, run_environment(trained.env, hardware_run)[0])
+    settings = cast(PPOConfig, trained.trainer).resolve()
+    statistics, *networks = load_checkpoint(
+        hardware_run, training.params_template(settings, env.observation_size, env.action_size), 0
+    )[1]
+    rng = np.random.default_rng(0)
+    statistics = statistics.replace(
+        mean=jnp.asarray(rng.normal(size=env.observation_size), jnp.float32),
+        std=jnp.asarray(rng.uniform(0.3, 2, env.observation_size), jnp.float32),
+    )
+    params = (statistics, *networks)
+    shutil.copytree(hardware_run, tmp_path / "run")
+    save_checkpoint(tmp_path / "run", 1, params)
+    export_controller(tmp_path / "run", tmp_path / "controller")
+    bundle, motions = load_bundle(tmp_path / "controller"), [1, 0, 1]
+    policy = Policy(bundle, motions)
+    controller = training.make_controller(settings, env.observation_size, env.action_size)(params)
+    past, table = np.zeros((3, SENT_ACTIONS * env.action_size), np.float32), expert_table(env)
+    for tick in range(HORIZON + 2):
+        measured = rng.uniform(-1, 1, (4, 3, env.learner.num_joints)).astype(np.float32)
+        steps = np.minimum(np.arange(tick, tick + env.config.preview + 1), HORIZON)
+        expert = table[motions][:, steps].reshape(3, -1)
+        parts = map(jnp.asarray, (np.concatenate(measured, axis=1), past, expert))
+        observation = jax.vmap(functools.partial(control_observation, env))(*parts)
+        expected = np.asarray(controller(SimpleNamespace(obs=observation)))
+        qpos, qvel, *reference = measured
+        action = policy.act(tick, qpos, qvel, Reference(reference[0], reference[1], reference[1]))
+        policy.warm_up()
+        assert np.ptp(expected) > 0.1
+        np.testing.assert_allclose(action, expected, atol=1e-5)  # float32, sums in another order
+        past = np.concatenate([expected, past[:, : -env.action_size]], axis=1)
 
 
 def test_a_run_without_an_inner_loop_has_no_controller(rejected, paper_run):

@@ -42,7 +42,7 @@ def test_reference_stays_within_the_manufacturers_limits(mode: str, hold: int) -
         if step % hold == 0:
             action = rng.choice([-1.0, 1.0, 0.3, 0.0], joint_control.action_size(mode, JOINTS))
             target = joint_control.action_target(mode, action, reference, joints, np).value
-        reference = joint_control.next_reference(mode, reference, target, joints, np)
+        reference = joint_control.next_reference(mode, reference, target, joint_control.reference_limits(joints), np)
         rows.append(reference)
     qpos, qvel, qacc = (np.stack(x) for x in zip(*rows, strict=True))
     assert np.all((qpos > limits.position[:, 0]) & (qpos < limits.position[:, 1]))
@@ -60,7 +60,9 @@ def test_reference_reaches_a_target_angle_without_overshoot() -> None:
     joints, reference = parameters(), start()
     target, largest = reference.qpos + 0.5, np.full(JOINTS, -np.inf)
     for _ in range(3000):
-        reference = joint_control.next_reference("joint_position", reference, target, joints, np)
+        reference = joint_control.next_reference(
+            "joint_position", reference, target, joint_control.reference_limits(joints), np
+        )
         largest = np.maximum(largest, reference.qpos)
     np.testing.assert_allclose(reference.qpos, target, atol=1e-4)
     assert np.all(largest < target + 1e-3)
@@ -71,7 +73,9 @@ def test_reference_stops_within_its_braking_time() -> None:
     reference = Reference(np.zeros(JOINTS), joints.velocity.copy(), joints.acceleration.copy())
     reference = reference._replace(qpos=RANGE.mean(axis=1))
     for _ in range(1000):
-        reference = joint_control.next_reference("joint_velocity", reference, np.zeros(JOINTS), joints, np)
+        reference = joint_control.next_reference(
+            "joint_velocity", reference, np.zeros(JOINTS), joint_control.reference_limits(joints), np
+        )
     assert np.abs(reference.qvel).max() < 1e-4
 
 
@@ -126,13 +130,26 @@ def test_jax_and_numpy_agree(mode: str) -> None:
             target = joint_control.action_target(mode, action, reference, values, xp)
             for _ in range(10):
                 if mode != "torque":
-                    reference = joint_control.next_reference(mode, reference, target.value, values, xp)
+                    reference = joint_control.next_reference(
+                        mode, reference, target.value, joint_control.reference_limits(values), xp
+                    )
                 torque = joint_control.joint_torque(
                     mode, reference.qpos, reference.qvel * 0, reference, target, torque, values, xp
                 )
         results.append((np.asarray(reference.qpos), np.asarray(torque)))
     np.testing.assert_allclose(results[0][0], results[1][0], atol=1e-5)
     np.testing.assert_allclose(results[0][1], results[1][1], atol=5e-2)
+
+
+def test_the_approach_is_the_smaller_of_its_two_pieces() -> None:
+    """Exponential near the point, a constant deceleration before, and a line beyond the point."""
+    acceleration, rate = 3.0, 12.0
+    near = acceleration / rate**2
+    distance = np.concatenate([np.linspace(-0.1, 0.5, 1000), [near, 0.0]])
+    root = np.sqrt(2 * acceleration * np.maximum(distance - near / 2, near / 2))
+    expected = np.where(distance < near, rate * distance, root)
+    speed = joint_control.approach_speed(distance, joint_control.approach(acceleration, rate), np)
+    np.testing.assert_allclose(speed, expected, rtol=1e-12)
 
 
 def test_unstated_limits_follow_from_the_others() -> None:

@@ -8,7 +8,8 @@ import pytest
 
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import load_bundle
-from mimic.deploy.sessions import Clearance, Policy
+from mimic.deploy.clearance import Clearance
+from mimic.deploy.sessions import Policy
 from tests.helpers import bundles
 
 
@@ -44,7 +45,7 @@ def test_a_policy_observes_what_it_was_exported_for(bundle, monkeypatch):
     last = feeds[-1]
     assert [last[name][0, 0] for name in ("qpos", "qvel", "reference_qpos", "reference_qvel")] == [1, 2, 3, 4]
     np.testing.assert_array_equal(last["past_actions"][0, ::7], [2, 1, 0])
-    phases = [feed["expert"][0].reshape(3, 84)[:, 0] for feed in feeds]
+    phases = [feed["features"][0] for feed in feeds]
     step = 2 * np.pi * bundles.CONTROL_DT
     np.testing.assert_allclose(phases[1], step * np.array([1, 2, 3]), rtol=1e-6)
     np.testing.assert_allclose(phases[2], step * bundle.ticks, rtol=1e-6)
@@ -68,6 +69,10 @@ BROKEN = {
     "no key": (lambda folder: (folder / "controller.json").write_text("{}"), "missing format, mimic_version"),
     "another format": (lambda folder: changed(folder, format=2), "format: expected 1, got 2"),
     "another network": (lambda folder: (folder / "policy.onnx").write_bytes(b"x"), "policy.onnx: expected the file"),
+    "another clearance": (
+        lambda folder: (folder / "clearance.npz").write_bytes(b"x"),
+        "clearance.npz: expected the file",
+    ),
     "no motions": (lambda folder: (folder / "motions.npz").write_bytes(b"x"), "motions.npz: "),
     "a mode": (lambda folder: changed(folder, mode="flying"), "mode: expected one of torque, joint_position"),
     "a tick": (lambda folder: changed(folder, control_dt=0.0505), "control_dt: expected a multiple of 0.001 s"),
@@ -87,6 +92,12 @@ def test_a_broken_bundle_is_rejected_in_one_line(bundle, damage, message):
 
 
 def test_a_network_with_other_inputs_is_rejected(bundle, tmp_path):
-    other = bundles.make_bundle(tmp_path / "other", clearance=(bundle.folder / "policy.onnx").read_bytes())
-    with pytest.raises(ValueError, match="clearance.onnx: inputs: expected qpos \\[7\\], got expert"):
-        Clearance(other)
+    other = bundles.make_bundle(tmp_path / "other", features=(bundle.folder / "policy.onnx").read_bytes())
+    with pytest.raises(ValueError, match="features.onnx: inputs: expected expert \\[252\\], got features"):
+        Policy(other, [0])
+
+
+def test_the_clearance_of_another_arm_is_rejected(tmp_path):
+    clearance = bundles.panda_clearance((3, 6, 7))
+    with pytest.raises(ValueError, match="clearance.npz: parent: expected finite numbers of the shape \\(7,\\)"):
+        bundles.make_bundle(tmp_path / "bundle", clearance=clearance)

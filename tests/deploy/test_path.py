@@ -18,6 +18,7 @@ def test_a_path_is_that_of_the_inner_loop(mode):
     size, rng = (7, ROBOTS), np.random.default_rng(0)
     reference = Reference(rng.uniform(joints.lower, joints.upper, size), np.zeros(size), np.zeros(size))
     is_position = mode == "joint_position"
+    limits = joint_control.reference_limits(joints)
     prediction = PathPrediction(joints, is_position, DELAY, HOLD, ROBOTS)
     target, left = (reference.qpos.copy() if is_position else np.zeros(size)), np.full(ROBOTS, HOLD)
     largest = 0.0
@@ -33,7 +34,7 @@ def test_a_path_is_that_of_the_inner_loop(mode):
         largest = max(largest, float(np.abs(path - prediction.path).max()))
         reference, target = after
         for period in range(50):
-            reference = joint_control.next_reference(mode, reference, target, joints, np)
+            reference = joint_control.next_reference(mode, reference, target, limits, np)
             assert period < HOLD
         left = rng.integers(0, HOLD, ROBOTS)
     assert 1e-4 < largest < PathPrediction.ERROR
@@ -42,17 +43,17 @@ def test_a_path_is_that_of_the_inner_loop(mode):
 
 def exact_path(mode, joints, reference, target, left, new_target, samples):
     """The angles after each 10 ms from the delay on, and the reference and target when the new one begins to act."""
-    zero, path = np.zeros_like(target), []
+    zero, path, limits = np.zeros_like(target), [], joint_control.reference_limits(joints)
     for period in range(DELAY):
-        held = joint_control.next_reference(mode, reference, target, joints, np)
-        braking = joint_control.next_reference("joint_velocity", reference, zero, joints, np)
+        held = joint_control.next_reference(mode, reference, target, limits, np)
+        braking = joint_control.next_reference("joint_velocity", reference, zero, limits, np)
         reference = Reference(*(np.where(left > period, x, y) for x, y in zip(held, braking, strict=True)))
     after = reference, new_target(reference)
     path.append(reference.qpos)
     for period in range(10 * (samples - 1)):
         is_held = period < HOLD
         reference = joint_control.next_reference(
-            mode if is_held else "joint_velocity", reference, after[1] if is_held else zero, joints, np
+            mode if is_held else "joint_velocity", reference, after[1] if is_held else zero, limits, np
         )
         if (period + 1) % 10 == 0:
             path.append(reference.qpos)

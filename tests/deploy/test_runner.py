@@ -12,6 +12,7 @@ import time
 import numpy as np
 import pytest
 
+from mimic.control.joint_control import Reference
 from mimic.deploy.driver import RobotAbort
 from mimic.deploy.fake_robot import FakeRobot
 from mimic.deploy.policy_process import LocalPolicy, PolicyProcess
@@ -45,6 +46,25 @@ def test_a_motion_is_run_in_simulated_time(bundle):
     assert np.ptp(qpos, axis=0).min() > 0.1  # every joint moved
     assert np.abs(qvel[-1]).max() < 1e-3
     assert json.loads(json.dumps(report.as_dict()))["is_complete"]
+
+
+def test_a_policy_in_its_own_process_gives_the_same_actions(bundle):
+    """Also where it waits for an observation for longer than a tick, and runs the network meanwhile."""
+    local, apart, zero = LocalPolicy(bundle, 1), PolicyProcess(bundle, 1), np.zeros(7)
+    try:
+        for tick in range(4):
+            for policy in (local, apart):
+                policy.send(tick, bundle.start_pose, zero, Reference(zero, zero, zero))
+            end, received = time.monotonic() + 10, None
+            while received is None and time.monotonic() < end:
+                time.sleep(0.1)
+                received = apart.receive()
+            expected = local.receive()
+            assert received is not None and expected is not None and received[0] == expected[0] == tick
+            np.testing.assert_allclose(received[1], expected[1], atol=1e-6)
+    finally:
+        apart.close()
+    assert len(apart.wall_s) == len(apart.cpu_s) == 4 and min(apart.cpu_s) > 0
 
 
 def test_the_runtime_needs_neither_jax_nor_mujoco(bundle):

@@ -7,9 +7,9 @@ import pytest
 
 from mimic.control.joint_control import PERIOD
 from mimic.deploy import measurements
+from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.safety import COLLISION, INVALID, LATE, MEASURED_CLEARANCE, REPEATED, SafetyLayer
-from mimic.deploy.sessions import Clearance
 from tests.helpers import bundles
 
 CONFIG = SafetyConfig()
@@ -44,6 +44,13 @@ def run(layer, action, ticks=1, present=True):
 
 def velocity(joint, value):
     return np.where(np.arange(7) == joint, value, 0.0)
+
+
+def test_a_check_has_the_clearance_of_the_whole_path(layer):
+    run(layer, velocity(0, 0.5))
+    assert len(layer._path.path) == layer._path.samples == len(layer._path_clearance)
+    poses = layer._path.path[:, :, 0]
+    np.testing.assert_allclose(layer._path_clearance[:, 0], layer._clearance(poses), atol=1e-6)
 
 
 def test_an_accepted_target_moves_the_arm(layer):

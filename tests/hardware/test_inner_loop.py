@@ -93,11 +93,12 @@ def simulate_in_mujoco(arm, plant, draw: Draw, mode: str, targets) -> np.ndarray
     data = mujoco.MjData(model)
     data.qpos[:] = arm.embodiment.home
     reference = Reference(data.qpos.copy(), np.zeros(joints), np.zeros(joints))
+    limits = joint_control.reference_limits(constants.parameters)
     torque, rows = np.zeros(joints), []
     for target in targets:
         for _ in range(PERIODS):
             if mode != "torque":
-                reference = joint_control.next_reference(mode, reference, target.value, constants.parameters, np)
+                reference = joint_control.next_reference(mode, reference, target.value, limits, np)
             qpos = data.qpos + np.asarray(draw.bias)
             torque = joint_control.joint_torque(
                 mode, qpos, data.qvel, reference, target, torque, constants.parameters, np

@@ -12,15 +12,17 @@ from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.drives import drives_of
 from mimic.commands.onnx_graph import to_onnx
+from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import JointParameters, action_size
 from mimic.deploy.bundle import load_bundle, write_bundle
 from mimic.envs import env_config
 from mimic.hardware.plant import make_plant
-from mimic.retargeting.clearance import make_clearance
+from mimic.retargeting.clearance import clearance_constants
 
 ON_FLOOR = np.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])  # poses in which a Panda touches the floor, and itself
 FOLDED = np.array([0, 0.6, 0, -3.05, 2.8, 3.7, 0])
 PREVIEW, PAST, LINKS, TICKS, CONTROL_DT = 2, 3, 7, 40, 0.05
+FEATURES, EXPERT = PREVIEW + 1, (PREVIEW + 1) * LINKS * 12
 
 
 @functools.cache
@@ -30,12 +32,9 @@ def panda(locked: tuple[int, ...] = ()) -> Arm:
 
 
 @functools.cache
-def panda_clearance(locked: tuple[int, ...] = ()) -> bytes:
-    """The clearance of a Panda as ONNX."""
-    clearance = make_clearance(panda(locked).embodiment, fit_capsules(ArmConfig(locked=list(locked)), "hardware"))
-    joints = panda(locked).embodiment.num_joints
-    model = to_onnx(lambda qpos: {"clearance": clearance(qpos)}, name="clearance", inputs={"qpos": joints}, metadata={})
-    return model.SerializeToString()
+def panda_clearance(locked: tuple[int, ...] = ()) -> ClearanceConstants:
+    """The constants of the clearance of a Panda."""
+    return clearance_constants(panda(locked).embodiment, fit_capsules(ArmConfig(locked=list(locked)), "hardware"))
 
 
 @functools.cache
@@ -50,7 +49,7 @@ def parameters(locked: tuple[int, ...] = ()) -> JointParameters:
 def policy(joints: int, size: int, action: Any) -> bytes:
     """A policy as ONNX; `action` gives the action of the six inputs by name."""
     inputs = {name: joints for name in ("qpos", "qvel", "reference_qpos", "reference_qvel")}
-    inputs |= {"past_actions": PAST * size, "expert": (PREVIEW + 1) * LINKS * 12}
+    inputs |= {"past_actions": PAST * size, "features": FEATURES}
     names = list(inputs)
 
     def function(*values: Any) -> dict[str, Any]:
@@ -61,9 +60,18 @@ def policy(joints: int, size: int, action: Any) -> bytes:
     return to_onnx(function, name="policy", inputs=inputs, metadata={}).SerializeToString()
 
 
+@functools.cache
+def expert_phases() -> bytes:
+    """The first number of the expert now and at the later ticks of the preview, as ONNX."""
+    model = to_onnx(
+        lambda expert: {"features": expert[:: LINKS * 12]}, name="features", inputs={"expert": EXPERT}, metadata={}
+    )
+    return model.SerializeToString()
+
+
 def sine(values: dict[str, Any]) -> Any:
     """A motion of all joints: the first number of the expert is its phase."""
-    phase = values["expert"][0]
+    phase = values["features"][0]
     return 0.4 * jnp.sin(phase + jnp.arange(values["qpos"].shape[0]))
 
 
@@ -80,7 +88,8 @@ def make_bundle(
     locked: Sequence[int] = (),
     start_poses: np.ndarray | None = None,
     ticks: int = TICKS,
-    clearance: bytes | None = None,
+    clearance: ClearanceConstants | None = None,
+    features: bytes | None = None,
 ) -> Any:
     """Writes a bundle for a Panda and loads it."""
     arm, locked = panda(tuple(locked)), tuple(locked)
@@ -92,6 +101,7 @@ def make_bundle(
     write_bundle(
         folder,
         policy=policy(joints, action_size(mode, joints), action),
+        features=features or expert_phases(),
         clearance=clearance or panda_clearance(locked),
         controller={
             "mimic_version": "test",
@@ -103,6 +113,7 @@ def make_bundle(
             "parameters": {name: x.tolist() for name, x in parameters(locked)._asdict().items()},
             "preview": PREVIEW,
             "past_actions": PAST,
+            "features": FEATURES,
             "expert_links": LINKS,
         },
         expert=expert,

@@ -1,4 +1,4 @@
-"""The clearance as a graph: the distances of the retargeting costs, of C MuJoCo, and of its ONNX model."""
+"""The clearance by matrices: the distances of the retargeting costs and of C MuJoCo, by JAX and by NumPy."""
 
 import dataclasses
 
@@ -10,7 +10,8 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
-from mimic.retargeting.clearance import make_clearance
+from mimic.control.clearance import clearance as control_clearance
+from mimic.retargeting.clearance import clearance_constants, make_clearance
 from mimic.retargeting.costs import capsule_axes, changing_pairs, pair_distances
 from tests.virtual_robot.cases import model
 
@@ -33,10 +34,13 @@ def test_it_is_the_distance_of_the_costs(config):
         return jnp.minimum(pair_distances(capsules, start, end)[np.flatnonzero(is_changing)].min(), height.min())
 
     qpos = poses(arm)
-    clearance = jax.jit(jax.vmap(make_clearance(arm, capsules)))(qpos)[:, 0]
+    clearance = jax.jit(jax.vmap(make_clearance(arm, capsules)))(qpos)
     assert np.ptp(clearance) > 0.1
     # The costs smooth distances by 0.1 mm where axes cross; there is none otherwise.
     np.testing.assert_allclose(clearance, jax.vmap(expected)(qpos), atol=2e-4)
+    by_numpy = control_clearance(qpos, clearance_constants(arm, capsules), np)
+    assert by_numpy.dtype == np.float32
+    np.testing.assert_allclose(by_numpy, clearance, atol=1e-5)  # float32
 
 
 def test_it_is_that_of_mujocos_geoms():
@@ -53,7 +57,7 @@ def test_it_is_that_of_mujocos_geoms():
         pairs = zip(robot.pair_geom1, robot.pair_geom2, strict=True)
         expected.append(min(mujoco.mj_geomDistance(robot, data, i, j, 10.0, None) for i, j in pairs))
     # Intersecting capsules: MuJoCo and we may differ by how deep; only the sign counts.
-    expected, value = np.array(expected), np.asarray(clearance(rows)[:, 0])
+    expected, value = np.array(expected), np.asarray(clearance(rows))
     apart = expected > 1e-3
     assert 10 < apart.sum() < 95
     np.testing.assert_allclose(value[apart], expected[apart], atol=1e-5)
@@ -63,7 +67,7 @@ def test_it_is_that_of_mujocos_geoms():
 def test_the_floor_may_be_lower():
     arm, capsules = build_arm(ArmConfig(), "hardware").embodiment, fit_capsules(ArmConfig(), "hardware")
     pose = jnp.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])
-    low, high = (float(make_clearance(arm, capsules, height)(pose)[0]) for height in (-0.1, 0.0))
+    low, high = (float(make_clearance(arm, capsules, height)(pose)) for height in (-0.1, 0.0))
     assert low == pytest.approx(high + 0.1, abs=1e-6)
 
 
