@@ -52,7 +52,7 @@ def prepare_robot_evaluation(
     out = new_folder("out", config.out) if config.out else None
     steps = check_checkpoint(run_dir, config.checkpoint)
     world = env_config("panda7dof", world=config.robot_world).world if config.robot_world else trained.env.world
-    robot = robot_model(trained.env.learner)
+    robot = robot_model(trained.env.learner, trained.env.world.floor_height)
 
     def run() -> None:
         console = Console()

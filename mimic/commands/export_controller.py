@@ -66,7 +66,7 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
                 partial / "bundle",
                 policy=policy,
                 features=features,
-                clearance=clearance_constants(env.learner, env.capsules),
+                clearance=clearance_constants(env.learner, env.capsules, env.config.world.floor_height),
                 controller=_description(env, steps) | {"features": settings.hidden_layers[0]},
                 expert=expert_table(env),
                 start_poses=np.asarray(env.start_poses, float),

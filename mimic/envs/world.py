@@ -38,6 +38,7 @@ class WorldConfig:
       start_noise: maximum deviation of each joint from the start pose [rad].
       stops: whether joints have mechanical stops at the ends of their ranges.
       contacts: whether links touch each other and the floor. Only of `physics=mjx` and of the virtual robot.
+      floor_height: of the floor in the base frame [m], negative for a robot on a pedestal.
     """
 
     gravity: bool = False
@@ -57,6 +58,7 @@ class WorldConfig:
     start_noise: float = number(0.0, at_least=0.0, at_most=1.0)
     stops: bool = False
     contacts: bool = False
+    floor_height: float = number(0.0, at_least=-100.0, at_most=100.0)
 
     def __post_init__(self) -> None:
         check_ranges(self, "world.")

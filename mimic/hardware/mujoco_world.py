@@ -72,7 +72,7 @@ def mujoco_world(arm: Arm, world: WorldConfig, capsules: Capsules | None = None)
     places = _places(arm)
     along = _add_payload(spec, arm, places)
     if capsules is not None:
-        _add_contacts(spec, arm, capsules, places)
+        _add_contacts(spec, arm, capsules, places, world.floor_height)
     model = spec.compile()
     body_joint = np.full(model.nbody, -1)
     body_joint[model.jnt_bodyid] = np.arange(model.njnt)
@@ -148,10 +148,10 @@ def _add_payload(spec: mujoco.MjSpec, arm: Arm, places: list[_Place]) -> np.ndar
     return place[0].T @ arm.T_world_base[:3, :3] @ along
 
 
-def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, places: list[_Place]) -> None:
+def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, places: list[_Place], floor_height: float) -> None:
     """Adds the capsules as geoms, pairs whose distance joints change, and a floor for all but those near the base.
 
-    These are the pairs of the safety layer's clearance. The floor is the plane of the base frame, as there.
+    These are the pairs of the safety layer's clearance. The floor is a plane of the base frame, as there.
     """
     for index, joint in enumerate(capsules.joint):
         ends = [_in_body(arm, places[joint + 1], np.asarray(end[index])) for end in (capsules.start, capsules.end)]
@@ -161,7 +161,7 @@ def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, places: lis
     mujoco.mju_mat2Quat(quaternion, arm.T_world_base[:3, :3].ravel())
     spec.worldbody.add_geom(
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[_FLOOR_SIZE, _FLOOR_SIZE, 0.1],
-        pos=arm.T_world_base[:3, 3], quat=quaternion, **_NO_CONTACT,
+        pos=arm.T_world_base[:3, :3] @ [0, 0, floor_height] + arm.T_world_base[:3, 3], quat=quaternion, **_NO_CONTACT,
     )  # fmt: skip
     for (i, j), changes in zip(capsules.pairs, changing_pairs(arm.embodiment, capsules), strict=True):
         if changes:

@@ -40,14 +40,18 @@ class RobotModel:
         return self.simulated.model.nv
 
 
-def robot_model(config: ArmConfig) -> RobotModel:
+def robot_model(config: ArmConfig, floor_height: float = 0.0) -> RobotModel:
     """The virtual robot of an arm, with the manufacturer's limits whatever the limits of a training are.
+
+    Args:
+      config: the arm.
+      floor_height: see `WorldConfig`.
 
     Raises:
       ValueError: what `build_arm` and `fit_capsules` reject.
     """
     arm = build_arm(config, "hardware")
-    features = WorldConfig(gravity=True, stops=True, contacts=True)
+    features = WorldConfig(gravity=True, stops=True, contacts=True, floor_height=floor_height)
     simulated, drives = mujoco_world(arm, features, fit_capsules(config, "hardware")), drives_of(config, arm)
     collision_torque = _COLLISION_FRACTION * drives.limits.torque
     if config.model == "panda":

@@ -2,15 +2,16 @@
 
 import copy
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
-from mimic.envs.self_collision import smallest_clearances
 from mimic.envs.world import WorldConfig
 from mimic.hardware.mujoco_world import disabled, loaded_fields, mujoco_world
+from mimic.retargeting.clearance import make_clearance
 from tests.hardware.test_inner_loop import NAMES, draw_for, make_arm_and_plant, mujoco_model
 
 TILTED = """<mujoco><worldbody><body name="base" pos="1 2 3" quat="0.9 0.3 0.1 0.2">
@@ -49,12 +50,13 @@ def test_a_load_is_that_of_a_payload_within_the_last_body(name):
     np.testing.assert_allclose(acceleration(ours, qpos, qvel), expected, rtol=1e-9, atol=1e-9)
 
 
-def test_gravity_is_vertical_and_the_floor_is_that_of_the_base(tmp_path):
+@pytest.mark.parametrize("floor_height", [0.0, -0.3])
+def test_gravity_is_vertical_and_the_floor_is_that_of_the_base(tmp_path, floor_height):
     """Where the base is tilted, too; the floor is the one of the safety layer and of the costs."""
     (tmp_path / "tilted.xml").write_text(TILTED)
     config = ArmConfig(model=str(tmp_path / "tilted.xml"), base="base")
     arm, capsules, qpos = build_arm(config), fit_capsules(config), np.array([0.4, 1.2])
-    model = mujoco_world(arm, WorldConfig(gravity=True, contacts=True), capsules).model
+    model = mujoco_world(arm, WorldConfig(gravity=True, contacts=True, floor_height=floor_height), capsules).model
     plain = copy.copy(arm.model)
     plain.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     np.testing.assert_allclose(acceleration(model, qpos, 0), acceleration(plain, qpos, 0), rtol=1e-9)
@@ -63,9 +65,8 @@ def test_gravity_is_vertical_and_the_floor_is_that_of_the_base(tmp_path):
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
     assert not capsules.pairs  # each contact is one with the floor
-    assert min(data.contact.dist) == pytest.approx(
-        smallest_clearances(arm.embodiment, capsules, qpos[None, None])[0], abs=2e-4
-    )
+    expected = make_clearance(arm.embodiment, capsules, floor_height)(jnp.asarray(qpos, jnp.float32))
+    assert min(data.contact.dist) == pytest.approx(float(expected), abs=2e-4)
 
 
 def test_what_a_world_lacks_is_disabled():
