@@ -49,7 +49,7 @@ def frame_times(env: Any, arms: Any, presets: Any, functions: Any, count: int) -
     """Time of a frame [ms], and compilations, by what has changed before it."""
     import jax
 
-    from mimic.commands import view
+    from mimic.commands import view_server
     from mimic.commands.config import ViewConfig
     from mimic.viewer.controls import LiveControls
     from mimic.viewer.history import History
@@ -88,7 +88,7 @@ def frame_times(env: Any, arms: Any, presets: Any, functions: Any, count: int) -
         probe.bind(("127.0.0.1", 0))
         config = ViewConfig(mapper="any_arm", port=probe.getsockname()[1])
     drawn = {f"{index}": arm.config for index, arm in enumerate(arms)}
-    view.serve(config, env, show, learners=drawn)
+    view_server.serve(config, env, "any_arm", show, learners=drawn)
     compiled = sum(event.startswith(_COMPILE) for event in compilations)
     return [
         {"changed": name, "frames": len(values), "compilations": compiled, **_quantiles(values)}

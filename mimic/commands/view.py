@@ -2,11 +2,7 @@
 
 import contextlib
 import dataclasses
-import importlib.util
-import io
-import socket
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +11,7 @@ import jax
 from rich.console import Console
 
 from mimic import compat
-from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arm import ArmConfig
 from mimic.commands.config import ViewConfig
 from mimic.commands.view_capture import (
     CapturedExpert,
@@ -26,25 +22,21 @@ from mimic.commands.view_capture import (
     read_clip,
     wait_for_arm,
 )
+from mimic.commands.view_server import check_port, is_installed, serve
 from mimic.distribution import install_command
 from mimic.envs.config import ArmsConfig, EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.runs.signals import Signals, noted_signals
 from mimic.trainers.run_config import load_config, policy_config, policy_run
-from mimic.viewer.history import RATE
 from mimic.viewer.live_session import LiveSession
-from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.viewer.follower import Mapper, Preset
     from mimic.viewer.newest_checkpoint import NewestCheckpoint
-    from mimic.viewer.page import LearnerShape, Page
+    from mimic.viewer.page import Page
     from mimic.viewer.playback import Playback
     from mimic.viewer.player import Player
-    from mimic.viewer.recorder import Recorder
 
-_MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
 CAPTURE_RATE = 100.0  # frames per second of a captured person, at most
 _NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a browser more than the arms
 
@@ -95,7 +87,7 @@ def _prepare_live(
         expert = ManualControls(session, env, page.expert)
         show_live(page, times, session, env, expert, LearnerControls(session, page.starts, presets))
 
-    return lambda: serve(config, env, follow, None, session.finish, learners=learners)
+    return lambda: serve(config, env, _title(config, env), follow, None, session.finish, learners=learners)
 
 
 def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
@@ -156,7 +148,7 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
             learner = LearnerControls(live, page.starts)
             show_live(page, times, live, expert.env, expert.controls(live), learner, _NUMBERS_RATE)
 
-        return serve(config, expert.env, follow, None, live.finish, rate=CAPTURE_RATE)
+        return serve(config, expert.env, _title(config, expert.env), follow, None, live.finish, rate=CAPTURE_RATE)
 
     if is_address(config.source):
         listener = listen(config)
@@ -195,9 +187,10 @@ def _prepare_playback(config: ViewConfig) -> Callable[[], int]:
             playback.replace(trainer.evaluate(params))
             _ = trainer.evaluator.lower_bound
 
-    return lambda: serve(
-        config, trained.env, lambda page, times: _play(page, times, playback, config.split), before=evaluate
-    )
+    def play(page: "Page", times: Iterator[float]) -> None:
+        _play(page, times, playback, config.split)
+
+    return lambda: serve(config, trained.env, _title(config, trained.env), play, before=evaluate)
 
 
 def _prepare_training_view(config: ViewConfig) -> Callable[[], int]:
@@ -218,105 +211,7 @@ def _prepare_training_view(config: ViewConfig) -> Callable[[], int]:
             print(f"view: {run_dir} has no checkpoint yet; waiting for the first one", flush=True)
         _play_newest(page, times, playback, newest, config.split)
 
-    return lambda: serve(config, trained.env, show, after=newest.finish)
-
-
-def is_installed() -> bool:
-    """Whether viser is installed."""
-    return importlib.util.find_spec("viser") is not None
-
-
-def check_port(host: str, port: int) -> None:
-    """Raises a `ValueError` unless a server can bind this address and port."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    except OSError as error:
-        raise ValueError(f"host: expected an address of this machine, as 127.0.0.1, got {host!r}: {error}") from None
-    with socket.socket(family, kind, protocol) as probe:
-        probe.setsockopt(
-            socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
-        )  # a port of a server that has just ended counts as free
-        try:
-            probe.bind(address)
-        except OSError as error:
-            raise ValueError(
-                f"port: expected a free port at {host}, got {port}: {error.strerror}; "
-                f"choose another, as in port={port + 1}"
-            ) from None
-
-
-def serve(
-    config: ViewConfig,
-    env: EnvConfig,
-    show: "Callable[[Page, Iterator[float]], None]",
-    before: Callable[[], None] | None = None,
-    after: Callable[[], None] | None = None,
-    rate: float = RATE,
-    learners: Mapping[str, ArmConfig] | None = None,
-) -> int:
-    """Serves a page until a signal, with a rate of frames [1/s].
-
-    Calls `before` before the server starts and `after` when it has ended. The page has the learners to choose from by
-    name; default None: the one of the environment.
-    """
-    from mimic.viewer.meshes import ArmShape
-    from mimic.viewer.page import Page
-    from mimic.viewer.recorder import Recorder
-    from mimic.viewer.server import make_server
-
-    if before is not None:
-        before()
-    if not is_local(config.host):
-        print(
-            f"view: host={config.host}: everyone who can reach this machine can see and move the arms; there is no "
-            f"password. Safer: ssh -L {config.port}:localhost:{config.port} {socket.gethostname()}",
-            file=sys.stderr,
-        )
-    signals = Signals()
-    with noted_signals(signals, "view: ending; repeat to stop immediately"):
-        server, gatekeeper = make_server(config.host, config.port)
-        try:
-            learners = learners or {_name(env.learner, env): env.learner}
-            is_flat = all(arm.model == "planar" for arm in (env.expert, *learners.values()))
-            shapes = [_learner_shape(name, arm, env) for name, arm in learners.items()]
-            expert = ArmShape(env.expert, env.limits, shapes[0].match.expert_colours)
-            page = Page(server, (_name(env.expert, env), expert), shapes, _title(config, env), is_flat)
-            print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
-            show(page, _recorded(Recorder(server), ticks(signals, rate)))
-        finally:
-            with contextlib.redirect_stdout(io.StringIO()):
-                server.stop()
-            if after is not None:
-                after()
-    counts = {"rejected requests": gatekeeper.rejected, "dropped messages": gatekeeper.dropped}
-    noticed = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-    print(f"\nview: ended{noticed and f' ({noticed})'}", flush=True)
-    return 0
-
-
-def _name(arm: ArmConfig, env: EnvConfig) -> str:
-    return build_arm(arm, env.limits).embodiment.name.partition("-")[0]
-
-
-def _learner_shape(name: str, learner: ArmConfig, env: EnvConfig) -> "LearnerShape":
-    from mimic.viewer.meshes import ArmShape
-    from mimic.viewer.page import LearnerShape
-
-    free = build_arm(dataclasses.replace(learner, locked=()), env.limits)  # joints are locked in the view
-    match = env.metric.match_links(build_arm(env.expert, env.limits).embodiment, free.embodiment)
-    return LearnerShape(name, ArmShape(learner, env.limits, match.learner_colours), match)
-
-
-def address(host: str, port: int) -> str:
-    """The address to open in a browser on this machine."""
-    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-    return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
-
-
-def _title(config: ViewConfig, env: EnvConfig) -> str:
-    policy = f"{'newest policy' if config.follow else 'policy'} of {Path(config.run).name}"
-    controller = policy if config.run else "pose mapper" if config.mapper else "optimiser"
-    return f"{env.name or 'mimic'}: the {controller} moves the learner"
+    return lambda: serve(config, trained.env, _title(config, trained.env), show, after=newest.finish)
 
 
 def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:
@@ -359,18 +254,7 @@ def _play_newest(
             _show_playback(page, playback, player, text)
 
 
-def _recorded(recorder: "Recorder", times: Iterator[float]) -> Iterator[float]:
-    """The time steps, also of the recording."""
-    for dt in times:
-        recorder.advance(dt)
-        yield dt
-
-
-def ticks(signals: Signals, rate: float = RATE) -> Iterator[float]:
-    """Yields the time since the last tick [s], at a rate [1/s] at most, until a signal."""
-    last = time.perf_counter()
-    while not signals.caught:
-        time.sleep(max(0.0, last + 1 / rate - time.perf_counter()))
-        now = time.perf_counter()
-        yield min(now - last, _MAX_STEP)
-        last = now
+def _title(config: ViewConfig, env: EnvConfig) -> str:
+    policy = f"{'newest policy' if config.follow else 'policy'} of {Path(config.run).name}"
+    controller = policy if config.run else "pose mapper" if config.mapper else "optimiser"
+    return f"{env.name or 'mimic'}: the {controller} moves the learner"

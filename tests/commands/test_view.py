@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.commands import view, view_capture
+from mimic.commands import view, view_capture, view_server
 from mimic.commands.capture import fixed_fraction
 from mimic.commands.config import ViewConfig
 from mimic.commands.view_capture import listen, wait_for_arm
@@ -105,12 +105,12 @@ def test_a_mapper_to_any_arm_has_its_own_learner_and_the_pandas_to_choose_from()
     [("127.0.0.1", "127.0.0.1"), ("0.0.0.0", "127.0.0.1"), ("::", "[::1]"), ("::1", "[::1]"), ("node1", "node1")],
 )
 def test_the_address_can_be_opened(host, url):
-    assert view.address(host, 8080) == f"http://{url}:8080"
+    assert view_server.address(host, 8080) == f"http://{url}:8080"
 
 
 def test_ticks_end_with_a_signal():
     signals = Signals()
-    ticks = view.ticks(signals)
+    ticks = view_server.ticks(signals)
     assert next(ticks) >= 0
     signals.caught.append(signal.SIGINT)
     assert list(ticks) == []
@@ -121,7 +121,7 @@ def test_ticks_end_with_a_signal():
 def test_a_view_that_others_can_reach_says_so(host, warned, capsys):
     config = ViewConfig(env=env_config("planar4dof"), host=host, port=free_port())
     shown = []
-    assert view.serve(config, config.env, lambda page, times: shown.append(page)) == 0
+    assert view_server.serve(config, config.env, "planar", lambda page, times: shown.append(page)) == 0
     output = capsys.readouterr()
     assert shown and f"view: http://127.0.0.1:{config.port}" in output.out and "view: ended\n" in output.out
     assert ("everyone who can reach this machine" in output.err) == warned

@@ -10,7 +10,7 @@ if importlib.util.find_spec("viser") is None:
     pytest.skip("needs viser: pip install 'mimic-arms[view]'", allow_module_level=True)
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.commands import view
+from mimic.commands import view_server
 from mimic.commands.config import ViewConfig
 from mimic.envs import env_config
 from mimic.viewer.follower import Preset
@@ -59,7 +59,7 @@ def shown():
             check(page, controls, session)
             done.append(True)
 
-        assert view.serve(config, config.env, show, learners=ARMS) == 0 and done
+        assert view_server.serve(config, config.env, "arms", show, learners=ARMS) == 0 and done
 
     return run
 
