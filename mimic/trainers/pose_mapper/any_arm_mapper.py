@@ -209,7 +209,8 @@ class AnyArmMapper:
         """The mapper between two arms, for everything that takes a `PoseMapper`.
 
         Args:
-          learner, expert: see `__call__`.
+          learner: see `__call__`.
+          expert: see `__call__`.
 
         Raises:
           ValueError: see `__call__`.
