@@ -51,7 +51,12 @@ def arm_sampler(config: EnvConfig) -> Sampler:
 
 
 def check_family(config: EnvConfig) -> None:
-    """Raises a ValueError for settings of one arm that an environment of many arms does not have."""
+    """Raises a ValueError for settings that an environment of many arms does not have."""
+    if config.arms.expert != "fixed":
+        raise ValueError(
+            f"arms.expert: expected fixed, because demonstrations are of one expert, got {config.arms.expert}; "
+            "trainer=pose_mapper draws experts"
+        )
     supported = {
         "physics": ("auto", "fused"),
         "start": ("home",),

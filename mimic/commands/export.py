@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from rich.console import Console
 
 from mimic.any_arm.description import SIZE, SUFFIXES, described_arm, description_layout, save_description
-from mimic.any_arm.kinematics import link_states
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
 from mimic.commands.export_controller import prepare_controller
@@ -25,7 +24,8 @@ from mimic.envs.imitation import layout_of, observation_layout, torque_scale
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_atomically
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, padded_poses
+from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
+from mimic.trainers.pose_mapper.any_arm_model import expert_pose
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.trainer import run_environment
@@ -282,8 +282,8 @@ def _any_arm_mapper(mapper: AnyArmMapper, trained: TrainConfig, steps: int) -> E
     params = jax.device_get(mapper.params)
 
     def function(expert_qpos: jax.Array, learner: jax.Array) -> dict[str, jax.Array]:
-        states = link_states(mapper.model.expert, padded_poses(expert_qpos))
-        return {"learner_qpos": mapper.model(params, states, described_arm(learner))}
+        expert = expert_pose(mapper.model.expert, mapper.own_expert.in_slots(expert_qpos))
+        return {"learner_qpos": mapper.model(params, expert, described_arm(learner))}
 
     metadata = {
         "mimic_version": VERSION,

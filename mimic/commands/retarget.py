@@ -165,8 +165,9 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
     _check(demonstrations, expert)
     capsules = fit_capsules(env.learner, env.limits) if config.costs.of_capsules else None
-    mapper = load_mapper(Path(config.mapper).expanduser(), learner=env.learner) if config.mapper else None
-    if mapper:
+    mapper = None
+    if config.mapper:
+        mapper = load_mapper(Path(config.mapper).expanduser(), learner=env.learner, expert=env.expert)
         mapper.check_fits(expert, learner)
 
     def run() -> None:

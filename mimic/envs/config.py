@@ -109,6 +109,8 @@ class ArmsConfig:
     """What the learner of each episode is drawn from. If all weights are 0, it is always the environment's learner.
 
     Attributes:
+      expert: "fixed": the environment's expert; or "drawn": another arm for each training pose, from the same
+        distribution as the learner. Only for `trainer=pose_mapper`.
       locked: weight of the environment's learner with joints locked at home, none of them included.
       most_locked: largest number of joints that are locked.
       unseen: sets of locked joints that training leaves out, as in "2" or "1+4"; the report shows them apart.
@@ -122,6 +124,7 @@ class ArmsConfig:
       armature, damping: minimum of each joint of `models` and `evaluated`, see `ArmConfig`; the default is the Panda's.
     """
 
+    expert: str = "fixed"
     locked: float = number(0.0, at_least=0.0, at_most=1e6)
     most_locked: int = number(2, at_least=0, at_most=7)
     unseen: list[str] = dataclasses.field(default_factory=list)
@@ -137,6 +140,11 @@ class ArmsConfig:
     def __post_init__(self) -> None:
         check_ranges(self, "arms.")
         check_choice("arms.reward", self.reward, ("relative", "distance"))
+        check_choice("arms.expert", self.expert, ("fixed", "drawn"))
+        if self.expert == "drawn" and not self.are_drawn:
+            raise ValueError(
+                "arms.expert: expected fixed where the learner is not drawn (all weights of arms are 0), got drawn"
+            )
         for text in self.unseen:
             if not all(number.isdecimal() and int(number) > 0 for number in text.split("+")):
                 raise ValueError(f"arms.unseen: expected numbers of joints from 1, as in 2 or 1+4, got {text!r:.80}")

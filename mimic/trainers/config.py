@@ -348,7 +348,8 @@ class PoseMapperConfig(TrainerConfig):
 
     If the environment draws its learner (`env.arms`), one network maps to all of these arms: see
     `mimic.trainers.pose_mapper.any_arm_model`. It has `width`, `layers` and `refinements`, and neither `inputs`,
-    `outputs`, `hidden_layers`, `activation` nor `dropout`. A training pose is then a pose of the expert and an arm.
+    `outputs`, `hidden_layers`, `activation` nor `dropout`. A training pose is then a pose of the expert and an arm, and
+    with `env.arms.expert=drawn` the expert is another arm for each pose too.
 
     Attributes:
       name: "pose_mapper".

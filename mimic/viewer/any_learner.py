@@ -20,7 +20,7 @@ from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.metric.distance import DistanceWeights
 from mimic.metric.similarity import similarity
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel
+from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, expert_pose
 from mimic.trainers.pose_mapper.any_arm_training import random_pose
 from mimic.viewer.follower import CompiledFunctions, PoseComparison, Preset, Settings, compiled
 
@@ -150,7 +150,7 @@ def _compile(mapper: AnyArmMapper) -> _Compiled:
         return dataclasses.replace(mapper.model, weights=DistanceWeights(weights[0], weights[1]))
 
     def follow(qpos: Array, weights: Array, learner: ArmArrays) -> Array:
-        return model_of(weights)(mapper.params, link_states(mapper.model.expert, qpos), learner)
+        return model_of(weights)(mapper.params, expert_pose(mapper.model.expert, qpos), learner)
 
     def compare(qpos: Array, learner_qpos: Array, weights: Array, learner: ArmArrays) -> PoseComparison:
         expert, matrix = mapper.model.expert, correspondence(mapper.model.expert, learner)
@@ -160,11 +160,13 @@ def _compile(mapper: AnyArmMapper) -> _Compiled:
         return PoseComparison(metric.reduced(links), matrix, links, similarity(*lines))
 
     def best(qpos: Array, guess: Array, weights: Array, learner: ArmArrays) -> tuple[Array, Array]:
-        model, expert = model_of(weights), link_states(mapper.model.expert, qpos)
+        model, expert = model_of(weights), expert_pose(mapper.model.expert, qpos)
         matrix, keys = correspondence(model.expert, learner), jax.random.split(jax.random.key(0), _GUESSES)
         random = jax.vmap(lambda key: random_pose(learner, key))(keys)
         guesses = jnp.concatenate([random, jnp.stack([jnp.asarray(learner.home), guess])])
-        poses = jax.vmap(lambda at: nearest_pose(learner, model.weights, matrix, expert, at, _STEPS).qpos)(guesses)
+        poses = jax.vmap(lambda at: nearest_pose(learner, model.weights, matrix, expert.states, at, _STEPS).qpos)(
+            guesses
+        )
         poses = jnp.concatenate([poses, guess[None]])  # the steps have no line search
         distances = model.distances(expert, learner, poses)
         nearest = jnp.argmin(distances)

@@ -11,6 +11,7 @@ import pytest
 import mimic
 from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.any_arm.kinematics import correspondence, joint_states, link_jacobians, link_states, link_states_in_frames
+from mimic.any_arm.sampler import random_arm
 from mimic.arms.arm import ArmConfig, build_arm
 from tests.any_arm.cases import Batch, random_source
 from tests.helpers import random_arms
@@ -113,6 +114,21 @@ def test_correspondence_is_that_by_arc_length(x64, batch):
         np.testing.assert_allclose(own / own.sum(), expected / expected.sum(), rtol=0, atol=ATOL)
         assert actual.mean() == pytest.approx(1.0)
         assert not actual[expert.num_links :].any() and not actual[:, learner.num_links :].any()
+
+
+def test_correspondence_of_drawn_arms_integrates_along_both_chains():
+    """In single precision, of traced experts and learners, some without a link in the first slot: links by length."""
+    drawn = jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(1), 128))
+    experts, learners = (jax.tree.map(lambda x, half=half: x[half], drawn) for half in (slice(64), slice(64, None)))
+    matrix = np.asarray(jax.jit(jax.vmap(correspondence))(experts, learners))
+    shares = matrix / matrix.sum(axis=(1, 2), keepdims=True)
+    for arms, axis in ((experts, 2), (learners, 1)):
+        lengths = np.asarray(arms.link_length)
+        assert (lengths[:, 0] == 0).any() and (lengths[:, 0] > 0).any()
+        # Ends are sums of up to 9 lengths, and an overlap is a difference of them: 20 roundings of 6e-8 each.
+        np.testing.assert_allclose(shares.sum(axis=axis), lengths / lengths.sum(1, keepdims=True), rtol=0, atol=2e-6)
+        empty = np.moveaxis(matrix, axis, -1)[lengths == 0]
+        assert not empty.any()
 
 
 def test_single_precision_and_locked_arms(x64):

@@ -119,9 +119,9 @@ def test_an_onnx_pose_mapper_equals_the_mapper(tmp_path, name, preset, metric):
     assert len(np.unique(np.round(outputs, 3), axis=0)) > 100
 
 
-def any_arm_run(run_dir):
+def any_arm_run(run_dir, expert="fixed"):
     """A run whose mapper to any arm has random weights."""
-    env = mimic.env_config("any_arm")
+    env = mimic.env_config("any_arm", arms={"expert": expert})
     config = PoseMapperConfig(width=16, layers=1, heads=2, refinements=2).resolve_any_arm()
     params = make_any_arm_model(env, config).init(jax.random.key(3))
     run_dir.mkdir()
@@ -130,9 +130,10 @@ def any_arm_run(run_dir):
     return AnyArmMapper.load(run_dir)
 
 
-def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path):
+@pytest.mark.parametrize("expert", ["fixed", pytest.param("drawn", marks=pytest.mark.slow)])
+def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path, expert):
     """One file for arms of 7 and 4 joints and for a random one, with the descriptions that the command writes."""
-    mapper = any_arm_run(tmp_path / "run")
+    mapper = any_arm_run(tmp_path / "run", expert)
     session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "mapper.onnx"))
     poses = random_poses(mapper.expert, 50)
     json_file, npz_file = tmp_path / "panda.json", tmp_path / "panda4dof.npz"

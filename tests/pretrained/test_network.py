@@ -10,12 +10,12 @@ import pytest
 
 import mimic
 from mimic.any_arm.family import UNSEEN, report_arms
-from mimic.any_arm.kinematics import link_states
 from mimic.evaluation.evaluator import Evaluator
 from mimic.pretrained.files import PARAMETERS, read_params, write_network
 from mimic.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network
 from mimic.runs.files import REPORT
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from mimic.trainers.pose_mapper.any_arm_model import expert_pose
 from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 from tests.helpers.repository import REPOSITORY
@@ -90,14 +90,18 @@ def test_the_mapper_to_any_arm_says_where_it_comes_from(any_arm):
 
 def test_the_mapper_to_any_arm_reaches_its_recorded_distance_on_unseen_locks(any_arm):
     arms = {name: arm for name, arm in report_arms(any_arm.env)[UNSEEN].items() if name.startswith("locked")}
-    poses = AnyArmMapperTrainer(TrainConfig(any_arm.env, PoseMapperConfig(preset="any_arm")))._expert_qpos
-    states = jax.jit(jax.vmap(lambda qpos: link_states(any_arm.model.expert, qpos)))(poses)
-    distances = jax.jit(jax.vmap(any_arm.model.distance, (0, None, 0)))
+    poses = (
+        AnyArmMapperTrainer(TrainConfig(any_arm.env, PoseMapperConfig(preset="any_arm")))._pairs["arms"].expert_qpos[0]
+    )
+    model = any_arm.model
+    distances = jax.jit(
+        jax.vmap(lambda pose, arm, qpos: model.distance(expert_pose(model.expert, pose), arm, qpos), (0, None, 0))
+    )
     recorded = {name: any_arm.report["arms"][name] for name in arms}
     assert len(arms) == 8 and not any(row["seen"] for row in recorded.values())
     for name, arm in arms.items():
         arrays = any_arm.arrays(arm)
-        distance = float(distances(states, arrays, any_arm(poses[:, :7], arrays)).mean())
+        distance = float(distances(poses, arrays, any_arm(poses[:, :7], arrays)).mean())
         # Where two proposals are equally near, another machine may take the other one.
         assert distance == pytest.approx(recorded[name]["mean_distance"], rel=2e-3)
     # None of these arms was in the training: 1 % of the way from the optimum to a random pose, in the mean.

@@ -13,7 +13,6 @@ import pytest
 import mimic
 from mimic.any_arm.arrays import MAX_JOINTS, lock_joints, stack_arms
 from mimic.any_arm.family import arm_sampler
-from mimic.any_arm.kinematics import link_states
 from mimic.commands import retarget
 from mimic.commands import train as session
 from mimic.commands.config import EvaluateConfig, RetargetConfig
@@ -22,9 +21,9 @@ from mimic.envs import env_config
 from mimic.metric.similarity import MEASURES
 from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import AnyArmMapperSettings, PoseMapperConfig, TrainConfig
-from mimic.trainers.pose_mapper.any_arm_evaluation import METHODS, Mapped, Reference, best_poses, table_of_arms
+from mimic.trainers.pose_mapper.any_arm_evaluation import METHODS, Mapped, Reference, best_poses, table_of_pairs
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, load_mapper
-from mimic.trainers.pose_mapper.any_arm_model import make_any_arm_model
+from mimic.trainers.pose_mapper.any_arm_model import expert_pose, make_any_arm_model
 from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
 from mimic.trainers.pose_mapper.any_arm_training import any_arm_objective, random_pose
 
@@ -94,10 +93,9 @@ def test_splits_without_arms_are_left_out(tmp_path):
     trainer = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 1.0, "most_locked": 1, "unseen": []}))
     distances = np.linspace(0.1, 0.2, 16).reshape(8, 2)
     mapped = Mapped(distances, np.zeros((8, 2, MAX_JOINTS)), distances)
-    vars(trainer)["_reference"] = Reference(
-        distances / 2, mapped.qpos, distances, mapped.qpos, distances, distances + 1
-    )
-    metrics = trainer.metrics(mapped)
+    reference = Reference(distances / 2, mapped.qpos, distances, mapped.qpos, distances, distances + 1)
+    vars(trainer)["_reference"] = {"arms": reference}
+    metrics = trainer.metrics({"arms": mapped})
     assert set(metrics["quality"]) == {"train"} and "unseen" not in trainer.status(metrics)
     assert trainer.rows(metrics)[0] == ("number of arms", "8", "0") and trainer.rows(metrics)[1][2] == ""
     drawn = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 0.0, "unseen": [], "random": 1.0}))
@@ -151,7 +149,7 @@ def test_joints_that_a_config_locks_are_locked_by_the_mask(mapper):
 def test_the_nearest_head_is_taken_and_locked_joints_stay(mapper):
     arm = lock_joints(mapper.arrays("panda"), np.eye(MAX_JOINTS)[3])
     (qpos,) = poses(1)
-    expert = link_states(mapper.model.expert, jnp.append(qpos, 0.0))
+    expert = expert_pose(mapper.model.expert, jnp.append(qpos, 0.0))
     refined, distances = mapper.model.refined(mapper.params, expert, arm)
     result = np.asarray(mapper(qpos, arm))
     np.testing.assert_allclose(result, refined[int(np.argmin(distances))], atol=1e-4)
@@ -206,7 +204,7 @@ def test_the_optimum_is_the_nearest_pose_that_is_known():
         random_distance=np.array([[1.1, 1.1]]),
     )
     mapped = Mapped(np.array([[0.1, 0.3]]), np.ones((1, 2, MAX_JOINTS)), np.array([[0.6, 0.6]]))
-    table = table_of_arms(reference, mapped)
+    table = table_of_pairs(reference, mapped)
     expected = {"optimal_distance": 0.1, "mean_distance": 0.2, "quality": 0.1, "quality_random_guesses": 0.25,
                 "quality_from_home": 0.4, "quality_proposed": 0.5}  # fmt: skip
     for key, value in expected.items():

@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.any_arm.arrays import ArmArrays
-from mimic.any_arm.kinematics import correspondence, link_states
+from mimic.any_arm.kinematics import correspondence
 from mimic.any_arm.nearest import nearest_pose
 from mimic.any_arm.similarity import motion_similarity
-from mimic.metric.kinematics import LinkStates
-from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, Params
+from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, ExpertPose, Params, expert_pose
 from mimic.trainers.pose_mapper.any_arm_training import random_pose
 
 # The optimum: Newton steps from this many random poses. A trained mapper may find a nearer pose than all of them, which
@@ -23,8 +22,21 @@ _GUESSES, _STEPS = 64, 16
 METHODS = ("quality", "quality_proposed", "quality_random_guesses", "quality_from_home")
 
 
+class Pairs(NamedTuple):
+    """Pairs of arms, along the first axis, and poses of each expert.
+
+    Attributes:
+      experts, learners: the arms.
+      expert_qpos: [rad], an angle for each slot of a joint.
+    """
+
+    experts: ArmArrays
+    learners: ArmArrays
+    expert_qpos: Float[Any, "pairs poses joints"]
+
+
 class Reference(NamedTuple):
-    """Poses without a network, for each arm and each pose of the expert.
+    """Poses without a network, for each pair of arms and each pose of the expert.
 
     Attributes:
       optimal_distance, optimal_qpos: nearest of the poses after 16 Newton steps from 64 random initial guesses and
@@ -34,45 +46,43 @@ class Reference(NamedTuple):
       random_distance: mean of random poses.
     """
 
-    optimal_distance: Float[Any, "arms poses"]
-    optimal_qpos: Float[Any, "arms poses joints"]
-    guessed_distance: Float[Any, "arms poses"]
-    guessed_qpos: Float[Any, "arms poses joints"]
-    home_distance: Float[Any, "arms poses"]
-    random_distance: Float[Any, "arms poses"]
+    optimal_distance: Float[Any, "pairs poses"]
+    optimal_qpos: Float[Any, "pairs poses joints"]
+    guessed_distance: Float[Any, "pairs poses"]
+    guessed_qpos: Float[Any, "pairs poses joints"]
+    home_distance: Float[Any, "pairs poses"]
+    random_distance: Float[Any, "pairs poses"]
 
 
 class Mapped(NamedTuple):
-    """Poses of a mapper, for each arm and each pose of the expert.
+    """Poses of a mapper, for each pair of arms and each pose of the expert.
 
     Attributes:
       distance, qpos: the mapper's result.
       proposed_distance: nearest of its proposals, before the Newton steps.
     """
 
-    distance: Float[Any, "arms poses"]
-    qpos: Float[Any, "arms poses joints"]
-    proposed_distance: Float[Any, "arms poses"]
+    distance: Float[Any, "pairs poses"]
+    qpos: Float[Any, "pairs poses joints"]
+    proposed_distance: Float[Any, "pairs poses"]
 
 
-def make_reference(
-    model: AnyArmMapperModel, key: Array, arms: ArmArrays, expert_qpos: Float[Array, "poses joints"]
-) -> Reference:
+def make_reference(model: AnyArmMapperModel, key: Array, pairs: Pairs) -> Reference:
     """Poses without a network.
 
     Args:
-      model: defines expert, metric, number of heads and Newton steps.
+      model: defines metric, number of heads and Newton steps.
       key: of the random initial guesses, which are the same for all poses of the expert.
-      arms: learners, along the first axis.
-      expert_qpos: poses of the expert [rad].
+      pairs: the arms and the experts' poses.
     """
-    states = jax.vmap(lambda qpos: link_states(model.expert, qpos))(expert_qpos)
 
-    def of_arm(arm: ArmArrays) -> Reference:
+    def of_pair(pair: Pairs) -> Reference:
+        arm = pair.learners
         guesses = jax.vmap(lambda key: random_pose(arm, key))(jax.random.split(key, max(_GUESSES, model.heads)))
         initial = jnp.concatenate([guesses, arm.home[None]])
 
-        def of_pose(expert: LinkStates) -> Reference:
+        def of_pose(qpos: Array) -> Reference:
+            expert = expert_pose(pair.experts, qpos)
             path = _newton_path(model, expert, arm, initial, max(_STEPS, model.refinements))
             optimum = _nearest(model, expert, arm, path[-1])
             few_steps = path[model.refinements]
@@ -80,33 +90,33 @@ def make_reference(
             home = model.distance(expert, arm, few_steps[-1])
             return Reference(*optimum, *guessed, home, model.distances(expert, arm, guesses).mean())
 
-        return jax.vmap(of_pose)(states)
+        return jax.vmap(of_pose)(pair.expert_qpos)
 
-    return jax.lax.map(of_arm, arms)
+    return jax.lax.map(of_pair, pairs)
 
 
-def run_mapper(
-    model: AnyArmMapperModel, params: Params, arms: ArmArrays, expert_qpos: Float[Array, "poses joints"]
-) -> Mapped:
-    """The mapper's poses for all arms and poses; see `make_reference`."""
-    states = jax.vmap(lambda qpos: link_states(model.expert, qpos))(expert_qpos)
+def run_mapper(model: AnyArmMapperModel, params: Params, pairs: Pairs) -> Mapped:
+    """The mapper's poses for all pairs and poses; see `make_reference`."""
 
-    def of_pose(arm: ArmArrays, expert: LinkStates) -> Mapped:
+    def of_pose(expert: ExpertPose, arm: ArmArrays) -> Mapped:
         proposed = model.candidates(params, expert, arm)
         path = _newton_path(model, expert, arm, proposed, model.refinements)
         return Mapped(*_nearest(model, expert, arm, path[-1]), model.distances(expert, arm, proposed).min())
 
-    return jax.lax.map(lambda arm: jax.vmap(lambda state: of_pose(arm, state))(states), arms)
+    def of_pair(pair: Pairs) -> Mapped:
+        return jax.vmap(lambda qpos: of_pose(expert_pose(pair.experts, qpos), pair.learners))(pair.expert_qpos)
+
+    return jax.lax.map(of_pair, pairs)
 
 
 def _newton_path(
-    model: AnyArmMapperModel, expert: LinkStates, arm: ArmArrays, initial: Float[Array, "n joints"], steps: int
+    model: AnyArmMapperModel, expert: ExpertPose, arm: ArmArrays, initial: Float[Array, "n joints"], steps: int
 ) -> Float[Array, "steps n joints"]:
     """The initial poses, and the poses after each Newton step; one loop, which halves the time to compile."""
-    matrix = correspondence(model.expert, arm)
+    matrix = correspondence(expert.arm, arm)
 
     def step(poses: Array, _: None) -> tuple[Array, Array]:
-        after = jax.vmap(lambda qpos: nearest_pose(arm, model.weights, matrix, expert, qpos, 1).qpos)(poses)
+        after = jax.vmap(lambda qpos: nearest_pose(arm, model.weights, matrix, expert.states, qpos, 1).qpos)(poses)
         return after, after
 
     _, path = jax.lax.scan(step, initial, None, length=steps)
@@ -114,7 +124,7 @@ def _newton_path(
 
 
 def _nearest(
-    model: AnyArmMapperModel, expert: LinkStates, arm: ArmArrays, poses: Float[Array, "n joints"]
+    model: AnyArmMapperModel, expert: ExpertPose, arm: ArmArrays, poses: Float[Array, "n joints"]
 ) -> tuple[Array, Array]:
     """The distance of the nearest pose, and the pose."""
     distances = model.distances(expert, arm, poses)
@@ -122,21 +132,21 @@ def _nearest(
     return distances[nearest], poses[nearest]
 
 
-def best_distance(reference: Reference, mapped: Mapped) -> Float[np.ndarray, "arms poses"]:
+def best_distance(reference: Reference, mapped: Mapped) -> Float[np.ndarray, "pairs poses"]:
     """Distances of the optimum: of the nearest pose that anything has found."""
     return np.minimum.reduce(
         [reference.optimal_distance, mapped.distance, reference.guessed_distance, reference.home_distance]
     )
 
 
-def best_poses(reference: Reference, mapped: Mapped) -> Float[np.ndarray, "arms poses joints"]:
+def best_poses(reference: Reference, mapped: Mapped) -> Float[np.ndarray, "pairs poses joints"]:
     """Poses of the optimum: the reference's, or the mapper's where those are nearer."""
     is_nearer = mapped.distance < reference.optimal_distance
     return np.where(is_nearer[..., None], mapped.qpos, reference.optimal_qpos)
 
 
-def table_of_arms(reference: Reference, mapped: Mapped) -> dict[str, Float[np.ndarray, " arms"]]:
-    """Columns of a table with one row for each arm, means over the poses.
+def table_of_pairs(reference: Reference, mapped: Mapped) -> dict[str, Float[np.ndarray, " pairs"]]:
+    """Columns of a table with one row for each pair of arms, means over the poses.
 
     Each of `METHODS` is (distance - optimum) / (random - optimum): 0 is the optimum, 1 a random pose.
     """
@@ -150,15 +160,10 @@ def table_of_arms(reference: Reference, mapped: Mapped) -> dict[str, Float[np.nd
 
 
 def mean_similarity(
-    expert: ArmArrays,
-    arms: ArmArrays,
-    expert_qpos: Float[Any, "poses joints"],
-    poses: Mapping[str, Float[Any, "arms poses joints"]],
-) -> dict[str, dict[str, Float[np.ndarray, " arms"]]]:
-    """Means over the poses of the measures of `mimic.metric.similarity`, as {method: {measure: [arms]}}."""
-    measure = jax.jit(
-        lambda qpos: jax.lax.map(lambda x: motion_similarity(expert, x[0], expert_qpos, x[1]), (arms, qpos))
-    )
+    pairs: Pairs, poses: Mapping[str, Float[Any, "pairs poses joints"]]
+) -> dict[str, dict[str, Float[np.ndarray, " pairs"]]]:
+    """Means over the learners' poses of the measures of `mimic.metric.similarity`, as {method: {measure: [pairs]}}."""
+    measure = jax.jit(lambda qpos: jax.lax.map(lambda x: motion_similarity(*x), (*pairs, qpos)))
     return {
         name: {key: np.asarray(value).mean(axis=1, dtype=float) for key, value in measure(jnp.asarray(qpos)).items()}
         for name, qpos in poses.items()

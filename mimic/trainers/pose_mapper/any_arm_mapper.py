@@ -10,46 +10,28 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays, masked_arrays
-from mimic.any_arm.kinematics import link_states
+from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, masked_arrays
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.envs import env_config, environments
 from mimic.envs.config import ArmsConfig, EnvConfig
-from mimic.metric.config import MetricConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, Params, make_any_arm_model
+from mimic.trainers.pose_mapper.any_arm_model import (
+    AnyArmMapperModel,
+    Params,
+    expert_pose,
+    make_any_arm_model,
+)
 from mimic.trainers.pose_mapper.model import PoseMapper, check_poses
+from mimic.trainers.pose_mapper.one_pair import DescribedArm, OnePairModel
 from mimic.trainers.run_config import load_config
 
-Learner = ArmArrays | Arm | ArmConfig | str | os.PathLike[str]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class DescribedArm:
-    """An arm and the arrays that the network takes.
-
-    Attributes:
-      arm: with its locked joints.
-      arrays: in single precision.
-      joints: slot of each of the arm's joints in the arrays.
-      slots: name of the joint in each of the first slots, locked ones included.
-    """
-
-    arm: Arm
-    arrays: ArmArrays
-    joints: Int[np.ndarray, " learner_joints"]
-    slots: tuple[str, ...]
-
-    @classmethod
-    def without_locks(cls, arm: Arm) -> "DescribedArm":
-        """An arm whose locked joints have no slot."""
-        names = arm.embodiment.joint_names
-        return cls(arm, arm_arrays(arm).astype(np.float32), np.arange(len(names)), names)
+OneArm = Arm | ArmConfig | str | os.PathLike[str]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,14 +41,14 @@ class AnyArmMapper:
     Attributes:
       model: network, expert and metric.
       params: parameters of the network.
-      expert: the arm of the input poses.
+      own_expert: the environment's expert.
       env: config of the environment; learners that are no arrays are built with its `limits` and `metric.links`.
       report: of `mimic.load`: the metrics of these weights, as in report.json of a run, and where they come from.
     """
 
     model: AnyArmMapperModel
     params: Params
-    expert: Embodiment
+    own_expert: DescribedArm
     env: EnvConfig
     report: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -105,138 +87,151 @@ class AnyArmMapper:
         env = config.env
         model = make_any_arm_model(env, config.trainer.resolve_any_arm())
         template = jax.eval_shape(model.init, jax.random.key(0))
-        expert = build_arm(env.expert, env.limits, env.metric.links).embodiment
+        expert = DescribedArm.without_locks(build_arm(env.expert, env.limits, env.metric.links))
         return cls(model, read_params(template), expert, env, report or {})
 
-    @functools.cached_property
-    def _map(self):  # compiled once for each shape of the poses, whatever the learner is
-        def of_pose(params: Params, qpos: Array, learner: ArmArrays) -> Array:
-            return self.model(params, link_states(self.model.expert, qpos), learner)
+    @property
+    def expert(self) -> Embodiment:
+        """The environment's expert: the arm of the input poses where no other one is named."""
+        return self.own_expert.arm.embodiment
 
-        return jax.jit(jax.vmap(of_pose, (None, 0, None)))
+    @functools.cached_property
+    def _map(self):  # compiled once for each shape of the poses, whatever the arms are
+        def of_pose(params: Params, expert: ArmArrays, qpos: Array, learner: ArmArrays) -> Array:
+            # XLA computes with a constant what it can while it compiles, which rounds otherwise than an argument does.
+            arm = expert if self.model.expert_is_drawn else self.model.expert
+            return self.model(params, expert_pose(arm, qpos), learner)
+
+        return jax.jit(jax.vmap(of_pose, (None, None, 0, None)))
 
     def __call__(
-        self, qpos: Float[ArrayLike, "*batch joints"], learner: Learner
+        self,
+        qpos: Float[ArrayLike, "*batch joints"],
+        learner: ArmArrays | OneArm,
+        expert: ArmArrays | OneArm | None = None,
     ) -> Float[Array, "*batch learner_joints"]:
-        """Maps poses of the expert to poses of a learner [rad].
+        """Maps poses of an expert to poses of a learner [rad].
 
         Args:
-          qpos: [n] or [..., n] the expert's poses [rad].
+          qpos: [n] or [..., n] the expert's poses [rad]; of an expert as arrays [..., 8], the slots of `ArmArrays`, of
+            which those of joints that do not move are ignored.
           learner: arrays of one arm, an arm, its config, its name or file (see `ArmConfig.model`), or the name of an
-            environment. `jax.vmap` takes many learners as arrays.
+            environment, whose learner it is. `jax.vmap` takes many learners as arrays.
+          expert: another expert than the environment's, in the same ways; only of a mapper that was trained with
+            `env.arms.expert=drawn`.
 
         Returns:
           The learner's poses [rad]: [n_hat] or [..., n_hat]; for arrays [..., 8], the slots of `ArmArrays`.
 
         Raises:
-          ValueError: poses of the wrong shape, not finite, or outside of the expert's joint range; a learner that
-            cannot be loaded, is a tree, or has too many joints or links.
+          ValueError: poses of the wrong shape, not finite, or (not of arrays) outside of the expert's joint range; an
+            arm that cannot be loaded, is a tree, or has too many joints or links; another expert where the mapper has
+            a fixed one.
         """
-        poses = check_poses(self.expert, qpos)
+        if isinstance(expert, ArmArrays):
+            self._check_takes_experts()
+            expert_arrays = self.arrays(expert, "expert")
+            poses = _checked_slots(expert_arrays, qpos)
+        else:
+            described = self.describe_expert(expert)
+            expert_arrays = described.arrays
+            poses = described.in_slots(check_poses(described.arm.embodiment, qpos))
         if isinstance(learner, ArmArrays):
             arrays, joints = self.arrays(learner), np.arange(MAX_JOINTS)
         else:
             described = self.describe(learner)
             arrays, joints = described.arrays, described.joints
-        flat = padded_poses(poses.reshape(-1, self.expert.num_joints))
-        learner_poses = self._map(self.params, flat, arrays)
-        return learner_poses.reshape(*poses.shape[:-1], MAX_JOINTS)[..., joints]
+        learner_poses = self._map(self.params, expert_arrays, poses.reshape(-1, MAX_JOINTS), arrays)
+        return learner_poses.reshape(poses.shape)[..., joints]
 
-    def arrays(self, learner: Learner) -> ArmArrays:
-        """The description of a learner that the network takes, in single precision.
+    def arrays(self, arm: ArmArrays | OneArm, role: str = "learner") -> ArmArrays:
+        """The description of an arm that the network takes, in single precision.
+
+        Args:
+          arm: see `__call__`.
+          role: "learner" or "expert", for the error.
 
         Raises:
           ValueError: see `__call__`.
         """
-        if not isinstance(learner, ArmArrays):
-            return self.describe(learner).arrays
+        if not isinstance(arm, ArmArrays):
+            return self.describe(arm).arrays
         expected = (MAX_JOINTS,), (MAX_LINKS,)
-        got = jnp.shape(learner.home), jnp.shape(learner.link_length)
+        got = jnp.shape(arm.home), jnp.shape(arm.link_length)
         if got != expected:
             raise ValueError(
-                f"learner: expected arrays of one arm, home {list(expected[0])} and link_length {list(expected[1])}, "
+                f"{role}: expected arrays of one arm, home {list(expected[0])} and link_length {list(expected[1])}, "
                 f"got {list(got[0])} and {list(got[1])}; use jax.vmap for many arms"
             )
-        return jax.tree.map(_single, learner)
+        return jax.tree.map(_single, arm)
 
-    def describe(self, learner: Arm | ArmConfig | str | os.PathLike[str]) -> "DescribedArm":
+    def describe(self, arm: OneArm) -> DescribedArm:
         """An arm and its arrays. Joints that a config locks are locked by the mask, as in training.
 
         Raises:
           ValueError: see `__call__`.
         """
         limits, links = self.env.limits, self.env.metric.links
-        if isinstance(learner, Arm):
-            return DescribedArm.without_locks(learner)
-        if not isinstance(learner, ArmConfig):
-            name = os.fspath(learner)
-            learner = env_config(name).learner if name in environments() else ArmConfig(model=name)
-        arm = build_arm(learner, limits, links)
-        whole = build_arm(dataclasses.replace(learner, locked=None), limits, links) if arm.locked else arm
+        if isinstance(arm, Arm):
+            return DescribedArm.without_locks(arm)
+        if isinstance(arm, ArmConfig):
+            config = arm
+        else:
+            name = os.fspath(arm)
+            config = env_config(name).learner if name in environments() else ArmConfig(model=name)
+        built = build_arm(config, limits, links)
+        whole = build_arm(dataclasses.replace(config, locked=None), limits, links) if built.locked else built
         if max(whole.embodiment.num_joints - MAX_JOINTS, whole.embodiment.num_links - MAX_LINKS) > 0:
-            return DescribedArm.without_locks(arm)  # it may have few enough without those that are locked
-        arrays, names = masked_arrays(learner, limits, links)
+            return DescribedArm.without_locks(built)  # it may have few enough without those that are locked
+        arrays, names = masked_arrays(config, limits, links)
         is_free = np.asarray(arrays.is_free) > 0
-        return DescribedArm(arm, arrays.astype(np.float32), np.flatnonzero(is_free), names)
+        return DescribedArm(built, arrays.astype(np.float32), np.flatnonzero(is_free), names)
 
-    def to(self, learner: Arm | ArmConfig | str | os.PathLike[str]) -> PoseMapper:
-        """The mapper to one learner, for everything that takes a `PoseMapper`.
+    def describe_expert(self, expert: OneArm | None) -> DescribedArm:
+        """An expert and its arrays; the environment's where None.
 
         Raises:
           ValueError: see `__call__`.
         """
-        return PoseMapper(
-            OneLearnerModel(self.model, self.describe(learner), self.expert, self.env.metric), self.params
-        )
+        if expert is None:
+            return self.own_expert
+        self._check_takes_experts()
+        return self.describe(expert)
 
+    def _check_takes_experts(self) -> None:
+        if not self.model.expert_is_drawn:
+            raise ValueError(
+                f"expert: expected none, because this mapper has a fixed one, {self.expert.name}; train one for any "
+                "expert with env.arms.expert=drawn"
+            )
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class OneLearnerModel:
-    """A mapper to any arm with a constant learner; the same functions as of `MapperModel`.
+    def to(self, learner: OneArm, expert: OneArm | None = None) -> PoseMapper:
+        """The mapper between two arms, for everything that takes a `PoseMapper`.
 
-    Attributes:
-      mapper: the mapper to any arm.
-      described: the learner.
-      expert: embodiment with n joints.
-      metric: config of the metric.
-    """
+        Args:
+          learner: see `__call__`.
+          expert: see `__call__`.
 
-    mapper: AnyArmMapperModel
-    described: DescribedArm
-    expert: Embodiment
-    metric: MetricConfig
-
-    @property
-    def learner(self) -> Embodiment:
-        """Embodiment with n_hat joints."""
-        return self.described.arm.embodiment
-
-    def candidates(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, "heads learner_joints"]:
-        """The poses of the heads after the Newton steps [rad]."""
-        expert = link_states(self.mapper.expert, padded_poses(qpos))
-        return self.mapper.refined(params, expert, self.described.arrays)[0][:, self.described.joints]
-
-    def distance(self, qpos: Float[Array, " joints"], learner_qpos: Float[Array, " learner_joints"]) -> Array:
-        """Embodiment distance between a pose of the expert and a pose of the learner."""
-        expert = link_states(self.mapper.expert, padded_poses(qpos))
-        arrays, joints = self.described.arrays, self.described.joints
-        return self.mapper.distance(expert, arrays, jnp.asarray(arrays.home).at[joints].set(learner_qpos))
-
-    def __call__(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
-        """The nearest of the poses of the heads."""
-        expert = link_states(self.mapper.expert, padded_poses(qpos))
-        return self.mapper(params, expert, self.described.arrays)[self.described.joints]
+        Raises:
+          ValueError: see `__call__`.
+        """
+        arms = self.describe_expert(expert), self.describe(learner)
+        return PoseMapper(OnePairModel(self.model, *arms, self.env.metric), self.params)
 
 
 def load_mapper(
-    run_dir: str | os.PathLike[str], checkpoint: int | None = None, learner: ArmConfig | None = None
+    run_dir: str | os.PathLike[str],
+    checkpoint: int | None = None,
+    learner: ArmConfig | None = None,
+    expert: ArmConfig | None = None,
 ) -> PoseMapper:
     """The mapper of a run to one learner, whether the run trained for that one or for any arm.
 
     Args:
       run_dir: the run directory.
       checkpoint: number of training poses of the checkpoint; the last checkpoint where None.
-      learner: arm to map to, where the run draws its arms; default: the learner of its environment.
+      learner: arm to map to, where the run draws its learners; default: the learner of its environment.
+      expert: arm of the poses, where the run draws its experts; default: the expert of its environment.
 
     Raises:
       ValueError: see `PoseMapper.load` and `AnyArmMapper.load`.
@@ -244,7 +239,9 @@ def load_mapper(
     env = load_config(Path(run_dir)).env
     if not env.arms.are_drawn:
         return PoseMapper.load(run_dir, checkpoint)
-    return AnyArmMapper.load(run_dir, checkpoint).to(learner or env.learner)
+    return AnyArmMapper.load(run_dir, checkpoint).to(
+        learner or env.learner, expert if env.arms.expert == "drawn" else None
+    )
 
 
 def one_learner(env: EnvConfig) -> EnvConfig:
@@ -252,10 +249,20 @@ def one_learner(env: EnvConfig) -> EnvConfig:
     return dataclasses.replace(env, arms=ArmsConfig())
 
 
-def padded_poses(qpos: Float[Array, "*batch joints"]) -> Float[Array, "*batch 8"]:
-    """Poses with 0 in the slots of joints that an arm does not have."""
-    missing = MAX_JOINTS - qpos.shape[-1]
-    return jnp.concatenate([qpos, jnp.zeros((*qpos.shape[:-1], missing), qpos.dtype)], axis=-1)
+def _checked_slots(arm: ArmArrays, qpos: ArrayLike) -> Float[Array, "*batch 8"]:
+    """Poses of an arm as arrays, at home in the slots of joints that do not move.
+
+    Under `jax.jit` only the shape is checked.
+
+    Raises:
+      ValueError: poses of the wrong shape, or not finite.
+    """
+    poses = jnp.asarray(qpos, jnp.float32)
+    if poses.shape[-1:] != (MAX_JOINTS,):
+        raise ValueError(f"qpos: expected shape [..., {MAX_JOINTS}] for an expert as arrays, got {poses.shape}")
+    if not isinstance(poses, Tracer) and not np.all(np.isfinite(np.asarray(poses))):
+        raise ValueError("qpos: expected finite angles [rad], got some that are not")
+    return jnp.where(jnp.asarray(arm.is_free) > 0, poses, arm.home)
 
 
 def _single(values: ArrayLike) -> Array:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
+from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
 from mimic.any_arm.kinematics import (
     check_metric,
     correspondence,
@@ -30,6 +30,23 @@ from mimic.trainers.networks import Transformer
 Params = Any
 
 
+class ExpertPose(NamedTuple):
+    """An expert in a pose.
+
+    Attributes:
+      arm: the expert.
+      states: its link states at rest.
+    """
+
+    arm: ArmArrays
+    states: LinkStates
+
+
+def expert_pose(arm: ArmArrays, qpos: Float[Array, " joints"]) -> ExpertPose:
+    """An expert in the pose `qpos` [rad], which has an angle for each slot of a joint."""
+    return ExpertPose(arm, link_states(arm, qpos))
+
+
 class _Network(nn.Module):
     """Tokens of the learner's joints and links and of the expert's links -> numbers of each joint for each head."""
 
@@ -38,12 +55,14 @@ class _Network(nn.Module):
     heads: int
 
     @nn.compact
-    def __call__(self, joints: Array, links: Array, expert: Array, is_free: Array, has_link: Array) -> Array:
+    def __call__(
+        self, joints: Array, links: Array, expert: Array, is_free: Array, has_link: Array, has_expert_link: Array
+    ) -> Array:
         groups = []
         for name, group in (("joints", joints), ("links", links), ("expert", expert)):
             place = self.param(f"{name}_place", nn.initializers.normal(0.1), (group.shape[-2], self.width))
             groups.append(nn.Dense(self.width, name=name)(group) + place)
-        present = jnp.concatenate([is_free, has_link, jnp.ones_like(expert[..., 0])], axis=-1) > 0
+        present = jnp.concatenate([is_free, has_link, has_expert_link], axis=-1) > 0
         tokens = Transformer(self.width, self.layers)(jnp.concatenate(groups, axis=-2), present)
         outputs = nn.Dense(2 * self.heads, name="outputs")(tokens[..., :MAX_JOINTS, :])
         return jnp.moveaxis(outputs.reshape(*outputs.shape[:-1], self.heads, 2), -2, -3)
@@ -51,10 +70,12 @@ class _Network(nn.Module):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class AnyArmMapperModel:
-    """A mapper without its parameters: pure functions of one pose and one learner; batch with `jax.vmap`.
+    """A mapper without its parameters: pure functions of an expert's pose and a learner; batch with `jax.vmap`.
 
     Attributes:
-      expert: the arm that is imitated, as NumPy arrays.
+      expert: the arm that is imitated, as NumPy arrays; where experts are drawn, one of them.
+      expert_is_drawn: whether the network takes any expert. If not, it has a token for each of the expert's links;
+        if so, one for each slot of a link.
       weights: of the metric.
       width: of the network's tokens.
       layers: of its transformer.
@@ -63,6 +84,7 @@ class AnyArmMapperModel:
     """
 
     expert: ArmArrays
+    expert_is_drawn: bool
     weights: DistanceWeights
     width: int
     layers: int
@@ -74,20 +96,20 @@ class AnyArmMapperModel:
         return _Network(self.width, self.layers, self.heads)
 
     @functools.cached_property
-    def _expert_links(self) -> int:
-        return int(np.count_nonzero(self.expert.link_length))
+    def _expert_tokens(self) -> int:
+        return MAX_LINKS if self.expert_is_drawn else int(np.count_nonzero(self.expert.link_length))
 
     def init(self, key: Array) -> Params:
         """Random parameters."""
-        states = link_states(self.expert, jnp.zeros(MAX_JOINTS))
-        return self._network.init(key, *self._tokens(states, self.expert))
+        expert = expert_pose(self.expert, jnp.zeros(MAX_JOINTS))
+        return self._network.init(key, *self._tokens(expert, self.expert))
 
-    def candidates(self, params: Params, expert: LinkStates, learner: ArmArrays) -> Float[Array, "heads joints"]:
+    def candidates(self, params: Params, expert: ExpertPose, learner: ArmArrays) -> Float[Array, "heads joints"]:
         """The poses that the heads propose [rad]; locked joints stay at home.
 
         Args:
           params: parameters of the network.
-          expert: link states of the expert, [links, 3] with the slots of `ArmArrays`.
+          expert: the expert in its pose.
           learner: the learner.
         """
         outputs = self._network.apply(params, *self._tokens(expert, learner))
@@ -98,35 +120,35 @@ class AnyArmMapperModel:
         poses = jnp.where(jnp.isinf(angle_limits(learner)[0]), on_circle, within)
         return jnp.where(learner.is_free > 0, poses, learner.home)
 
-    def distance(self, expert: LinkStates, learner: ArmArrays, qpos: Float[Array, " joints"]) -> Float[Array, ""]:
+    def distance(self, expert: ExpertPose, learner: ArmArrays, qpos: Float[Array, " joints"]) -> Float[Array, ""]:
         """Embodiment distance between the expert's pose and a learner's, both at rest."""
-        metric = make_metric(self.weights, correspondence(self.expert, learner))
-        return metric(expert, link_states(learner, qpos))
+        metric = make_metric(self.weights, correspondence(expert.arm, learner))
+        return metric(expert.states, link_states(learner, qpos))
 
-    def distances(self, expert: LinkStates, learner: ArmArrays, poses: Float[Array, "n joints"]) -> Float[Array, " n"]:
+    def distances(self, expert: ExpertPose, learner: ArmArrays, poses: Float[Array, "n joints"]) -> Float[Array, " n"]:
         """Embodiment distances between the expert's pose and some of a learner's."""
         return jax.vmap(lambda qpos: self.distance(expert, learner, qpos))(poses)
 
     def refined(
-        self, params: Params, expert: LinkStates, learner: ArmArrays
+        self, params: Params, expert: ExpertPose, learner: ArmArrays
     ) -> tuple[Float[Array, "heads joints"], Float[Array, " heads"]]:
         """The proposed poses after the Newton steps, and their distances."""
-        matrix = correspondence(self.expert, learner)
+        matrix = correspondence(expert.arm, learner)
 
         def refine(qpos: Array) -> Array:
-            return nearest_pose(learner, self.weights, matrix, expert, qpos, self.refinements).qpos
+            return nearest_pose(learner, self.weights, matrix, expert.states, qpos, self.refinements).qpos
 
         poses = self.candidates(params, expert, learner)
         if self.refinements:
             poses = jax.vmap(refine)(poses)
         return poses, self.distances(expert, learner, poses)
 
-    def __call__(self, params: Params, expert: LinkStates, learner: ArmArrays) -> Float[Array, " joints"]:
+    def __call__(self, params: Params, expert: ExpertPose, learner: ArmArrays) -> Float[Array, " joints"]:
         """The nearest of the proposed poses."""
         poses, distances = self.refined(params, expert, learner)
         return poses[jnp.argmin(distances)]
 
-    def _tokens(self, expert: LinkStates, learner: ArmArrays) -> tuple[Array, ...]:
+    def _tokens(self, expert: ExpertPose, learner: ArmArrays) -> tuple[Array, ...]:
         """Features of each joint, of each link, and of each link of the expert, and which of them exist.
 
         The learner is described in its home pose. Lengths are in chain lengths; the place of a link on the chain is the
@@ -141,20 +163,21 @@ class AnyArmMapperModel:
         moved_by = jax.nn.one_hot(learner.link_joint, MAX_JOINTS, dtype=unit.dtype)
         links = [states.position, states.direction, _arcs(learner), moved_by]
         links = has_link[:, None] * jnp.concatenate([x for x in links if x is not None], axis=1)
-        features = [expert.position, expert.direction, _arcs(self.expert)]
-        of_expert = jnp.concatenate([x for x in features if x is not None], axis=1)[: self._expert_links]
-        return joints, links, of_expert, learner.is_free, has_link
+        features = [expert.states.position, expert.states.direction, _arcs(expert.arm)]
+        of_expert = jnp.concatenate([x for x in features if x is not None], axis=1)[: self._expert_tokens]
+        has_expert_link = jnp.asarray(expert.arm.link_length > 0, unit.dtype)[: self._expert_tokens]
+        return joints, links, of_expert, learner.is_free, has_link, has_expert_link
 
 
 def make_any_arm_model(env: EnvConfig, settings: AnyArmMapperSettings) -> AnyArmMapperModel:
-    """The untrained mapper of an environment's expert and metric.
+    """The untrained mapper of an environment's experts and metric.
 
     Raises:
       ValueError: an expert that cannot be loaded or has no arrays, or a metric other than of constant weights.
     """
     expert = arm_arrays(build_arm(env.expert, env.limits, env.metric.links)).astype(np.float32)
     sizes = settings.width, settings.layers, settings.heads, settings.refinements
-    return AnyArmMapperModel(expert, check_metric(env.metric), *sizes)
+    return AnyArmMapperModel(expert, env.arms.expert == "drawn", check_metric(env.metric), *sizes)
 
 
 def _arcs(arm: ArmArrays) -> Float[Array, "links 2"]:

@@ -22,12 +22,13 @@ from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.any_arm_evaluation import (
     METHODS,
     Mapped,
+    Pairs,
     Reference,
     best_poses,
     make_reference,
     mean_similarity,
     run_mapper,
-    table_of_arms,
+    table_of_pairs,
 )
 from mimic.trainers.pose_mapper.any_arm_model import make_any_arm_model
 from mimic.trainers.pose_mapper.any_arm_training import any_arm_objective, random_pose
@@ -39,12 +40,17 @@ _SEED = 2**20  # of these: a small one would be that of a training too
 _SPLITS = {"train": SEEN, "held_out": UNSEEN}  # the columns of a report: arms seen in training, and others
 _SIMILARITY_POSES = 32  # of each arm
 _DRAWN_ARMS = 16  # of the report, where the config names none that training sees
+# Parts of the report, by their key: each arm imitates the environment's expert, and another arm of its split.
+_ARMS_PART, _PAIRS_PART = "arms", "pairs"
+
+Outcome = Mapping[str, Mapped]  # by part of the report
 
 
 class AnyArmMapperTrainer(Trainer):
     """Trains a mapper to any arm, and compares it with the optimum on arms that it has seen and on others.
 
-    Both columns of the report are on the same poses of the expert, which are in no training.
+    Both columns of the report are on the same poses of the environment's expert, which are in no training. Where
+    experts are drawn too, each arm of a column also imitates the one before it.
 
     Args:
       config: the run's config.
@@ -69,38 +75,47 @@ class AnyArmMapperTrainer(Trainer):
         self._objective = any_arm_objective(self._model, sampler)
         self._arms = _arms_by_split(report_arms(config.env), sampler)
         counts = " and ".join(f"{len(self._arms[split])} {name}" for split, name in _SPLITS.items())
+        experts = "any arm" if self._model.expert_is_drawn else config.env.expert.model
         kind = "fresh arms and poses in each epoch" if self.settings.fresh else "training arms and poses"
         self.headline = (
-            f"{config.env.name}: {config.env.expert.model} to any arm, {self.settings.samples} {kind}, "
-            f"report on {counts} arms"
+            f"{config.env.name}: {experts} to any arm, {self.settings.samples} {kind}, report on {counts} arms"
         )
 
     @functools.cached_property
-    def _stacked_arms(self) -> ArmArrays:
+    def _arm_before(self) -> list[int]:
+        """Number of the arm before each one in its split; before the first is the last."""
+        indices, start = [], 0
+        for arms in self._arms.values():
+            indices += np.roll(np.arange(start, start + len(arms)), 1).tolist()
+            start += len(arms)
+        return indices
+
+    @functools.cached_property
+    def _pairs(self) -> dict[str, Pairs]:
+        """The arms and poses of each part of the report; all parts have the same shapes."""
         arms = [arm.astype(np.float32) for of_split in self._arms.values() for arm in of_split.values()]
-        return stack_arms(arms)
-
-    @functools.cached_property
-    def _expert_qpos(self) -> np.ndarray:
-        """The expert's poses [poses, joints] of the evaluation [rad]."""
+        experts = {_ARMS_PART: [self._model.expert] * len(arms)}
+        if self._model.expert_is_drawn:
+            experts[_PAIRS_PART] = [arms[i] for i in self._arm_before]
         keys = jax.random.split(_key(_HELD_OUT), self.settings.held_out_poses)
-        return np.asarray(jax.jit(jax.vmap(lambda key: random_pose(self._model.expert, key)))(keys))
-
-    @functools.cached_property
-    def _inputs(self) -> tuple[ArmArrays, np.ndarray]:
-        return self._stacked_arms, self._expert_qpos
+        draw = jax.jit(jax.vmap(jax.vmap(random_pose, (None, 0)), (0, None)))
+        stacked = {part: stack_arms(of_part) for part, of_part in experts.items()}
+        return {
+            part: Pairs(of_part, stack_arms(arms), np.asarray(draw(of_part, keys))) for part, of_part in stacked.items()
+        }
 
     @functools.cached_property
     def _evaluation(self) -> Background[Callable[..., Mapped]]:
-        return compiling(functools.partial(run_mapper, self._model), self.params_template(), *self._inputs)
+        return compiling(functools.partial(run_mapper, self._model), self.params_template(), self._pairs[_ARMS_PART])
 
     @functools.cached_property
     def _optimisation(self) -> Background[Callable[..., Reference]]:
-        return compiling(functools.partial(make_reference, self._model), _key(_GUESSES), *self._inputs)
+        return compiling(functools.partial(make_reference, self._model), _key(_GUESSES), self._pairs[_ARMS_PART])
 
     @functools.cached_property
-    def _reference(self) -> Reference:
-        return jax.device_get(self._optimisation()(_key(_GUESSES), *self._inputs))
+    def _reference(self) -> dict[str, Reference]:
+        optimise = self._optimisation()
+        return {part: jax.device_get(optimise(_key(_GUESSES), pairs)) for part, pairs in self._pairs.items()}
 
     def save_inputs(self, run_dir: Path) -> None:
         """Writes nothing, because arms and poses follow from the config and the seed."""
@@ -135,10 +150,11 @@ class AnyArmMapperTrainer(Trainer):
             restored=restored,
         )
 
-    def evaluate(self, params: Params) -> Mapped:
+    def evaluate(self, params: Params) -> Outcome:
         """The mapper's poses for the arms of the report."""
         _ = self._optimisation  # starts to compile it in parallel with the evaluation, if there was no training
-        return jax.device_get(self._evaluation()(params, *self._inputs))
+        evaluate = self._evaluation()
+        return {part: jax.device_get(evaluate(params, pairs)) for part, pairs in self._pairs.items()}
 
     def _by_split(self, values: np.ndarray) -> dict[str, np.ndarray]:
         """Values of the arms by split; without a split that has no arms."""
@@ -149,43 +165,56 @@ class AnyArmMapperTrainer(Trainer):
     def _means(self, values: np.ndarray) -> dict[str, float]:
         return {split: float(part.mean()) for split, part in self._by_split(values).items()}
 
-    def metrics(self, outcome: Mapped) -> Metrics:
-        """Means over the arms of a split, and the arm with the largest quality; see `table_of_arms`."""
-        table = table_of_arms(self._reference, outcome)
-        largest = {split: float(part.max()) for split, part in self._by_split(table["quality"]).items()}
+    def metrics(self, outcome: Outcome) -> Metrics:
+        """Means over the arms of a split, and the arm with the largest quality; see `table_of_pairs`.
+
+        Those of the environment's expert; where experts are drawn, those of the other experts are in `other_experts`.
+        """
+        parts = {part: self._part_metrics(part, mapped) for part, mapped in outcome.items()}
+        others = {"other_experts": parts[_PAIRS_PART]} if _PAIRS_PART in parts else {}
+        return parts[_ARMS_PART] | others
+
+    def _part_metrics(self, part: str, mapped: Mapped) -> Metrics:
+        table = table_of_pairs(self._reference[part], mapped)
+        largest = {split: float(values.max()) for split, values in self._by_split(table["quality"]).items()}
         return {**{name: self._means(column) for name, column in table.items()}, "quality_largest": largest}
 
-    def details(self, outcome: Mapped, controller: str = "mapper") -> Metrics:
-        """Similarity of the mapper, the optimum and random initial guesses; and the table of the arms."""
+    def details(self, outcome: Outcome, controller: str = "mapper") -> Metrics:
+        """Similarity of the mapper, the optimum and random initial guesses to the environment's expert; and tables."""
+        pairs, reference, mapped = self._pairs[_ARMS_PART], self._reference[_ARMS_PART], outcome[_ARMS_PART]
         poses = {
-            "mapper": outcome.qpos,
-            "nearest_poses": best_poses(self._reference, outcome),
-            "random_guesses": self._reference.guessed_qpos,
+            "mapper": mapped.qpos,
+            "nearest_poses": best_poses(reference, mapped),
+            "random_guesses": reference.guessed_qpos,
         }
         few = slice(_SIMILARITY_POSES)
         similarity = mean_similarity(
-            self._model.expert,
-            self._stacked_arms,
-            self._expert_qpos[few],
+            pairs._replace(expert_qpos=pairs.expert_qpos[:, few]),
             {name: np.asarray(qpos)[:, few] for name, qpos in poses.items()},
         )
         by_split = {
             name: {measure: self._means(values) for measure, values in measures.items()}
             for name, measures in similarity.items()
         }
-        return {"similarity": by_split, "arms": self._table(outcome)}
+        return {"similarity": by_split, **{part: self._table(part, mapped) for part, mapped in outcome.items()}}
 
-    def _table(self, outcome: Mapped) -> dict[str, dict[str, Any]]:
-        """The metrics of each arm by its name, with whether it was seen in training and its number of joints."""
-        columns = table_of_arms(self._reference, outcome)
-        names = [(split == "train", name, arm) for split, arms in self._arms.items() for name, arm in arms.items()]
+    def _table(self, part: str, mapped: Mapped) -> dict[str, dict[str, Any]]:
+        """The metrics of each learner by its name, with whether it was seen in training and its number of joints.
+
+        With other experts a name is that of the expert and that of the learner, as in "ur5e to panda".
+        """
+        columns = table_of_pairs(self._reference[part], mapped)
+        arms = [(split == "train", name, arm) for split, arms in self._arms.items() for name, arm in arms.items()]
+        names = [name for _, name, _ in arms]
+        if part == _PAIRS_PART:
+            names = [f"{names[expert]} to {name}" for expert, name in zip(self._arm_before, names, strict=True)]
         return {
             name: {
                 "seen": seen,
                 "joints": int(arm.is_free.sum()),
                 **{key: float(column[i]) for key, column in columns.items()},
             }
-            for i, (seen, name, arm) in enumerate(names)
+            for i, (name, (seen, _, arm)) in enumerate(zip(names, arms, strict=True))
         }
 
     def status(self, metrics: Metrics) -> str:
@@ -201,31 +230,34 @@ class AnyArmMapperTrainer(Trainer):
     def rows(self, metrics: Metrics) -> list[Row]:
         """Rows of the quality, of what it is compared with, and of the distances that define it."""
         steps = f"{self.settings.refinements} Newton steps"
+        guesses = f"  {self.settings.heads} random initial guesses, {steps}"
         rows: tuple[tuple[str, str, str], ...] = (
             ("above the optimum (0 best, 1 a random pose)", METHODS[0], "{:.2%}"),
             ("  the largest of an arm", "quality_largest", "{:.2%}"),
             ("  without Newton steps", METHODS[1], "{:.2%}"),
-            (f"  {self.settings.heads} random initial guesses, {steps}", METHODS[2], "{:.2%}"),
+            (guesses, METHODS[2], "{:.2%}"),
             (f"  home, {steps}", METHODS[3], "{:.2%}"),
             ("mean distance", "mean_distance", "{:.4f}"),
             ("  optimal poses", "optimal_distance", "{:.4f}"),
             ("  random poses", "random_distance", "{:.4f}"),
         )
+        of_others = (("other experts, above the optimum", *rows[0][1:]), *rows[1:2], (guesses, METHODS[2], "{:.2%}"))
         counts = [str(len(self._arms[split])) for split in _SPLITS]
-        cells = [
-            (label, _cell(metrics[key], "train", form), _cell(metrics[key], "held_out", form))
-            for label, key, form in rows
-        ]
+        cells = [_row(metrics, *row) for row in rows]
+        cells += [_row(metrics["other_experts"], *row) for row in of_others if "other_experts" in metrics]
         return [("number of arms", counts[0], counts[1]), *cells]
 
     def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
-        """Writes the table of the arms, its plot, and in a run directory a plot of the training."""
+        """Writes a table of each part, a plot of the arms, and in a run directory a plot of the training."""
         del controller
         from mimic.evaluation import mapper_arms_plot, plots  # imports matplotlib, which takes a second
 
-        table = self._table(outcome)
-        _write_table(folder / "arms.csv", table)
-        mapper_arms_plot.plot_mapper_arms(table, folder / "arms.png", self.settings.heads, title=self._name)
+        tables = {part: self._table(part, mapped) for part, mapped in outcome.items()}
+        for part, table in tables.items():
+            _write_table(folder / f"{part}.csv", table)
+        mapper_arms_plot.plot_mapper_arms(
+            tables[_ARMS_PART], folder / "arms.png", self.settings.heads, title=self._name
+        )
         labels = {"train": "arms seen in training", "held_out": "unseen arms"}
         plots.plot_training(folder, "quality", "above the optimum [%]", labels=labels, title=self._name)
 
@@ -248,6 +280,10 @@ def _key(purpose: int) -> jax.Array:
 def _cell(values: Mapping[str, float], split: str, form: str) -> str:
     """The value of a split as text; nothing where the split has no arms."""
     return form.format(values[split]) if split in values else ""
+
+
+def _row(metrics: Mapping[str, Any], label: str, key: str, form: str) -> Row:
+    return label, _cell(metrics[key], "train", form), _cell(metrics[key], "held_out", form)
 
 
 def _write_table(file: Path, table: Mapping[str, Mapping[str, Any]]) -> None:
