@@ -96,7 +96,7 @@ def _print_clearance(console: Console, env: EnvConfig, arm: Arm, demonstrations:
         capsules = fit_capsules(env.expert, env.limits)
     except ValueError:  # no geoms
         return
-    clearances = smallest_clearances(arm.embodiment, capsules, demonstrations.qpos)
+    clearances = smallest_clearances(arm.embodiment, capsules, demonstrations.qpos, env.world.floor_height)
     console.print(touching_line(clearances), soft_wrap=True, highlight=False)
 
 

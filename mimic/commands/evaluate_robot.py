@@ -52,7 +52,8 @@ def prepare_robot_evaluation(
     out = new_folder("out", config.out) if config.out else None
     steps = check_checkpoint(run_dir, config.checkpoint)
     world = env_config("panda7dof", world=config.robot_world).world if config.robot_world else trained.env.world
-    robot = robot_model(trained.env.learner, trained.env.world.floor_height)
+    floor_height = trained.env.world.floor_height  # where the robot stands, whatever its world is
+    world, robot = dataclasses.replace(world, floor_height=floor_height), robot_model(trained.env.learner, floor_height)
 
     def run() -> None:
         console = Console()

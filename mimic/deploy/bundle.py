@@ -14,7 +14,7 @@ from mimic.control.joint_control import MODES, PERIOD, JointParameters, action_s
 from mimic.control.limits import JointLimits
 from mimic.npz import read_arrays
 
-FORMAT = 1
+FORMAT = 2
 POLICY, FEATURES = "policy.onnx", "features.onnx"
 CLEARANCE, CONTROLLER, MOTIONS = "clearance.npz", "controller.json", "motions.npz"
 _MODELS = POLICY, FEATURES, CLEARANCE
@@ -148,11 +148,11 @@ def load_bundle(folder: str | Path) -> Bundle:
       ValueError: a file is missing, damaged or of another version, or does not fit the others; in one line.
     """
     folder = Path(folder).expanduser()
+    content = _controller(folder) if (folder / CONTROLLER).is_file() else {}
     missing = [name for name in (CONTROLLER, *_MODELS, MOTIONS) if not (folder / name).is_file()]
     if missing:
         raise ValueError(f"bundle: {str(folder)!r}: expected a folder of mimic.export with format=controller; it lacks "
                          f"{', '.join(missing)}")  # fmt: skip
-    content = _controller(folder)
     for name in _MODELS:
         if content["hashes"].get(name) != _sha256(folder / name):
             raise ValueError(f"bundle: {name}: expected the file that {CONTROLLER} was written for, got another one")
@@ -171,7 +171,10 @@ def _controller(folder: Path) -> dict[str, Any]:
         raise ValueError(f"bundle: {CONTROLLER}: expected JSON: {error}") from error
     keys = content if isinstance(content, dict) else {}
     if keys.get("format", FORMAT) != FORMAT:
-        raise ValueError(f"bundle: {CONTROLLER}: format: expected {FORMAT}, got {keys['format']!r:.40}")
+        raise ValueError(
+            f"bundle: {CONTROLLER}: format: expected {FORMAT}, got {keys['format']!r:.40}; export the run again, with "
+            "python -m mimic.export format=controller"
+        )
     missing = [key for key in _KEYS if key not in keys]
     if missing:
         raise ValueError(f"bundle: {CONTROLLER}: expected the keys {', '.join(_KEYS)}; missing {', '.join(missing)}")

@@ -37,7 +37,7 @@ class FakeRobot:
         self._qpos, self._limits = np.array(qpos, float), limits
         self._qvel, self._torque = np.zeros((2, len(self._qpos)))
         self._inertia, self._damping, self._is_paced = inertia, damping, is_paced
-        self._periods, self._started = 0, 0.0
+        self._periods, self._missed, self._started = 0, 0, 0.0
         self.states: list[RobotState] = []
 
     def read(self) -> RobotState:
@@ -45,7 +45,8 @@ class FakeRobot:
         if self._is_paced:
             self._wait()
         self._check()
-        state = RobotState(self._periods * PERIOD, self._qpos.copy(), self._qvel.copy(), self._torque.copy())
+        time_s = (self._periods + self._missed) * PERIOD
+        state = RobotState(time_s, self._qpos.copy(), self._qvel.copy(), self._torque.copy())
         self.states.append(state)
         return state
 
@@ -69,7 +70,8 @@ class FakeRobot:
         due = self._started + self._periods * PERIOD
         if now < due:
             time.sleep(due - now)
-        else:  # a period that was missed is not made up for
+        else:  # periods that were missed are counted, and not made up for
+            self._missed += int((now - due) / PERIOD)
             self._started = now - self._periods * PERIOD
 
     def _check(self) -> None:

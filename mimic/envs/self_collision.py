@@ -11,7 +11,7 @@ from mimic.retargeting.clearance import make_clearance
 
 
 def smallest_clearances(
-    arm: Embodiment, capsules: Capsules, qpos: Float[np.ndarray, "motions time joints"]
+    arm: Embodiment, capsules: Capsules, qpos: Float[np.ndarray, "motions time joints"], floor_height: float = 0.0
 ) -> Float[np.ndarray, " motions"]:
     """The smallest clearance of each motion [m], negative where capsules of links touch each other or the floor.
 
@@ -20,8 +20,9 @@ def smallest_clearances(
       capsules: from `fit_capsules`, of the same arm. They contain its shapes, so that a small negative clearance need
         not be a contact of the shapes.
       qpos: joint angles [rad].
+      floor_height: see `WorldConfig`.
     """
-    clearance = jax.jit(jax.vmap(make_clearance(arm, capsules)))
+    clearance = jax.jit(jax.vmap(make_clearance(arm, capsules, floor_height)))
     return np.stack([np.asarray(clearance(jnp.asarray(motion, jnp.float32))).min() for motion in qpos])
 
 

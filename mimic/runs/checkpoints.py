@@ -271,9 +271,14 @@ def _read_params(path: Path, template: Any) -> Any:
         raise DamagedCheckpoint(f"checkpoint {str(path)!r} cannot be read: {reason}") from error
     name = next(key for key in {**expected, **stored} if expected.get(key) != stored.get(key))
     raise ValueError(
-        f"checkpoint {str(path)!r} does not fit the config of its run: it has other arms or another network "
-        f"({name}: expected shape {expected.get(name)}, got {stored.get(name)})"
+        f"checkpoint {str(path)!r} does not fit the config of its run: it has other arms or another network, or "
+        f"is of another version of mimic ({name}: expected {_shape_text(expected.get(name))}, got "
+        f"{_shape_text(stored.get(name))})"
     )
+
+
+def _shape_text(shape: tuple[int, ...] | None) -> str:
+    return "no such array" if shape is None else f"shape {shape}"
 
 
 def _checkpointer() -> ocp.Checkpointer:

@@ -46,6 +46,7 @@ def test_the_kernel_equals_the_looped_form(x64, interpreted, batch):
     assert not np.asarray(actual[1])[rests].any()
 
 
+@pytest.mark.slow
 def test_single_precision(interpreted, batch):
     """With polynomials for cosines and sines, against double precision."""
     with jax.enable_x64(True):

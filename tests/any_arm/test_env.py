@@ -125,6 +125,7 @@ def compared(config, motions):
     return AnyArmEnv(dataclasses.replace(config, arms=arms), random_arm, motions[0])
 
 
+@pytest.mark.slow
 def test_a_relative_reward_compares_with_the_zero_action(compared, four_joints, zero_actions):
     """The zero action itself has no reward; others have that of their distance and of that of `zero_actions`."""
     step, still = jax.jit(compared.step), jnp.zeros(compared.action_size)
@@ -229,6 +230,7 @@ def test_an_action_of_another_length_is_rejected(env, four_joints):
         env.step(state, jnp.zeros(MAX_JOINTS - 1))
 
 
+@pytest.mark.slow
 def test_arms_that_are_not_done_go_on_as_without_a_restart(env, zero_actions):
     """Training restarts in each step the arms that are done; the others must be those of an evaluation."""
     some = jax.tree.map(lambda x: x[:, 3], zero_actions)
@@ -239,6 +241,7 @@ def test_arms_that_are_not_done_go_on_as_without_a_restart(env, zero_actions):
     np.testing.assert_allclose(now.goals.others, before.goals.others, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_observations_know_nothing_of_the_expert_after_the_next_step(env, four_joints):
     def observed(env):
         start = env.at_step(env.start_of(four_joints, 0, jax.random.PRNGKey(0)), 5)

@@ -30,6 +30,7 @@ def test_registered_environments_of_many_arms_are_made_too(own_registry):
     assert isinstance(mimic.make("few", **SMALL), AnyArmEnv)
 
 
+@pytest.mark.slow
 def test_brax_wraps_it_for_training():
     env = mimic.make("panda_family", **SMALL)
     wrapped = wrap_for_training(env, 6)

@@ -99,6 +99,7 @@ def test_some_arguments_may_be_common_to_the_batch(mixed):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_and_those_of_finite_differences(x64, mixed):
     """Of each argument, for a batch: locked joints and empty slots give 0 and never NaN."""
     advance = make_advance(TIMESTEP, 3)

@@ -174,6 +174,7 @@ def test_a_description_needs_a_file_for_it(rejected, tmp_path):
     assert "out: expected a file .json or .npz for the description of learner=panda" in message
 
 
+@pytest.mark.slow
 def test_jax_reads_a_mapper_to_any_arm(tmp_path):
     pytest.importorskip("flatbuffers")
     from jax import export

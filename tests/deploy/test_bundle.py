@@ -67,7 +67,11 @@ BROKEN = {
     "no folder": (lambda folder: (folder / "policy.onnx").unlink(), "expected a folder of mimic.export"),
     "no JSON": (lambda folder: (folder / "controller.json").write_text("{"), "controller.json: expected JSON"),
     "no key": (lambda folder: (folder / "controller.json").write_text("{}"), "missing format, mimic_version"),
-    "another format": (lambda folder: changed(folder, format=2), "format: expected 1, got 2"),
+    "another format": (lambda folder: changed(folder, format=1), "format: expected 2, got 1; export the run again"),
+    "another format with other files": (
+        lambda folder: (changed(folder, format=1), (folder / "features.onnx").unlink()),
+        "format: expected 2, got 1; export the run again",
+    ),
     "another network": (lambda folder: (folder / "policy.onnx").write_bytes(b"x"), "policy.onnx: expected the file"),
     "another clearance": (
         lambda folder: (folder / "clearance.npz").write_bytes(b"x"),

@@ -53,6 +53,26 @@ def test_a_check_has_the_clearance_of_the_whole_path(layer):
     np.testing.assert_allclose(layer._path_clearance[:, 0], layer._clearance(poses), atol=1e-6)
 
 
+def test_a_path_that_is_checked_in_part_is_rejected(layer):
+    layer._steps -= 1  # the check does not come to the end of the path
+    references = run(layer, velocity(0, 0.5))
+    assert layer.counts[COLLISION][0] == 1 and all(reference.qvel[0, 0] == 0 for reference in references)
+
+
+def test_a_path_whose_clearance_is_unknown_is_rejected(layer):
+    known, calls = layer._clearance, []
+
+    def once_unknown(poses):
+        calls.append(len(poses))
+        clearance = known(poses)
+        return np.where(np.arange(len(clearance)) == 1, np.nan, clearance) if len(calls) == 5 else clearance
+
+    layer._clearance = once_unknown
+    references = run(layer, velocity(0, 0.5))
+    assert len(calls) > 5 and layer.counts[COLLISION][0] == 1
+    assert all(reference.qvel[0, 0] == 0 for reference in references)
+
+
 def test_an_accepted_target_moves_the_arm(layer):
     references = run(layer, velocity(0, 0.5), ticks=20)
     assert references[-1].qvel[0, 0] == pytest.approx(0.5 * bundles.parameters().velocity[0], rel=1e-3)

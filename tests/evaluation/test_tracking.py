@@ -26,6 +26,7 @@ def test_it_is_much_nearer_than_the_start_pose(control):
     assert 1 <= setting["lead_ticks"] <= 3
 
 
+@pytest.mark.slow
 def test_delays_need_a_longer_lead_and_cost_more_if_the_reference_is_late_too():
     evaluator = make_evaluator(world="hardware", horizon=60)
     (known, lead), (late, late_lead) = (run_tracking(evaluator, is_delayed=is_delayed) for is_delayed in (False, True))

@@ -109,6 +109,7 @@ def test_the_mapper_to_any_arm_reaches_its_recorded_distance_on_unseen_locks(any
     assert all(row["quality"] < row["quality_random_guesses"] for row in recorded.values())
 
 
+@pytest.mark.slow
 def test_the_mapper_to_any_arm_is_near_the_optimum_of_three_locked_joints(any_arm):
     lower, upper = np.asarray(any_arm.expert.joint_range).T
     poses = np.random.default_rng(0).uniform(lower, upper, (64, 7)).astype(np.float32)

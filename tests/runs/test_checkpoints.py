@@ -164,7 +164,7 @@ def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path):
 
 def test_another_network_is_named(run_dir):
     other = {"layer": {**PARAMS["layer"], "kernel": np.zeros((2, 4), np.float32)}}
-    with pytest.raises(ValueError, match=r"another network \(layer.kernel: expected shape \(2, 4\), got \(2, 3\)\)"):
+    with pytest.raises(ValueError, match=r"layer.kernel: expected shape \(2, 4\), got shape \(2, 3\)\)"):
         load_checkpoint(run_dir, other)
 
 

@@ -156,6 +156,7 @@ def test_the_nearest_head_is_taken_and_locked_joints_stay(mapper):
     assert result.shape == (MAX_JOINTS,) and result[3] == arm.home[3] and result[7] == 0
 
 
+@pytest.mark.slow
 def test_a_batch_of_arms_is_mapped_by_vmap(mapper):
     arms = [lock_joints(mapper.arrays("panda"), row) for row in np.eye(MAX_JOINTS)[:3]]
     qpos = poses(2)

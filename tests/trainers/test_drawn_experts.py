@@ -60,6 +60,7 @@ def poses(count, joints, seed=0):
     return np.random.default_rng(seed).uniform(-2, 2, (count, joints)).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_an_expert_is_the_same_in_all_its_forms(mapper):
     """A config, the arm that it builds, and arrays with angles in all slots, those of locked joints ignored."""
     qpos = poses(5, 4)
