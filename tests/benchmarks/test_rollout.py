@@ -23,6 +23,7 @@ def test_compilation_is_apart_and_memory_is_known():
     assert set(timing.summary()) == {"compile_s", "median_ms", "spread"}
 
 
+@pytest.mark.slow
 def test_only_the_cases_asked_for_are_measured():
     rows = list(rollout.run(["panda4dof"], [16], ["fused", "reward", "observation", "C MuJoCo, all cores"]))
     assert [(row["group"], row["case"]) for row in rows] == [

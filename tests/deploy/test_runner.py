@@ -16,7 +16,7 @@ from mimic.control.joint_control import Reference
 from mimic.deploy.driver import RobotAbort
 from mimic.deploy.fake_robot import FakeRobot
 from mimic.deploy.policy_process import LocalPolicy, PolicyProcess
-from mimic.deploy.runner import run_controller
+from mimic.deploy.runner import missed_periods, run_controller
 from mimic.deploy.safety import COLLISION, INVALID, LATE, REPEATED
 from tests.helpers import bundles
 from tests.helpers.repository import REPOSITORY
@@ -195,3 +195,12 @@ def test_a_policy_that_cannot_start_is_an_error(tmp_path):
     with pytest.raises(RuntimeError, match="policy: expected its process to be ready"):
         PolicyProcess(bundle, 0)
     assert time.monotonic() - started < 25  # as soon as it has ended
+
+
+def test_missed_periods_are_counted_by_the_clock(bundle):
+    robot = FakeRobot(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0, is_paced=True)
+    for period in range(6):
+        robot.read()
+        robot.write(np.zeros(7))
+        time.sleep(0.0045 if period == 3 else 0.0)
+    assert missed_periods(robot.states) >= 3

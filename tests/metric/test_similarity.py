@@ -127,6 +127,7 @@ def test_frechet_distance_is_that_of_its_definition():
         np.testing.assert_allclose(similarity.frechet_distance(*in_jax), expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_at_a_match():
     qpos = random_poses(panda(), 1)[0]
 

@@ -113,6 +113,7 @@ def test_more_starts_change_nothing(name):
     np.testing.assert_allclose(closest.distance, more, rtol=0.005, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_starts_iterations_and_seed_reach_the_search():
     """After one iteration the result depends on the initial guesses: more of them lower it by 3 %."""
     expert, learner = planar_arm([1 / 4] * 4), planar_arm([1 / 3] * 3)

@@ -118,6 +118,7 @@ def test_a_resumed_run_is_that_of_one_without_an_interruption(trained, tmp_path)
     assert not np.array_equal(*(jax.tree.leaves(x.params)[0] for x in (whole, AnyArmMapper.load(trained[0]))))
 
 
+@pytest.mark.slow
 def test_poses_of_a_learner_have_its_joints(mapper):
     qpos = poses(6)
     locked = mimic.ArmConfig(locked=["joint2"])
