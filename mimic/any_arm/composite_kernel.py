@@ -202,7 +202,7 @@ class _Elimination:
                 self._matrix[i][j] = plus(self._matrix[i][j], times(factor, row[j]))
 
     def solution(self) -> tuple[Scalar, ...]:
-        """X, after all rows."""
+        """The solution x; call it after all rows."""
         solution: list[Scalar] = []
         for value, factors in zip(self._scaled, self._factors, strict=True):
             for factor, x in zip(factors, solution, strict=True):

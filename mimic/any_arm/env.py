@@ -227,7 +227,8 @@ class AnyArmEnv(Env):
         assert before.baseline is not None
         expert, metric = self.expert_at(before.demonstration, before.step + 1), self.metric_of(before.arm)
         goals = before.goals.goal, before.baseline.goals.goal
-        return jnp.minimum(*(metric(expert, link_states(before.arm, goal.qpos, goal.qvel)) for goal in goals))
+        own, baseline = (metric(expert, link_states(before.arm, goal.qpos, goal.qvel)) for goal in goals)
+        return jnp.fmin(own, baseline)  # a baseline that ran away may be NaN, and must not end the training
 
     def torque(self, state: AnyArmState, action: Float[Array, " actions"]) -> Float[Array, " joints"]:
         """The torque of an action [N m]."""

@@ -146,6 +146,14 @@ def test_a_relative_reward_compares_with_the_zero_action(compared, four_joints, 
     assert size > 0.01
 
 
+def test_a_baseline_that_ran_away_leaves_the_reward_finite(compared, four_joints):
+    start = compared.start_of(four_joints, 0, jax.random.PRNGKey(0))
+    assert start.baseline is not None
+    lost = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), start.baseline.goals)
+    start = dataclasses.replace(start, baseline=dataclasses.replace(start.baseline, goals=lost))
+    assert np.isfinite(jax.jit(compared._nearest)(start))
+
+
 def test_observations_have_their_size_and_are_bounded(env, zero_actions):
     observation = np.asarray(zero_actions.obs)
     assert observation.shape == (COUNT, HORIZON, env.observation_size)

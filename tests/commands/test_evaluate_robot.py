@@ -207,7 +207,7 @@ def test_tracking_on_virtual_robots(hardware_run, tmp_path):
 
 @pytest.mark.slow
 def test_tracking_is_the_same_on_a_virtual_robot_as_in_the_environment(tmp_path):
-    """Of nominal worlds; on a virtual robot an action acts 20 ms later."""
+    """Of nominal worlds, where nothing is random."""
     run = untrained(tmp_path / "run", world="nominal", control="joint_position")
     row = evaluate(run, tmp_path / "virtual", controller="tracking")["cases"]["all ranges"]
     prepare_evaluation(

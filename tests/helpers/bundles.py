@@ -41,9 +41,7 @@ def panda_clearance(locked: tuple[int, ...] = ()) -> ClearanceConstants:
 def parameters(locked: tuple[int, ...] = ()) -> JointParameters:
     """The parameters of the inner loop of a Panda in the hardware world."""
     config = env_config("panda7dof", world="hardware", learner={"locked": list(locked)})
-    joints = panda(locked).embodiment.num_joints
-    padded = make_plant(config, panda(locked)).constants.parameters
-    return JointParameters(*(np.asarray(x, float)[:joints] for x in padded))
+    return JointParameters(*(np.asarray(x, float) for x in make_plant(config, panda(locked)).constants.parameters))
 
 
 def policy(joints: int, size: int, action: Any) -> bytes:
