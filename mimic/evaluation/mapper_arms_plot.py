@@ -16,18 +16,18 @@ _FLOOR = 0.01  # per cent: smaller values are drawn here
 _INCHES, _MIN_INCHES = 0.17, 3.0  # width of a column and of a part
 
 
-def plot_mapper_arms(table: Mapping[str, Mapping[str, Any]], out: Path, heads: int, *, title: str) -> None:
+def plot_mapper_arms(table: Mapping[str, Mapping[str, Any]], out: Path, guesses: int, *, title: str) -> None:
     """Plots how far each arm is above the optimum: by the mapper, its proposals, and Newton steps without a network.
 
     Args:
       table: metrics of each arm by its name, and whether it was `seen` in training, see `AnyArmMapperTrainer`.
       out: file of the plot.
-      heads: number of poses that the mapper proposes.
+      guesses: number of random guesses that the mapper is compared with.
       title: of the plot.
     """
     series = {  # label, marker, colour
         "quality_from_home": ("Newton steps from home", "v", "tab:green"),
-        "quality_random_guesses": (f"Newton steps from {heads} random guesses", "^", "tab:orange"),
+        "quality_random_guesses": (f"Newton steps from {guesses} random guesses", "^", "tab:orange"),
         "quality_proposed": ("mapper, without Newton steps", "o", "lightsteelblue"),
         "quality": ("mapper, with Newton steps", "o", "tab:blue"),
     }

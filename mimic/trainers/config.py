@@ -305,7 +305,8 @@ MAPPER_PRESETS: dict[str, dict[str, Any]] = {
         "width": 128,
         "layers": 3,
         "heads": 8,
-        "refinements": 4,
+        "guesses": 8,
+        "refinements": 8,
         "samples": 262_144,
         "batch_size": 2048,
         "fresh": True,
@@ -322,7 +323,8 @@ MAPPER_PRESETS: dict[str, dict[str, Any]] = {
         "width": 64,
         "layers": 2,
         "heads": 8,
-        "refinements": 4,
+        "guesses": 8,
+        "refinements": 8,
         "samples": 65_536,
         "batch_size": 512,
         "fresh": True,
@@ -337,7 +339,8 @@ MAPPER_PRESETS: dict[str, dict[str, Any]] = {
 }
 _ONE_LEARNER_PRESETS, _ANY_ARM_PRESETS = ("paper", "large"), ("any_arm", "any_arm_cpu")
 # Fields that apply only to the network of one learner, and only to that of any arm.
-_OF_ONE_LEARNER, _OF_ANY_ARM = ("inputs", "outputs", "hidden_layers", "activation"), ("width", "layers", "refinements")
+_OF_ONE_LEARNER = ("inputs", "outputs", "hidden_layers", "activation")
+_OF_ANY_ARM = ("width", "layers", "guesses", "refinements")
 ATTENTION_HEADS = 4  # of each layer of the network of any arm
 MAPPER_INPUTS, MAPPER_OUTPUTS, ACTIVATIONS = ("angles", "link_states"), ("tanh", "circle"), ("leaky_relu", "gelu")
 
@@ -347,9 +350,9 @@ class PoseMapperConfig(TrainerConfig):
     """The neural pose mapper. A field that is None takes its value from the preset.
 
     If the environment draws its learner (`env.arms`), one network maps to all of these arms: see
-    `mimic.trainers.pose_mapper.any_arm_model`. It has `width`, `layers` and `refinements`, and neither `inputs`,
-    `outputs`, `hidden_layers`, `activation` nor `dropout`. A training pose is then a pose of the expert and an arm, and
-    with `env.arms.expert=drawn` the expert is another arm for each pose too.
+    `mimic.trainers.pose_mapper.any_arm_model`. It has `width`, `layers`, `guesses` and `refinements`, and neither
+    `inputs`, `outputs`, `hidden_layers`, `activation` nor `dropout`. A training pose is then a pose of the expert and
+    an arm, and with `env.arms.expert=drawn` the expert is another arm for each pose too.
 
     Attributes:
       name: "pose_mapper".
@@ -363,7 +366,9 @@ class PoseMapperConfig(TrainerConfig):
       activation: "leaky_relu" (paper) or "gelu".
       width: of a token of the network of any arm; a multiple of 4.
       layers: transformer layers of the network of any arm.
-      refinements: Newton steps from each pose that the network of any arm proposes; training has none.
+      guesses: number of constant random poses of the learner, which the mapper to any arm improves beside those of its
+        network.
+      refinements: Newton steps of the mapper to any arm from each of these poses; training has none.
       samples: poses in an epoch.
       batch_size: poses in a minibatch; must divide samples.
       fresh: whether each epoch draws new random poses; otherwise all epochs have the same poses, shuffled.
@@ -396,6 +401,7 @@ class PoseMapperConfig(TrainerConfig):
     activation: str | None = None
     width: int | None = number(None, at_least=4, at_most=2**14)
     layers: int | None = number(None, at_least=1, at_most=100)
+    guesses: int | None = number(None, at_least=0, at_most=1000)
     refinements: int | None = number(None, at_least=0, at_most=1000)
     samples: int | None = number(None, at_least=1, at_most=10**9)
     batch_size: int | None = number(None, at_least=1, at_most=10**9)
@@ -503,6 +509,7 @@ class AnyArmMapperSettings(PoseMapperConfig):
     heads: int = MISSING
     width: int = MISSING
     layers: int = MISSING
+    guesses: int = MISSING
     refinements: int = MISSING
     samples: int = MISSING
     batch_size: int = MISSING

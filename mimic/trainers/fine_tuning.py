@@ -55,7 +55,8 @@ def with_only_arm(env: EnvConfig, model: str) -> EnvConfig:
       env: the environment of a run of many arms.
       model: the arm, see `ArmConfig.model`.
     """
-    arms = ArmsConfig(locked=1.0, most_locked=0, armature=env.arms.armature, damping=env.arms.damping)
+    kept = {key: getattr(env.arms, key) for key in ("reward", "armature", "damping")}
+    arms = ArmsConfig(locked=1.0, most_locked=0, **kept)
     learner = arm_of(env, model)
     return dataclasses.replace(env, name=f"{env.name}-{arm_name(learner)}", arms=arms, learner=learner)
 

@@ -65,6 +65,7 @@ def test_a_mapper_to_any_arm_is_stored_without_the_files_of_its_report(tmp_path)
         "width": 16,
         "layers": 1,
         "heads": 2,
+        "guesses": 1,
         "refinements": 1,
         "samples": 64,
         "batch_size": 32,

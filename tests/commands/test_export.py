@@ -122,7 +122,7 @@ def test_an_onnx_pose_mapper_equals_the_mapper(tmp_path, name, preset, metric):
 def any_arm_run(run_dir, expert="fixed"):
     """A run whose mapper to any arm has random weights."""
     env = mimic.env_config("any_arm", arms={"expert": expert})
-    config = PoseMapperConfig(width=16, layers=1, heads=2, refinements=2).resolve_any_arm()
+    config = PoseMapperConfig(width=16, layers=1, heads=2, guesses=1, refinements=2).resolve_any_arm()
     params = make_any_arm_model(env, config).init(jax.random.key(3))
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env, config))

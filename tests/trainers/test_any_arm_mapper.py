@@ -28,7 +28,7 @@ from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
 from mimic.trainers.pose_mapper.any_arm_training import any_arm_objective, random_pose
 
 TINY: dict[str, Any] = {
-    "width": 16, "layers": 1, "heads": 2, "refinements": 1, "samples": 64, "batch_size": 32, "epochs": 2,
+    "width": 16, "layers": 1, "heads": 2, "guesses": 1, "refinements": 1, "samples": 64, "batch_size": 32, "epochs": 2,
     "evaluations": 2, "validation_poses": 8, "held_out_poses": 2,
 }  # fmt: skip
 FEW_ARMS = {"locked": 1.0, "most_locked": 1, "unseen": ["2", "5", "1+4"]}
@@ -290,6 +290,14 @@ def test_runs_of_the_other_kind_are_rejected(trained, tmp_path):
 @pytest.mark.slow
 def test_two_minutes_of_training_are_better_than_random_guesses(tmp_path):
     """On arms seen in training; 130,000 samples, an eighth of the preset's width."""
-    settings = {"width": 32, "layers": 2, "heads": 8, "refinements": 4, "samples": 8192, "batch_size": 256}
+    settings = {
+        "width": 32,
+        "layers": 2,
+        "heads": 8,
+        "guesses": 0,
+        "refinements": 4,
+        "samples": 8192,
+        "batch_size": 256,
+    }
     report = train(tmp_path / "run", **settings, epochs=16, held_out_poses=16)
     assert report["quality"]["train"] < report["quality_random_guesses"]["train"]

@@ -28,7 +28,7 @@ from mimic.trainers.pose_mapper.any_arm_training import any_arm_objective
 from mimic.trainers.run_config import save_config
 
 TINY: dict[str, Any] = {
-    "width": 16, "layers": 1, "heads": 2, "refinements": 1, "samples": 64, "batch_size": 32, "epochs": 1,
+    "width": 16, "layers": 1, "heads": 2, "guesses": 1, "refinements": 1, "samples": 64, "batch_size": 32, "epochs": 1,
     "evaluations": 1, "validation_poses": 8, "held_out_poses": 2,
 }  # fmt: skip
 DRAWN = {"expert": "drawn", "locked": 1.0, "most_locked": 1, "unseen": ["2", "5", "1+4"]}

@@ -41,7 +41,8 @@ class Reference(NamedTuple):
     Attributes:
       optimal_distance, optimal_qpos: nearest of the poses after 16 Newton steps from 64 random initial guesses and
         home.
-      guessed_distance, guessed_qpos: the same from as many guesses as the mapper has heads, with its Newton steps.
+      guessed_distance, guessed_qpos: the same from as many other random guesses as the mapper has initial poses, with
+        its Newton steps.
       home_distance: after the mapper's Newton steps from home.
       random_distance: mean of random poses.
     """
@@ -59,7 +60,7 @@ class Mapped(NamedTuple):
 
     Attributes:
       distance, qpos: the mapper's result.
-      proposed_distance: nearest of its proposals, before the Newton steps.
+      proposed_distance: nearest of the poses of its heads, before the Newton steps.
     """
 
     distance: Float[Any, "pairs poses"]
@@ -71,14 +72,15 @@ def make_reference(model: AnyArmMapperModel, key: Array, pairs: Pairs) -> Refere
     """Poses without a network.
 
     Args:
-      model: defines metric, number of heads and Newton steps.
+      model: defines metric, number of initial poses and Newton steps.
       key: of the random initial guesses, which are the same for all poses of the expert.
       pairs: the arms and the experts' poses.
     """
+    starts = model.heads + model.guesses
 
     def of_pair(pair: Pairs) -> Reference:
         arm = pair.learners
-        guesses = jax.vmap(lambda key: random_pose(arm, key))(jax.random.split(key, max(_GUESSES, model.heads)))
+        guesses = jax.vmap(lambda key: random_pose(arm, key))(jax.random.split(key, max(_GUESSES, starts)))
         initial = jnp.concatenate([guesses, arm.home[None]])
 
         def of_pose(qpos: Array) -> Reference:
@@ -86,7 +88,7 @@ def make_reference(model: AnyArmMapperModel, key: Array, pairs: Pairs) -> Refere
             path = _newton_path(model, expert, arm, initial, max(_STEPS, model.refinements))
             optimum = _nearest(model, expert, arm, path[-1])
             few_steps = path[model.refinements]
-            guessed = _nearest(model, expert, arm, few_steps[: model.heads])
+            guessed = _nearest(model, expert, arm, few_steps[:starts])
             home = model.distance(expert, arm, few_steps[-1])
             return Reference(*optimum, *guessed, home, model.distances(expert, arm, guesses).mean())
 
@@ -99,8 +101,9 @@ def run_mapper(model: AnyArmMapperModel, params: Params, pairs: Pairs) -> Mapped
     """The mapper's poses for all pairs and poses; see `make_reference`."""
 
     def of_pose(expert: ExpertPose, arm: ArmArrays) -> Mapped:
-        proposed = model.candidates(params, expert, arm)
-        path = _newton_path(model, expert, arm, proposed, model.refinements)
+        initial = model.initial_poses(params, expert, arm)
+        path = _newton_path(model, expert, arm, initial, model.refinements)
+        proposed = initial[: model.heads]
         return Mapped(*_nearest(model, expert, arm, path[-1]), model.distances(expert, arm, proposed).min())
 
     def of_pair(pair: Pairs) -> Mapped:

@@ -80,7 +80,8 @@ class AnyArmMapperModel:
       width: of the network's tokens.
       layers: of its transformer.
       heads: number of poses that it proposes.
-      refinements: Newton steps from each proposed pose.
+      guesses: number of constant random poses beside them: what is proposed for an arm is often near one minimum only.
+      refinements: Newton steps from each of these poses.
     """
 
     expert: ArmArrays
@@ -89,6 +90,7 @@ class AnyArmMapperModel:
     width: int
     layers: int
     heads: int
+    guesses: int
     refinements: int
 
     @functools.cached_property
@@ -129,22 +131,31 @@ class AnyArmMapperModel:
         """Embodiment distances between the expert's pose and some of a learner's."""
         return jax.vmap(lambda qpos: self.distance(expert, learner, qpos))(poses)
 
+    def initial_poses(
+        self, params: Params, expert: ExpertPose, learner: ArmArrays
+    ) -> Float[Array, "heads+guesses joints"]:
+        """Where the Newton steps start [rad]: the poses of the heads, then those that do not depend on the expert."""
+        lower, upper = learner.joint_range[:, 0], learner.joint_range[:, 1]
+        shares = np.random.default_rng(0).uniform(size=(self.guesses, MAX_JOINTS)).astype(np.float32)
+        guesses = jnp.where(learner.is_free > 0, lower + shares * (upper - lower), learner.home)
+        return jnp.concatenate([self.candidates(params, expert, learner), guesses])
+
     def refined(
         self, params: Params, expert: ExpertPose, learner: ArmArrays
-    ) -> tuple[Float[Array, "heads joints"], Float[Array, " heads"]]:
-        """The proposed poses after the Newton steps, and their distances."""
+    ) -> tuple[Float[Array, "heads+guesses joints"], Float[Array, " heads+guesses"]]:
+        """The initial poses after the Newton steps, and their distances."""
         matrix = correspondence(expert.arm, learner)
 
         def refine(qpos: Array) -> Array:
             return nearest_pose(learner, self.weights, matrix, expert.states, qpos, self.refinements).qpos
 
-        poses = self.candidates(params, expert, learner)
+        poses = self.initial_poses(params, expert, learner)
         if self.refinements:
             poses = jax.vmap(refine)(poses)
         return poses, self.distances(expert, learner, poses)
 
     def __call__(self, params: Params, expert: ExpertPose, learner: ArmArrays) -> Float[Array, " joints"]:
-        """The nearest of the proposed poses."""
+        """The nearest of the poses after the Newton steps."""
         poses, distances = self.refined(params, expert, learner)
         return poses[jnp.argmin(distances)]
 
@@ -176,7 +187,7 @@ def make_any_arm_model(env: EnvConfig, settings: AnyArmMapperSettings) -> AnyArm
       ValueError: an expert that cannot be loaded or has no arrays, or a metric other than of constant weights.
     """
     expert = arm_arrays(build_arm(env.expert, env.limits, env.metric.links)).astype(np.float32)
-    sizes = settings.width, settings.layers, settings.heads, settings.refinements
+    sizes = settings.width, settings.layers, settings.heads, settings.guesses, settings.refinements
     return AnyArmMapperModel(expert, env.arms.expert == "drawn", check_metric(env.metric), *sizes)
 
 

@@ -72,8 +72,8 @@ class OnePairModel:
     def _expert_pose(self, qpos: Array) -> ExpertPose:
         return expert_pose(self.expert_arm.arrays, self.expert_arm.in_slots(qpos))
 
-    def candidates(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, "heads learner_joints"]:
-        """The poses of the heads after the Newton steps [rad]."""
+    def candidates(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, "poses learner_joints"]:
+        """All poses after the Newton steps [rad]."""
         learner = self.learner_arm
         return self.mapper.refined(params, self._expert_pose(qpos), learner.arrays)[0][:, learner.joints]
 
@@ -83,6 +83,6 @@ class OnePairModel:
         return self.mapper.distance(self._expert_pose(qpos), learner.arrays, learner.in_slots(learner_qpos))
 
     def __call__(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, " learner_joints"]:
-        """The nearest of the poses of the heads."""
+        """The nearest of the poses after the Newton steps."""
         learner = self.learner_arm
         return self.mapper(params, self._expert_pose(qpos), learner.arrays)[learner.joints]
