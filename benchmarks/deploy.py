@@ -1,10 +1,10 @@
 """Times of `mimic.deploy` on one core: `python -m benchmarks.deploy [--out FILE] [--bundle FOLDER] [--motions N]`.
 
-A period of the inner loop lasts 1 ms. What is timed is what it computes from a state to the end of the period: torque,
-checks of the measurement, and a part of the check of a target. The policy is timed in its own process on the same core,
-from an observation to the answer, at the rate at which the inner loop asks it. Wall times include what other processes
-on the core cost; CPU times do not, but for what those evict from the caches. The last row is a loop of Python alone,
-which is as long each time: what its p99.9 is above its p50 is the machine's.
+A period of the inner loop lasts 1 ms. It is timed from a state to its torque, with the checks of the measurement, which
+is what a robot waits for; and to the end of its computation, with a part of the check of a target. The policy is timed
+in its own process on the same core, from an observation to the answer, at the rate at which the inner loop asks it.
+Wall times include what other processes on the core cost; CPU times do not, but for what those evict from the caches.
+The last row is a loop of Python alone, which is as long each time: what its p99.9 is above its p50 is the machine's.
 """
 
 import dataclasses
@@ -77,12 +77,15 @@ class _Times:
 
 def _row(what: str, times: _Times, **more: int) -> Row:
     names, wall = ("p50", "p99", "p999"), times.wall
-    wall_ms, cpu_ms = (1e3 * np.percentile(values, _PERCENTILES) for values in (wall, times.cpu))
+    seconds = {"wall": wall, **({"cpu": times.cpu} if times.cpu else {})}
     return {
         "what": what,
         "count": len(wall),
-        **{f"wall_{name}": float(x) for name, x in zip(names, wall_ms, strict=True)},
-        **{f"cpu_{name}": float(x) for name, x in zip(names, cpu_ms, strict=True)},
+        **{
+            f"{kind}_{name}": float(1e3 * np.percentile(values, share))
+            for kind, values in seconds.items()
+            for name, share in zip(names, _PERCENTILES, strict=True)
+        },
         "wall_max": 1e3 * max(wall),
         **more,
     }
@@ -90,18 +93,20 @@ def _row(what: str, times: _Times, **more: int) -> Row:
 
 def periods(bundle: Bundle, motions: int) -> Iterator[Row]:
     """Periods of motions on a fake robot in real time, and the evaluations of the policy in its own process."""
-    loop, policy = _Times(), _Times()
+    latency, loop, policy = _Times(), _Times(), _Times()
     missed, interventions = 0, 0
     for motion in range(motions):
         index = motion % len(bundle.expert)
         robot, connection = _robot(bundle), PolicyProcess(bundle, index)
         report = run_controller(robot, bundle, index, policy=connection)
         assert not report.cause, report.cause
+        latency.add(report.latency_s, [])
         loop.add(report.wall_s, report.cpu_s)
         policy.add(connection.wall_s[1:], connection.cpu_s[1:])  # the first has no tick before it
         missed += missed_periods(robot.states)
         interventions += sum(report.interventions.values())
-    yield _row("period: inner loop and safety layer", loop, missed=missed, interventions=interventions)
+    yield _row("inner loop and safety layer, to the torque", latency)
+    yield _row("to the end of the period", loop, missed=missed, interventions=interventions)
     yield _row("policy, in its own process", policy)
 
 

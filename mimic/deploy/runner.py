@@ -45,9 +45,10 @@ class Report:
       interventions: number of interventions of the safety layer, by kind.
       tracking_error: largest difference between a measured angle and the reference [rad].
       clearance: smallest clearance of a measured pose [m].
-      compute_ms: wall times of the computation in a period [ms]: p50, p99, p99.9 and max.
-      cpu_ms: the same of the CPU time, which other processes on the computer do not add to.
-      wall_s, cpu_s: the times of each period [s].
+      latency_ms: wall times from a state to its torque [ms]: p50, p99, p99.9 and max.
+      compute_ms: the same of all that is computed in a period.
+      cpu_ms: the same of its CPU time, which other processes on the computer do not add to.
+      latency_s, wall_s, cpu_s: the times of each period [s].
     """
 
     cause: str
@@ -56,8 +57,10 @@ class Report:
     interventions: dict[str, int]
     tracking_error: float
     clearance: float
+    latency_ms: dict[str, float]
     compute_ms: dict[str, float]
     cpu_ms: dict[str, float]
+    latency_s: list[float]
     wall_s: list[float]
     cpu_s: list[float]
 
@@ -69,7 +72,7 @@ class Report:
     def as_dict(self) -> dict[str, Any]:
         """The report for JSON, without the times of each period."""
         fields = dataclasses.asdict(self)
-        del fields["wall_s"], fields["cpu_s"]
+        del fields["latency_s"], fields["wall_s"], fields["cpu_s"]
         return {**fields, "is_complete": self.is_complete}
 
 
@@ -115,6 +118,7 @@ class _Loop:
 
     def __init__(self, driver: Driver, bundle: Bundle, layer: SafetyLayer, policy: PolicyConnection):
         self._driver, self._bundle, self._layer, self._policy = driver, bundle, layer, policy
+        self._latency: list[float] = []
         self._wall: list[float] = []
         self._cpu: list[float] = []
         self._tick, self._due, self._action = -1, False, np.zeros((bundle.action_size, 1))
@@ -142,25 +146,24 @@ class _Loop:
     def _period(self, state: RobotState, period: int | None) -> None:
         """One period; `period` counts those of the motion, None after its end."""
         wall, cpu = time.perf_counter(), time.thread_time()
-        if period is not None:
-            self._policy_step(state, period)
+        tick, since = divmod(period or 0, self._bundle.periods)
+        reference = self._layer.reference  # of the same moment as the state
+        if self._due and not self._layer.is_checking:
+            self._receive(since)
         torque = self._layer.period(state.qpos[:, None], state.qvel[:, None])
         self._driver.write(torque[:, 0])
+        self._latency.append(time.perf_counter() - wall)
         self._layer.work()
+        if period is not None and since == 0:  # last, as the policy may run on the same core
+            self._policy.send(tick, state.qpos, state.qvel, Reference(*(x[:, 0] for x in reference)))
+            self._tick, self._due = tick, True
         self._wall.append(time.perf_counter() - wall)
         self._cpu.append(time.thread_time() - cpu)
 
-    def _policy_step(self, state: RobotState, period: int) -> None:
-        """Sends an observation at the start of a tick, and begins the check of an action when it has arrived."""
-        tick, since = divmod(period, self._bundle.periods)
-        if since == 0:
-            reference = Reference(*(x[:, 0] for x in self._layer.reference))
-            self._policy.send(tick, state.qpos, state.qvel, reference)
-            self._tick, self._due = tick, True
-        if not self._due or self._layer.is_checking:
-            return
+    def _receive(self, since: int) -> None:
+        """Begins the check of the tick's action when it has arrived, some periods after the start of the tick."""
         received = self._policy.receive()
-        is_present = received is not None and received[0] == tick
+        is_present = received is not None and received[0] == self._tick
         if is_present or since >= _LATEST:
             if received is not None and is_present:
                 self._action = received[1][:, None]
@@ -171,7 +174,8 @@ class _Loop:
         """The report of the run."""
         counts = {name: int(self._layer.counts[name][0]) for name in INTERVENTIONS}
         error = float(self._layer.tracking_error[0])
-        times = _percentiles(self._wall), _percentiles(self._cpu), self._wall, self._cpu
+        seconds = self._latency, self._wall, self._cpu
+        times = *(_percentiles(values) for values in seconds), *seconds
         return Report(cause, aborted, self._tick + 1, counts, error, float(self._layer.clearance[0]), *times)
 
 
