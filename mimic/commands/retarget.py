@@ -101,7 +101,7 @@ def follow_mapper(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Computes motions through the poses that a pose mapper proposes.
 
-    Each head of the mapper proposes one pose per time step. Dynamic programming selects a head at each step, such that
+    The mapper has several candidates for each time step. Dynamic programming selects one at each step, such that
     the sum over the motion of the distances and of the jumps' excess over `largest_jump` [rad] is minimal. Jumps that
     still exceed their bound are cut off at it.
 
@@ -120,8 +120,8 @@ def follow_mapper(
     continuous = continuous_joints(model.learner)
 
     def motion(candidates: Array, distances: Array) -> tuple[Array, Array]:
-        heads = _select_heads(candidates, distances, largest_jump, continuous)
-        proposed = jnp.take_along_axis(candidates, heads[:, None, None], axis=1)[:, 0]
+        selected = _select_candidates(candidates, distances, largest_jump, continuous)
+        proposed = jnp.take_along_axis(candidates, selected[:, None, None], axis=1)[:, 0]
 
         def follow(pose: Array, target: Array) -> tuple[Array, tuple[Array, Array]]:
             change = wrap_angles(target - pose, continuous)
@@ -136,8 +136,8 @@ def follow_mapper(
     return np.asarray(poses), np.asarray(distance), np.asarray(settled)
 
 
-def _select_heads(candidates: Array, distances: Array, largest_jump: np.ndarray, continuous: np.ndarray) -> Array:
-    """The head [time] of the mapper for each step of a motion, by dynamic programming; see `follow_mapper`."""
+def _select_candidates(candidates: Array, distances: Array, largest_jump: np.ndarray, continuous: np.ndarray) -> Array:
+    """The candidate [time] of the mapper for each step of a motion, by dynamic programming; see `follow_mapper`."""
 
     def extend(cost: Array, step: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         previous, current, distance = step
@@ -146,9 +146,9 @@ def _select_heads(candidates: Array, distances: Array, largest_jump: np.ndarray,
         return total.min(axis=0) + distance, total.argmin(axis=0)
 
     cost, predecessors = jax.lax.scan(extend, distances[0], (candidates[:-1], candidates[1:], distances[1:]))
-    last_head = cost.argmin()
-    _, heads = jax.lax.scan(lambda head, row: (row[head], row[head]), last_head, predecessors, reverse=True)
-    return jnp.append(heads, last_head)
+    last = cost.argmin()
+    _, selected = jax.lax.scan(lambda after, row: (row[after], row[after]), last, predecessors, reverse=True)
+    return jnp.append(selected, last)
 
 
 def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:

@@ -146,7 +146,7 @@ class _Loop:
     def _period(self, state: RobotState, period: int | None) -> None:
         """One period; `period` counts those of the motion, None after its end."""
         wall, cpu = time.perf_counter(), time.thread_time()
-        tick, since = divmod(period or 0, self._bundle.periods)
+        tick, since = divmod(period or 0, self._bundle.periods)  # after the end of the motion nothing is due
         reference = self._layer.reference  # of the same moment as the state
         if self._due and not self._layer.is_checking:
             self._receive(since)

@@ -36,8 +36,8 @@ _ACTION_TOLERANCE = 1e-3  # beyond [-1, 1]: float32 rounds a saturated tanh
 class SafetyLayer:
     """The inner loops of some robots with the same controller.
 
-    In each period: `tick` at the start of a tick of the policy, then `period` gives the torques, and `work` computes in
-    the rest of the period.
+    In each period: `tick` when the policy's actions have arrived, then `period` gives the torques, and `work` computes
+    in the rest of the period.
 
     Args:
       bundle: the controller.
@@ -181,8 +181,7 @@ class SafetyLayer:
         """Computes a part of the check that is under way, and the clearances of the measured pose and of that part.
 
         Each period has about the same work, also without a check: code that has not run for some milliseconds takes
-        several times as long. Only the first period of a check has none: in it the policy is sent a state, and its
-        action is taken.
+        several times as long. Only the first period of a check has none: in it the policy's action is taken.
         """
         pending, first, path = self._pending, 0, self._no_path
         if pending is not None and pending.periods < self._config.check_periods:

@@ -28,8 +28,8 @@ def plot_mapper_arms(table: Mapping[str, Mapping[str, Any]], out: Path, guesses:
     series = {  # label, marker, colour
         "quality_from_home": ("Newton steps from home", "v", "tab:green"),
         "quality_random_guesses": (f"Newton steps from {guesses} random guesses", "^", "tab:orange"),
-        "quality_proposed": ("mapper, without Newton steps", "o", "lightsteelblue"),
-        "quality": ("mapper, with Newton steps", "o", "tab:blue"),
+        "quality_proposed": ("the network's proposals, without Newton steps", "o", "lightsteelblue"),
+        "quality": ("mapper", "o", "tab:blue"),
     }
     by_quality = sorted(table, key=lambda name: table[name]["quality"])
     groups = {seen: [name for name in by_quality if table[name]["seen"] == seen] for seen in (True, False)}

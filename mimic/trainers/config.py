@@ -361,13 +361,13 @@ class PoseMapperConfig(TrainerConfig):
       inputs: "angles" of the expert (paper), or its "link_states": positions and directions.
       outputs: "tanh", scaled to the joint's range (paper), or "circle": a point on the unit circle for joints whose
         range is a full rotation.
-      heads: number of poses that the network proposes; the nearest one is the output.
+      heads: number of poses that the network proposes; the nearest one is the output, to any arm after Newton steps.
       hidden_layers: widths of the hidden layers.
       activation: "leaky_relu" (paper) or "gelu".
       width: of a token of the network of any arm; a multiple of 4.
       layers: transformer layers of the network of any arm.
-      guesses: number of constant random poses of the learner, which the mapper to any arm improves beside those of its
-        network.
+      guesses: number of constant poses of the learner, spread over its joints' ranges, which the mapper to any arm
+        improves beside those of its network.
       refinements: Newton steps of the mapper to any arm from each of these poses; training has none.
       samples: poses in an epoch.
       batch_size: poses in a minibatch; must divide samples.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import jax
 
-from mimic.any_arm.arrays import MAX_LINKS
+from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS
 from mimic.any_arm.observation import observation_size
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import ArmsConfig
@@ -81,10 +81,12 @@ def _mapper_bytes(trainer: PoseMapperConfig, expert: Embodiment, learner: Embodi
 
 
 def _any_arm_mapper_bytes(trainer: PoseMapperConfig) -> dict[str, float]:
-    """Network; hidden units of a minibatch, of which each token of a link has those of all layers."""
+    """Network; hidden units of a minibatch, each token of a link has those of all layers; Jacobians of Newton steps."""
     settings = trainer.resolve_any_arm(jax.default_backend())
     units = float(settings.width) * settings.layers
+    poses = float(settings.held_out_poses) * (settings.heads + settings.guesses)
     return {
+        "trainer.held_out_poses, trainer.heads, trainer.guesses": poses * 6 * MAX_LINKS * MAX_JOINTS * _FLOAT32,
         "trainer.width, trainer.layers": 8 * units * settings.width * _COPIES * _FLOAT32,  # attention 4, then 2 and 2
         "trainer.batch_size, trainer.width, trainer.layers": settings.batch_size * MAX_LINKS * units * _FLOAT32,
     }

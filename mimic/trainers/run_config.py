@@ -102,6 +102,8 @@ def _with_old_defaults(content: DictConfig) -> DictConfig:
     defaults: dict[str, Any] = {"keep": 1_000_000}
     if trainer.name == "ppo":
         defaults |= {"timed_critic": False, "final_entropy_cost": 1.0}
+    elif trainer.get("refinements") is not None:  # a mapper to any arm
+        defaults |= {"guesses": 0}
     return merged(content, {"trainer": {**defaults, **trainer}})
 
 

@@ -76,11 +76,10 @@ def make_reference(model: AnyArmMapperModel, key: Array, pairs: Pairs) -> Refere
       key: of the random initial guesses, which are the same for all poses of the expert.
       pairs: the arms and the experts' poses.
     """
-    starts = model.heads + model.guesses
 
     def of_pair(pair: Pairs) -> Reference:
         arm = pair.learners
-        guesses = jax.vmap(lambda key: random_pose(arm, key))(jax.random.split(key, max(_GUESSES, starts)))
+        guesses = jax.vmap(lambda key: random_pose(arm, key))(jax.random.split(key, max(_GUESSES, model.starts)))
         initial = jnp.concatenate([guesses, arm.home[None]])
 
         def of_pose(qpos: Array) -> Reference:
@@ -88,7 +87,7 @@ def make_reference(model: AnyArmMapperModel, key: Array, pairs: Pairs) -> Refere
             path = _newton_path(model, expert, arm, initial, max(_STEPS, model.refinements))
             optimum = _nearest(model, expert, arm, path[-1])
             few_steps = path[model.refinements]
-            guessed = _nearest(model, expert, arm, few_steps[:starts])
+            guessed = _nearest(model, expert, arm, few_steps[: model.starts])
             home = model.distance(expert, arm, few_steps[-1])
             return Reference(*optimum, *guessed, home, model.distances(expert, arm, guesses).mean())
 
@@ -101,10 +100,10 @@ def run_mapper(model: AnyArmMapperModel, params: Params, pairs: Pairs) -> Mapped
     """The mapper's poses for all pairs and poses; see `make_reference`."""
 
     def of_pose(expert: ExpertPose, arm: ArmArrays) -> Mapped:
-        initial = model.initial_poses(params, expert, arm)
-        path = _newton_path(model, expert, arm, initial, model.refinements)
-        proposed = initial[: model.heads]
-        return Mapped(*_nearest(model, expert, arm, path[-1]), model.distances(expert, arm, proposed).min())
+        poses, distances = model.refined(params, expert, arm)
+        nearest = jnp.argmin(distances)
+        proposed = model.distances(expert, arm, model.candidates(params, expert, arm))
+        return Mapped(distances[nearest], poses[nearest], proposed.min())
 
     def of_pair(pair: Pairs) -> Mapped:
         return jax.vmap(lambda qpos: of_pose(expert_pose(pair.experts, qpos), pair.learners))(pair.expert_qpos)

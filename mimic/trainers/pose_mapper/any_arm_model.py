@@ -80,7 +80,8 @@ class AnyArmMapperModel:
       width: of the network's tokens.
       layers: of its transformer.
       heads: number of poses that it proposes.
-      guesses: number of constant random poses beside them: what is proposed for an arm is often near one minimum only.
+      guesses: number of constant poses beside them, spread over the joints' ranges: all that is proposed may be near one
+        minimum.
       refinements: Newton steps from each of these poses.
     """
 
@@ -92,6 +93,11 @@ class AnyArmMapperModel:
     heads: int
     guesses: int
     refinements: int
+
+    @property
+    def starts(self) -> int:
+        """Number of poses from which it takes Newton steps."""
+        return self.heads + self.guesses
 
     @functools.cached_property
     def _network(self) -> _Network:
@@ -131,18 +137,15 @@ class AnyArmMapperModel:
         """Embodiment distances between the expert's pose and some of a learner's."""
         return jax.vmap(lambda qpos: self.distance(expert, learner, qpos))(poses)
 
-    def initial_poses(
-        self, params: Params, expert: ExpertPose, learner: ArmArrays
-    ) -> Float[Array, "heads+guesses joints"]:
+    def initial_poses(self, params: Params, expert: ExpertPose, learner: ArmArrays) -> Float[Array, "starts joints"]:
         """Where the Newton steps start [rad]: the poses of the heads, then those that do not depend on the expert."""
         lower, upper = learner.joint_range[:, 0], learner.joint_range[:, 1]
-        shares = np.random.default_rng(0).uniform(size=(self.guesses, MAX_JOINTS)).astype(np.float32)
-        guesses = jnp.where(learner.is_free > 0, lower + shares * (upper - lower), learner.home)
+        guesses = jnp.where(learner.is_free > 0, lower + _spread(self.guesses) * (upper - lower), learner.home)
         return jnp.concatenate([self.candidates(params, expert, learner), guesses])
 
     def refined(
         self, params: Params, expert: ExpertPose, learner: ArmArrays
-    ) -> tuple[Float[Array, "heads+guesses joints"], Float[Array, " heads+guesses"]]:
+    ) -> tuple[Float[Array, "starts joints"], Float[Array, " starts"]]:
         """The initial poses after the Newton steps, and their distances."""
         matrix = correspondence(expert.arm, learner)
 
@@ -189,6 +192,15 @@ def make_any_arm_model(env: EnvConfig, settings: AnyArmMapperSettings) -> AnyArm
     expert = arm_arrays(build_arm(env.expert, env.limits, env.metric.links)).astype(np.float32)
     sizes = settings.width, settings.layers, settings.heads, settings.guesses, settings.refinements
     return AnyArmMapperModel(expert, env.arms.expert == "drawn", check_metric(env.metric), *sizes)
+
+
+def _spread(count: int) -> Float[np.ndarray, "count joints"]:
+    """Points that fill the unit cube evenly: the additive recurrence of M. Roberts (2018), which never changes."""
+    root = 2.0
+    for _ in range(64):
+        root = (1 + root) ** (1 / (MAX_JOINTS + 1))  # solves x^(joints + 1) = x + 1
+    steps = root ** -np.arange(1.0, MAX_JOINTS + 1)
+    return ((0.5 + np.outer(np.arange(1, count + 1), steps)) % 1).astype(np.float32)
 
 
 def _arcs(arm: ArmArrays) -> Float[Array, "links 2"]:

@@ -81,11 +81,6 @@ class AnyArmMapperTrainer(Trainer):
             f"{config.env.name}: {experts} to any arm, {self.settings.samples} {kind}, report on {counts} arms"
         )
 
-    @property
-    def _starts(self) -> int:
-        """Number of poses from which the mapper takes Newton steps."""
-        return self.settings.heads + self.settings.guesses
-
     @functools.cached_property
     def _arm_before(self) -> list[int]:
         """Number of the arm before each one in its split; before the first is the last."""
@@ -235,11 +230,11 @@ class AnyArmMapperTrainer(Trainer):
     def rows(self, metrics: Metrics) -> list[Row]:
         """Rows of the quality, of what it is compared with, and of the distances that define it."""
         steps = f"{self.settings.refinements} Newton steps"
-        guesses = f"  {self._starts} random initial guesses, {steps}"
+        guesses = f"  {self._model.starts} random initial guesses, {steps}"
         rows: tuple[tuple[str, str, str], ...] = (
             ("above the optimum (0 best, 1 a random pose)", METHODS[0], "{:.2%}"),
             ("  the largest of an arm", "quality_largest", "{:.2%}"),
-            ("  without Newton steps", METHODS[1], "{:.2%}"),
+            ("  the network's proposals, without Newton steps", METHODS[1], "{:.2%}"),
             (guesses, METHODS[2], "{:.2%}"),
             (f"  home, {steps}", METHODS[3], "{:.2%}"),
             ("mean distance", "mean_distance", "{:.4f}"),
@@ -260,7 +255,7 @@ class AnyArmMapperTrainer(Trainer):
         tables = {part: self._table(part, mapped) for part, mapped in outcome.items()}
         for part, table in tables.items():
             _write_table(folder / f"{part}.csv", table)
-        mapper_arms_plot.plot_mapper_arms(tables[_ARMS_PART], folder / "arms.png", self._starts, title=self._name)
+        mapper_arms_plot.plot_mapper_arms(tables[_ARMS_PART], folder / "arms.png", self._model.starts, title=self._name)
         labels = {"train": "arms seen in training", "held_out": "unseen arms"}
         plots.plot_training(folder, "quality", "above the optimum [%]", labels=labels, title=self._name)
 
