@@ -139,6 +139,72 @@ def test_a_policy_without_valid_answers_is_counted(bundle, actions, kind):
     assert report.interventions[kind] > 0 and not report.is_complete and not report.cause
 
 
+def test_an_observation_is_sent_after_the_torque_and_has_the_state_before_it(bundle):
+    events = []
+
+    class Recording(FakeRobot):
+        def write(self, torque):
+            events.append(("write", None, None))
+            super().write(torque)
+
+    class Policy(Scripted):
+        def send(self, tick, qpos, qvel, reference):
+            events.append(("send", qpos, reference))
+            super().send(tick, qpos, qvel, reference)
+
+    fake = Recording(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0)
+    report = run_controller(fake, bundle, policy=Policy(dict.fromkeys(range(bundles.TICKS), 0.3)))
+    names = [name for name, *_ in events]
+    sent = [i for i, name in enumerate(names) if name == "send"]
+    assert len(sent) == report.ticks == bundles.TICKS and names[:2] == ["write", "send"]
+    assert np.diff(sent).tolist() == [bundle.periods + 1] * (bundles.TICKS - 1)
+    states = fake.states[:: bundle.periods][: bundles.TICKS]
+    for i, state in zip(sent, states, strict=True):
+        np.testing.assert_array_equal(events[i][1], state.qpos)
+        assert np.abs(events[i][2].qpos - state.qpos).max() < 0.02
+    assert np.abs(events[sent[5]][2].qvel).max() > 0.1  # the reference moves, and the arm with it
+
+
+def test_an_action_acts_21_periods_after_its_state(bundle):
+    fake = robot(bundle)
+    report = run_controller(fake, bundle, policy=Scripted(dict.fromkeys(range(bundles.TICKS), 0.3)))
+    moves = [np.abs(state.torque).max() > 0 for state in fake.states]  # a state has the torque of the period before
+    assert moves.index(True) == 22 and not any(report.interventions.values())
+
+
+def test_an_action_after_half_a_tick_is_not_used(bundle):
+    """The last one is used again, and the answer is not taken for that of the next tick."""
+
+    class Slow(Scripted):
+        def __init__(self):
+            super().__init__({})
+            self._asked = 0
+
+        def send(self, tick, qpos, qvel, reference):
+            super().send(tick, qpos, qvel, reference)
+            self._asked = 0
+
+        def receive(self):
+            self._asked += 1
+            late = self._tick == 3
+            if late and self._asked <= 10:
+                return None
+            return self._tick - late, np.full(7, 0.9 if late else 0.1)
+
+    fake = robot(bundle)
+    report = run_controller(fake, bundle, policy=Slow())
+    assert report.interventions[REPEATED] == 1 and report.interventions[LATE] == 0
+    assert np.abs(trace(fake)[1]).max() < 0.15 * bundle.limits.velocity.max()
+
+
+def test_times_are_those_of_each_period(bundle):
+    report = run_controller(robot(bundle), bundle, policy=LocalPolicy(bundle, 0))
+    assert len(report.latency_s) == len(report.wall_s) == len(report.cpu_s) > bundles.TICKS * bundle.periods
+    assert all(0 < latency < wall for latency, wall in zip(report.latency_s, report.wall_s, strict=True))
+    assert report.latency_ms["p50"] == pytest.approx(1e3 * np.median(report.latency_s))
+    assert not any(isinstance(value, list) for value in report.as_dict().values())
+
+
 def test_actions_of_an_earlier_tick_are_not_used(bundle):
     class Late(Scripted):
         def receive(self):

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import shutil
 from typing import Any
 
 import jax
@@ -58,6 +59,42 @@ def mapper(trained):
 
 def poses(count, seed=0):
     return np.random.default_rng(seed).uniform(-3, 3, (count, 7)).astype(np.float32)
+
+
+@pytest.mark.parametrize("guesses", [0, 5])
+def test_guesses_are_constant_poses_beside_the_proposals(mapper, guesses):
+    model = dataclasses.replace(mapper.model, guesses=guesses)
+    learner = jax.tree.map(jnp.asarray, lock_joints(mapper.arrays("panda"), np.arange(MAX_JOINTS) == 2))
+    experts = [expert_pose(model.expert, jnp.full(MAX_JOINTS, angle)) for angle in (0.1, 0.5)]
+    initial = [np.asarray(model.initial_poses(mapper.params, expert, learner)) for expert in experts]
+    lower, upper = np.asarray(learner.joint_range).T
+    for expert, poses_of_expert in zip(experts, initial, strict=True):
+        assert poses_of_expert.shape == (model.starts, MAX_JOINTS) == (2 + guesses, MAX_JOINTS)
+        np.testing.assert_array_equal(poses_of_expert[:2], model.candidates(mapper.params, expert, learner))
+        assert np.all((poses_of_expert[2:] >= lower) & (poses_of_expert[2:] <= upper))
+        np.testing.assert_array_equal(poses_of_expert[:, 2], learner.home[2])
+    np.testing.assert_array_equal(initial[0][2:], initial[1][2:])
+    assert len(np.unique(initial[0][2:], axis=0)) == guesses
+
+
+def test_more_guesses_are_never_worse(mapper):
+    """By the nearest of all poses; with the same Newton steps."""
+    learner, expert = mapper.arrays("panda4dof"), expert_pose(mapper.model.expert, jnp.full(MAX_JOINTS, 0.3))
+    few, many = (
+        float(dataclasses.replace(mapper.model, guesses=count).refined(mapper.params, expert, learner)[1].min())
+        for count in (1, 9)
+    )
+    assert many <= few
+
+
+def test_an_older_run_has_no_guesses(trained, tmp_path):
+    run_dir = tmp_path / "run"
+    shutil.copytree(trained[0], run_dir)
+    config = run_dir / "config.yaml"
+    text = config.read_text()
+    assert "  guesses: 1\n" in text
+    config.write_text(text.replace("  guesses: 1\n", ""))
+    assert AnyArmMapper.load(run_dir).model.guesses == 0
 
 
 def test_a_run_reports_each_arm(trained):
@@ -241,6 +278,8 @@ def test_settings_that_do_not_apply_are_rejected(settings, message, tmp_path):
 def test_settings_of_any_arm_are_rejected_for_one_learner():
     with pytest.raises(ValueError, match="trainer.width: expected none for a mapper to one learner, got 16"):
         PoseMapperConfig(width=16).resolve()
+    with pytest.raises(ValueError, match="trainer.guesses: expected none for a mapper to one learner, got 0"):
+        PoseMapperConfig(guesses=0).resolve()
     with pytest.raises(ValueError, match="trainer.preset: expected paper or large for a mapper to one learner"):
         PoseMapperConfig(preset="any_arm").resolve()
 

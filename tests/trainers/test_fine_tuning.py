@@ -4,6 +4,7 @@ import pytest
 
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.fine_tuning import fine_tuned, with_one_learner
+from mimic.trainers.run_config import save_config
 from tests.helpers.run_directories import write_run
 from tests.helpers.untrained_family import HORIZON, family, untrained_family
 
@@ -35,6 +36,12 @@ def test_the_learner_is_the_only_arm(run_dir):
 def test_what_the_policy_was_trained_with_stays(run_dir, override):
     with pytest.raises(ValueError, match="learner: expected overrides of the length and rates of the trainer only"):
         fine_tuned(requested(run_dir), [override])
+
+
+def test_the_reward_stays(tmp_path):
+    for reward in ("distance", "relative"):
+        save_config(tmp_path, TrainConfig(family(arms={"reward": reward}), PPOConfig(preset="any_arm_cpu").resolve()))
+        assert fine_tuned(requested(tmp_path), []).env.arms.reward == reward
 
 
 def test_a_run_of_one_learner_is_rejected(tmp_path):

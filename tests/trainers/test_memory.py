@@ -73,6 +73,10 @@ def test_large_mappers_to_any_arm_are_rejected():
     cases: list[tuple[dict[str, Any], str]] = [
         ({"width": 2**13, "layers": 3}, "trainer.width, trainer.layers: expected to fit"),
         ({"samples": 2**20, "batch_size": 2**20}, "trainer.batch_size, trainer.width, trainer.layers: expected"),
+        (
+            {"guesses": 1000, "held_out_poses": 2**10},
+            "trainer.held_out_poses, trainer.heads, trainer.guesses: expected",
+        ),
     ]
     for settings, message in cases:
         with pytest.raises(ValueError, match=message):

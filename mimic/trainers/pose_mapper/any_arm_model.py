@@ -80,7 +80,7 @@ class AnyArmMapperModel:
       width: of the network's tokens.
       layers: of its transformer.
       heads: number of poses that it proposes.
-      guesses: number of constant poses beside them, spread over the joints' ranges: all that is proposed may be near one
+      guesses: number of constant poses beside them, spread over the joints' ranges: all proposals may be near one
         minimum.
       refinements: Newton steps from each of these poses.
     """
