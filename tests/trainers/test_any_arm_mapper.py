@@ -184,7 +184,7 @@ def test_joints_that_a_config_locks_are_locked_by_the_mask(mapper):
     np.testing.assert_allclose(one.model.distance(jnp.asarray(qpos), learner_qpos), expected, rtol=1e-4)
 
 
-def test_the_nearest_head_is_taken_and_locked_joints_stay(mapper):
+def test_the_nearest_pose_is_taken_and_locked_joints_stay(mapper):
     arm = lock_joints(mapper.arrays("panda"), np.eye(MAX_JOINTS)[3])
     (qpos,) = poses(1)
     expert = expert_pose(mapper.model.expert, jnp.append(qpos, 0.0))
