@@ -83,7 +83,8 @@ def any_arm():
 def test_the_mapper_to_any_arm_says_where_it_comes_from(any_arm):
     report = any_arm.report
     assert len(report["source"]["commit"]) == 40 and report["training_poses"] > 2e7
-    assert report["source"]["command"] == "python -m mimic.train env=any_arm trainer=pose_mapper trainer.preset=any_arm"
+    command = "python -m mimic.train env=any_arm trainer=pose_mapper trainer.preset=any_arm env.arms.expert=drawn"
+    assert report["source"]["command"] == command and any_arm.model.expert_is_drawn
     assert report["hardware"]["device"] and {"python", "jax", "numpy"} <= set(report["versions"])
     assert any_arm.env.arms.evaluated == [] and "ur5e" in report["arms"]
 
@@ -104,9 +105,9 @@ def test_the_mapper_to_any_arm_reaches_its_recorded_distance_on_unseen_locks(any
         distance = float(distances(poses, arrays, any_arm(poses[:, :7], arrays)).mean())
         # Where two proposals are equally near, another machine may take the other one.
         assert distance == pytest.approx(recorded[name]["mean_distance"], rel=2e-3)
-    # None of these arms was in the training: 1 % of the way from the optimum to a random pose, in the mean.
-    assert np.mean([row["quality"] for row in recorded.values()]) < 0.01
-    assert all(row["quality"] < row["quality_random_guesses"] for row in recorded.values())
+    # None of these arms was in the training: at most 0.2 % of the way from the optimum to a random pose.
+    quality, guesses = ([row[key] for row in recorded.values()] for key in ("quality", "quality_random_guesses"))
+    assert max(quality) < 0.002 and np.mean(quality) < np.mean(guesses)
 
 
 @pytest.mark.slow
