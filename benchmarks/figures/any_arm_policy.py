@@ -80,8 +80,11 @@ def main() -> None:
     policy, outside, *files, out = map(Path, sys.argv[1:])
     results = [json.loads(file.read_text()) for file in files]
     specialists = {row["arm"]: row["gap"]["held_out"] for result in results for row in result["rows"]}
-    rows, others = (json.loads(file.read_text())["arms"] for file in (policy, outside))
-    draw(rows, [row for row in others if row["controller_gap"] is not None], specialists, out)
+    rows, others = (
+        [row for row in json.loads(file.read_text())["arms"] if row["controller_gap"] is not None]
+        for file in (policy, outside)
+    )
+    draw(rows, others, specialists, out)
 
 
 if __name__ == "__main__":
