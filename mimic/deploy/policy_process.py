@@ -25,9 +25,9 @@ _READY = -1  # the tick of the first message
 _MAX_MESSAGE = 65_536  # bytes
 _COMMAND = "import sys; from mimic.deploy.policy_process import main; main(*sys.argv[1:])"
 _WATCH = 1.0  # s between two looks whether the inner loop still lives
-# From some time before an observation is due [s], the network runs some times at intervals [s], so that it ends shortly
-# before: caches lose it in a tick, and the evaluation would take several times as long.
-_WARM_UP, _INTERVAL, _WARM_UPS = 0.002, 0.0002, 6
+# From some time before an observation is due [s], the last answer is computed again some times at intervals [s]: caches
+# lose code and weights in a tick, and the evaluation would take several times as long.
+_REHEARSAL, _INTERVAL, _REHEARSALS = 0.002, 0.0002, 6
 
 
 class LocalPolicy:
@@ -130,29 +130,31 @@ def main(folder: str, motion: str, descriptor: str, parent: str) -> None:
     policy = Policy(bundle, [int(motion)])
     connection.send(_TICK.pack(_READY))
     connection.settimeout(_WATCH)
-    warm_ups = 0
+    message, rehearsals = b"", 0
     while os.getppid() == int(parent):
         try:
             message = connection.recv(_MAX_MESSAGE)
         except TimeoutError:
-            policy.warm_up()
-            warm_ups += 1
-            connection.settimeout(_INTERVAL if warm_ups < _WARM_UPS else _WATCH)
+            if message:
+                _answer(policy, message, joints, is_rehearsal=True)
+            rehearsals += 1
+            connection.settimeout(_INTERVAL if rehearsals < _REHEARSALS else _WATCH)
             continue
         except OSError:
             return
         with contextlib.suppress(OSError):
             connection.send(_answer(policy, message, joints))
-        warm_ups = 0
-        connection.settimeout(max(bundle.control_dt - _WARM_UP, _INTERVAL))
+        rehearsals = 0
+        connection.settimeout(max(bundle.control_dt - _REHEARSAL, _INTERVAL))
 
 
-def _answer(policy: Policy, message: bytes, joints: int) -> bytes:
+def _answer(policy: Policy, message: bytes, joints: int, *, is_rehearsal: bool = False) -> bytes:
     """The message with the action for an observation."""
     wall, cpu = time.perf_counter(), time.thread_time()
     values = np.frombuffer(message, np.float32, offset=_TICK.size).reshape(4, 1, joints)
     (tick,) = _TICK.unpack_from(message)
-    action = policy.act(tick, values[0], values[1], Reference(values[2], values[3], values[3])).astype(np.float32)
+    reference = Reference(values[2], values[3], values[3])
+    action = policy.act(tick, values[0], values[1], reference, is_rehearsal=is_rehearsal).astype(np.float32)
     return _ANSWER.pack(tick, time.perf_counter() - wall, time.thread_time() - cpu) + action.tobytes()
 
 

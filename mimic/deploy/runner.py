@@ -174,9 +174,9 @@ class _Loop:
         """The report of the run."""
         counts = {name: int(self._layer.counts[name][0]) for name in INTERVENTIONS}
         error = float(self._layer.tracking_error[0])
-        seconds = self._latency, self._wall, self._cpu
-        times = *(_percentiles(values) for values in seconds), *seconds
-        return Report(cause, aborted, self._tick + 1, counts, error, float(self._layer.clearance[0]), *times)
+        clearance, seconds = float(self._layer.clearance[0]), (self._latency, self._wall, self._cpu)
+        latency, compute, cpu = map(_percentiles, seconds)
+        return Report(cause, aborted, self._tick + 1, counts, error, clearance, latency, compute, cpu, *seconds)
 
 
 def _percentiles(seconds: list[float]) -> dict[str, float]:

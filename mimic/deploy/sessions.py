@@ -60,11 +60,16 @@ class Policy:
         inputs |= {"past_actions": bundle.past_actions * size, "features": bundle.features}
         self._session = open_session(bundle.folder / POLICY, inputs, {"action": size})
         self._last, self._size = bundle.ticks, size
-        self._feed: dict[str, np.ndarray] = {}
         self._past = np.zeros((len(motions), bundle.past_actions * size), np.float32)
 
-    def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
-        """The actions [robots, numbers] at a tick, of measured and reference motions [robots, joints]."""
+    def act(
+        self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference, *, is_rehearsal: bool = False
+    ) -> np.ndarray:
+        """The actions [robots, numbers] at a tick, of measured and reference motions [robots, joints].
+
+        A rehearsal is not among the past actions that the policy observes: it only brings code and weights into the
+        caches, so that the next call takes a fraction of the time.
+        """
         observation = {
             "qpos": qpos,
             "qvel": qvel,
@@ -73,16 +78,12 @@ class Policy:
             "past_actions": self._past,
             "features": self._features[min(tick, self._last), self._row],
         }
-        self._feed = {name: np.ascontiguousarray(value, np.float32) for name, value in observation.items()}
-        (action,) = self._session.run(["action"], self._feed)
-        if self._past.size:
-            self._past = np.concatenate([action, self._past[:, : -self._size]], axis=1)
+        feed = {name: np.ascontiguousarray(value, np.float32) for name, value in observation.items()}
+        (action,) = self._session.run(["action"], feed)
+        past = np.concatenate([action, self._past[:, : -self._size]], axis=1) if self._past.size else self._past
+        if not is_rehearsal:
+            self._past = past
         return np.asarray(action, float)
-
-    def warm_up(self) -> None:
-        """Runs the network on the last observation, after which the next `act` takes a fraction of the time."""
-        if self._feed:
-            self._session.run(["action"], self._feed)
 
 
 def _expert_features(bundle: Bundle, motions: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

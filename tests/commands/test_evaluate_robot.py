@@ -158,8 +158,9 @@ def test_an_exported_policy_is_the_policy(hardware_run, tmp_path):
         observation = jax.vmap(functools.partial(control_observation, env))(*parts)
         expected = np.asarray(controller(SimpleNamespace(obs=observation)))
         qpos, qvel, *reference = measured
-        action = policy.act(tick, qpos, qvel, Reference(reference[0], reference[1], reference[1]))
-        policy.warm_up()
+        observed = tick, qpos, qvel, Reference(reference[0], reference[1], reference[1])
+        policy.act(*observed, is_rehearsal=True)
+        action = policy.act(*observed)
         assert np.ptp(expected) > 0.1
         np.testing.assert_allclose(action, expected, atol=1e-5)  # float32, sums in another order
         past = np.concatenate([expected, past[:, : -env.action_size]], axis=1)
