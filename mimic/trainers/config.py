@@ -300,7 +300,7 @@ MAPPER_PRESETS: dict[str, dict[str, Any]] = {
         "evaluations": 10,
         "held_out_poses": 10_000,
     },
-    # A learner that is drawn for each training pose, on one GPU: 24 million arms and poses.
+    # A learner that is drawn for each training pose, on one GPU: 26 million arms and poses.
     "any_arm": {
         "width": 128,
         "layers": 3,
