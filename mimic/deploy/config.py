@@ -22,7 +22,7 @@ class SafetyConfig:
       position: distance from the ends of a joint's range at which the arm stops [rad].
       velocity: fraction of the velocity limit at which the arm stops.
       slow_down: fraction of the velocity limit beyond which a torque brakes a joint in addition, because an arm that
-        accelerates overshoots its reference's velocity.
+        accelerates overshoots its reference's velocity. It also brakes a joint that leaves the range of its reference.
       velocity_scale, acceleration_scale: factors on the limits of the reference; noise and payloads add to its
         velocity. Smaller ones are for first trials of a controller.
       min_stiffness: of joint_impedance, as a fraction: softer arms leave the path that was checked.
@@ -41,7 +41,7 @@ class SafetyConfig:
     tracking: float = 0.2
     position: float = 0.005
     velocity: float = 0.985
-    slow_down: float = 0.96
+    slow_down: float = 0.92
     velocity_scale: float = 0.96
     acceleration_scale: float = 1.0
     min_stiffness: float = 0.5

@@ -165,13 +165,16 @@ class SafetyLayer:
             qpos, qvel = np.where(is_lost, self.reference.qpos, qpos), np.where(is_lost, self.reference.qvel, qvel)
         target = Target(self._value, stiffness)
         torque = joint_torque("joint_position", qpos, qvel, self.reference, target, self.torque, self._joints, np)
-        if np.count_nonzero(np.abs(qvel) > self._slow):
-            torque = self._slowed(torque, qvel - np.minimum(np.maximum(qvel, -self._slow), self._slow))
+        excess = qvel - np.minimum(np.maximum(qvel, -self._slow), self._slow)
+        beyond = qpos - np.minimum(np.maximum(qpos, self._joints.lower), self._joints.upper)
+        excess = np.where(beyond * qvel > 0, qvel, excess)
+        if np.count_nonzero(excess):
+            torque = self._slowed(torque, excess)
         self.torque = torque
         return self.torque
 
     def _slowed(self, torque: np.ndarray, excess: np.ndarray) -> np.ndarray:
-        """Torques that also brake joints beyond `slow_down`, by some velocity, within the limits of the torque."""
+        """Torques that also brake joints by an excess of their velocity, within the limits of the torque."""
         joints = self._joints
         braking = np.clip(torque - _SLOWING * joints.damping * excess, -joints.torque, joints.torque)
         change = joints.torque_rate * PERIOD

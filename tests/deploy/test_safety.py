@@ -234,6 +234,22 @@ def test_an_arm_beyond_its_speed_is_slowed_down(bundle):
     assert -87 <= torques[0.96] < torques[10.0] - 1 < 0
 
 
+@pytest.mark.parametrize(("beyond", "speed", "damping"), [(0.02, 0.1, 4), (0.02, -0.1, 1), (-0.005, 0.1, 1)])
+def test_an_arm_that_leaves_the_range_of_its_reference_is_braked(bundle, beyond, speed, damping):
+    """Only outwards, and only beyond the end of the range; within the limit of the torque."""
+    layer, parameters = SafetyLayer(bundle, lambda rows: np.ones(len(rows))), bundle.parameters
+    pose = bundle.start_pose[:, None].copy()
+    pose[0] = parameters.upper[0] - 0.01
+    layer.start(pose, 0 * pose, pose)
+    measured = pose.copy()
+    measured[0] = parameters.upper[0] + beyond
+    for _ in range(200):
+        torque = layer.period(measured, velocity(0, speed)[:, None])
+    expected = -parameters.stiffness[0] * (0.01 + beyond) - damping * parameters.damping[0] * speed
+    assert abs(expected) > 1 and not layer.cause[0]
+    assert torque[0, 0] == pytest.approx(max(expected, -parameters.torque[0]), rel=1e-6)
+
+
 def test_softness_is_bounded(tmp_path):
     action = bundles.constant(*[0.0] * 7, *[-1.0] * 7)
     bundle = bundles.make_bundle(tmp_path / "soft", action, mode="joint_impedance")
