@@ -121,6 +121,11 @@ def python_loop() -> Row:
     return _row("loop of Python alone", times)
 
 
+def _priority() -> int:
+    """The real-time priority, as `chrt -f 50` sets it; 0 for none. Processes inherit it."""
+    return os.sched_getparam(0).sched_priority
+
+
 def measure(bundle: Bundle, motions: int) -> Iterator[Row]:
     yield from periods(bundle, motions)
     yield python_loop()
@@ -132,7 +137,7 @@ def main() -> None:
     os.sched_setaffinity(0, {core})
     with tempfile.TemporaryDirectory() as folder:
         bundle = load_bundle(options.bundle) if options.bundle else untrained_bundle(Path(folder))
-        collect(options, measure(bundle, options.motions), "rows", _COLUMNS, unit="ms")
+        collect(options, measure(bundle, options.motions), "rows", _COLUMNS, unit="ms", real_time_priority=_priority())
 
 
 if __name__ == "__main__":

@@ -67,6 +67,19 @@ def test_a_policy_in_its_own_process_gives_the_same_actions(bundle):
     assert len(apart.wall_s) == len(apart.cpu_s) == 4 and min(apart.cpu_s) > 0
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux only")
+def test_the_policy_process_does_not_preempt_the_inner_loop(bundle):
+    policy = PolicyProcess(bundle, 0)
+    try:
+        if os.sched_getscheduler(0) == os.SCHED_OTHER:
+            assert os.sched_getscheduler(policy.pid) == os.SCHED_BATCH
+        else:
+            own, of_policy = os.sched_getparam(0).sched_priority, os.sched_getparam(policy.pid).sched_priority
+            assert of_policy == (own - 1 if own > 1 else own)
+    finally:
+        policy.close()
+
+
 def test_the_runtime_needs_neither_jax_nor_mujoco(bundle):
     """A whole motion, with the policy in its own process, where imports of all other packages fail."""
     code = """
