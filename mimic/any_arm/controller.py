@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
 from mimic.any_arm.control import make_plan, max_speed, planned_torque
-from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals
+from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import check_metric, correspondence
 from mimic.any_arm.observation import observe
 from mimic.arms.arm import build_arm
@@ -71,7 +71,7 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
         own_states = env.expert_at(now.demonstration, now.step + 1)
         next_states = jax.tree.map(lambda x: _padded(x, MAX_LINKS), own_states)
         problem = Problem(arm, weights, jnp.asarray(matrix), next_states, dt)
-        goals = next_goals(problem, goals, qpos, now.key, now.step)
+        goals = next_goals(problem, goals, qpos, random_numbers(now.key, now.step))
         plan = make_plan(arm, qpos, qvel, goals.goal, speed, dt)
         if policy is None:
             action = jnp.zeros(MAX_JOINTS)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from mimic import compat
 from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.any_arm.control import Plan, make_plan, max_speed, planned_torque, torque_scale
-from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals
+from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import (
     check_metric,
     correspondence,
@@ -162,7 +162,7 @@ class AnyArmEnv(Env):
         expert = self.expert_at(state.demonstration, state.step + 1)
         matrix, dt = correspondence(self._expert_arrays, state.arm), self.config.control_dt
         problem = Problem(state.arm, self._weights, matrix, expert, dt)
-        goals = next_goals(problem, state.followed, state.qpos, state.key, state.step)
+        goals = next_goals(problem, state.followed, state.qpos, random_numbers(state.key, state.step))
         speed = max_speed(state.arm, self.config.limits)
         plan = make_plan(state.arm, state.qpos, state.qvel, goals.goal, speed, dt)
         return dataclasses.replace(state, goals=goals, plan=plan)

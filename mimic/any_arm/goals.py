@@ -21,8 +21,8 @@ from mimic.metric.distance import DistanceWeights
 from mimic.metric.kinematics import LinkStates
 
 NEWTON_STEPS = 3  # of each pose; 1 gives a gap of 0.16 instead of 0.14 % on panda4dof, 8 gives 0.13 %
-_OTHERS = 4  # minima that are followed beside the goal
-_NEW = 2  # random poses that join in each step
+OTHERS = 4  # minima that are followed beside the goal
+NEW_POSES = 2  # random poses that join in each step
 _POSES = 5  # folded into an episode's key: others are the noise and the start of the episode
 _SAME = 0.05  # rad, maximum over the joints: minima at a smaller difference are the same
 _SPEED = 2.0  # on the way to another minimum, in velocity limits
@@ -81,7 +81,7 @@ def first_goals(qpos: Float[Array, " joints"]) -> Goals:
     """What `next_goals` starts from: the arm's own pose."""
     zeros = jnp.zeros_like(qpos)
     here = NearestPose(qpos, zeros, zeros)
-    return Goals(here, jnp.tile(qpos, (_OTHERS, 1)), here, -jnp.ones((), qpos.dtype))
+    return Goals(here, jnp.tile(qpos, (OTHERS, 1)), here, -jnp.ones((), qpos.dtype))
 
 
 def chosen_goal(goals: Goals) -> Goals:
@@ -91,17 +91,18 @@ def chosen_goal(goals: Goals) -> Goals:
     return goals._replace(goal=goal)
 
 
-def next_goals(problem: Problem, goals: Goals, qpos: Float[Array, " joints"], key: Array, step: Array) -> Goals:
+def next_goals(
+    problem: Problem, goals: Goals, qpos: Float[Array, " joints"], random: Float[Array, "new joints"]
+) -> Goals:
     """The goals when the expert has moved on.
 
     Args:
       problem: arm and expert.
       goals: those of the last step, after `chosen_goal`.
       qpos: the arm's pose [rad].
-      key: random key of the episode.
-      step: control steps since the start of the episode.
+      random: numbers in [0, 1], new in each step: random poses, as fractions of the joints' ranges.
     """
-    poses = jnp.concatenate([goals.others, _random_poses(problem.arm, key, step), goals.goal.qpos[None]])
+    poses = jnp.concatenate([goals.others, _random_poses(problem.arm, random), goals.goal.qpos[None]])
     # One function for all of them compiles several times faster than one for each kind.
     near = jax.vmap(lambda pose: problem.nearest(pose, NEWTON_STEPS))(poses)
     near = near._replace(qpos=_without_revolutions(problem.arm, near.qpos, qpos))
@@ -114,14 +115,23 @@ def next_goals(problem: Problem, goals: Goals, qpos: Float[Array, " joints"], ke
     advantage = jnp.where(is_goal[best], -1.0, jnp.clip(advantage, -1.0, 1.0))
     repeats = jnp.any(jnp.tril(differences[:-1, :-1] < _SAME, -1), axis=1) | is_goal
     order = jnp.argsort(distance[:-1] + 1e2 * repeats)
-    return Goals(goal, others.qpos[order[:_OTHERS]], jax.tree.map(lambda x: x[best], others), advantage)
+    return Goals(goal, others.qpos[order[:OTHERS]], jax.tree.map(lambda x: x[best], others), advantage)
 
 
-def _random_poses(arm: ArmArrays, key: Array, step: Array) -> Float[Array, "new joints"]:
+def random_numbers(key: Array, step: Array) -> Float[Array, "new joints"]:
+    """The random numbers of a step for `next_goals`.
+
+    Args:
+      key: random key of the episode.
+      step: control steps since the start of the episode.
+    """
     key = jax.random.fold_in(jax.random.fold_in(key, _POSES), step)
+    return jax.random.uniform(key, (NEW_POSES, MAX_JOINTS))
+
+
+def _random_poses(arm: ArmArrays, random: Float[Array, "new joints"]) -> Float[Array, "new joints"]:
     lower, upper = arm.joint_range[:, 0], arm.joint_range[:, 1]
-    poses = jax.random.uniform(key, (_NEW, MAX_JOINTS), minval=lower, maxval=upper)
-    return jnp.where(arm.is_free > 0, poses, arm.home)
+    return jnp.where(arm.is_free > 0, lower + random * (upper - lower), arm.home)
 
 
 def _without_revolutions(

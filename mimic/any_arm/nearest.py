@@ -130,12 +130,13 @@ def nearest_pose(
     """
     lower, upper = angle_limits(arm)
 
-    def newton(qpos: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+    def newton(pose: NearestPose, _: None) -> tuple[NearestPose, None]:
+        qpos = pose.qpos
         near = pose_quadratic(arm, weights, matrix, expert, qpos)
         step = solve_free(near.hessian, -near.gradient, arm.is_free)
         velocity = solve_free(near.hessian, -near.rate, arm.is_free)
         after = jnp.clip(qpos + jnp.clip(step, -max_step, max_step), lower, upper)
-        return after, (velocity, jnp.diagonal(near.hessian))
+        return NearestPose(after, velocity, jnp.diagonal(near.hessian)), None
 
-    qpos, of_steps = jax.lax.scan(newton, qpos, None, length=steps)
-    return NearestPose(qpos, *(x[-1] for x in of_steps))
+    start = NearestPose(qpos, jnp.zeros_like(qpos), jnp.ones_like(qpos))
+    return jax.lax.scan(newton, start, None, length=steps)[0]

@@ -22,7 +22,7 @@ from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.make import make_ppo_trainer
+from mimic.trainers.make import make_policy_trainer
 from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper, one_learner
 from mimic.trainers.run_config import load_config, policy_run
 
@@ -98,8 +98,8 @@ def prepare_clip(config: RenderConfig) -> ClipPlan:
 def _policy_clip(config: RenderConfig) -> ClipPlan:
     """A policy's rollout, with the kinematic bound and the distance of holding the start pose."""
     run_dir, trained = policy_run(config.run, config.checkpoint)
-    _check_unused(config, "a run of trainer=ppo", "demonstrations", "learner", "limits", "seed")
-    trainer = make_ppo_trainer(trained, run_dir)
+    _check_unused(config, "a run of trainer=ppo", "demonstrations", "limits", "seed")
+    trained, trainer = make_policy_trainer(trained, run_dir, config.learner, config.locked)
     index = demonstration_index(trainer.evaluator, config.split, config.demonstration)
     _, params = load_checkpoint(run_dir, trainer.params_template(), config.checkpoint)
     title = f"{trained.env.name}, {config.split.replace('_', '-')} demonstration {config.demonstration}"
@@ -119,12 +119,15 @@ def _policy_clip(config: RenderConfig) -> ClipPlan:
         measures = _similarity(arms, poses)
         return Clip(title, ("expert", "learner"), rollout.time, poses, steps, curves, *bars, measures, match)
 
-    return ClipPlan(trained.env, run_dir / "videos" / f"{config.split}-{config.demonstration}.mp4", compute)
+    name = f"{config.split}-{config.demonstration}.mp4"
+    if config.learner:
+        name = f"{trained.env.name}-{name}"
+    return ClipPlan(trained.env, run_dir / "videos" / name, compute)
 
 
 def _mapper_clip(config: RenderConfig) -> ClipPlan:
     """A demonstration of the expert, and the pose of the pose mapper at each frame."""
-    _check_unused(config, "a run of trainer=pose_mapper", "split", "learner", "limits")
+    _check_unused(config, "a run of trainer=pose_mapper", "split", "learner", "locked", "limits")
     run_dir = Path(config.run).expanduser()
     env = one_learner(load_config(run_dir).env)
     mapper = load_mapper(run_dir, config.checkpoint)
@@ -159,7 +162,7 @@ def _mapper_clip(config: RenderConfig) -> ClipPlan:
 
 def _retargeted_clip(config: RenderConfig) -> ClipPlan:
     """A demonstration of the expert, and the learner's motion that `mimic.retarget` computed from it."""
-    _check_unused(config, "retargeted=FILE", "run", "checkpoint", "split", "seed")
+    _check_unused(config, "retargeted=FILE", "run", "checkpoint", "split", "seed", "locked")
     for key, example in (("demonstrations", "EXPERT.npz"), ("retargeted", "LEARNER.npz"), ("learner", "panda4dof")):
         if not getattr(config, key):
             raise ValueError(f"{key}: expected with retargeted=FILE, as in {key}={example}")

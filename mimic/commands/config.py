@@ -34,6 +34,11 @@ def _steps() -> Any:
     return number(None, at_least=0, at_most=10**15)
 
 
+def _check_locked(locked: list[Any], learner: str) -> None:
+    if locked and not learner:
+        raise ValueError(f"locked: expected with learner=NAME, as in learner=panda locked=[2,4], got {locked}")
+
+
 def _factor() -> Any:
     """Field for a factor on masses or damping, as in `RandomizationConfig`."""
     return number(None, at_least=1e-3, at_most=1e3)
@@ -87,8 +92,7 @@ class EvaluateConfig:
         check_ranges(self)
         check_choice("controller", self.controller, CONTROLLERS)
         self._check_robot()
-        if self.locked and not self.learner:
-            raise ValueError(f"locked: expected with learner=NAME, as in learner=panda locked=[2,4], got {self.locked}")
+        _check_locked(self.locked, self.learner)
         if self.physics:
             check_choice("physics", self.physics, PHYSICS)
 
@@ -149,7 +153,9 @@ class RenderConfig:
         settings of its environment.
       seed: seed of the recorded demonstrations.
       retargeted: file of the learner's motions that `mimic.retarget` computed from `demonstrations`.
-      learner: name of the environment that `retargeted` was computed for.
+      learner: name of the environment that `retargeted` was computed for; of a run of many arms, name or file of the
+        one that its policy moves.
+      locked: numbers or names of the joints of this arm that are locked.
       limits: the `limits` that `retargeted` was computed with, see `EnvConfig`.
       out: video file. Default "": a file in the folder `videos` of the run directory.
       gif: whether to write a GIF as well.
@@ -164,6 +170,7 @@ class RenderConfig:
     seed: int = number(0, at_least=0, at_most=2**63 - 1)
     retargeted: str = ""
     learner: str = ""
+    locked: list[Any] = dataclasses.field(default_factory=list)
     limits: str = "none"
     out: str = ""
     gif: bool = False
@@ -172,6 +179,7 @@ class RenderConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
         check_choice("split", self.split, SPLITS)
+        _check_locked(self.locked, self.learner)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,8 +190,9 @@ class ExportConfig:
       run: run directory.
       out: exported file, or folder of a controller; must not exist.
       format: "onnx", "jax", or "controller": a policy with an inner loop and what a robot needs beside it.
-      learner: name of the environment that the run's arms must equal; for a pose mapper to any arm, an arm whose
+      learner: name of the environment that the run's arms must equal; of a run whose learner is any arm, an arm whose
         description is written to `out` instead. Default "": not checked.
+      locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
     """
 
@@ -191,11 +200,13 @@ class ExportConfig:
     out: str = ""
     format: str = "onnx"
     learner: str = ""
+    locked: list[Any] = dataclasses.field(default_factory=list)
     checkpoint: int | None = _steps()
 
     def __post_init__(self) -> None:
         check_ranges(self)
         check_choice("format", self.format, EXPORT_FORMATS)
+        _check_locked(self.locked, self.learner)
 
 
 @dataclasses.dataclass(frozen=True)

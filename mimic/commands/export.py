@@ -1,6 +1,5 @@
 """`python -m mimic.export`: writes a trained policy or pose mapper to a file that runs without mimic."""
 
-import dataclasses
 import importlib
 import json
 import os
@@ -13,10 +12,11 @@ import jax
 import jax.numpy as jnp
 from rich.console import Console
 
-from mimic.any_arm.description import SIZE, SUFFIXES, described_arm, description_layout, save_description
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
+from mimic.commands.export_any_arm import any_arm_function, description_writer
 from mimic.commands.export_controller import prepare_controller
+from mimic.commands.exported_function import ExportedFunction, joint_ranges
 from mimic.config import check_choice, new_file, new_folder
 from mimic.distribution import VERSION, install_command
 from mimic.envs import env_config
@@ -24,8 +24,6 @@ from mimic.envs.imitation import layout_of, observation_layout, torque_scale
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_atomically
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-from mimic.trainers.pose_mapper.any_arm_model import expert_pose
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.trainer import run_environment
@@ -35,29 +33,13 @@ _PACKAGES = {"onnx": "onnx", "jax": "flatbuffers", CONTROLLER: "onnx"}  # the pa
 _JAX_PLATFORMS = ("cpu", "cuda")
 
 
-@dataclasses.dataclass(frozen=True)
-class ExportedFunction:
-    """A function to export.
-
-    Attributes:
-      function: maps one float32 vector for each input to the named output vectors.
-      kind: "policy" or "pose_mapper".
-      inputs: length of each input by its name.
-      metadata: meaning and units of inputs and outputs.
-    """
-
-    function: Callable[..., dict[str, jax.Array]]
-    kind: str
-    inputs: dict[str, int]
-    metadata: dict[str, Any]
-
-
 def export_run(
     run: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
     format: Literal["onnx", "jax", "controller"] = "onnx",
     learner: str = "",
+    locked: Sequence[int | str] = (),
     checkpoint: int | None = None,
 ) -> Path:
     """Writes the policy or the pose mapper of a run to a file that other programs can run without mimic.
@@ -66,18 +48,21 @@ def export_run(
     to `torque` [N m]. A pose mapper maps `expert_qpos` [batch, joints] to `learner_qpos` [batch, learner_joints], both
     in rad. The file includes the normalisation of inputs and the scaling of outputs.
 
-    A pose mapper to any arm has a second input, `learner` [batch, 180]: the description of an arm, which this function
-    writes too. With the metadata's `learner_layout` it can also be made without mimic, see `ArmArrays` in
-    mimic/any_arm/arrays.py. Its output has 8 angles, those of locked joints included, and 0 where the arm has no joint.
+    Of a run whose learner is any arm, the function has an input `learner`: the description of an arm, which this
+    function writes too. With the metadata's `learner_layout` it can also be made without mimic, see `ArmArrays` in
+    mimic/any_arm/arrays.py. Angles and torques are then [batch, 8], with those of locked joints, and 0 where the arm
+    has no joint. A policy of any arm is a step of its controller, with the poses that it follows as an input and an
+    output; the metadata says what the inputs are.
 
     Args:
       run: run directory.
       out: exported file; must not exist.
       format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json";
         or "controller", a folder for `mimic.deploy`, see `export_controller`.
-      learner: name of the environment that the run's arms must equal. Default "": not checked. For a pose mapper to any
-        arm, an arm (see `AnyArmMapper`) whose description is written to `out`, a .json or .npz file, instead of the
-        network.
+      learner: name of the environment that the run's arms must equal. Default "": not checked. Of a run whose learner
+        is any arm, an arm (see `ArmConfig.model`) whose description is written to `out`, a .json or .npz file, instead
+        of the network.
+      locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
 
     Returns:
@@ -87,7 +72,7 @@ def export_run(
       ValueError: the run or the checkpoint does not exist, the run has other arms, the file cannot be written, the
         format is unknown, or a package that it needs is not installed.
     """
-    config = ExportConfig(os.fspath(run), os.fspath(out), format, learner, checkpoint)
+    config = ExportConfig(os.fspath(run), os.fspath(out), format, learner, list(locked), checkpoint)
     if export := _folder_writer(config) or _description_writer(config):
         export()
     else:
@@ -125,7 +110,7 @@ def _folder_writer(config: ExportConfig) -> Callable[[], None] | None:
     _check_package(config.format)
     out, run_dir = new_folder("out", config.out), _run_dir(config)
     if config.learner:
-        _check_arms(config.learner, *load_config(run_dir).env.build_arms().embodiments)
+        _check_arms(config, *load_config(run_dir).env.build_arms().embodiments)
     write = prepare_controller(run_dir, config.checkpoint)
 
     def run() -> None:
@@ -174,11 +159,11 @@ def exported_function(config: ExportConfig) -> ExportedFunction:
     if trained.env.has_inner_loop:
         raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
     steps = check_checkpoint(run_dir, config.checkpoint)
-    if _is_of_any_arm(trained):
-        return _any_arm_mapper(AnyArmMapper.load(run_dir, steps), trained, steps)
+    if trained.env.arms.are_drawn:
+        return any_arm_function(trained, run_dir, steps)
     expert, learner = trained.env.build_arms().embodiments
     if config.learner:
-        _check_arms(config.learner, expert, learner)
+        _check_arms(config, expert, learner)
     common = {
         "mimic_version": VERSION,
         "env": trained.env.name,
@@ -194,34 +179,23 @@ def exported_function(config: ExportConfig) -> ExportedFunction:
     return _mapper(PoseMapper.load(run_dir, steps), common)
 
 
-def _is_of_any_arm(trained: TrainConfig) -> bool:
-    return trained.trainer.name == "pose_mapper" and trained.env.arms.are_drawn
-
-
 def _description_writer(config: ExportConfig) -> Callable[[], None] | None:
-    """Writes the description of the arm `learner` for a mapper to any arm; None for another export."""
+    """Writes the description of the arm `learner` for a run whose learner is any arm; None for another export."""
     run_dir = Path(config.run).expanduser()
-    if not config.learner or not config.run or not _is_of_any_arm(load_config(run_dir)):
+    if not config.learner or not config.run:
         return None
-    out = new_file("out", config.out)
-    if out.suffix not in SUFFIXES:
-        raise ValueError(
-            f"out: expected a file {' or '.join(SUFFIXES)} for the description of learner={config.learner}, got "
-            f"{config.out!r}; export the network, which takes any arm, without learner="
-        )
-    mapper = AnyArmMapper.load(run_dir, config.checkpoint)
-    described = mapper.describe(config.learner)
-    name, arrays, slots = described.arm.embodiment.name, described.arrays, described.slots
-
-    def run() -> None:
-        save_description(out, arrays, name, slots)
-        Console().print(f"results: {out}", soft_wrap=True, highlight=False)
-
-    return run
+    trained = load_config(run_dir)
+    if not trained.env.arms.are_drawn:
+        return None
+    check_checkpoint(run_dir, config.checkpoint)
+    return description_writer(trained, config.learner, config.locked, config.out)
 
 
-def _check_arms(name: str, expert: Embodiment, learner: Embodiment) -> None:
-    """Raises a `ValueError` unless the arms of a run are those of an environment."""
+def _check_arms(config: ExportConfig, expert: Embodiment, learner: Embodiment) -> None:
+    """Raises a `ValueError` unless the arms of a run are those of the environment `learner`."""
+    name = config.learner
+    if config.locked:
+        raise ValueError(f"locked: expected none for a run of one learner, got {config.locked}")
     required_arms = env_config(name).build_arms().embodiments
     for role, arm, required in zip(("expert", "learner"), (expert, learner), required_arms, strict=True):
         if (arm.name, arm.joint_names) != (required.name, required.joint_names):
@@ -272,40 +246,10 @@ def _mapper(mapper: PoseMapper, common: Mapping[str, Any]) -> ExportedFunction:
         **common,
         "inputs": {"expert_qpos": "rad, in the order of expert_joints"},
         "outputs": {"learner_qpos": "rad, in the order of learner_joints"},
-        "expert_range": _range(mapper.expert),
-        "learner_range": _range(mapper.learner),
+        "expert_range": joint_ranges(mapper.expert),
+        "learner_range": joint_ranges(mapper.learner),
     }
     return ExportedFunction(function, "pose_mapper", {"expert_qpos": mapper.expert.num_joints}, metadata)
-
-
-def _any_arm_mapper(mapper: AnyArmMapper, trained: TrainConfig, steps: int) -> ExportedFunction:
-    params = jax.device_get(mapper.params)
-
-    def function(expert_qpos: jax.Array, learner: jax.Array) -> dict[str, jax.Array]:
-        expert = expert_pose(mapper.model.expert, mapper.own_expert.in_slots(expert_qpos))
-        return {"learner_qpos": mapper.model(params, expert, described_arm(learner))}
-
-    metadata = {
-        "mimic_version": VERSION,
-        "env": trained.env.name,
-        "trainer": trained.trainer.name,
-        "checkpoint": steps,
-        "expert": mapper.expert.name,
-        "expert_joints": list(mapper.expert.joint_names),
-        "inputs": {
-            "expert_qpos": "rad, in the order of expert_joints",
-            "learner": "description of an arm, see learner_layout; mimic.export with learner=ARM writes it",
-        },
-        "outputs": {"learner_qpos": "rad, from base to tip, with those of locked joints; 0 where the arm has no joint"},
-        "expert_range": _range(mapper.expert),
-        "learner_layout": description_layout(),
-    }
-    inputs = {"expert_qpos": mapper.expert.num_joints, "learner": SIZE}
-    return ExportedFunction(function, "pose_mapper", inputs, metadata)
-
-
-def _range(arm: Embodiment) -> Sequence[Sequence[float]]:
-    return [[float(bound) for bound in bounds] for bounds in arm.joint_range]
 
 
 def _write(exported: ExportedFunction, out: Path, format: str) -> None:

@@ -20,10 +20,13 @@ from mimic.commands.onnx_operations import (
     UNARY,
     Tensor,
     Value,
+    carried_in_use,
     einsum_equation,
     ints,
     live_equations,
+    read_names,
     read_value,
+    used_nodes,
 )
 
 OPSET, IR_VERSION = 18, 8  # of 2022: reductions take axes as inputs; supported by all runtimes since then
@@ -58,7 +61,10 @@ def to_onnx(
         graph.nodes.append(helper.make_node("Identity", [graph.batched(result)], [output_name]))
         outputs.append(_value_info(output_name, shapes[output_name].shape[0]))
     input_infos = [_value_info(*item) for item in inputs.items()]
-    proto = helper.make_graph(graph.nodes, name, input_infos, outputs, list(graph.constants.values()))
+    nodes = used_nodes(graph.nodes, [output.name for output in outputs])
+    read = {key for node in nodes for key in read_names(node)}
+    constants = [constant for constant in graph.constants.values() if constant.name in read]
+    proto = helper.make_graph(nodes, name, input_infos, outputs, constants)
     opset = [helper.make_opsetid("", OPSET)]
     model = helper.make_model(proto, opset_imports=opset, ir_version=IR_VERSION, producer_name="mimic")
     helper.set_model_props(model, dict(metadata))
@@ -78,26 +84,33 @@ class _Graph:
         self.constants: dict[tuple, onnx.TensorProto] = {}
         self._input = input_name
         self._names = 0
+        self._outputs: dict[tuple[str, ...], str] = {}  # of each node, by its operation and its inputs
 
     def run(
-        self, jaxpr: Any, consts: Sequence[Value], arguments: Sequence[Value], outputs: int | None = None
+        self, jaxpr: Any, consts: Sequence[Value], arguments: Sequence[Value | None], kept: Sequence[int] | None = None
     ) -> list[Value]:
-        """Adds a traced function and returns its results, or the first `outputs` of them."""
-        values: dict[Any, Value] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
-        for equation in live_equations(jaxpr, outputs):
-            results = self._apply(equation, [read_value(values, variable) for variable in equation.invars])
-            values.update(zip(equation.outvars, results, strict=False))  # a loop returns only what it carries
-        return [read_value(values, variable) for variable in jaxpr.outvars[:outputs]]
+        """Adds a traced function and returns its results, or those that are kept; others may lack arguments."""
+        outputs = jaxpr.outvars if kept is None else [jaxpr.outvars[i] for i in kept]
+        values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
+        live = live_equations(jaxpr, outputs)
+        read = {variable for equation in live for variable in equation.invars if not hasattr(variable, "val")}
+        read |= {variable for variable in outputs if not hasattr(variable, "val")}
+        for equation in live:
+            inputs = [read_value(values, variable) for variable in equation.invars]
+            if equation.primitive.name == "scan" and any(isinstance(value, Tensor) for value in inputs):
+                results = self._loop(equation, inputs, [variable in read for variable in equation.outvars])
+            else:
+                results = self._apply(equation, inputs)
+            values.update(zip(equation.outvars, results, strict=True))
+        return [read_value(values, variable) for variable in outputs]
 
-    def _apply(self, equation: Any, inputs: list[Value]) -> list[Value]:
+    def _apply(self, equation: Any, inputs: list[Value]) -> Sequence[Value | None]:
         primitive, params = equation.primitive, equation.params
         if primitive.name == "platform_index":  # of a function with another form on TPUs
             return [np.asarray(0)]
         if primitive.name == "cond" and params.get("branches_platforms"):
             default = params["branches"][params["branches_platforms"].index(None)]
             return self.run(default.jaxpr, default.consts, inputs[1:])
-        if primitive.name == "scan":
-            return self._unrolled(inputs, params)
         if not any(isinstance(value, Tensor) for value in inputs):  # constant over the batch: folded
             results = primitive.bind(*inputs, **params)
             return list(map(np.asarray, results if primitive.multiple_results else [results]))
@@ -107,19 +120,60 @@ class _Graph:
         name, shapes = primitive.name, [variable.aval.shape for variable in equation.outvars]
         if name == "split":
             return self._split(inputs[0], shapes, params["axis"])
+        if name == "sort":
+            return self._sort(inputs, shapes, params)
         if name in ("copy", "optimization_barrier", "stop_gradient"):
             return inputs
+        if name == "select_n" and equation.outvars[0].aval.dtype == bool:
+            name = "select_bool"
         return [Tensor(self._single_output(name, inputs, shapes[0], params), shapes[0])]
 
-    def _unrolled(self, inputs: list[Value], params: Mapping[str, Any]) -> list[Value]:
+    def _loop(self, equation: Any, inputs: list[Value], is_read: Sequence[bool]) -> list[Value | None]:
         """A loop over a constant number of steps, without values for each step; what it carries at the end."""
-        consts, carried = inputs[: params["num_consts"]], inputs[params["num_consts"] :]
-        if len(carried) != params["num_carry"]:
-            raise NotImplementedError("onnx: expected a loop without inputs for each step")
-        for _ in range(params["length"]):
-            body = params["jaxpr"]
-            carried = self.run(body.jaxpr, list(map(np.asarray, body.consts)), [*consts, *carried], len(carried))
-        return carried
+        params, body = equation.params, equation.params["jaxpr"]
+        first, count = params["num_consts"], params["num_carry"]
+        consts, carried = inputs[:first], inputs[first:]
+        if len(carried) != count or any(is_read[count:]):
+            raise NotImplementedError("onnx: expected a loop without values for each step")
+        kept = carried_in_use(body.jaxpr, first, [i for i in range(count) if is_read[i]])
+        self._names += 1
+        name = f"Loop_{self._names}"
+        avals = {i: equation.invars[first + i].aval for i in kept}
+        states = [Tensor(f"{name}_state_{i}", avals[i].shape) if i in avals else None for i in range(count)]
+        outer = self.nodes, self._outputs
+        self.nodes, self._outputs = [], dict(self._outputs)
+        results = self.run(body.jaxpr, list(map(np.asarray, body.consts)), [*consts, *states], kept)
+        after = [f"{name}_next_{i}" for i in kept]
+        for value, output in zip(results, after, strict=True):
+            self.nodes.append(helper.make_node("Identity", [self.batched(value)], [output]))
+        self.nodes.append(helper.make_node("Identity", [f"{name}_condition"], [f"{name}_goes_on"]))
+        nodes, (self.nodes, self._outputs) = self.nodes, outer
+
+        def infos(names: Sequence[str]) -> list[onnx.ValueInfoProto]:
+            types = [helper.np_dtype_to_tensor_dtype(np.dtype(avals[i].dtype)) for i in kept]
+            shapes = [["batch", *avals[i].shape] for i in kept]
+            return [helper.make_tensor_value_info(*info) for info in zip(names, types, shapes, strict=True)]
+
+        step = helper.make_tensor_value_info(f"{name}_step", TensorProto.INT64, [])
+        conditions = [
+            helper.make_tensor_value_info(f"{name}_{key}", TensorProto.BOOL, []) for key in ("condition", "goes_on")
+        ]
+        state_inputs = infos([state.name for state in states if state is not None])
+        body_outputs = [conditions[1], *infos(after)]
+        graph = helper.make_graph(
+            used_nodes(nodes, [info.name for info in body_outputs]),
+            name,
+            [step, conditions[0], *state_inputs],
+            body_outputs,
+        )
+        length = self.name(np.asarray(params["length"], np.int64))
+        start = [self.batched(carried[i]) for i in kept]
+        outputs = [f"{name}_{i}" for i in kept]
+        self.nodes.append(helper.make_node("Loop", [length, "", *start], outputs, body=graph))
+        at_end: list[Value | None] = [None] * len(is_read)
+        for i, output in zip(kept, outputs, strict=True):
+            at_end[i] = Tensor(output, avals[i].shape)
+        return at_end
 
     def _single_output(self, name: str, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         """Adds an operation with one output, and returns its name."""
@@ -136,11 +190,14 @@ class _Graph:
         return _RULES[name](self, inputs, shape, params)
 
     def node(self, kind: str, *inputs: Value | str, **attributes: Any) -> str:
-        """Adds a node and returns the name of its output."""
-        self._names += 1
-        output = f"{kind}_{self._names}"
-        self.nodes.append(helper.make_node(kind, [self.name(value) for value in inputs], [output], **attributes))
-        return output
+        """Adds a node, unless there is the same one already, and returns the name of its output."""
+        names = [self.name(value) for value in inputs]
+        key = kind, *names, repr(sorted(attributes.items()))
+        if key not in self._outputs:
+            self._names += 1
+            self._outputs[key] = f"{kind}_{self._names}"
+            self.nodes.append(helper.make_node(kind, names, [self._outputs[key]], **attributes))
+        return self._outputs[key]
 
     def name(self, value: Value | str) -> str:
         """The name of a value in the graph."""
@@ -175,6 +232,23 @@ class _Graph:
         self.nodes.append(helper.make_node("Split", inputs, names, axis=axis + 1))
         return [Tensor(name, shape) for name, shape in zip(names, shapes, strict=True)]
 
+    def _sort(self, inputs: list[Value], shapes: list[tuple[int, ...]], params: Mapping[str, Any]) -> list[Value]:
+        """Arrays in the ascending order of the first one."""
+        if params["num_keys"] != 1:
+            raise NotImplementedError(f"onnx: expected a sort by one array, got {params['num_keys']}")
+        axis = params["dimension"] + 1
+        self._names += 1
+        names = [f"TopK_{self._names}_{part}" for part in range(2)]  # equal ones keep their order
+        keys = [self.batched(inputs[0]), self.name(ints([shapes[0][axis - 1]]))]
+        self.nodes.append(helper.make_node("TopK", keys, names, axis=axis, largest=0, sorted=1))
+        others = (self.node("GatherElements", self.batched(value), names[1], axis=axis) for value in inputs[1:])
+        return [Tensor(name, shape) for name, shape in zip([names[0], *others], shapes, strict=True)]
+
+    def _any(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
+        numbers = self.node("Cast", inputs[0], to=TensorProto.INT32)
+        largest = self.node("ReduceMax", numbers, ints([axis + 1 for axis in params["axes"]]), keepdims=0)
+        return self.node("Cast", largest, to=TensorProto.BOOL)
+
     def _integer_pow(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         return self.node("Pow", inputs[0], np.asarray(params["y"], np.float32))
 
@@ -200,6 +274,16 @@ class _Graph:
     def _select(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         condition, if_false, if_true = inputs
         return self.node("Where", self._aligned(condition, shape), if_true, if_false)
+
+    def _select_bool(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
+        """Runtimes have no Where of truth values."""
+        condition, if_false, if_true = inputs
+        condition = self._aligned(condition, shape)
+        return self.node(
+            "Or",
+            self.node("And", condition, if_true),
+            self.node("And", self.node("Not", condition), if_false),
+        )
 
     def _convert(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         return self.node("Cast", inputs[0], to=helper.np_dtype_to_tensor_dtype(np.dtype(params["new_dtype"])))
@@ -250,9 +334,16 @@ class _Graph:
         return self.node("Pad", values, ints([0, *low, 0, *high]), filling)
 
     def _gather(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
-        """Entries along one axis, by a vector of indices."""
+        """Entries along one axis, by a vector of indices; or numbers at constant positions, such as a diagonal."""
         values, indices = inputs
         numbers = params["dimension_numbers"]
+        lead = len(values.shape) - len(numbers.start_index_map)
+        last = tuple(range(lead, len(values.shape)))
+        if isinstance(indices, np.ndarray) and tuple(numbers.start_index_map) == last == numbers.collapsed_slice_dims:
+            whole, inner = values.shape[:lead], values.shape[lead:]
+            positions = np.asarray(np.ravel_multi_index(tuple(np.moveaxis(indices, -1, 0)), inner))
+            flat = self._reshape(values, [*whole, math.prod(inner)])
+            return self.node("Gather", flat, ints(positions.tolist()), axis=lead + 1)
         (axis,) = map(int, numbers.start_index_map)
         kept = tuple(i for i in range(len(shape)) if i != axis)
         is_along_axis = tuple(map(int, numbers.offset_dims)) == kept and len(values.shape) == len(shape)
@@ -290,7 +381,9 @@ _RULES: dict[str, Callable[[_Graph, list[Value], tuple[int, ...], Mapping[str, A
     "integer_pow": _Graph._integer_pow,
     "ne": _Graph._not_equal,
     "pad": _Graph._pad,
+    "reduce_or": _Graph._any,
     "rsqrt": _Graph._rsqrt,
+    "select_bool": _Graph._select_bool,
     "select_n": _Graph._select,
     "slice": _Graph._slice,
     "square": _Graph._square,
@@ -300,4 +393,4 @@ _RULES: dict[str, Callable[[_Graph, list[Value], tuple[int, ...], Mapping[str, A
 
 
 def _supported() -> list[str]:
-    return sorted([*UNARY, *BINARY, *REDUCTIONS, *_RULES, "expand_dims", "reshape", "scan", "split", "squeeze"])
+    return sorted([*UNARY, *BINARY, *REDUCTIONS, *_RULES, "expand_dims", "reshape", "scan", "sort", "split", "squeeze"])

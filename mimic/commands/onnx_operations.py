@@ -1,6 +1,6 @@
 """Parts of the conversion to ONNX: values, the operations with the same meaning, and the equations of a jaxpr."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,12 +41,12 @@ def einsum_equation(left: Value, right: Value, contracted: Any, batch: Any) -> s
     return f"{','.join(terms)}->z{''.join((*shared, *free))}"
 
 
-def live_equations(jaxpr: Any, outputs: int | None = None) -> list[Any]:
-    """The equations that the first `outputs` results, or all of them, depend on.
+def live_equations(jaxpr: Any, outputs: Sequence[Any]) -> list[Any]:
+    """The equations that some of the results depend on.
 
     They are without the standard deviation of PPO's network, for example.
     """
-    live_variables, live = {variable for variable in jaxpr.outvars[:outputs] if not hasattr(variable, "val")}, []
+    live_variables, live = {variable for variable in outputs if not hasattr(variable, "val")}, []
     for equation in reversed(jaxpr.eqns):
         if live_variables.intersection(equation.outvars):
             live.append(equation)
@@ -54,9 +54,47 @@ def live_equations(jaxpr: Any, outputs: int | None = None) -> list[Any]:
     return live[::-1]
 
 
+def carried_in_use(body: Any, first: int, wanted: Sequence[int]) -> list[int]:
+    """Which of the values that a loop carries determine the wanted ones at its end.
+
+    Args:
+      body: the traced function of a step.
+      first: index of the first carried value among its arguments.
+      wanted: indices of carried values.
+    """
+    used = set(wanted)
+    while True:
+        outputs = [body.outvars[i] for i in used]
+        read = {variable for equation in live_equations(body, outputs) for variable in equation.invars
+                if not hasattr(variable, "val")}  # fmt: skip
+        read.update(variable for variable in outputs if not hasattr(variable, "val"))
+        more = {i for i, variable in enumerate(body.invars[first:]) if variable in read} - used
+        if not more:
+            return sorted(used)
+        used |= more
+
+
+def used_nodes(nodes: Sequence[Any], outputs: Sequence[str]) -> list[Any]:
+    """The nodes, in their order, that outputs of a graph depend on."""
+    read, used = set(outputs), []
+    for node in reversed(nodes):
+        if read.intersection(node.output):
+            used.append(node)
+            read.update(read_names(node))
+    return used[::-1]
+
+
+def read_names(node: Any) -> Iterator[str]:
+    """The names that a node reads, in the body of a loop too."""
+    yield from node.input
+    for attribute in node.attribute:
+        for inner in attribute.g.node:
+            yield from read_names(inner)
+
+
 def read_value(values: Mapping[Any, Value], variable: Any) -> Value:
     """The value of a variable or of a literal."""
-    return np.asarray(variable.val) if hasattr(variable, "val") else values[variable]
+    return np.asarray(variable.val, variable.aval.dtype) if hasattr(variable, "val") else values[variable]
 
 
 def ints(values: Sequence[int]) -> np.ndarray:

@@ -1,12 +1,14 @@
 """Makes the trainer of a config, by its name."""
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mimic import compat, registry
 from mimic.envs.demonstrations import Demonstrations
 from mimic.trainers.config import TrainConfig
+from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.memory import check_training_memory
 from mimic.trainers.trainer import Trainer
 
@@ -55,6 +57,33 @@ def make_any_arm_trainer(
     from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
 
     return AnyArmPPOTrainer(config, run_dir, unseen)
+
+
+def make_policy_trainer(
+    config: TrainConfig, run_dir: Path, learner: str = "", locked: Sequence[int | str] = ()
+) -> "tuple[TrainConfig, PPOTrainer]":
+    """The trainer that evaluates a run's policy on one learner, and the config of its environment.
+
+    Args:
+      config: of a run of trainer=ppo.
+      run_dir: its directory.
+      learner: of a run of many arms: name or file of the one to evaluate on.
+      locked: numbers or names of the joints of `learner` that are locked.
+
+    Raises:
+      ValueError: a learner for a run of one, none for a run of many, or one that its policy cannot move.
+    """
+    if not config.env.arms.are_drawn:
+        if learner:
+            raise ValueError(f"learner: expected none for a run of one learner, got {learner!r}")
+        return config, make_ppo_trainer(config, run_dir)
+    if not learner:
+        raise ValueError(
+            f"learner: expected one arm for a run of many, env={config.env.name}, as in learner=panda locked=[2,4]"
+        )
+    of_one = dataclasses.replace(config, env=with_one_learner(config.env, learner, locked))
+    shared = make_any_arm_trainer(config, run_dir).shared_policy()
+    return of_one, make_ppo_trainer(of_one, run_dir, shared=shared)
 
 
 def _make_ppo_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:

@@ -7,7 +7,7 @@ import pytest
 
 from mimic.any_arm import goals
 from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints
-from mimic.any_arm.goals import Problem, chosen_goal, first_goals, next_goals
+from mimic.any_arm.goals import Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import correspondence, link_states
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.metric.distance import DistanceWeights
@@ -40,7 +40,9 @@ def problem(panda):
 
 @pytest.fixture(scope="module")
 def advance(problem):
-    return jax.jit(lambda values, qpos, step: next_goals(problem, values, qpos, jax.random.PRNGKey(0), step))
+    return jax.jit(
+        lambda values, qpos, step: next_goals(problem, values, qpos, random_numbers(jax.random.PRNGKey(0), step))
+    )
 
 
 @pytest.fixture(scope="module")

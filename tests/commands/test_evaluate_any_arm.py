@@ -2,12 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 
-from mimic.commands.config import EvaluateConfig
+from mimic.commands.clips import prepare_clip
+from mimic.commands.config import EvaluateConfig, RenderConfig
 from mimic.commands.evaluate import prepare_evaluation
 from tests.helpers.run_directories import write_run
-from tests.helpers.untrained_family import COUNT, HELD_OUT, untrained_family
+from tests.helpers.untrained_family import COUNT, HELD_OUT, HORIZON, untrained_family
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +49,24 @@ def test_a_run_of_one_learner_has_its_own(rejected, tmp_path):
     [
         ("view", ["env=panda_family"]),
         ("view", ["run=RUN"]),
-        ("render", ["run=RUN"]),
-        ("export", ["run=RUN", "out=policy.onnx"]),
         ("retarget", ["learner=any_arm", "demonstrations=RUN/demonstrations.npz", "out=motions.npz"]),
     ],
 )
 def test_commands_of_one_learner_reject_many(run_dir, rejected, name, arguments):
     line = rejected(name, *(argument.replace("RUN", str(run_dir)) for argument in arguments))
     assert "expected an environment of one learner, got" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "learner: expected one arm for a run of many, env=panda_family, as in learner=panda locked=[2,4]"),
+        (["locked=[2]"], "locked: expected with learner=NAME"),
+        (["learner=panda", "demonstration=9"], "demonstration: "),
+    ],
+)
+def test_a_video_is_of_one_of_many_arms(run_dir, rejected, arguments, message):
+    assert message in rejected("render", f"run={run_dir}", *arguments)
 
 
 @pytest.mark.slow
@@ -70,3 +82,13 @@ def test_one_arm_has_the_report_of_a_run_of_one_learner(run_dir, tmp_path):
     assert report["mjx"]["mean_distance"] == pytest.approx(report["mean_distance"], rel=1e-3)
     assert len((out / "demonstrations.csv").read_text().splitlines()) == 1 + COUNT + HELD_OUT
     prepare_evaluation(EvaluateConfig(str(run_dir), controller="hold", mass=1.2, **options), 0.0)()
+
+
+@pytest.mark.slow
+def test_a_video_shows_the_policy_on_one_arm(run_dir):
+    plan = prepare_clip(RenderConfig(str(run_dir), learner="panda", locked=[2], compilation_cache=""))
+    clip = plan.compute()
+    assert plan.out == run_dir / "videos" / "panda_family-panda-locked-2-held_out-0.mp4"
+    assert [poses.shape[1] for poses in clip.poses] == [7, 6]
+    bound, policy = (next(c.values for c in clip.curves if c.label == key) for key in ("kinematic bound", "policy"))
+    assert len(policy) == HORIZON and np.all(bound <= policy + 1e-6)

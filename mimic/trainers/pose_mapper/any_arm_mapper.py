@@ -166,26 +166,8 @@ class AnyArmMapper:
         return jax.tree.map(_single, arm)
 
     def describe(self, arm: OneArm) -> DescribedArm:
-        """An arm and its arrays. Joints that a config locks are locked by the mask, as in training.
-
-        Raises:
-          ValueError: see `__call__`.
-        """
-        limits, links = self.env.limits, self.env.metric.links
-        if isinstance(arm, Arm):
-            return DescribedArm.without_locks(arm)
-        if isinstance(arm, ArmConfig):
-            config = arm
-        else:
-            name = os.fspath(arm)
-            config = env_config(name).learner if name in environments() else ArmConfig(model=name)
-        built = build_arm(config, limits, links)
-        whole = build_arm(dataclasses.replace(config, locked=None), limits, links) if built.locked else built
-        if max(whole.embodiment.num_joints - MAX_JOINTS, whole.embodiment.num_links - MAX_LINKS) > 0:
-            return DescribedArm.without_locks(built)  # it may have few enough without those that are locked
-        arrays, names = masked_arrays(config, limits, links)
-        is_free = np.asarray(arrays.is_free) > 0
-        return DescribedArm(built, arrays.astype(np.float32), np.flatnonzero(is_free), names)
+        """An arm and its arrays, see `describe_arm`."""
+        return describe_arm(self.env, arm)
 
     def describe_expert(self, expert: OneArm | None) -> DescribedArm:
         """An expert and its arrays; the environment's where None.
@@ -217,6 +199,33 @@ class AnyArmMapper:
         """
         arms = self.describe_expert(expert), self.describe(learner)
         return PoseMapper(OnePairModel(self.model, *arms, self.env.metric), self.params)
+
+
+def describe_arm(env: EnvConfig, arm: OneArm) -> DescribedArm:
+    """An arm and its arrays. Joints that a config locks are locked by the mask, as in training.
+
+    Args:
+      env: the environment, whose `limits` and `metric.links` the arm is built with.
+      arm: the arm, see `AnyArmMapper.__call__`.
+
+    Raises:
+      ValueError: see `AnyArmMapper.__call__`.
+    """
+    limits, links = env.limits, env.metric.links
+    if isinstance(arm, Arm):
+        return DescribedArm.without_locks(arm)
+    if isinstance(arm, ArmConfig):
+        config = arm
+    else:
+        name = os.fspath(arm)
+        config = env_config(name).learner if name in environments() else ArmConfig(model=name)
+    built = build_arm(config, limits, links)
+    whole = build_arm(dataclasses.replace(config, locked=None), limits, links) if built.locked else built
+    if max(whole.embodiment.num_joints - MAX_JOINTS, whole.embodiment.num_links - MAX_LINKS) > 0:
+        return DescribedArm.without_locks(built)  # it may have few enough without those that are locked
+    arrays, names = masked_arrays(config, limits, links)
+    is_free = np.asarray(arrays.is_free) > 0
+    return DescribedArm(built, arrays.astype(np.float32), np.flatnonzero(is_free), names)
 
 
 def load_mapper(
