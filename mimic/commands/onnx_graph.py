@@ -76,6 +76,13 @@ def _value_info(name: str, size: int) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
 
 
+def _value_infos(names: Sequence[str], avals: Sequence[Any]) -> list[onnx.ValueInfoProto]:
+    """Names, types and shapes, from JAX's description of a sample."""
+    types = [helper.np_dtype_to_tensor_dtype(np.dtype(aval.dtype)) for aval in avals]
+    shapes = [["batch", *aval.shape] for aval in avals]
+    return [helper.make_tensor_value_info(*info) for info in zip(names, types, shapes, strict=True)]
+
+
 class _Graph:
     """A graph under construction, with its nodes in execution order."""
 
@@ -129,50 +136,40 @@ class _Graph:
         return [Tensor(self._single_output(name, inputs, shapes[0], params), shapes[0])]
 
     def _loop(self, equation: Any, inputs: list[Value], is_read: Sequence[bool]) -> list[Value | None]:
-        """A loop over a constant number of steps, without values for each step; what it carries at the end."""
+        """A loop over a constant number of steps: what it carries, at its end; None for what is not read."""
         params, body = equation.params, equation.params["jaxpr"]
         first, count = params["num_consts"], params["num_carry"]
         consts, carried = inputs[:first], inputs[first:]
         if len(carried) != count or any(is_read[count:]):
             raise NotImplementedError("onnx: expected a loop without values for each step")
         kept = carried_in_use(body.jaxpr, first, [i for i in range(count) if is_read[i]])
+        avals = [equation.invars[first + i].aval for i in kept]
         self._names += 1
         name = f"Loop_{self._names}"
-        avals = {i: equation.invars[first + i].aval for i in kept}
-        states = [Tensor(f"{name}_state_{i}", avals[i].shape) if i in avals else None for i in range(count)]
+        states, after, results = ([f"{name}_{key}_{i}" for i in kept] for key in ("before", "after", "end"))
+
         outer = self.nodes, self._outputs
-        self.nodes, self._outputs = [], dict(self._outputs)
-        results = self.run(body.jaxpr, list(map(np.asarray, body.consts)), [*consts, *states], kept)
-        after = [f"{name}_next_{i}" for i in kept]
-        for value, output in zip(results, after, strict=True):
-            self.nodes.append(helper.make_node("Identity", [self.batched(value)], [output]))
-        self.nodes.append(helper.make_node("Identity", [f"{name}_condition"], [f"{name}_goes_on"]))
-        nodes, (self.nodes, self._outputs) = self.nodes, outer
+        self.nodes, self._outputs = [], dict(self._outputs)  # a step reads what is outside, and not the reverse
+        arguments: list[Value | None] = [*consts, *[None] * count]
+        for i, state, aval in zip(kept, states, avals, strict=True):
+            arguments[first + i] = Tensor(state, aval.shape)
+        values = self.run(body.jaxpr, list(map(np.asarray, body.consts)), arguments, kept)
+        pairs = [*zip(map(self.batched, values), after, strict=True), (f"{name}_runs", f"{name}_goes_on")]
+        nodes = [*self.nodes, *(helper.make_node("Identity", [value], [output]) for value, output in pairs)]
+        self.nodes, self._outputs = outer
 
-        def infos(names: Sequence[str]) -> list[onnx.ValueInfoProto]:
-            types = [helper.np_dtype_to_tensor_dtype(np.dtype(avals[i].dtype)) for i in kept]
-            shapes = [["batch", *avals[i].shape] for i in kept]
-            return [helper.make_tensor_value_info(*info) for info in zip(names, types, shapes, strict=True)]
-
-        step = helper.make_tensor_value_info(f"{name}_step", TensorProto.INT64, [])
-        conditions = [
-            helper.make_tensor_value_info(f"{name}_{key}", TensorProto.BOOL, []) for key in ("condition", "goes_on")
-        ]
-        state_inputs = infos([state.name for state in states if state is not None])
-        body_outputs = [conditions[1], *infos(after)]
-        graph = helper.make_graph(
-            used_nodes(nodes, [info.name for info in body_outputs]),
-            name,
-            [step, conditions[0], *state_inputs],
-            body_outputs,
+        number = helper.make_tensor_value_info(f"{name}_number", TensorProto.INT64, [])
+        runs, goes_on = (
+            helper.make_tensor_value_info(f"{name}_{x}", TensorProto.BOOL, []) for x in ("runs", "goes_on")
         )
+        step_inputs, step_outputs = [number, runs, *_value_infos(states, avals)], [goes_on, *_value_infos(after, avals)]
+        graph = helper.make_graph(used_nodes(nodes, [f"{name}_goes_on", *after]), name, step_inputs, step_outputs)
         length = self.name(np.asarray(params["length"], np.int64))
         start = [self.batched(carried[i]) for i in kept]
-        outputs = [f"{name}_{i}" for i in kept]
-        self.nodes.append(helper.make_node("Loop", [length, "", *start], outputs, body=graph))
+        self.nodes.append(helper.make_node("Loop", [length, "", *start], results, body=graph))
         at_end: list[Value | None] = [None] * len(is_read)
-        for i, output in zip(kept, outputs, strict=True):
-            at_end[i] = Tensor(output, avals[i].shape)
+        for i, result, aval in zip(kept, results, avals, strict=True):
+            at_end[i] = Tensor(result, aval.shape)
         return at_end
 
     def _single_output(self, name: str, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
