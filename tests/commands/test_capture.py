@@ -1,5 +1,6 @@
 """From a clip to demonstrations: `python -m mimic.demonstrations source=CLIP`, and the inspection of clips."""
 
+import shlex
 import subprocess
 import sys
 
@@ -91,7 +92,7 @@ def test_a_gap_in_the_other_arm_splits_nothing(tmp_path):
 def test_the_printed_command_trains(request, arms):
     folder, printed = request.getfixturevalue(arms)
     command = next(line for line in printed.splitlines() if line.startswith("train on it: "))
-    arguments = command.removeprefix("train on it: python -m mimic.train ").split()
+    arguments = shlex.split(command.removeprefix("train on it: python -m mimic.train "))
     small = ["trainer.num_timesteps=4096", "trainer.num_envs=16", "trainer.batch_size=16", "trainer.evaluations=1"]
     done = run(folder, "train", *arguments, *small, "env.physics=fused", f"run_dir={arms}")
     assert done.returncode == 0, done.stderr
