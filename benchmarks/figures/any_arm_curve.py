@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.figures.canvas import plt, save
 
 COLOURS = {"unseen locks": "#1f4e8c", "real arms": "#c2410c", "random arms": "#4d7c0f"}
@@ -20,19 +22,20 @@ SERIES = {
 
 
 def draw(rows: Sequence[Mapping[str, Any]], out: Path) -> None:
-    """Draws a line for each group of arms and each series.
+    """Draws the mean of the seeds as a line for each group of arms and each series, and each mapper as a point.
 
     Args:
-      rows: one for each training, with its number of distinct arms and a dict `groups`.
+      rows: one for each number of distinct arms, with a list `seeds` of trainings that have a dict `groups`.
       out: image file.
     """
     figure, axes = plt.subplots(figsize=(10, 4), layout="constrained")
     names = [f"{row['distinct']:,}" if row["distinct"] else "a new one\nfor each pose" for row in rows]
     for group, colour in COLOURS.items():
         for key, (_, style, alpha) in SERIES.items():
-            values = [100 * row["groups"][group][key] for row in rows]
-            marker = "o" if key == "quality" else ""
-            axes.plot(names, values, style, color=colour, alpha=alpha, marker=marker, markersize=4)
+            values = np.array([[100 * seed["groups"][group][key] for seed in row["seeds"]] for row in rows])
+            axes.plot(names, values.mean(axis=1), style, color=colour, alpha=alpha)
+            if key == "quality":
+                axes.plot(names, values, "o", color=colour, markersize=4)
     for group, colour in COLOURS.items():
         axes.plot([], [], color=colour, label=group)
     for label, style, alpha in SERIES.values():
