@@ -114,11 +114,12 @@ def test_memory_is_flat_over_saves(tmp_path):
         "params = {f'layer_{i}': {'kernel': np.ones((8, 8)), 'bias': np.ones(8)} for i in range(4)}\n"
         "for step in range(2000):\n"
         "    save_checkpoint(folder, step, params); thin_checkpoints(folder, 2)\n"
-        "    if step in (999, 1999): print(Path('/proc/self/statm').read_text().split()[1])"
+        "    if step % 200 == 199: print(Path('/proc/self/statm').read_text().split()[1])"
     )
     run = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=True)
     pages = [int(line) for line in run.stdout.split()]
-    assert 4 * (pages[1] - pages[0]) < 1500  # kB; 0.3 at each save
+    growth = 4 * np.diff(pages) / 200  # kB at each save
+    assert np.median(growth) < 1.5  # 0.1 to 0.4; the allocator may once take 2 MB at a time
 
 
 def test_a_missing_file_is_noticed(run_dir):
