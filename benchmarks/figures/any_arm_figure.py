@@ -18,11 +18,12 @@ def draw(results: dict[str, Any], out: Path) -> None:
     """Draws the arms with names as bars, and the random arms as points.
 
     Args:
-      results: rows by kind of arm, as `benchmarks.any_arm` writes them, and `rows`: gaps of policies of one arm.
+      results: rows by kind of arm, as `benchmarks.any_arm` writes them; `report`: more random arms, those of reports;
+        and `rows`: gaps of policies of one arm.
       out: image file.
     """
     named = [row for kind in ("presets", "locks", "real") for row in results.get(kind, []) if row["span"] >= MIN_SPAN]
-    random = [row for row in results.get("random", []) if row["span"] >= MIN_SPAN]
+    random = [row for kind in ("random", "report") for row in results.get(kind, []) if row["span"] >= MIN_SPAN]
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4), width_ratios=[2.2, 1], layout="constrained")
     places = np.arange(len(named))
     left.bar(places, [100 * row["gap"] for row in named], color="#9db8d9", label="whole episode")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,8 @@ def save_description(
 ) -> None:
     """Writes the vector of an arm, its layout and the names of its joints to a .json or .npz file.
 
+    The file gets its name when it is complete.
+
     Args:
       file: the file.
       arm: the arm.
@@ -96,8 +99,10 @@ def save_description(
     vector = description(arm, has_dynamics=has_dynamics)
     layout = description_layout(has_dynamics=has_dynamics)
     if file.suffix == ".npz":
-        with file.open("wb") as opened:
+        partial = file.with_name(file.name + ".partial")
+        with partial.open("wb") as opened:
             np.savez(opened, learner=vector, name=name, joints=np.array(joints), layout=json.dumps(layout))
+        os.replace(partial, file)
         return
     content = {"name": name, "joints": list(joints), "learner": [float(x) for x in vector], "layout": layout}
     write_atomically(file, json.dumps(content, indent=2) + "\n")

@@ -50,12 +50,13 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
 def _robot_evaluation(config: EvaluateConfig) -> Callable[[], None]:
     """An evaluation on virtual robots, see `prepare_robot_evaluation`."""
     try:
-        importlib.import_module("onnx")
-        from mimic.commands.evaluate_robot import prepare_robot_evaluation  # imports onnxruntime
+        for package in ("onnx", "onnxruntime"):
+            importlib.import_module(package)
     except ImportError as error:
         raise ValueError(
             f"robot: needs the packages onnx and onnxruntime: {install_command('deploy,export')}"
         ) from error
+    from mimic.commands.evaluate_robot import prepare_robot_evaluation  # brax and MJX, which take seconds to import
 
     use_compilation_cache(config.compilation_cache)
     run_dir, trained = _run_to_evaluate(config)

@@ -17,7 +17,7 @@ from rich.table import Table
 from mimic.commands.config import EvaluateConfig, ExportConfig
 from mimic.config import new_folder
 from mimic.deploy.bundle import MOTIONS
-from mimic.deploy.safety import COLLISION, LATE
+from mimic.deploy.safety import COLLISION, LATE, check_supported
 from mimic.envs import env_config
 from mimic.envs.world import WorldConfig
 from mimic.evaluation.evaluator import Evaluator
@@ -88,14 +88,16 @@ def prepare_robot_evaluation(
 
 
 def _check(config: EvaluateConfig, trained: TrainConfig) -> None:
-    """Raises a `ValueError` for what virtual robots do not have."""
+    """Raises a `ValueError` for what virtual robots or the safety layer do not have."""
     if trained.trainer.name != "ppo" or trained.env.arms.are_drawn:
         raise ValueError(f"robot: expected a run of trainer=ppo with one learner, got env={trained.env.name} and "
                          f"trainer={trained.trainer.name}")  # fmt: skip
     if config.robot == "virtual_panda" and trained.env.learner.model != "panda":
         raise ValueError("robot: expected virtual_robot for another learner than a Panda, got virtual_panda")
     env = trained.env
-    if not env.has_inner_loop and (env.observation.terms or env.environment):
+    if env.has_inner_loop:
+        check_supported(env.control, env.control_dt)
+    elif env.observation.terms or env.environment:
         raise ValueError("robot: expected a run without observation.terms and environment, or with an inner loop")
 
 

@@ -156,7 +156,7 @@ def exported_function(config: ExportConfig) -> ExportedFunction:
     """The function of a run's network."""
     run_dir = _run_dir(config)
     trained = load_config(run_dir)
-    if trained.env.has_inner_loop:
+    if trained.env.has_inner_loop and trained.trainer.name == "ppo":
         raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
     steps = check_checkpoint(run_dir, config.checkpoint)
     if trained.env.arms.are_drawn:

@@ -30,7 +30,7 @@ from mimic.config import new_file
 from mimic.distribution import VERSION
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.fine_tuning import arm_of
+from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, describe_arm
 from mimic.trainers.pose_mapper.any_arm_model import expert_pose
 from mimic.trainers.ppo import training
@@ -158,7 +158,7 @@ def description_writer(trained: TrainConfig, learner: str, locked: Sequence[Any]
     is_policy = trained.trainer.name == "ppo"
     env, arm = trained.env, learner
     if is_policy:
-        arm = dataclasses.replace(arm_of(env, learner), locked=list(locked) or None)
+        arm = with_one_learner(env, learner, locked).learner  # of up to 8 joints, locked ones included
     elif locked:
         arm = ArmConfig(model=learner, locked=list(locked))
     described = describe_arm(env, arm)

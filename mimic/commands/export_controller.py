@@ -15,6 +15,7 @@ from mimic.arms.drives import drives_of
 from mimic.control import joint_control
 from mimic.control.joint_control import JointParameters
 from mimic.deploy.bundle import write_bundle
+from mimic.deploy.safety import check_supported
 from mimic.distribution import VERSION
 from mimic.hardware.env import SENT_ACTIONS, HardwareEnv
 from mimic.metric.kinematics import LinkStates
@@ -38,7 +39,7 @@ def export_controller(run_dir: Path, out: Path, checkpoint: int | None = None) -
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
 
     Raises:
-      ValueError: a run of another kind, or a checkpoint that does not exist.
+      ValueError: a run of another kind, one that the safety layer cannot run, or a checkpoint that does not exist.
     """
     prepare_controller(run_dir, checkpoint)(out)
 
@@ -50,8 +51,9 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
     if not isinstance(config, PPOConfig) or not trained.env.has_inner_loop or trained.env.arms.are_drawn:
         raise ValueError(
             "format=controller: expected a run of trainer=ppo with an inner loop, as of world=hardware, got one of "
-            f"trainer={config.name} with control={trained.env.control} in the world of the paper"
+            f"trainer={config.name} with {'an' if trained.env.has_inner_loop else 'no'} inner loop"
         )
+    check_supported(trained.env.control, trained.env.control_dt)
     steps = check_checkpoint(run_dir, checkpoint)
     env = cast(HardwareEnv, run_environment(trained.env, run_dir)[0])
     settings = config.resolve()  # saved with all values resolved

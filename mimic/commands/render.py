@@ -200,24 +200,46 @@ def _similarity_at(clip: Clip, frame: int) -> dict[str, float]:
     return {name: float(values[frame]) for name, values in clip.similarity.items()}
 
 
-def _write_video(out: Path, frames: Any) -> list[Image.Image]:
+def _write_video(out: Path, frames: Iterator[_Frame]) -> list[Image.Image]:
     """Encodes the frames and returns scaled copies of every third one. The file gets its name when it is complete."""
     partial = out.with_name(f".{out.stem}.partial.mp4")
-    writer = imageio_ffmpeg.write_frames(str(partial), _SIZE, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=2)
+    try:
+        count, thumbnails = _encode(partial, frames)
+        if _num_frames(partial) != count:
+            raise OSError(f"{str(out)!r}: the encoder did not write all {count} frames; the disk may be full")
+        os.replace(partial, out)
+    finally:
+        partial.unlink(missing_ok=True)
+    return thumbnails
+
+
+def _encode(file: Path, frames: Iterator[_Frame]) -> tuple[int, list[Image.Image]]:
+    """Sends the frames to the encoder; returns the number sent and scaled copies of every third one."""
+    writer = imageio_ffmpeg.write_frames(str(file), _SIZE, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=2)
     with warnings.catch_warnings():  # JAX warns about forks; this one only starts the encoder
         warnings.filterwarnings("ignore", message=".*os.fork", category=RuntimeWarning)
         writer.send(None)
-    thumbnails = []
+    count, thumbnails = 0, []
     try:
-        for index, frame in enumerate(frames):
-            writer.send(np.ascontiguousarray(frame))
-            if index % _GIF_EVERY == 0:
+        for count, frame in enumerate(frames, start=1):
+            try:
+                writer.send(np.ascontiguousarray(frame))
+            except OSError:  # the encoder has ended
+                break
+            if (count - 1) % _GIF_EVERY == 0:
                 size = round(_GIF_SCALE * _SIZE[0]), round(_GIF_SCALE * _SIZE[1])
                 thumbnails.append(Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS))
     finally:
-        writer.close()
-    os.replace(partial, out)
-    return thumbnails
+        writer.close()  # does not tell whether the encoder failed
+    return count, thumbnails
+
+
+def _num_frames(file: Path) -> int:
+    """The number of frames that can be read from a video; 0 if it is damaged."""
+    try:
+        return imageio_ffmpeg.count_frames_and_secs(str(file))[0]
+    except RuntimeError:
+        return 0
 
 
 def _write_gif(out: Path, frames: list[Image.Image]) -> None:

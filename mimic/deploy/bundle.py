@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -178,6 +179,8 @@ def _controller(folder: Path) -> dict[str, Any]:
     missing = [key for key in _KEYS if key not in keys]
     if missing:
         raise ValueError(f"bundle: {CONTROLLER}: expected the keys {', '.join(_KEYS)}; missing {', '.join(missing)}")
+    if not isinstance(keys["hashes"], dict):
+        raise ValueError(f"bundle: {CONTROLLER}: hashes: expected one for each file, got {keys['hashes']!r:.40}")
     return keys
 
 
@@ -217,7 +220,7 @@ def _parsed(
             names=tuple(str(name) for name in motions["names"]),
             clearance=ClearanceConstants(**{**clearance, "parent": clearance["parent"].tolist()}),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise ValueError(
             f"bundle: expected numbers and names of a controller, got an error in {error!r:.120}"
         ) from error
@@ -227,8 +230,11 @@ def _check(bundle: Bundle) -> None:
     """Raises a `ValueError` where parts of a bundle do not fit together."""
     if bundle.mode not in MODES:
         raise ValueError(f"bundle: mode: expected one of {', '.join(MODES)}, got {bundle.mode!r:.40}")
-    if not bundle.control_dt >= PERIOD or abs(bundle.control_dt / PERIOD - bundle.periods) > 1e-6:
+    periods = bundle.control_dt / PERIOD
+    if not 1 <= periods < math.inf or abs(periods - bundle.periods) > 1e-6:
         raise ValueError(f"bundle: control_dt: expected a multiple of {PERIOD} s, got {bundle.control_dt}")
+    if bundle.expert.ndim != 3:
+        raise ValueError(f"bundle: expert: expected [motions, ticks + 1, numbers], got {bundle.expert.shape}")
     joints, motions = bundle.num_joints, len(bundle.expert)
     vectors = {"start_pose": bundle.start_pose, **bundle.parameters._asdict()}
     limits = {field.name: getattr(bundle.limits, field.name) for field in dataclasses.fields(bundle.limits)}

@@ -63,7 +63,7 @@ class MeasurementCheck:
         np.abs(values[:3], out=values[:3])
         np.subtract(qpos, upper, out=values[3])
         np.subtract(lower, qpos, out=values[4])
-        self._previous = qpos
+        np.copyto(self._previous, qpos)  # a driver may use its array again
         is_within = values <= self._bounds  # False for NaN
         if np.count_nonzero(is_within) == is_within.size:
             self._fast[:] = 0

@@ -3,6 +3,8 @@
 import contextlib
 import dataclasses
 import gc
+import signal
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any, Protocol
@@ -15,9 +17,9 @@ from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.driver import Driver, RobotAbort, RobotState
 from mimic.deploy.policy_process import PolicyProcess
-from mimic.deploy.safety import INTERVENTIONS, LATE, SafetyLayer
+from mimic.deploy.safety import INTERVENTIONS, INVALID, LATE, SafetyLayer
 
-ENDED = "policy ended"
+INTERRUPTED = "interrupted"
 _REST = 1e-3  # rad/s, of a reference that has stopped
 _AT_REST = 200  # periods that the arm is held at the end, for its tracking error to decay
 _MAX_STOP = 2000  # periods to brake and hold, many times what it takes
@@ -42,6 +44,7 @@ class Report:
       cause: why the arm was stopped or the robot aborted; empty where the motion was completed.
       aborted: whether the robot stopped by itself.
       ticks: of the policy that were run.
+      waited: those before its first valid action, in which the arm stood still.
       interventions: number of interventions of the safety layer, by kind.
       tracking_error: largest difference between a measured angle and the reference [rad].
       clearance: smallest clearance of a measured pose [m].
@@ -54,6 +57,7 @@ class Report:
     cause: str
     aborted: bool
     ticks: int
+    waited: int
     interventions: dict[str, int]
     tracking_error: float
     clearance: float
@@ -66,8 +70,8 @@ class Report:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the whole motion was run, under the policy's control."""
-        return not self.cause and not self.interventions[LATE]
+        """Whether the whole motion was run, under the policy's control, and all of its actions were valid."""
+        return not (self.cause or self.waited or self.interventions[LATE] or self.interventions[INVALID])
 
     def as_dict(self) -> dict[str, Any]:
         """The report for JSON, without the times of each period."""
@@ -86,6 +90,9 @@ def run_controller(
 ) -> Report:
     """Runs a motion on a robot, from its start pose until the arm is at rest again.
 
+    The first Ctrl-C makes the arm brake; when it is at rest and the driver has stopped, it is raised again. A second
+    one stops the driver at once.
+
     Args:
       driver: of the robot.
       bundle: see `load_bundle`.
@@ -96,25 +103,28 @@ def run_controller(
     Raises:
       ValueError: there is no such motion, or the bundle's mode has no braking path.
       RuntimeError: the policy's process does not start.
+      KeyboardInterrupt: Ctrl-C, after the arm has been stopped.
     """
     index = bundle.motion_index(motion)
     layer = SafetyLayer(bundle, Clearance(bundle), config=config)
     connection = policy or PolicyProcess(bundle, index)
     loop = _Loop(driver, bundle, layer, connection)
     try:
-        with _without_collection():
+        with _interrupts_noted(loop), _without_collection():
             loop.run(bundle.start_poses[index])
     except RobotAbort as abort:
         return loop.report(abort.cause, aborted=True)
     finally:
-        connection.close()
-        with contextlib.suppress(RobotAbort):
-            driver.stop()
+        try:
+            with contextlib.suppress(RobotAbort):
+                driver.stop()  # first: meanwhile the robot gets no commands
+        finally:
+            connection.close()
     return loop.report(str(layer.cause[0]), aborted=False)
 
 
 class _Loop:
-    """The periods of a run."""
+    """The periods of a run; where `is_interrupted` is set, the arm brakes from the next one on."""
 
     def __init__(self, driver: Driver, bundle: Bundle, layer: SafetyLayer, policy: PolicyConnection):
         self._driver, self._bundle, self._layer, self._policy = driver, bundle, layer, policy
@@ -122,6 +132,7 @@ class _Loop:
         self._wall: list[float] = []
         self._cpu: list[float] = []
         self._tick, self._due, self._action = -1, False, np.zeros((bundle.action_size, 1))
+        self._waited, self.is_interrupted = 0, False
 
     def run(self, start_pose: np.ndarray) -> None:
         """Runs all ticks, then brakes and holds."""
@@ -134,6 +145,8 @@ class _Loop:
             state = state if is_first else self._driver.read()
             self._period(state, period)
             is_first = False
+            if self.is_interrupted:
+                self._layer.stop(INTERRUPTED)
             if self._layer.cause[0]:
                 break
         self._due, at_rest = False, 0
@@ -168,6 +181,7 @@ class _Loop:
             if received is not None and is_present:
                 self._action = received[1][:, None]
             self._layer.tick(self._action, np.array([is_present]))
+            self._waited += not self._layer.has_action[0]
             self._due = False
 
     def report(self, cause: str, *, aborted: bool) -> Report:
@@ -176,7 +190,9 @@ class _Loop:
         error = float(self._layer.tracking_error[0])
         clearance, seconds = float(self._layer.clearance[0]), (self._latency, self._wall, self._cpu)
         latency, compute, cpu = map(_percentiles, seconds)
-        return Report(cause, aborted, self._tick + 1, counts, error, clearance, latency, compute, cpu, *seconds)
+        return Report(
+            cause, aborted, self._tick + 1, self._waited, counts, error, clearance, latency, compute, cpu, *seconds
+        )
 
 
 def _percentiles(seconds: list[float]) -> dict[str, float]:
@@ -196,6 +212,30 @@ def _without_collection() -> Iterator[None]:
     finally:
         if was_enabled:
             gc.enable()
+
+
+@contextlib.contextmanager
+def _interrupts_noted(loop: _Loop) -> Iterator[None]:
+    """Context in which the first Ctrl-C only sets `is_interrupted`, and is raised at the end.
+
+    Raised at any moment it would leave a period without a torque, or a torque that was computed but not commanded.
+    """
+    previous = signal.getsignal(signal.SIGINT)
+    if not callable(previous) or threading.current_thread() is not threading.main_thread():
+        yield  # it is ignored, or raised in another thread
+        return
+
+    def note(*_: object) -> None:
+        loop.is_interrupted = True
+        signal.signal(signal.SIGINT, previous)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+        if loop.is_interrupted:
+            signal.raise_signal(signal.SIGINT)
 
 
 def missed_periods(states: list[RobotState]) -> int:

@@ -22,8 +22,8 @@ from mimic.control.joint_control import (
 )
 from mimic.deploy.bundle import Bundle
 from mimic.deploy.config import SafetyConfig
-from mimic.deploy.measurements import MeasurementCheck, StartCheck
-from mimic.deploy.path import PathPrediction
+from mimic.deploy.measurements import TRACKING, MeasurementCheck, StartCheck
+from mimic.deploy.path import SAMPLE, PathPrediction
 
 # Interventions, which replace a target, and the causes for which an arm stops for good.
 COLLISION, INVALID, REPEATED, LATE = "clearance", "invalid action", "repeated action", "late policy"
@@ -31,6 +31,35 @@ INTERVENTIONS = (COLLISION, INVALID, REPEATED, LATE)
 MEASURED_CLEARANCE = "measured clearance"
 _SLOWING = 3.0  # of the damping of the inner loop
 _ACTION_TOLERANCE = 1e-3  # beyond [-1, 1]: float32 rounds a saturated tanh
+
+
+def check_supported(control: str, control_dt: float, config: SafetyConfig | None = None) -> None:
+    """Checks that the safety layer can check the targets of a policy.
+
+    Args:
+      control: mode of the inner loop, see `mimic.control`.
+      control_dt: tick of the policy [s].
+      config: thresholds; default: `SafetyConfig()`.
+
+    Raises:
+      ValueError: the mode has no braking path, or the check of a target does not fit the tick.
+    """
+    config = config or SafetyConfig()
+    if control == "torque":
+        raise ValueError(
+            "mode: expected joint_position, joint_velocity or joint_impedance, whose targets have a braking path, "
+            "got torque"
+        )
+    if round(control_dt / PERIOD) <= config.check_periods or _hold_periods(control_dt, config) % SAMPLE:
+        raise ValueError(
+            f"control_dt, grace: expected a tick of more than {config.check_periods} ms, and a multiple of {SAMPLE} ms "
+            f"together, got {control_dt} s and {config.grace} s"
+        )
+
+
+def _hold_periods(control_dt: float, config: SafetyConfig) -> int:
+    """Periods for which a target acts."""
+    return round(control_dt / PERIOD) + round(config.grace / PERIOD)
 
 
 class SafetyLayer:
@@ -49,6 +78,7 @@ class SafetyLayer:
       reference: the motion that the arms track.
       torque: of the last period [N m].
       cause: [robots] why the arm was stopped for good; empty while it is controlled.
+      has_action: [robots] whether a valid action has ever arrived.
       counts: [robots] number of interventions, by kind.
       clearance: [robots] smallest clearance of a measured pose [m], of nearly every period.
     """
@@ -61,17 +91,8 @@ class SafetyLayer:
         config: SafetyConfig | None = None,
     ):
         config = config or SafetyConfig()
-        if bundle.mode == "torque":
-            raise ValueError(
-                "mode: expected joint_position, joint_velocity or joint_impedance, whose targets have a braking path, "
-                "got torque"
-            )
-        hold = bundle.periods + round(config.grace / PERIOD)
-        if bundle.periods <= config.check_periods or hold % 10:
-            raise ValueError(
-                f"control_dt, grace: expected a tick of more than {config.check_periods} ms, and a multiple of 10 ms "
-                f"together, got {bundle.control_dt} s and {config.grace} s"
-            )
+        check_supported(bundle.mode, bundle.control_dt, config)
+        hold = _hold_periods(bundle.control_dt, config)
         self._mode, self._config, self._clearance, self._hold = bundle.mode, config, clearance, hold
         # As large as the states: NumPy takes twice as long to broadcast.
         self._actions = JointParameters(*(np.tile(np.asarray(x, float)[:, None], robots) for x in bundle.parameters))
@@ -92,13 +113,13 @@ class SafetyLayer:
         self._stiffness = np.ones((joints, robots))
         self._action = np.zeros((bundle.action_size, robots))
         self._left, self._repeats = np.zeros((2, robots), int)
-        self._has_action = np.zeros(robots, bool)
+        self.has_action = np.zeros(robots, bool)
         self._pending: _Pending | None = None
         self.reference = Reference(*np.zeros((3, joints, robots)))
         self.cause = np.full(robots, "", object)
         self.counts = {name: np.zeros(robots, int) for name in INTERVENTIONS}
         self._largest_errors, self.clearance = np.zeros((joints, robots)), np.full(robots, np.inf)
-        self._qpos, self._rest = np.zeros((2, joints, robots))
+        self._qpos, self._qvel, self._rest = np.zeros((3, joints, robots))
         self._is_tracked = np.ones(robots, bool)
 
     def start(self, qpos: np.ndarray, qvel: np.ndarray, start_pose: np.ndarray) -> np.ndarray:
@@ -128,13 +149,13 @@ class SafetyLayer:
         self.counts[INVALID] += is_active & is_present & ~is_valid
         is_new = is_present & is_valid
         self._action = np.where(is_new, action, self._action)
-        self._has_action |= is_new
+        self.has_action |= is_new
         self._repeats = np.where(is_present, 0, self._repeats + 1)
         is_repeated = ~is_present & (self._repeats <= self._config.repeats)
-        is_missing = is_active & ~is_present & self._has_action
+        is_missing = is_active & ~is_present & self.has_action
         self.counts[REPEATED] += is_missing & is_repeated
         self.counts[LATE] += is_missing & ~is_repeated
-        self._pending = _Pending(is_active & (is_new | is_repeated) & self._has_action)
+        self._pending = _Pending(is_active & (is_new | is_repeated) & self.has_action)
         self._path.begin(self.reference, self._value, self._left)
         self._path_clearance[:] = -np.inf  # what has not been checked is not safe
 
@@ -152,7 +173,7 @@ class SafetyLayer:
         """The torques [N m] of a period, for measured angles [rad] and velocities [rad/s]."""
         if self._pending is not None and self._pending.periods == self._config.check_periods:
             self._accept(self._pending)
-        self._qpos = qpos
+        self._qpos, self._qvel = qpos, qvel
         cause, error = self._measurements(qpos, qvel, self.reference, self.cause)
         np.maximum(self._largest_errors, error, out=self._largest_errors, where=self._is_tracked)
         if cause is not None:
@@ -250,6 +271,13 @@ class SafetyLayer:
         self.cause[is_stopped] = cause[is_stopped]
         self._left[is_stopped] = 0
         self._stiffness[:, is_stopped] = 1.0
+        is_blocked = is_stopped & (cause == TRACKING)
+        if np.count_nonzero(is_blocked):  # brakes from the measured motion: the reference would push the arm on
+            qvel = np.clip(self._qvel, -self._joints.velocity, self._joints.velocity)
+            measured = Reference(self._qpos, qvel, self.reference.qacc)
+            self.reference = Reference(
+                *(np.where(is_blocked, x, y) for x, y in zip(measured, self.reference, strict=True))
+            )
 
     def _move_reference(self) -> None:
         """One period of all references, towards their targets or to rest."""

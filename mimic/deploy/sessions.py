@@ -2,15 +2,18 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import onnxruntime
 
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import FEATURES, POLICY, Bundle
 
+if TYPE_CHECKING:
+    import onnxruntime
 
-def open_session(path: Path | bytes, inputs: dict[str, int], outputs: dict[str, int]) -> onnxruntime.InferenceSession:
+
+def open_session(path: Path | bytes, inputs: dict[str, int], outputs: dict[str, int]) -> "onnxruntime.InferenceSession":
     """A session on one thread.
 
     Args:
@@ -20,6 +23,8 @@ def open_session(path: Path | bytes, inputs: dict[str, int], outputs: dict[str, 
     Raises:
       ValueError: a file that onnxruntime cannot read, or with other inputs or outputs.
     """
+    import onnxruntime  # here, as bundles are written where it is not installed
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL

@@ -62,8 +62,7 @@ _OF_DRAWN_ARMS = {
     "entropy_cost": 0.0,
     "final_entropy_cost": 1.0,
 }
-# With an inner loop: a third of the learning rate leaves a fourth of the gap (measured), and delays need a longer
-# horizon.
+# With an inner loop: a smaller learning rate ends with a smaller gap (measured), and delays need a longer horizon.
 _OF_INNER_LOOP = {"learning_rate": 3e-4, "discounting": 0.9, "entropy_cost": 0.02}
 # Presets in the order of the backends cpu and gpu.
 _ONE_ARM, _DRAWN_ARMS, _INNER_LOOP = ("cpu", "gpu"), ("any_arm_cpu", "any_arm"), ("inner_loop_cpu", "inner_loop")

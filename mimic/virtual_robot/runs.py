@@ -89,7 +89,7 @@ def run_tasks(tasks: list[Task], update: Callable[[int], None], processes: int |
       processes: number of them; 1 runs all in this process.
     """
     parts = [(i, part) for i, task in enumerate(tasks) for part in groups(task)]
-    processes = min(processes or len(os.sched_getaffinity(0)), len(parts))
+    processes = min(processes or _num_cores(), len(parts))
     results: dict[int, list[Episodes]] = {i: [] for i in range(len(tasks))}
     if processes == 1:
         for i, part in parts:
@@ -101,3 +101,8 @@ def run_tasks(tasks: list[Task], update: Callable[[int], None], processes: int |
             results[i].append(result)
             update(len(part.motion))
     return [joined(results[i]) for i in range(len(tasks))]
+
+
+def _num_cores() -> int:
+    """The cores that this process may use; all of them where the system does not tell, as on macOS."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

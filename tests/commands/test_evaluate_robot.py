@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import shutil
+import sys
 from types import SimpleNamespace
 from typing import cast
 
@@ -15,9 +16,9 @@ import pytest
 import mimic
 from mimic.commands.config import EvaluateConfig, ExportConfig
 from mimic.commands.evaluate import prepare_evaluation
-from mimic.commands.evaluate_robot import summary
+from mimic.commands.evaluate_robot import prepare_robot_evaluation, summary
 from mimic.commands.export import prepare_export
-from mimic.commands.export_controller import expert_table, export_controller
+from mimic.commands.export_controller import expert_table, export_controller, prepare_controller
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import load_bundle
 from mimic.deploy.fake_robot import FakeRobot
@@ -171,6 +172,23 @@ def test_a_run_without_an_inner_loop_has_no_controller(rejected, paper_run):
     assert "format=controller: expected a run of trainer=ppo with an inner loop" in error
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"control": "torque"}, "got torque"),
+        ({"control_dt": 0.02}, "got 0.02 s"),  # as long as the check of a target
+        ({"control_dt": 0.025}, "got 0.025 s"),
+    ],
+)
+def test_what_the_safety_layer_cannot_run_is_rejected(tmp_path, settings, message):
+    trained = TrainConfig(mimic.env_config("panda7dof", world="nominal", **settings), PPOConfig())
+    save_config(tmp_path, trained)
+    with pytest.raises(ValueError, match=message):
+        prepare_controller(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        prepare_robot_evaluation(EvaluateConfig(robot="virtual_panda"), trained, None, tmp_path)
+
+
 @pytest.mark.parametrize("controller", ["pd", "computed_torque", "nearest_pose", "searched"])
 def test_controllers_of_torques_do_not_fit_an_inner_loop(rejected, hardware_run, controller):
     error = rejected("evaluate", f"run={hardware_run}", f"controller={controller}")
@@ -239,3 +257,10 @@ def test_a_mapper_has_no_robot(rejected, tmp_path):
     save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda4dof"), PoseMapperConfig()))
     error = rejected("evaluate", f"run={tmp_path / 'run'}", "robot=virtual_panda", "compilation_cache=")
     assert "robot: expected a run of trainer=ppo with one learner" in error
+
+
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+def test_missing_packages_are_named(rejected, monkeypatch, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    error = rejected("evaluate", "run=runs/NAME", "robot=virtual_panda")
+    assert "robot: needs the packages onnx and onnxruntime: pip install 'mimic-arms[deploy,export]'" in error

@@ -11,6 +11,9 @@ import pytest
 import mimic
 from mimic.any_arm.description import described_arm, description, description_layout
 from mimic.any_arm.sampler import random_arm
+from mimic.commands.config import ExportConfig
+from mimic.commands.export import exported_function
+from mimic.commands.export_controller import prepare_controller
 from mimic.metric.config import MetricConfig
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
@@ -44,9 +47,9 @@ def policy_run(run_dir, name="panda4dof"):
     return env, training.make_controller(config, env.observation_size, env.action_size)(params)
 
 
-def mapper_run(run_dir, name="panda4dof", preset="paper", metric=None):
+def mapper_run(run_dir, name="panda4dof", preset="paper", metric=None, **settings):
     """A run whose mapper has random weights."""
-    env = mimic.env_config(name, **({"metric": metric} if metric else {}))
+    env = mimic.env_config(name, **({"metric": metric} if metric else {}), **settings)
     config = PoseMapperConfig(preset=preset, hidden_layers=[16, 16]).resolve()
     params = make_model(env, config).init(jax.random.key(3))
     run_dir.mkdir()
@@ -117,6 +120,13 @@ def test_an_onnx_pose_mapper_equals_the_mapper(tmp_path, name, preset, metric):
     off = np.abs(np.angle(np.exp(1j * (outputs - np.asarray(expected))))).max(axis=1)
     assert np.mean(off < TOLERANCE) >= (1.0 if preset == "paper" else 0.99)
     assert len(np.unique(np.round(outputs, 3), axis=0)) > 100
+
+
+def test_a_mapper_of_an_environment_with_an_inner_loop_is_a_function(tmp_path):
+    mapper_run(tmp_path / "run", world="nominal")
+    assert exported_function(ExportConfig(str(tmp_path / "run"))).kind == "pose_mapper"
+    with pytest.raises(ValueError, match="trainer=ppo with .*, got one of trainer=pose_mapper with an inner loop"):
+        prepare_controller(tmp_path / "run")
 
 
 def any_arm_run(run_dir, expert="fixed"):

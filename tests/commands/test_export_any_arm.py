@@ -5,6 +5,7 @@ import json
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
 from mimic.trainers.make import make_any_arm_trainer
 from mimic.trainers.pose_mapper.any_arm_mapper import describe_arm
 from mimic.trainers.run_config import load_config
+from tests.helpers.random_arms import random_arm as random_model
 from tests.helpers.untrained_family import HORIZON, untrained_family
 
 pytest.importorskip("onnx")
@@ -77,6 +79,14 @@ def with_locks(arm, joints):
 )
 def test_bad_input_is_rejected(run_dir, rejected, arguments, message):
     assert message in rejected("export", f"run={run_dir}", *arguments)
+
+
+def test_an_arm_that_evaluate_rejects_has_no_description(run_dir, rejected, tmp_path):
+    """Of 9 joints, one of them locked: a policy moves arms of up to 8, locked ones included."""
+    model = tmp_path / "nine.xml"
+    mujoco.mj_saveLastXML(str(model), random_model(0, joints=9))
+    error = rejected("export", f"run={run_dir}", "out=new.json", f"learner={model}", "locked=[1]")
+    assert "expected at most 8 joints and 12 links, got 9 and 9" in error
 
 
 @pytest.mark.slow

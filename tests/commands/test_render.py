@@ -1,6 +1,7 @@
 """`python -m mimic.render` for pose mappers and retargeted motions: what videos show, and what is rejected."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import imageio_ffmpeg
@@ -16,7 +17,7 @@ from mimic.arms.rendering import ArmScene
 from mimic.commands import train
 from mimic.commands.clips import prepare_clip
 from mimic.commands.config import RenderConfig
-from mimic.commands.render import draw_frames, prepare_video
+from mimic.commands.render import _write_video, draw_frames, prepare_video
 from mimic.envs import env_config
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.recording import record_demonstrations
@@ -125,6 +126,17 @@ def test_a_video_has_all_frames(files, tmp_path, capsys):
         assert gif.n_frames == 5  # type: ignore[attr-defined]  # every third
     with pytest.raises(ValueError, match="exists; name a new file"):
         prepare_video(RenderConfig(**files, out=str(out)))
+
+
+@pytest.mark.parametrize("options", [["-vf", "select=lt(n\\,2)"], ["-frames:v", "2"], ["-f", "null"]])
+def test_a_video_that_lacks_frames_is_removed(tmp_path, monkeypatch, options):
+    """The encoder leaves the last frames out, ends before them, or writes no file."""
+    encode = functools.partial(imageio_ffmpeg.write_frames, output_params=options)
+    monkeypatch.setattr(imageio_ffmpeg, "write_frames", encode)
+    frames = np.zeros((5, 640, 1280, 3), np.uint8)
+    with pytest.raises(OSError, match=r"swing\.mp4': the encoder did not write all"):
+        _write_video(tmp_path / "swing.mp4", iter(frames))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

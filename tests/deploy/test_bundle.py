@@ -63,6 +63,12 @@ def changed(folder, **changes):
     path.write_text(json.dumps({**content, **changes}))
 
 
+def motions(folder, **changes):
+    with np.load(folder / "motions.npz") as content:
+        arrays = {**content, **changes}
+    np.savez(folder / "motions.npz", **arrays)
+
+
 BROKEN = {
     "no folder": (lambda folder: (folder / "policy.onnx").unlink(), "expected a folder of mimic.export"),
     "no JSON": (lambda folder: (folder / "controller.json").write_text("{"), "controller.json: expected JSON"),
@@ -80,6 +86,13 @@ BROKEN = {
     "no motions": (lambda folder: (folder / "motions.npz").write_bytes(b"x"), "motions.npz: "),
     "a mode": (lambda folder: changed(folder, mode="flying"), "mode: expected one of torque, joint_position"),
     "a tick": (lambda folder: changed(folder, control_dt=0.0505), "control_dt: expected a multiple of 0.001 s"),
+    "an endless tick": (lambda folder: changed(folder, control_dt=float("inf")), "control_dt: expected a multiple of"),
+    "an endless preview": (lambda folder: changed(folder, preview=float("inf")), "expected numbers and names"),
+    "no hashes": (lambda folder: changed(folder, hashes=None), "hashes: expected one for each file, got None"),
+    "an expert of one dimension": (
+        lambda folder: motions(folder, expert=np.zeros(4)),
+        "expert: expected [motions, ticks + 1, numbers], got (4,)",
+    ),
     "joints": (lambda folder: changed(folder, joint_names=["one"]), "expected the shape"),
     "a number": (lambda folder: changed(folder, start_pose=[float("nan")] * 7), "start_pose: expected finite numbers"),
     "parameters": (lambda folder: changed(folder, parameters={}), "expected numbers and names of a controller"),

@@ -104,6 +104,12 @@ def test_the_runtime_needs_neither_jax_nor_mujoco(bundle):
     assert result.returncode == 0, result.stderr[-2000:]
 
 
+def test_controllers_are_exported_where_onnxruntime_is_not_installed():
+    code = "import sys; sys.modules['onnxruntime'] = None; import mimic.commands.export, mimic.deploy"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY)
+    assert result.returncode == 0, result.stderr[-2000:]
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_policy_that_dies_or_stops_makes_the_arm_brake_and_hold(tmp_path, number):
     """In real time, in the middle of a fast motion."""
@@ -142,6 +148,70 @@ class Scripted:
 
     def close(self):
         pass
+
+
+@pytest.mark.parametrize("interrupts", [(500,), (500, 520)], ids=["once", "twice"])
+def test_ctrl_c_makes_the_arm_brake_before_the_driver_is_stopped(bundle, interrupts):
+    """A second one stops the driver at once."""
+    events = []
+
+    class Interrupted(FakeRobot):
+        def read(self):
+            state = super().read()
+            if len(self.states) in interrupts:
+                signal.raise_signal(signal.SIGINT)
+            return state
+
+        def stop(self):
+            events.append("stop")
+
+    class Policy(Scripted):
+        def close(self):
+            events.append("close")
+
+    fake = Interrupted(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        run_controller(fake, bundle, policy=Policy(dict.fromkeys(range(bundles.TICKS), 0.3)))
+    assert events == ["stop", "close"] and signal.getsignal(signal.SIGINT) is before
+    _, qvel, qacc = trace(fake)
+    assert np.abs(qvel[499]).max() > 0.3 and len(qvel) < bundles.TICKS * bundle.periods
+    assert np.all(np.abs(qacc) < bundle.limits.acceleration + 1)  # 1 rad/s^2: of the tracking error
+    is_at_rest = np.abs(qvel[-1]).max() < 1e-2
+    assert is_at_rest if len(interrupts) == 1 else len(qvel) == interrupts[-1]
+
+
+def test_the_policy_is_closed_where_the_driver_does_not_stop(bundle):
+    class Broken(FakeRobot):
+        def stop(self):
+            raise OSError("no connection")
+
+    class Policy(Scripted):
+        is_closed = False
+
+        def close(self):
+            self.is_closed = True
+
+    policy = Policy({})
+    with pytest.raises(OSError, match="no connection"):
+        run_controller(Broken(bundle.start_pose + 0.2, bundle.limits, bundle.parameters.inertia), bundle, policy=policy)
+    assert policy.is_closed
+
+
+@pytest.mark.parametrize(
+    ("actions", "waited"),
+    [({}, bundles.TICKS), (dict.fromkeys(range(3, bundles.TICKS), 0.1), 3)],
+    ids=["never", "after three ticks"],
+)
+def test_a_motion_without_actions_at_its_start_is_not_complete(bundle, actions, waited):
+    report = run_controller(robot(bundle), bundle, policy=Scripted(actions))
+    assert report.waited == waited and not report.is_complete
+    assert not report.cause and not any(report.interventions.values())
+
+
+def test_a_motion_with_invalid_actions_alone_is_not_complete(bundle):
+    report = run_controller(robot(bundle), bundle, policy=Scripted(dict.fromkeys(range(bundles.TICKS), np.nan)))
+    assert report.interventions[INVALID] == report.waited == bundles.TICKS and not report.is_complete
 
 
 @pytest.mark.parametrize(

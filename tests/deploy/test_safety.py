@@ -1,6 +1,7 @@
 """The safety layer: what it rejects, why it stops, and that a checked braking path is always left."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from mimic.control.joint_control import PERIOD
 from mimic.deploy import measurements
 from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
-from mimic.deploy.safety import COLLISION, INVALID, LATE, MEASURED_CLEARANCE, REPEATED, SafetyLayer
+from mimic.deploy.safety import COLLISION, INVALID, LATE, MEASURED_CLEARANCE, REPEATED, SafetyLayer, check_supported
 from tests.helpers import bundles
 
 CONFIG = SafetyConfig()
@@ -192,6 +193,24 @@ def test_an_arm_that_does_not_follow_is_stopped(layer):
     assert drift(layer, (velocity(4, 0.3)[:, None], 0)) == measurements.TRACKING
 
 
+def test_a_blocked_arm_is_not_pushed_on(layer):
+    """It brakes where it is, as its reference goes on for 0.4 rad at this speed; the torque changes within its rate."""
+    block, before = layer.reference.qpos[0, 0] + 0.15, layer.torque.copy()
+    for period in range(1000):
+        if period % 50 == 0:
+            layer.tick(velocity(0, 1.0)[:, None], ONE)
+        qpos, qvel = layer.reference.qpos.copy(), layer.reference.qvel.copy()
+        if qpos[0, 0] > block:
+            qpos[0], qvel[0] = block, 0.0
+        torque = layer.period(qpos, qvel)
+        layer.work()
+        assert np.abs(torque - before).max() <= 1.0 + 1e-9
+        before = torque
+    assert layer.cause[0] == measurements.TRACKING
+    assert layer.reference.qpos[0, 0] - block < 0.01 and abs(torque[0, 0]) < 10  # of 87 N m
+    assert np.abs(layer.reference.qvel).max() < 1e-3
+
+
 def test_an_arm_that_is_too_fast_is_stopped(layer):
     assert drift(layer, (0, velocity(0, -2.3)[:, None])) == measurements.VELOCITY
 
@@ -266,6 +285,45 @@ def test_torque_policies_and_short_ticks_are_rejected(bundle):
         SafetyLayer(dataclasses.replace(bundle, mode="torque"), Clearance(bundle))
     with pytest.raises(ValueError, match="control_dt, grace: expected a tick of more than 20 ms"):
         SafetyLayer(dataclasses.replace(bundle, control_dt=0.01), Clearance(bundle))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("check_periods", 0, "one of 2, 4, 6, ..."),
+        ("check_periods", 1, "one of 2, 4, 6, ..."),
+        ("check_periods", 21, "one of 2, 4, 6, ..."),
+        ("check_periods", 20.0, "one of 2, 4, 6, ..."),
+        ("repeats", -1, "one of 0, 1, 2, ..."),
+        ("velocity_periods", 0, "one of 1, 2, 3, ..."),
+        ("velocity_scale", 30, "a number above 0, at most 1"),
+        ("acceleration_scale", 0.0, "a number above 0, at most 1"),
+        ("margin", -0.01, "a finite number, at least 0"),
+        ("grace", np.nan, "a finite number, at least 0"),
+        ("tracking", np.inf, "a finite number, at least 0"),
+        ("jump", "0.05", "a finite number, at least 0"),
+    ],
+)
+def test_invalid_thresholds_are_rejected_in_one_line(name, value, expected):
+    with pytest.raises(ValueError, match=f"SafetyConfig: {name}: expected {re.escape(expected)}, got {value!r}$"):
+        SafetyConfig(**{name: value})
+
+
+def test_a_driver_may_use_its_array_again(layer, bundle):
+    qpos = bundle.start_pose[:, None].copy()
+    layer.period(qpos, 0 * qpos)
+    qpos[3] += 2 * CONFIG.jump
+    layer.period(qpos, 0 * qpos)
+    assert layer.cause[0] == measurements.JUMP
+
+
+def test_what_the_layer_supports_is_known_without_a_bundle():
+    check_supported("joint_velocity", 0.05)
+    with pytest.raises(ValueError, match="got torque"):
+        check_supported("torque", 0.05)
+    with pytest.raises(ValueError, match="multiple of 10 ms together, got 0.055 s and 0.02 s"):
+        check_supported("joint_impedance", 0.055)
+    check_supported("joint_impedance", 0.055, SafetyConfig(grace=0.025))
 
 
 def test_robots_of_a_batch_do_not_depend_on_each_other(bundle):

@@ -1,6 +1,7 @@
 """Episodes on virtual robots: the safety layer against random actions, delays and losses, and the same as alone."""
 
 import dataclasses
+import os
 
 import numpy as np
 import pytest
@@ -110,6 +111,14 @@ def test_processes_give_the_same_episodes(bundle):
     for a, b in zip(apart, together, strict=True):
         np.testing.assert_array_equal(a.qpos, b.qpos)
         np.testing.assert_array_equal(a.interventions[REPEATED], b.interventions[REPEATED])
+
+
+def test_tasks_run_where_the_system_has_no_affinity(bundle, monkeypatch):
+    """As on macOS."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    done: list[int] = []
+    run_tasks([task(bundle, WorldConfig(), 1)], done.append)
+    assert done == [1]
 
 
 def test_a_task_is_cut_into_groups(bundle):
