@@ -6,6 +6,7 @@ loop nothing to wait for. Linux and macOS have such sockets.
 
 import contextlib
 import os
+import signal
 import socket
 import struct
 import subprocess
@@ -124,6 +125,7 @@ class PolicyProcess:
 
 def main(folder: str, motion: str, descriptor: str, parent: str) -> None:
     """The process of a policy: it answers each observation with an action, until the inner loop has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in a terminal reaches it too: the inner loop ends it
     _yield_to_inner_loop()
     bundle = load_bundle(Path(folder))
     joints, connection = bundle.num_joints, socket.socket(fileno=int(descriptor))

@@ -133,6 +133,20 @@ def test_a_policy_that_dies_or_stops_makes_the_arm_brake_and_hold(tmp_path, numb
     assert qvel[fastest:, 0].min() > -0.1  # it brakes, and does not turn round
 
 
+def test_ctrl_c_does_not_end_the_policy(bundle):
+    """It is the inner loop's: a terminal sends it to both processes."""
+    policy, zeros = PolicyProcess(bundle, 0), np.zeros(7)
+    try:
+        os.kill(policy.pid, signal.SIGINT)
+        policy.send(0, bundle.start_pose, zeros, Reference(bundle.start_pose, zeros, zeros))
+        deadline, answer = time.monotonic() + 30.0, None
+        while answer is None and time.monotonic() < deadline:
+            answer = policy.receive()
+    finally:
+        policy.close()
+    assert answer is not None and answer[0] == 0
+
+
 class Scripted:
     """A policy of given answers: {tick: action}; others are missing."""
 
