@@ -52,7 +52,8 @@ def test_every_environment_of_many_arms_resets_and_steps(name, limits):
     env = mimic.make(name, demonstrations=FEW, limits=limits)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
     after = jax.jit(env.step)(state, jnp.zeros(env.action_size))
-    assert after.reward == pytest.approx(-float(after.metrics["distance"] / after.pipeline_state.hold))
+    assert after.reward == 0  # the reward is relative to the zero action
+    assert 0 < after.metrics["distance"] < 1.1 * after.pipeline_state.hold
     assert np.all(np.isfinite(after.obs)) and not after.done
 
 
