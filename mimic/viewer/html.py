@@ -54,7 +54,10 @@ def heat_map(
         f"<tr><th>{html.escape(_cut(row))}</th>{''.join(_cell(float(value), scale, colour) for value in line)}</tr>"
         for row, line in zip(rows, values, strict=True)
     )
-    style = "border-collapse:separate;border-spacing:1px;font-size:10px;line-height:15px;width:100%;table-layout:fixed"
+    style = (
+        "border-collapse:separate;border-spacing:1px;font-size:9px;letter-spacing:-0.3px;line-height:14px;width:100%;"
+        "table-layout:fixed"
+    )
     return (
         f'<div style="flex:1 1 0;min-width:0"><div style="font-size:11px">{html.escape(title)}</div>'
         f'<table id="{name}" style="{style}"><tr><th{width}></th>{head}</tr>{body}</table></div>'
@@ -66,7 +69,7 @@ def _cell(value: float, scale: float, colour: tuple[int, int, int]) -> str:
     mixed = ",".join(str(round(255 + fraction * (channel - 255))) for channel in colour)
     ink = "#fff" if fraction > 0.55 else "#333"
     text = "" if value < 0.005 else f"{value:.2f}" if value < 9.995 else f"{value:.1f}"  # four characters fit
-    return f'<td style="background:rgb({mixed});color:{ink};text-align:center;height:15px">{text}</td>'
+    return f'<td style="background:rgb({mixed});color:{ink};text-align:center;height:14px">{text}</td>'
 
 
 def heat_maps(

@@ -126,7 +126,10 @@ def test_a_slider_moves_and_the_learner_follows(page, serve, tmp_path):
     slider.focus()
     for _ in range(60):
         slider.press("ArrowRight")
-    time.sleep(2.0)
+    page.wait_for_function(
+        "before => Number(document.querySelector('#mimic-distance').innerText) != before", arg=before, timeout=LATEST
+    )
+    settled(page)
     page.screenshot(path=tmp_path / "moved.png")
     after, bound = number(page, "distance"), number(page, "bound")
     assert float(slider.get_attribute("aria-valuenow")) == pytest.approx(0.6)  # nothing pulls it back
@@ -137,7 +140,10 @@ def test_a_slider_moves_and_the_learner_follows(page, serve, tmp_path):
     weight = page.get_by_role("slider").first
     weight.focus()
     weight.press("ArrowRight")
-    time.sleep(1.0)
+    page.wait_for_function(
+        "after => Number(document.querySelector('#mimic-distance').innerText) != after", arg=after, timeout=LATEST
+    )
+    settled(page)
     assert number(page, "distance") == pytest.approx(after * 1.05, rel=0.01)  # from weight 1 to 1.05; 4 digits shown
 
     page.get_by_role("tab", name="Expert").click()
