@@ -122,17 +122,19 @@ def test_a_slider_moves_and_the_learner_follows(page, serve, tmp_path):
     time.sleep(1.0)  # until the learner rests
     before, still = number(page, "distance"), learner_pixels(page)
     page.screenshot(path=tmp_path / "home.png")
-    slider = page.get_by_role("slider").nth(1)
-    slider.focus()
-    for _ in range(60):
-        slider.press("ArrowRight")
+    sliders = [page.get_by_role("slider").nth(i) for i in (1, 5)]  # joints 2 and 6; the learner has no joint6
+    for slider in sliders:
+        slider.focus()
+        for _ in range(60):
+            slider.press("ArrowRight")
     page.wait_for_function(
         "before => Number(document.querySelector('#mimic-distance').innerText) != before", arg=before, timeout=LATEST
     )
     settled(page)
     page.screenshot(path=tmp_path / "moved.png")
     after, bound = number(page, "distance"), number(page, "bound")
-    assert float(slider.get_attribute("aria-valuenow")) == pytest.approx(0.6)  # nothing pulls it back
+    shown = [float(slider.get_attribute("aria-valuenow")) for slider in sliders]
+    assert shown == pytest.approx([0.6, 0.6])  # nothing pulls them back
     assert after != before and 0 <= bound <= after
     assert np.mean(np.abs(learner_pixels(page) - still).max(axis=-1) > 40) > 0.01
 
@@ -144,7 +146,7 @@ def test_a_slider_moves_and_the_learner_follows(page, serve, tmp_path):
         "after => Number(document.querySelector('#mimic-distance').innerText) != after", arg=after, timeout=LATEST
     )
     settled(page)
-    assert number(page, "distance") == pytest.approx(after * 1.05, rel=0.01)  # from weight 1 to 1.05; 4 digits shown
+    assert after < number(page, "distance") < 1.06 * after  # one of the weights from 1 to 1.05; 4 digits shown
 
     page.get_by_role("tab", name="Expert").click()
     page.get_by_text("play", exact=True).click()
