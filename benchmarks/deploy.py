@@ -5,10 +5,16 @@ is what a robot waits for; and to the end of its computation, with a part of the
 in its own process on the same core, from an observation to the answer, at the rate at which the inner loop asks it.
 Wall times include what other processes on the core cost; CPU times do not, but for what those evict from the caches.
 The last row is a loop of Python alone, which is as long each time: what its p99.9 is above its p50 is the machine's.
+
+With `--awake` a process of the lowest priority keeps the core from halting between the periods, as a kernel with
+idle=poll does: a virtual machine may lose a core that halts to another one. It yields to every other process.
 """
 
+import contextlib
 import dataclasses
 import os
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -28,6 +34,7 @@ _COLUMNS = " ".join(
     ["what count", *(f"{kind}_{name}:.3f" for kind in ("cpu", "wall") for name in ("p50", "p99", "p999")), "missed"]
 )
 _LOOP, _LOOPS = 2000, 5000  # additions of a loop, and periods of it
+_AWAKE = "import os; os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)); exec('while True: pass')"
 
 
 def untrained_bundle(folder: Path) -> Bundle:
@@ -126,18 +133,31 @@ def _priority() -> int:
     return os.sched_getparam(0).sched_priority
 
 
-def measure(bundle: Bundle, motions: int) -> Iterator[Row]:
-    yield from periods(bundle, motions)
-    yield python_loop()
+@contextlib.contextmanager
+def _core_awake() -> Iterator[None]:
+    """Context in which the core of this process does not halt."""
+    with subprocess.Popen([sys.executable, "-c", _AWAKE]) as process:
+        try:
+            yield
+        finally:
+            process.kill()
+
+
+def measure(bundle: Bundle, motions: int, awake: bool = False) -> Iterator[Row]:
+    with _core_awake() if awake else contextlib.nullcontext():
+        yield from periods(bundle, motions)
+        yield python_loop()
 
 
 def main() -> None:
-    options = make_parser("deploy", __doc__, bundle=str, motions=20).parse_args()
+    options = make_parser("deploy", __doc__, bundle=str, motions=20, awake=False).parse_args()
     core = min(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     with tempfile.TemporaryDirectory() as folder:
         bundle = load_bundle(options.bundle) if options.bundle else untrained_bundle(Path(folder))
-        collect(options, measure(bundle, options.motions), "rows", _COLUMNS, unit="ms", real_time_priority=_priority())
+        rows = measure(bundle, options.motions, options.awake)
+        content = {"unit": "ms", "real_time_priority": _priority(), "awake": options.awake}
+        collect(options, rows, "rows", _COLUMNS, **content)
 
 
 if __name__ == "__main__":
