@@ -1,9 +1,12 @@
 """The server of a view: viser's, behind checks of each request and of each message that a browser sends.
 
-viser 1.1 accepts requests of every site, and a message that it cannot read ends its task with a traceback.
+viser 1.1 accepts requests of every site, a message that it cannot read ends its task with a traceback, and updates from
+several threads may end one of these.
 """
 
+import asyncio
 import contextlib
+import dataclasses
 import functools
 import http
 import io
@@ -14,6 +17,7 @@ from typing import Any
 import msgspec
 import viser
 import websockets.asyncio.server
+from viser.infra import _infra
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
@@ -32,6 +36,7 @@ _HEADERS = {"Content-Security-Policy": "frame-ancestors 'self'", "X-Content-Type
 def make_server(host: str, port: int) -> "tuple[viser.ViserServer, Gatekeeper]":
     """Starts a server without elements, and the checks before it."""
     gatekeeper = Gatekeeper(host)
+    _infra.AsyncMessageBuffer = _MessageBuffer  # the class of the buffers that viser makes from now on
     banner = contextlib.redirect_stdout(io.StringIO())  # which `verbose` does not turn off
     with banner, _serving_through(gatekeeper):
         server = viser.ViserServer(host=host, port=port, label="mimic", verbose=False)
@@ -126,6 +131,28 @@ class Gatekeeper:
         if note not in self._noted and len(self._noted) < _MAX_LINES:
             self._noted.add(note)
             print(f"view: {what} from {client}; further ones are only counted", file=sys.stderr, flush=True)
+
+
+class _LoopEvent(asyncio.Event):
+    """An event that is set in a loop only: `set` does nothing in other threads.
+
+    viser sets the event of a buffer in the thread that updates the page, while the loop may change the waiting tasks,
+    and then in the loop, which is enough.
+    """
+
+    def set(self) -> None:
+        try:
+            asyncio.get_running_loop()
+        except RuntimeError:
+            return
+        super().set()
+
+
+@dataclasses.dataclass
+class _MessageBuffer(_infra.AsyncMessageBuffer):
+    """The updates that wait for their connection; threads may add to it."""
+
+    message_event: asyncio.Event = dataclasses.field(default_factory=_LoopEvent)
 
 
 def _protocols(request: Request) -> list[str]:

@@ -4,6 +4,7 @@ import asyncio
 import importlib.util
 import math
 import socket
+import threading
 import time
 
 import pytest
@@ -13,6 +14,8 @@ if importlib.util.find_spec("viser") is None:
 
 import msgspec
 import viser
+from viser._messages import GuiUpdateMessage
+from viser.infra import _infra
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
@@ -175,3 +178,20 @@ def test_twenty_clients_move_the_slider(served):
 
     values.clear()
     asyncio.run(send())
+
+
+def test_an_update_in_a_thread_wakes_connections_in_the_loop_alone(served):
+    message = GuiUpdateMessage(served[2]._impl.uuid, {"value": 0.5})
+
+    async def run():
+        buffer = _infra.AsyncMessageBuffer(asyncio.get_running_loop(), persistent_messages=True)
+        waiting = [asyncio.create_task(buffer.message_event.wait()) for _ in range(20)]
+        await asyncio.sleep(0)
+        thread = threading.Thread(target=buffer.push, args=(message,))
+        thread.start()
+        thread.join()  # the loop does not run meanwhile
+        is_set_by_thread = buffer.message_event.is_set()
+        await asyncio.wait_for(asyncio.gather(*waiting), 5)
+        return is_set_by_thread
+
+    assert not asyncio.run(run())
