@@ -1,6 +1,11 @@
-"""Predicts where a reference goes under a target and then brakes: `next_reference` with larger steps, in place."""
+"""Predicts where a reference goes under a target and then brakes: `next_reference` with larger steps.
 
-from collections.abc import Callable
+It computes with Python's numbers, one joint at a time: for the few joints of an arm that takes a quarter of the time of
+operations on arrays.
+"""
+
+from collections.abc import Callable, Iterable
+from math import sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +16,7 @@ from mimic.control.joint_control import (
     PERIOD,
     REACTION_FRACTION,
     VELOCITY_RATE,
+    Approach,
     JointParameters,
     Reference,
     approach,
@@ -18,7 +24,7 @@ from mimic.control.joint_control import (
 
 HOLD, BRAKE = 2, 30  # periods of a step, while targets act and while the references brake
 SAMPLE = 10  # periods between two angles of a path; those in the middle of a step of braking are interpolated
-_PER_BRAKE = BRAKE // SAMPLE
+_PER_SAMPLE, _PER_BRAKE = SAMPLE // HOLD, BRAKE // SAMPLE
 
 
 class PathPrediction:
@@ -28,7 +34,7 @@ class PathPrediction:
     parts that fit between two periods.
 
     Args:
-      joints: parameters, [joints, 1] each.
+      joints: parameters, [joints, robots] or [joints, 1] each.
       is_position: whether targets are angles [rad]; otherwise velocities [rad/s].
       delay: periods until the new target acts, a multiple of `HOLD`.
       hold: periods for which it acts, a multiple of `SAMPLE`.
@@ -45,39 +51,16 @@ class PathPrediction:
         self._delay_steps, self._hold_steps = delay // HOLD, (delay + hold) // HOLD
         brake_steps = braking_steps(joints)
         self.steps = self._hold_steps + brake_steps
-        size = joints.lower.shape[0], robots
-        self._first_brake = 1 + hold // SAMPLE
-        self.samples = self._first_brake + brake_steps * _PER_BRAKE
-        self._path = np.zeros((self.samples, *size))
-        self._qpos, self._qvel, self._qacc, self._speed, self._a, self._b = np.zeros((6, *size))
-        self._room = np.zeros((2, *size))
+        self.samples = 1 + hold // SAMPLE + brake_steps * _PER_BRAKE
+        self._size = joints.lower.shape[0], robots
+        full = (np.broadcast_to(x, self._size) for x in joints)
+        self._joints = [_joint(JointParameters(*numbers)) for numbers in _numbers(full)]
         self._is_position = is_position
-
-        def full(values: Any, shape: tuple[int, ...] = size) -> np.ndarray:  # NumPy takes longer to broadcast
-            return np.array(np.broadcast_to(values, shape), float)
-
-        def approaching(acceleration: np.ndarray, rate: float, shape: tuple[int, ...] = size) -> _Approach:
-            return _Approach(*(full(x, shape) for x in approach(acceleration, rate)))
-
-        braking, pair = BRAKING_FRACTION * joints.acceleration, (2, *size)
-        self._lower, self._upper = full(joints.lower), full(joints.upper)
-        self._max_speeds = full(joints.velocity, pair)
-        self._max_qacc = full(joints.acceleration)
-        self._reaction = full(REACTION_FRACTION * joints.acceleration / joints.jerk)
-        self._position, self._ends = (approaching(braking, APPROACH_RATE, shape) for shape in (size, pair))
-        self._steps = {
-            periods: _Step(
-                full(periods * PERIOD),
-                full(0.5 * (periods * PERIOD + PERIOD)),
-                full(joints.jerk * periods * PERIOD),
-                full(-joints.jerk * periods * PERIOD),
-                approaching(BRAKING_FRACTION * joints.jerk, _rate(periods)),
-            )
-            for periods in (HOLD, BRAKE)
-        }
-        self._swing_time = full(1 / (2 * joints.jerk))
-        self._target, self._left, self._first_end = np.zeros(size), np.zeros(robots, int), 0
-        self._count, self._samples, self._filled = self.steps, 0, 0
+        self._path = np.zeros((self.samples, *self._size))
+        self._states: list[_State] = []
+        self._targets: list[float] = []
+        self._left: list[int] = []
+        self._count, self._samples = self.steps, 0
 
     def begin(self, reference: Reference, target: np.ndarray, left: np.ndarray) -> None:
         """Starts the paths.
@@ -87,9 +70,10 @@ class PathPrediction:
           target: that acts at present, [joints, robots].
           left: [robots] periods until its references brake.
         """
-        self._qpos[:], self._qvel[:], self._qacc[:] = reference
-        self._target, self._left, self._first_end = target, left.copy(), int(left.min())
-        self._count, self._samples, self._filled = 0, 0, 0
+        self._states = _numbers(reference)
+        self._targets = target.ravel().tolist()
+        self._left = np.tile(left, self._size[0]).tolist()
+        self._count, self._samples = 0, 0
 
     def advance(self, steps: int, new_target: Callable[[Reference], np.ndarray]) -> bool:
         """Computes some more steps; returns whether the paths are complete.
@@ -98,23 +82,17 @@ class PathPrediction:
           steps: number of them.
           new_target: gives the new target, [joints, robots], for the reference at the time when it begins to act.
         """
-        for _ in range(min(steps, self.steps - self._count)):
-            if self._count == self._delay_steps:
-                self._target = new_target(Reference(self._qpos, self._qvel, self._qacc))
-                self._sample(1)
-            is_braking = self._count >= self._hold_steps
-            if is_braking:
-                self._brake()
-            else:
-                self._follow()
-            self._step(self._steps[BRAKE if is_braking else HOLD])
-            self._count += 1
-            since = HOLD * (self._count - self._delay_steps)
-            if is_braking:
-                self._sample(_PER_BRAKE)
-            elif since > 0 and since % SAMPLE == 0:
-                self._sample(1)
-        self._interpolate()
+        end = min(self._count + steps, self.steps)
+        if self._count < self._delay_steps:
+            self._delay(min(end, self._delay_steps))
+        if self._count == self._delay_steps < end:
+            reference = Reference(*np.array(self._states).T.reshape(3, *self._size))
+            self._targets = new_target(reference).ravel().tolist()
+            self._path[0], self._samples = reference.qpos, 1
+        if self._delay_steps <= self._count < min(end, self._hold_steps):
+            self._hold(min(end, self._hold_steps))
+        if self._hold_steps <= self._count < end:
+            self._brake(end)
         return self._count == self.steps
 
     @property
@@ -122,106 +100,102 @@ class PathPrediction:
         """The angles when the new target begins to act and after each `SAMPLE`, [samples, joints, robots] [rad]."""
         return self._path[: self._samples]
 
-    def _sample(self, count: int) -> None:
-        """Adds the present angles to the path as the last of some samples; those before are interpolated later."""
-        self._samples += count
-        self._path[self._samples - 1] = self._qpos
+    def _delay(self, end: int) -> None:
+        """Steps with the present target, until it acts no more: then joints stop."""
+        first, count = self._count, end - self._count
+        for i, (joint, target, left) in enumerate(zip(self._joints, self._targets, self._left, strict=True)):
+            held = min(max(-(-left // HOLD) - first, 0), count)
+            state, _ = _moved(self._states[i], held, joint, HOLD, target, is_position=self._is_position)
+            self._states[i], _ = _moved(state, count - held, joint, HOLD, None)
+        self._count = end
 
-    def _interpolate(self) -> None:
-        """Fills the samples between the ends of the steps of braking that are new."""
-        first, last = max(self._filled, self._first_brake), self._samples
-        if first < last:
-            before, after = (
-                self._path[first - 1 : last - 1 : _PER_BRAKE],
-                self._path[first + _PER_BRAKE - 1 : last : _PER_BRAKE],
-            )
-            change = after - before
-            for k in range(1, _PER_BRAKE):
-                self._path[first + k - 1 : last : _PER_BRAKE] = before + k / _PER_BRAKE * change
-        self._filled = last
+    def _hold(self, end: int) -> None:
+        """Steps with the new target, and a sample after each `_PER_SAMPLE` of them."""
+        angles, count = [], end - self._count
+        for i, (joint, target) in enumerate(zip(self._joints, self._targets, strict=True)):
+            state, reached = _moved(self._states[i], count, joint, HOLD, target, is_position=self._is_position)
+            self._states[i] = state
+            angles.append(reached)
+        skipped = -(self._count - self._delay_steps + 1) % _PER_SAMPLE
+        self._count = end
+        self._add([x[skipped::_PER_SAMPLE] for x in angles])
 
-    def _ahead(self) -> np.ndarray:
-        """Where the joints would stop."""
-        np.multiply(self._reaction, self._qvel, out=self._a)
-        self._a += self._qpos
-        return self._a
+    def _brake(self, end: int) -> None:
+        """Steps of braking, and the samples between their ends."""
+        angles, count = [], end - self._count
+        for i, joint in enumerate(self._joints):
+            self._states[i], reached = _moved(self._states[i], count, joint, BRAKE, None)
+            angles.append(reached)
+        before = self._path[self._samples - 1].ravel().tolist()
+        self._count = end
+        self._add([_interpolated(x, y) for x, y in zip(before, angles, strict=True)])
 
-    def _brake(self) -> None:
-        """The speed for the target 0: not 0 beyond the ends of the range, where joints return."""
-        speed, ahead = self._speed, self._ahead()
-        np.minimum(ahead, self._upper, out=speed)
-        np.maximum(speed, self._lower, out=speed)
-        speed -= ahead
-        speed *= self._position.rate
-
-    def _follow(self) -> None:
-        """The speed for the target that acts, or 0 where none acts any more, so that joints stop at their ends."""
-        speed, room, ahead = self._speed, self._room, self._ahead()
-        if self._is_position:
-            error = np.subtract(self._target, ahead, out=self._b)
-            np.copysign(self._position(np.abs(error)), error, out=speed)
-        else:
-            speed[:] = self._target
-        if self._first_end <= HOLD * self._count < HOLD * self._delay_steps:
-            speed *= self._left > HOLD * self._count
-        np.subtract(self._upper, ahead, out=room[0])
-        np.subtract(ahead, self._lower, out=room[1])
-        bound = self._ends(room)
-        np.minimum(bound, self._max_speeds, out=bound)
-        np.minimum(speed, bound[0], out=speed)
-        np.maximum(speed, np.negative(bound[1], out=bound[1]), out=speed)
-
-    def _step(self, step: "_Step") -> None:
-        """A step as in `next_reference`, towards `speed`."""
-        a, b = self._a, self._b
-        change = np.subtract(self._speed, self._qvel, out=self._speed)
-        swing = step.approach(np.abs(change, out=a))
-        np.minimum(swing, self._max_qacc, out=swing)
-        np.copysign(swing, change, out=swing)
-        swing -= self._qacc
-        np.minimum(swing, step.max_change, out=swing)
-        np.maximum(swing, step.min_change, out=swing)
-        self._qacc += swing
-        np.multiply(self._qacc, step.time, out=a)
-        np.multiply(np.abs(swing, out=b), swing, out=b)  # the jerk limit delays a part of the change
-        b *= self._swing_time
-        a -= b
-        # The angle moves at the mean of the velocities after each period.
-        self._qpos += np.multiply(self._qvel, step.time, out=b)
-        self._qpos += np.multiply(a, step.mean_time, out=b)
-        self._qvel += a
+    def _add(self, angles: list[list[float]]) -> None:
+        """Adds samples, a list of the same length for each joint."""
+        first, self._samples = self._samples, self._samples + len(angles[0])
+        if first < self._samples:
+            self._path[first : self._samples] = np.array(angles).T.reshape(-1, *self._size)
 
 
-class _Approach(NamedTuple):
-    """`approach_speed` with its constants, in few operations."""
+def braking_steps(joints: JointParameters) -> int:
+    """Steps in which every joint stops from its velocity limit."""
+    times = joints.velocity / joints.acceleration + 2 * joints.acceleration / joints.jerk + 5 / VELOCITY_RATE
+    return int(np.ceil(float(np.max(times)) / (BRAKE * PERIOD))) + 1
 
-    slope: np.ndarray
-    offset: np.ndarray
-    rate: np.ndarray
 
-    def __call__(self, distance: np.ndarray) -> np.ndarray:
-        far = distance * self.slope
-        far -= self.offset
-        np.maximum(far, self.offset, out=far)
-        np.sqrt(far, out=far)
-        return np.minimum(far, distance * self.rate, out=far)
+_State = tuple[float, float, float]  # angle, velocity and acceleration of a reference
 
 
 class _Step(NamedTuple):
-    """Constants of steps of one length, [joints, robots] each.
+    """Constants of steps of one length.
 
     Attributes:
       time: length [s].
       mean_time: mean time for which a change of the velocity in the step acts [s].
-      max_change, min_change: of the acceleration in a step [rad/s^2].
+      max_change: of the acceleration in a step [rad/s^2].
+      swing_time: by how much a change of the acceleration delays that of the velocity, for its square [s^3/rad].
       approach: of a velocity.
     """
 
-    time: np.ndarray
-    mean_time: np.ndarray
-    max_change: np.ndarray
-    min_change: np.ndarray
-    approach: _Approach
+    time: float
+    mean_time: float
+    max_change: float
+    swing_time: float
+    approach: Approach
+
+
+class _Joint(NamedTuple):
+    """Constants of a joint: see `ReferenceLimits`; `approach` of an angle, and of the steps of each length."""
+
+    lower: float
+    upper: float
+    velocity: float
+    acceleration: float
+    reaction: float
+    approach: Approach
+    steps: dict[int, _Step]
+
+
+def _joint(joint: JointParameters) -> _Joint:
+    """The constants of a joint from its parameters, numbers."""
+    return _Joint(
+        joint.lower,
+        joint.upper,
+        joint.velocity,
+        joint.acceleration,
+        REACTION_FRACTION * joint.acceleration / joint.jerk,
+        approach(BRAKING_FRACTION * joint.acceleration, APPROACH_RATE),
+        {
+            periods: _Step(
+                periods * PERIOD,
+                0.5 * (periods * PERIOD + PERIOD),
+                joint.jerk * periods * PERIOD,
+                1 / (2 * joint.jerk),
+                approach(BRAKING_FRACTION * joint.jerk, _rate(periods)),
+            )
+            for periods in (HOLD, BRAKE)
+        },
+    )
 
 
 def _rate(periods: int) -> float:
@@ -229,7 +203,95 @@ def _rate(periods: int) -> float:
     return (1 - (1 - VELOCITY_RATE * PERIOD) ** periods) / (periods * PERIOD)
 
 
-def braking_steps(joints: JointParameters) -> int:
-    """Steps in which every joint stops from its velocity limit."""
-    times = joints.velocity / joints.acceleration + 2 * joints.acceleration / joints.jerk + 5 / VELOCITY_RATE
-    return int(np.ceil(float(np.max(times)) / (BRAKE * PERIOD))) + 1
+def _numbers(arrays: Iterable[np.ndarray]) -> list[Any]:
+    """A tuple of the numbers of some arrays [joints, robots] for each joint of each robot."""
+    return list(zip(*(x.ravel().tolist() for x in arrays), strict=True))
+
+
+def _moved(
+    state: _State, count: int, joint: _Joint, periods: int, target: float | None, *, is_position: bool = False
+) -> tuple[_State, list[float]]:
+    """Some steps of a reference as in `next_reference`, and its angle after each of them.
+
+    Args:
+      state: of the reference.
+      count: number of steps.
+      joint: constants.
+      periods: in a step.
+      target: that acts; None where the joint stops.
+      is_position: whether the target is an angle.
+    """
+    # Conditions in place of min and max, and `approach_speed` written out: calls would take twice as long.
+    qpos, qvel, qacc = state
+    lower, upper, max_speed, max_qacc, reaction, (slope, offset, rate), steps = joint
+    time, mean_time, max_change, swing_time, (swing_slope, swing_offset, swing_rate) = steps[periods]
+    speed, angles = 0.0, []
+    for _ in range(count):
+        ahead = qpos + reaction * qvel  # where the joint would stop
+        if target is None:
+            speed = 0.0
+        elif is_position:
+            error = target - ahead
+            far = slope * (error if error > 0 else -error) - offset
+            far = sqrt(far if far > offset else offset)
+            speed = rate * error
+            if speed > far:
+                speed = far
+            elif speed < -far:
+                speed = -far
+        else:
+            speed = target
+        if speed > 0 or ahead > upper:
+            room = upper - ahead
+            far = slope * room - offset
+            far = sqrt(far if far > offset else offset)
+            near = rate * room
+            if speed > near:
+                speed = near
+            if speed > far:
+                speed = far
+            if speed > max_speed:
+                speed = max_speed
+        if speed < 0 or ahead < lower:
+            room = ahead - lower
+            far = slope * room - offset
+            far = -sqrt(far if far > offset else offset)
+            near = -rate * room
+            if speed < near:
+                speed = near
+            if speed < far:
+                speed = far
+            if speed < -max_speed:
+                speed = -max_speed
+        change = speed - qvel
+        far = swing_slope * (change if change > 0 else -change) - swing_offset
+        far = sqrt(far if far > swing_offset else swing_offset)
+        if far > max_qacc:
+            far = max_qacc
+        swing = swing_rate * change
+        if swing > far:
+            swing = far
+        elif swing < -far:
+            swing = -far
+        swing -= qacc
+        if swing > max_change:
+            swing = max_change
+        elif swing < -max_change:
+            swing = -max_change
+        qacc += swing
+        change = qacc * time - (swing if swing > 0 else -swing) * swing * swing_time  # the jerk limit delays a part
+        # The angle moves at the mean of the velocities after each period.
+        qpos += qvel * time + change * mean_time
+        qvel += change
+        angles.append(qpos)
+    return (qpos, qvel, qacc), angles
+
+
+def _interpolated(before: float, ends: list[float]) -> list[float]:
+    """The samples of steps of braking that end at some angles."""
+    samples = []
+    for end in ends:
+        samples += [before + k / _PER_BRAKE * (end - before) for k in range(1, _PER_BRAKE)]
+        samples.append(end)
+        before = end
+    return samples

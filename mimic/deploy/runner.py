@@ -161,11 +161,11 @@ class _Loop:
         wall, cpu = time.perf_counter(), time.thread_time()
         tick, since = divmod(period or 0, self._bundle.periods)  # after the end of the motion nothing is due
         reference = self._layer.reference  # of the same moment as the state
-        if self._due and not self._layer.is_checking:
-            self._receive(since)
         torque = self._layer.period(state.qpos[:, None], state.qvel[:, None])
         self._driver.write(torque[:, 0])
         self._latency.append(time.perf_counter() - wall)
+        if self._due and not self._layer.is_checking:
+            self._receive(since)
         self._layer.work()
         if period is not None and since == 0:  # last, as the policy may run on the same core
             self._policy.send(tick, state.qpos, state.qvel, Reference(*(x[:, 0] for x in reference)))

@@ -65,8 +65,8 @@ def _hold_periods(control_dt: float, config: SafetyConfig) -> int:
 class SafetyLayer:
     """The inner loops of some robots with the same controller.
 
-    In each period: `tick` when the policy's actions have arrived, then `period` gives the torques, and `work` computes
-    in the rest of the period.
+    In each period: `period` gives the torques, `tick` takes the policy's actions where they have arrived, and `work`
+    computes in the rest of the period.
 
     Args:
       bundle: the controller.
@@ -116,6 +116,7 @@ class SafetyLayer:
         self.has_action = np.zeros(robots, bool)
         self._pending: _Pending | None = None
         self.reference = Reference(*np.zeros((3, joints, robots)))
+        self._begun: tuple[Reference, np.ndarray] | None = None  # references and periods left as the period began
         self.cause = np.full(robots, "", object)
         self.counts = {name: np.zeros(robots, int) for name in INTERVENTIONS}
         self._largest_errors, self.clearance = np.zeros((joints, robots)), np.full(robots, np.inf)
@@ -138,7 +139,7 @@ class SafetyLayer:
         return self.cause
 
     def tick(self, action: np.ndarray, is_present: np.ndarray) -> None:
-        """Takes the actions of a tick, whose targets act after `check_periods` if their paths are safe.
+        """Takes the actions of a tick, whose targets act `check_periods` after this period if their paths are safe.
 
         Args:
           action: [numbers, robots] in [-1, 1].
@@ -156,7 +157,10 @@ class SafetyLayer:
         self.counts[REPEATED] += is_missing & is_repeated
         self.counts[LATE] += is_missing & ~is_repeated
         self._pending = _Pending(is_active & (is_new | is_repeated) & self.has_action)
-        self._path.begin(self.reference, self._value, self._left)
+        if self._begun is None:
+            raise RuntimeError("tick: expected after `period` and before `work`")
+        reference, left = self._begun
+        self._path.begin(reference, self._value, left)
         self._path_clearance[:] = -np.inf  # what has not been checked is not safe
 
     @property
@@ -173,7 +177,7 @@ class SafetyLayer:
         """The torques [N m] of a period, for measured angles [rad] and velocities [rad/s]."""
         if self._pending is not None and self._pending.periods == self._config.check_periods:
             self._accept(self._pending)
-        self._qpos, self._qvel = qpos, qvel
+        self._qpos, self._qvel, self._begun = qpos, qvel, (self.reference, self._left)
         cause, error = self._measurements(qpos, qvel, self.reference, self.cause)
         np.maximum(self._largest_errors, error, out=self._largest_errors, where=self._is_tracked)
         if cause is not None:
@@ -207,7 +211,7 @@ class SafetyLayer:
         Each period has about the same work, also without a check: code that has not run for some milliseconds takes
         several times as long. Only the first period of a check has none: in it the policy's action is taken.
         """
-        pending, first, path = self._pending, 0, self._no_path
+        pending, first, path, self._begun = self._pending, 0, self._no_path, None
         if pending is not None and pending.periods < self._config.check_periods:
             pending.periods += 1
             if pending.periods == 1:
@@ -289,7 +293,7 @@ class SafetyLayer:
             braking = next_reference("joint_velocity", self.reference, self._rest, self._limits, np)
             held = Reference(*(np.where(is_held, x, y) for x, y in zip(held, braking, strict=True)))
         self.reference = held
-        self._left -= is_held
+        self._left = self._left - is_held  # not in place: `_begun` has the last ones
 
 
 @dataclasses.dataclass

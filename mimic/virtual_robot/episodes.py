@@ -184,6 +184,7 @@ class SafeController:
         self._policy = policy or Policy(bundle, motion.tolist())
         self._layer = SafetyLayer(bundle, Clearance(bundle), len(motion), config)
         self._channel = Channel(world, bundle.action_size, seed)
+        self._sent: tuple[np.ndarray, np.ndarray] | None = None  # actions of this period, then of the last one
         self._arrived: tuple[np.ndarray, np.ndarray] | None = None
         self.ticks, self.periods = bundle.ticks, bundle.periods
         qpos, qvel = robots.measure()
@@ -195,7 +196,7 @@ class SafeController:
         values = np.concatenate([qpos, qvel, reference.qpos.T, reference.qvel.T], axis=1)
         seen = np.split(self._channel.observed(values), 4, axis=1)
         action = self._policy.act(tick, seen[0], seen[1], Reference(seen[2], seen[3], seen[3]))
-        self._arrived = self._channel.arrived(action)
+        self._sent = self._channel.arrived(action)
 
     def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         """See `Controller`."""
@@ -203,11 +204,11 @@ class SafeController:
 
     def work(self) -> None:
         """See `Controller`; the actions of a tick arrive in its second period, as from the policy's process."""
-        self._layer.work()
         if self._arrived is not None:
             action, is_present = self._arrived
             self._layer.tick(action.T, is_present)
-            self._arrived = None
+        self._layer.work()
+        self._arrived, self._sent = self._sent, None
 
     def drop(self, is_aborted: np.ndarray) -> None:
         """See `Controller`."""

@@ -41,6 +41,24 @@ def test_a_path_is_that_of_the_inner_loop(mode):
     assert np.abs(path[-1] - path[-2]).max() < 1e-4  # it ends at rest
 
 
+@pytest.mark.parametrize("mode", ["joint_velocity", "joint_position"])
+@pytest.mark.parametrize("unknown", ["qpos", "qvel", "qacc", "target", "new target"])
+def test_the_path_of_an_unknown_motion_is_unknown(mode, unknown):
+    """It ends as NaN, which has no clearance, and the other joints' paths do not change."""
+    joints, zero = JointParameters(*(x[:, None] for x in parameters())), np.zeros((7, 1))
+    prediction = PathPrediction(joints, mode == "joint_position", DELAY, HOLD)
+    given = {name: zero + 0.1 for name in ("qpos", "qvel", "qacc", "target", "new target")}
+    paths = []
+    for value in (0.1, np.nan):
+        given[unknown] = np.where(np.arange(7)[:, None] == 2, value, 0.1)
+        prediction.begin(Reference(given["qpos"], given["qvel"], given["qacc"]), given["target"], np.array([HOLD]))
+        assert prediction.advance(10**6, lambda at: given["new target"])
+        paths.append(prediction.path[:, :, 0].copy())
+    known, path = paths
+    assert np.isfinite(known).all() and np.isnan(path[1:, 2]).all()
+    np.testing.assert_array_equal(np.delete(path, 2, axis=1), np.delete(known, 2, axis=1))
+
+
 def exact_path(mode, joints, reference, target, left, new_target, samples):
     """The angles after each 10 ms from the delay on, and the reference and target when the new one begins to act."""
     zero, path, limits = np.zeros_like(target), [], joint_control.reference_limits(joints)

@@ -35,9 +35,10 @@ def run(layer, action, ticks=1, present=True):
     """Ticks with an action on an arm that follows its reference exactly; the reference after each period."""
     references = []
     for _ in range(ticks):
-        layer.tick(np.asarray(action, float)[:, None], ONE & present)
-        for _ in range(50):
+        for period in range(50):
             layer.period(layer.reference.qpos, layer.reference.qvel)
+            if period == 0:
+                layer.tick(np.asarray(action, float)[:, None], ONE & present)
             layer.work()
             references.append(layer.reference)
     return references
@@ -79,6 +80,24 @@ def test_an_accepted_target_moves_the_arm(layer):
     assert references[-1].qvel[0, 0] == pytest.approx(0.5 * bundles.parameters().velocity[0], rel=1e-3)
     assert references[CONFIG.check_periods - 1].qvel[0, 0] == 0 < references[CONFIG.check_periods + 2].qvel[0, 0]
     assert not any(count[0] for count in layer.counts.values())
+
+
+def test_a_path_begins_where_the_reference_will_be(layer):
+    """When the new target begins to act, to a twentieth of what the reference moves in a period."""
+    references = run(layer, velocity(0, 0.5), ticks=5)
+    begin = references[-50 + CONFIG.check_periods - 1]  # the last one with the old target
+    assert begin.qvel[0, 0] > 0.9
+    assert abs(layer._path.path[0, 0, 0] - begin.qpos[0, 0]) < 0.05 * begin.qvel[0, 0] * PERIOD
+
+
+def test_actions_are_taken_between_the_torque_and_the_work_of_a_period(layer):
+    action = velocity(0, 0.5)[:, None]
+    with pytest.raises(RuntimeError, match="tick: expected after `period` and before `work`"):
+        layer.tick(action, ONE)
+    layer.period(layer.reference.qpos, layer.reference.qvel)
+    layer.work()
+    with pytest.raises(RuntimeError, match="tick: expected after `period`"):
+        layer.tick(action, ONE)
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, 1.5])
@@ -149,9 +168,10 @@ def test_it_starts_only_near_the_start_pose_and_at_rest(bundle, change, cause):
     pose = bundle.start_pose[:, None]
     qpos, qvel, pose = change(pose, 0 * pose, pose)
     assert layer.start(qpos, qvel, pose)[0] == cause
-    layer.tick(velocity(0, 1.0)[:, None], ONE)
-    for _ in range(100):
+    for period in range(100):
         torque = layer.period(np.nan_to_num(qpos), qvel)
+        if period == 0:
+            layer.tick(velocity(0, 1.0)[:, None], ONE)
         layer.work()
     assert np.isfinite(torque).all() and np.all(layer.reference.qvel[0] < 0.01)
 
@@ -197,12 +217,12 @@ def test_a_blocked_arm_is_not_pushed_on(layer):
     """It brakes where it is, as its reference goes on for 0.4 rad at this speed; the torque changes within its rate."""
     block, before = layer.reference.qpos[0, 0] + 0.15, layer.torque.copy()
     for period in range(1000):
-        if period % 50 == 0:
-            layer.tick(velocity(0, 1.0)[:, None], ONE)
         qpos, qvel = layer.reference.qpos.copy(), layer.reference.qvel.copy()
         if qpos[0, 0] > block:
             qpos[0], qvel[0] = block, 0.0
         torque = layer.period(qpos, qvel)
+        if period % 50 == 0:
+            layer.tick(velocity(0, 1.0)[:, None], ONE)
         layer.work()
         assert np.abs(torque - before).max() <= 1.0 + 1e-9
         before = torque
@@ -336,14 +356,15 @@ def test_robots_of_a_batch_do_not_depend_on_each_other(bundle):
     for i, layer in enumerate(alone):
         layer.start(pose[:, i : i + 1], 0 * pose[:, :1], pose[:, i : i + 1])
     for action, is_present in zip(actions, present, strict=True):
-        together.tick(action, is_present)
-        for i, layer in enumerate(alone):
-            layer.tick(action[:, i : i + 1], is_present[i : i + 1])
-        for _ in range(50):
+        for period in range(50):
             together.period(together.reference.qpos, together.reference.qvel)
+            if period == 0:
+                together.tick(action, is_present)
             together.work()
-            for layer in alone:
+            for i, layer in enumerate(alone):
                 layer.period(layer.reference.qpos, layer.reference.qvel)
+                if period == 0:
+                    layer.tick(action[:, i : i + 1], is_present[i : i + 1])
                 layer.work()
     for i, layer in enumerate(alone):
         np.testing.assert_allclose(together.reference.qpos[:, i], layer.reference.qpos[:, 0], atol=1e-12)

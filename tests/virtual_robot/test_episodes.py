@@ -37,8 +37,7 @@ class Adversary(SafeController):
         is_new, self._held = self._held <= 1, self._held - 1
         self._action = np.where(is_new[:, None], action, self._action)
         self._held = np.where(is_new, rng.integers(1, LONGEST + 1, robots), self._held)
-        arrived, is_present = self._channel.arrived(self._action)
-        self._layer.tick(arrived.T, is_present)
+        self._arrived = self._channel.arrived(self._action)
 
 
 def adversarial_episodes(folder, mode, episodes, seed, ticks=TICKS):
