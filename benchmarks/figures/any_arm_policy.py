@@ -1,6 +1,6 @@
 """The gap of one policy for any arm, beside the controller without training and policies of one arm.
 
-python -m benchmarks.figures.any_arm_policy POLICY.json OUTSIDE.json SPECIALISTS.json [SPECIALISTS.json ...] OUT.png
+python -m benchmarks.figures.any_arm_policy POLICY.json OUTSIDE.json OUT.png
 """
 
 import json
@@ -20,22 +20,21 @@ FLOOR = 0.05  # %, the lowest gap that is shown
 def draw(
     rows: Sequence[Mapping[str, Any]],
     outside: Sequence[Mapping[str, Any]],
-    specialists: Mapping[str, float],
     out: Path,
 ) -> None:
     """Draws arms with a specialist on the left; random arms by joints, and arms outside the distribution, on the right.
 
     Args:
-      rows: gaps of arms, `controller_gap` and `seed_0` to `seed_2`, with the number of `joints`.
+      rows: gaps of arms, `controller_gap` and `seed_0` to `seed_2`, with the number of `joints`; `specialist_gap` of
+        the policy of this arm alone, where there is one.
       outside: the same of arms outside the distribution, with one seed.
-      specialists: gap of the policy of each arm alone.
       out: image file.
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4.5), width_ratios=[1.5, 1], layout="constrained")
-    own = [row for row in rows if row["arm"] in specialists]
+    own = [row for row in rows if "specialist_gap" in row]
     own.sort(key=lambda row: (not row["arm"].startswith("locked"), row["seen"], _mean(row)))
     _points(left, range(len(own)), own)
-    gaps = [_percent(specialists[row["arm"]]) for row in own]
+    gaps = [_percent(row["specialist_gap"]) for row in own]
     left.plot(range(len(own)), gaps, "_", color=SPECIALIST, markersize=14, markeredgewidth=2, label="PPO of this arm")
     labels = [row["arm"] + (" (seen)" if row["seen"] else "") for row in own]
     left.set_xticks(range(len(own)), labels, rotation=90, fontsize=8)
@@ -77,14 +76,12 @@ def _percent(gap: float) -> float:
 
 def main() -> None:
     """Runs the command."""
-    policy, outside, *files, out = map(Path, sys.argv[1:])
-    results = [json.loads(file.read_text()) for file in files]
-    specialists = {row["arm"]: row["gap"]["held_out"] for result in results for row in result["rows"]}
+    policy, outside, out = map(Path, sys.argv[1:])
     rows, others = (
         [row for row in json.loads(file.read_text())["arms"] if row["controller_gap"] is not None]
         for file in (policy, outside)
     )
-    draw(rows, others, specialists, out)
+    draw(rows, others, out)
 
 
 if __name__ == "__main__":

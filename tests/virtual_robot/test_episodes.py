@@ -1,6 +1,7 @@
 """Episodes on virtual robots: the safety layer against random actions, delays and losses, and the same as alone."""
 
 import dataclasses
+import multiprocessing
 import os
 
 import numpy as np
@@ -10,6 +11,7 @@ from mimic.deploy.policy_process import LocalPolicy
 from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import COLLISION, LATE, REPEATED
 from mimic.envs.world import WorldConfig
+from mimic.virtual_robot import runs
 from mimic.virtual_robot.driver import VirtualRobot
 from mimic.virtual_robot.episodes import ABORTED, Channel, SafeController, run_episodes
 from mimic.virtual_robot.robots import TORQUE_RATE, VirtualRobots
@@ -110,6 +112,16 @@ def test_processes_give_the_same_episodes(bundle):
     for a, b in zip(apart, together, strict=True):
         np.testing.assert_array_equal(a.qpos, b.qpos)
         np.testing.assert_array_equal(a.interventions[REPEATED], b.interventions[REPEATED])
+
+
+def test_numpy_has_one_thread_in_each_process(monkeypatch):
+    """But for what the user has set, and only while the processes start."""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    monkeypatch.setenv("MKL_NUM_THREADS", "3")
+    with runs._one_thread_each(), multiprocessing.get_context("spawn").Pool(1) as pool:
+        names = ["OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"]
+        assert pool.map(os.getenv, names) == ["1", "3"]
+    assert "OPENBLAS_NUM_THREADS" not in os.environ and os.environ["MKL_NUM_THREADS"] == "3"
 
 
 def test_tasks_run_where_the_system_has_no_affinity(bundle, monkeypatch):
