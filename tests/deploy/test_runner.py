@@ -164,6 +164,15 @@ class Scripted:
         pass
 
 
+@pytest.fixture
+def _sigint():
+    """Python's handler: what runs the tests may ignore the signal, as a shell in the background does."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_sigint")
 @pytest.mark.parametrize("interrupts", [(500,), (500, 520)], ids=["once", "twice"])
 def test_ctrl_c_makes_the_arm_brake_before_the_driver_is_stopped(bundle, interrupts):
     """A second one stops the driver at once."""
