@@ -144,7 +144,13 @@ class SafetyLayer:
         Args:
           action: [numbers, robots] in [-1, 1].
           is_present: [robots] whether a new action has arrived; otherwise the last one is used again.
+
+        Raises:
+          RuntimeError: it is not called between `period` and `work`; nothing has changed then.
         """
+        if self._begun is None:
+            raise RuntimeError("tick: expected after `period` and before `work`")
+        reference, left = self._begun
         is_active = self.cause == ""
         is_valid = np.all(np.abs(action) <= 1 + _ACTION_TOLERANCE, axis=0)  # False for NaN
         self.counts[INVALID] += is_active & is_present & ~is_valid
@@ -157,9 +163,6 @@ class SafetyLayer:
         self.counts[REPEATED] += is_missing & is_repeated
         self.counts[LATE] += is_missing & ~is_repeated
         self._pending = _Pending(is_active & (is_new | is_repeated) & self.has_action)
-        if self._begun is None:
-            raise RuntimeError("tick: expected after `period` and before `work`")
-        reference, left = self._begun
         self._path.begin(reference, self._value, left)
         self._path_clearance[:] = -np.inf  # what has not been checked is not safe
 
@@ -273,7 +276,7 @@ class SafetyLayer:
         """Makes arms brake: those with a cause."""
         is_stopped = (self.cause == "") & (cause != "")
         self.cause[is_stopped] = cause[is_stopped]
-        self._left[is_stopped] = 0
+        self._left = np.where(is_stopped, 0, self._left)
         self._stiffness[:, is_stopped] = 1.0
         is_blocked = is_stopped & (cause == TRACKING)
         if np.count_nonzero(is_blocked):  # brakes from the measured motion: the reference would push the arm on

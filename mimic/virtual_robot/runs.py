@@ -25,7 +25,7 @@ from mimic.virtual_robot.episodes import (
 from mimic.virtual_robot.robots import VirtualRobots
 
 GROUP = 100  # robots in lockstep: more are not faster
-_BLAS_THREADS = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"  # environment variables
+_BLAS_THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"  # variables
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,18 +107,18 @@ def run_tasks(tasks: list[Task], update: Callable[[int], None], processes: int |
 
 @contextlib.contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Context in which NumPy has one thread in new processes, unless the user has set it.
+    """Context in which NumPy has one thread in new processes, unless the user has set a number.
 
     Otherwise each of them has a thread for each core, which wait for each other: on 16 cores that takes over twice as
     long.
     """
-    added = [name for name in _BLAS_THREADS if name not in os.environ]
+    added = () if any(name in os.environ for name in _BLAS_THREADS) else _BLAS_THREADS
     os.environ.update(dict.fromkeys(added, "1"))
     try:
         yield
     finally:
         for name in added:
-            del os.environ[name]
+            os.environ.pop(name, None)
 
 
 def _num_cores() -> int:

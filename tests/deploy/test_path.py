@@ -41,6 +41,23 @@ def test_a_path_is_that_of_the_inner_loop(mode):
     assert np.abs(path[-1] - path[-2]).max() < 1e-4  # it ends at rest
 
 
+@pytest.mark.parametrize("steps", [1, 4, 7])
+def test_a_path_in_parts_is_the_same(steps):
+    """Of several robots, one of them slower, from a little beyond the range, with an odd time left."""
+    joints = JointParameters(*(np.tile(x[:, None], 3) for x in parameters()))
+    joints.velocity[:, 1] *= 0.5
+    reference = Reference(joints.upper + 0.02, 0.5 * joints.velocity, 0 * joints.velocity)
+    target, paths = joints.upper - [0.3, 0.2, 0.1], []
+    for part in (10**6, steps):
+        prediction = PathPrediction(joints, True, DELAY, HOLD, 3)
+        prediction.begin(reference, target, np.array([0, 7, HOLD]))
+        while not prediction.advance(part, lambda at: at.qpos - 0.2):
+            pass
+        paths.append(prediction.path.copy())
+    np.testing.assert_array_equal(*paths)
+    assert len(paths[0]) == prediction.samples and np.ptp(paths[0], axis=0).min() > 0.03
+
+
 @pytest.mark.parametrize("mode", ["joint_velocity", "joint_position"])
 @pytest.mark.parametrize("unknown", ["qpos", "qvel", "qacc", "target", "new target"])
 def test_the_path_of_an_unknown_motion_is_unknown(mode, unknown):

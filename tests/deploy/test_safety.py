@@ -98,6 +98,17 @@ def test_actions_are_taken_between_the_torque_and_the_work_of_a_period(layer):
     layer.work()
     with pytest.raises(RuntimeError, match="tick: expected after `period`"):
         layer.tick(action, ONE)
+    assert not layer.is_checking and not layer.has_action[0] and not any(count[0] for count in layer.counts.values())
+
+
+def test_a_path_begins_with_the_time_that_is_left_to_the_last_target(bundle):
+    """Without grace it is exactly the time of the check, so that the reference never brakes between two targets."""
+    layer = SafetyLayer(bundle, Clearance(bundle), config=SafetyConfig(grace=0.0))
+    pose = bundle.start_pose[:, None]
+    layer.start(pose, 0 * pose, pose)
+    references = run(layer, velocity(0, 0.5), ticks=5)
+    begin = references[-50 + CONFIG.check_periods - 1]
+    assert abs(layer._path.path[0, 0, 0] - begin.qpos[0, 0]) < 0.05 * begin.qvel[0, 0] * PERIOD
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, 1.5])

@@ -115,13 +115,15 @@ def test_processes_give_the_same_episodes(bundle):
 
 
 def test_numpy_has_one_thread_in_each_process(monkeypatch):
-    """But for what the user has set, and only while the processes start."""
-    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    monkeypatch.setenv("MKL_NUM_THREADS", "3")
+    """Unless the user has set a number; this process keeps its own."""
+    for name in runs._BLAS_THREADS:
+        monkeypatch.delenv(name, raising=False)
     with runs._one_thread_each(), multiprocessing.get_context("spawn").Pool(1) as pool:
-        names = ["OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"]
-        assert pool.map(os.getenv, names) == ["1", "3"]
-    assert "OPENBLAS_NUM_THREADS" not in os.environ and os.environ["MKL_NUM_THREADS"] == "3"
+        assert pool.map(os.getenv, runs._BLAS_THREADS) == ["1"] * len(runs._BLAS_THREADS)
+    assert not any(name in os.environ for name in runs._BLAS_THREADS)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    with runs._one_thread_each():
+        assert "OPENBLAS_NUM_THREADS" not in os.environ and os.environ["OMP_NUM_THREADS"] == "3"
 
 
 def test_tasks_run_where_the_system_has_no_affinity(bundle, monkeypatch):
