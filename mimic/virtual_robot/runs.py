@@ -25,7 +25,8 @@ from mimic.virtual_robot.episodes import (
 from mimic.virtual_robot.robots import VirtualRobots
 
 GROUP = 100  # robots in lockstep: more are not faster
-_BLAS_THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"  # variables
+# Environment variables, which NumPy's libraries read when it is imported.
+_BLAS_THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"
 
 
 @dataclasses.dataclass(frozen=True)

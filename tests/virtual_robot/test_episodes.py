@@ -1,8 +1,10 @@
 """Episodes on virtual robots: the safety layer against random actions, delays and losses, and the same as alone."""
 
+import contextlib
 import dataclasses
 import multiprocessing
 import os
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -114,16 +116,24 @@ def test_processes_give_the_same_episodes(bundle):
         np.testing.assert_array_equal(a.interventions[REPEATED], b.interventions[REPEATED])
 
 
-def test_numpy_has_one_thread_in_each_process(monkeypatch):
-    """Unless the user has set a number; this process keeps its own."""
+@pytest.mark.parametrize("chosen", [None, "3"])
+def test_numpy_has_one_thread_in_each_process(bundle, monkeypatch, chosen):
+    """Unless the user has chosen a number; this process keeps its own."""
     for name in runs._BLAS_THREADS:
         monkeypatch.delenv(name, raising=False)
-    with runs._one_thread_each(), multiprocessing.get_context("spawn").Pool(1) as pool:
-        assert pool.map(os.getenv, runs._BLAS_THREADS) == ["1"] * len(runs._BLAS_THREADS)
-    assert not any(name in os.environ for name in runs._BLAS_THREADS)
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    with runs._one_thread_each():
-        assert "OPENBLAS_NUM_THREADS" not in os.environ and os.environ["OMP_NUM_THREADS"] == "3"
+    if chosen:
+        monkeypatch.setenv("OMP_NUM_THREADS", chosen)
+    before, inherited = dict(os.environ), []
+
+    @contextlib.contextmanager
+    def pool(_):
+        inherited.extend(os.environ.get(name) for name in runs._BLAS_THREADS)
+        yield SimpleNamespace(imap=map)
+
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: SimpleNamespace(Pool=pool))
+    run_tasks([task(bundle, WorldConfig(), 1), task(bundle, WorldConfig(), 1)], lambda _: None, processes=2)
+    assert inherited == ([chosen, None, None, None] if chosen else ["1"] * 4)
+    assert dict(os.environ) == before
 
 
 def test_tasks_run_where_the_system_has_no_affinity(bundle, monkeypatch):
