@@ -37,32 +37,41 @@ class FakeRobot:
         self._qpos, self._limits = np.array(qpos, float), limits
         self._qvel, self._torque = np.zeros((2, len(self._qpos)))
         self._inertia, self._damping, self._is_paced = inertia, damping, is_paced
+        self._command: np.ndarray | None = None
         self._periods, self._missed, self._started = 0, 0, 0.0
         self.states: list[RobotState] = []
 
     def read(self) -> RobotState:
         """See `Driver`."""
+        self._move()  # here, as a robot does this by itself while its controller computes
+        self._check()
         if self._is_paced:
             self._wait()
-        self._check()
         time_s = (self._periods + self._missed) * PERIOD
         state = RobotState(time_s, self._qpos.copy(), self._qvel.copy(), self._torque.copy())
         self.states.append(state)
         return state
 
     def write(self, torque: np.ndarray) -> None:
-        """See `Driver`."""
-        change = np.abs(torque - self._torque) / PERIOD
-        if np.any(change > self._limits.torque_rate * (1 + _TOLERANCE)):
-            raise RobotAbort("torque rate")
-        self._torque = np.array(torque, float)
-        self._qvel += PERIOD * (self._torque - self._damping * self._qvel) / self._inertia
-        self._qpos += PERIOD * self._qvel
-        self._periods += 1
+        """See `Driver`; what is wrong with the torque is raised by the next `read`."""
+        self._command = np.array(torque, float)
 
     def stop(self) -> None:
         """See `Driver`."""
         self._qvel[:] = 0
+
+    def _move(self) -> None:
+        """One period with the commanded torque."""
+        torque, self._command = self._command, None
+        if torque is None:
+            return
+        change = np.abs(torque - self._torque) / PERIOD
+        if np.any(change > self._limits.torque_rate * (1 + _TOLERANCE)):
+            raise RobotAbort("torque rate")
+        self._torque = torque
+        self._qvel += PERIOD * (self._torque - self._damping * self._qvel) / self._inertia
+        self._qpos += PERIOD * self._qvel
+        self._periods += 1
 
     def _wait(self) -> None:
         now = time.perf_counter()

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from mimic.control.joint_control import Reference
 from mimic.control.limits import JointLimits
 from mimic.deploy.config import SafetyConfig
+from mimic.deploy.joint_motion import State, joint_numbers
 
 START_POSE, NOT_AT_REST = "start pose", "not at rest"
 INVALID_STATE, JUMP, TRACKING = "invalid state", "state jump", "tracking error"
@@ -30,58 +30,90 @@ class StartCheck:
 class MeasurementCheck:
     """Finds arms whose measured states are implausible or near limits.
 
+    Lists have a number for each joint of each robot, in the order of arrays [joints, robots].
+
     Attributes:
-      is_lost: [robots] whether the measurements of an arm can no longer be used.
-      any_lost: whether there is such an arm.
+      is_lost: whether the measurements of the arm can no longer be used.
     """
 
-    def __init__(self, limits: JointLimits, config: SafetyConfig):
-        position, velocity = np.asarray(limits.position, float), np.asarray(limits.velocity, float)
-        self._lower, self._upper = position[:, 0] + config.position, position[:, 1] - config.position
-        zero = np.zeros_like(velocity)
-        # Maxima of the tracking error, the change of the angle, the speed, and how far the angle is beyond its range.
-        self._maxima = np.stack([zero + config.tracking, zero + config.jump, config.velocity * velocity, zero, zero])
-        self._periods = config.velocity_periods
-        self.begin(np.zeros((len(velocity), 0)))
+    def __init__(self, limits: JointLimits, config: SafetyConfig, robots: int):
+        self._robots, self._config = robots, config
+        lower, upper = limits.position.T
+        bounds = lower + config.position, upper - config.position, config.velocity * np.asarray(limits.velocity)
+        self._bounds = joint_numbers(np.repeat(x, robots) for x in bounds)
+        self._largest_errors = [0.0] * len(self._bounds)
+        self._is_tracked = [True] * len(self._bounds)
+        self.begin([0.0] * len(self._bounds))
 
-    def begin(self, qpos: np.ndarray) -> None:
+    @property
+    def tracking_error(self) -> np.ndarray:
+        """The largest tracking error [robots] [rad]."""
+        return np.array(self._largest_errors).reshape(-1, self._robots).max(axis=0)
+
+    def begin(self, qpos: list[float]) -> None:
         """Begins with measured angles."""
-        joints, robots = qpos.shape
-        self._previous, self._values = qpos.copy(), np.zeros((5, joints, robots))
-        self._ends = np.tile(np.stack([self._upper, self._lower])[..., None], robots)
-        self._bounds = np.tile(self._maxima[..., None], robots)
-        self._fast, self.is_lost, self.any_lost = np.zeros(robots, int), np.zeros(robots, bool), False
+        self._previous = qpos
+        self._fast, self.is_lost = np.zeros(self._robots, int), [False] * len(qpos)
+
+    def release(self, robots: np.ndarray) -> None:
+        """No longer notes the tracking errors of some robots [robots]."""
+        self._is_tracked = (np.reshape(self._is_tracked, (-1, self._robots)) & ~robots).ravel().tolist()
 
     def __call__(
-        self, qpos: np.ndarray, qvel: np.ndarray, reference: Reference, known: np.ndarray
-    ) -> tuple[np.ndarray | None, np.ndarray]:
-        """The causes of arms that must stop, None if there are none, and tracking errors [joints, robots] [rad]."""
-        values, (upper, lower) = self._values, self._ends
-        np.subtract(qpos, reference.qpos, out=values[0])
-        np.subtract(qpos, self._previous, out=values[1])
-        values[2] = qvel
-        np.abs(values[:3], out=values[:3])
-        np.subtract(qpos, upper, out=values[3])
-        np.subtract(lower, qpos, out=values[4])
-        np.copyto(self._previous, qpos)  # a driver may use its array again
-        is_within = values <= self._bounds  # False for NaN
-        if np.count_nonzero(is_within) == is_within.size:
-            self._fast[:] = 0
-            return None, values[0]
-        return self._causes(np.all(is_within, axis=1), known)
+        self, qpos: list[float], qvel: list[float], states: list[State], known: np.ndarray
+    ) -> np.ndarray | None:
+        """The causes [robots] of arms that must stop, None if there are none.
 
-    def _causes(self, is_within: np.ndarray, known: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
-        """See `__call__`, where a value of a robot is not within its bound; [5, robots]."""
-        tracks, is_smooth, is_slow, *is_inside = is_within
-        is_finite = np.isfinite(self._values.sum(axis=(0, 1)))
-        self._fast = (self._fast + 1) * ~is_slow
-        self.is_lost |= ~is_finite | ~is_smooth
-        self.any_lost = bool(self.is_lost.any())
-        is_near, is_fast = ~np.all(is_inside, axis=0), self._fast >= self._periods
-        error = np.where(is_finite, self._values[0], 0.0)
+        Args:
+          qpos, qvel: measured [rad, rad/s].
+          states: references at the same time.
+          known: [robots] causes for which arms have been stopped.
+        """
+        tracking, jump, largest = self._config.tracking, self._config.jump, self._largest_errors
+        previous, self._previous, are_within = self._previous, qpos, True
+        for i, (angle, speed, before, state, (lower, upper, fastest)) in enumerate(
+            zip(qpos, qvel, previous, states, self._bounds, strict=True)
+        ):
+            error = angle - state[0]
+            if error < 0:
+                error = -error
+            is_within = -jump <= angle - before <= jump and -fastest <= speed <= fastest and lower <= angle <= upper
+            if not (is_within and error <= tracking):  # neither for NaN
+                are_within = False
+            elif error > largest[i] and self._is_tracked[i]:
+                largest[i] = error
+        if are_within:
+            self._fast[:] = 0
+            return None
+        reference = [state[0] for state in states]
+        return self._causes(np.reshape([qpos, qvel, previous, reference], (4, -1, self._robots)), known)
+
+    def _causes(self, measured: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """See `__call__`, where a value of a robot is not within its bound.
+
+        Args:
+          measured: angles, velocities, the angles before and the reference's [4, joints, robots].
+          known: [robots].
+        """
+        qpos, qvel, previous, reference = measured
+        lower, upper, fastest = np.array(self._bounds).T.reshape(3, *qpos.shape)
+        error = np.abs(qpos - reference)
+        is_finite = np.isfinite(error + qvel).all(axis=0)
+        is_smooth = (np.abs(qpos - previous) <= self._config.jump).all(axis=0)
+        self._fast = np.where((np.abs(qvel) <= fastest).all(axis=0), 0, self._fast + 1)
+        is_noted = np.reshape(self._is_tracked, qpos.shape) & is_finite
+        largest = np.reshape(self._largest_errors, qpos.shape)
+        self._largest_errors = np.where(is_noted, np.maximum(largest, error), largest).ravel().tolist()
+        self.is_lost = (np.reshape(self.is_lost, qpos.shape) | ~is_finite | ~is_smooth).ravel().tolist()
         cause = np.select(
-            [~is_finite, ~is_smooth, ~tracks, is_near, is_fast],
+            [
+                ~is_finite,
+                ~is_smooth,
+                ~(error <= self._config.tracking).all(axis=0),
+                ~((lower <= qpos) & (qpos <= upper)).all(axis=0),
+                self._fast >= self._config.velocity_periods,
+            ],
             [INVALID_STATE, JUMP, TRACKING, POSITION, VELOCITY],
             "",
         )
-        return np.where(known == "", cause, "").astype(object), error
+        return np.where(known == "", cause, "").astype(object)

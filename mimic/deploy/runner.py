@@ -160,14 +160,15 @@ class _Loop:
         """One period; `period` counts those of the motion, None after its end."""
         wall, cpu = time.perf_counter(), time.thread_time()
         tick, since = divmod(period or 0, self._bundle.periods)  # after the end of the motion nothing is due
-        reference = self._layer.reference  # of the same moment as the state
+        is_tick = period is not None and since == 0
+        reference = self._layer.reference if is_tick else None  # of the same moment as the state
         torque = self._layer.period(state.qpos[:, None], state.qvel[:, None])
         self._driver.write(torque[:, 0])
         self._latency.append(time.perf_counter() - wall)
         if self._due and not self._layer.is_checking:
             self._receive(since)
         self._layer.work()
-        if period is not None and since == 0:  # last, as the policy may run on the same core
+        if reference is not None:  # last, as the policy may run on the same core
             self._policy.send(tick, state.qpos, state.qvel, Reference(*(x[:, 0] for x in reference)))
             self._tick, self._due = tick, True
         self._wall.append(time.perf_counter() - wall)

@@ -10,18 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mimic.control.joint_control import (
-    PERIOD,
-    JointParameters,
-    Reference,
-    Target,
-    action_target,
-    joint_torque,
-    next_reference,
-    reference_limits,
-)
+from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target, action_target
 from mimic.deploy.bundle import Bundle
 from mimic.deploy.config import SafetyConfig
+from mimic.deploy.inner_loop import InnerLoop
+from mimic.deploy.joint_motion import State, joint_reference
 from mimic.deploy.measurements import TRACKING, MeasurementCheck, StartCheck
 from mimic.deploy.path import SAMPLE, PathPrediction
 
@@ -29,7 +22,6 @@ from mimic.deploy.path import SAMPLE, PathPrediction
 COLLISION, INVALID, REPEATED, LATE = "clearance", "invalid action", "repeated action", "late policy"
 INTERVENTIONS = (COLLISION, INVALID, REPEATED, LATE)
 MEASURED_CLEARANCE = "measured clearance"
-_SLOWING = 3.0  # of the damping of the inner loop
 _ACTION_TOLERANCE = 1e-3  # beyond [-1, 1]: float32 rounds a saturated tanh
 
 
@@ -62,6 +54,20 @@ def _hold_periods(control_dt: float, config: SafetyConfig) -> int:
     return round(control_dt / PERIOD) + round(config.grace / PERIOD)
 
 
+def _parts(path: PathPrediction, config: SafetyConfig) -> list[int]:
+    """Steps of a path in each second period of a check, without the first and the last one.
+
+    Those of braking have several samples each, whose clearance takes time too. So they are spread over two thirds of
+    the periods, though they are fewer.
+    """
+    count = max(config.check_periods // 2 - 1, 1)
+    hold, brake = count // 3, count - count // 3
+    ends = np.concatenate(
+        [[0], np.linspace(0, path.hold_steps, hold + 1)[1:], np.linspace(path.hold_steps, path.steps, brake + 1)[1:]]
+    )
+    return np.diff(np.ceil(ends).astype(int)).tolist()
+
+
 class SafetyLayer:
     """The inner loops of some robots with the same controller.
 
@@ -75,12 +81,10 @@ class SafetyLayer:
       config: thresholds.
 
     Attributes:
-      reference: the motion that the arms track.
-      torque: of the last period [N m].
       cause: [robots] why the arm was stopped for good; empty while it is controlled.
       has_action: [robots] whether a valid action has ever arrived.
       counts: [robots] number of interventions, by kind.
-      clearance: [robots] smallest clearance of a measured pose [m], of nearly every period.
+      clearance: [robots] smallest clearance of a measured pose [m], of every period.
     """
 
     def __init__(
@@ -94,33 +98,34 @@ class SafetyLayer:
         check_supported(bundle.mode, bundle.control_dt, config)
         hold = _hold_periods(bundle.control_dt, config)
         self._mode, self._config, self._clearance, self._hold = bundle.mode, config, clearance, hold
-        # As large as the states: NumPy takes twice as long to broadcast.
-        self._actions = JointParameters(*(np.tile(np.asarray(x, float)[:, None], robots) for x in bundle.parameters))
+        full = (np.tile(np.asarray(x, float)[:, None], robots) for x in (*bundle.parameters, bundle.limits.velocity))
+        *parameters, velocity = full
+        self._actions = JointParameters(*parameters)
         self._joints = self._actions._replace(
             velocity=config.velocity_scale * self._actions.velocity,
             acceleration=config.acceleration_scale * self._actions.acceleration,
         )
-        self._limits = reference_limits(self._joints)
-        self._slow = config.slow_down * np.tile(np.asarray(bundle.limits.velocity, float)[:, None], robots)
         is_position = bundle.mode != "joint_velocity"
+        self._inner_loop = InnerLoop(self._joints, is_position, config.slow_down * velocity)
         self._path = PathPrediction(self._joints, is_position, config.check_periods, hold, robots)
-        self._steps = -(-self._path.steps // (config.check_periods - 1))  # in a period, all but the first of a check
-        self._no_path = self._path.path
+        self._parts = _parts(self._path, config)
         self._path_clearance = np.zeros((self._path.samples, robots))
-        self._start, self._measurements = StartCheck(bundle.limits, config), MeasurementCheck(bundle.limits, config)
-        joints = bundle.num_joints
-        self.torque, self._value = np.zeros((2, joints, robots))
-        self._stiffness = np.ones((joints, robots))
+        self._start = StartCheck(bundle.limits, config)
+        self._measurements = MeasurementCheck(bundle.limits, config, robots)
+        self._size = bundle.num_joints, robots
+        self._value, self._stiffness = np.zeros(self._size), np.ones(self._size)
         self._action = np.zeros((bundle.action_size, robots))
-        self._left, self._repeats = np.zeros((2, robots), int)
+        self._left, self._repeats = [0] * robots, np.zeros(robots, int)  # periods that the targets still act
         self.has_action = np.zeros(robots, bool)
         self._pending: _Pending | None = None
-        self.reference = Reference(*np.zeros((3, joints, robots)))
-        self._begun: tuple[Reference, np.ndarray] | None = None  # references and periods left as the period began
+        self._checked = 0  # angles of the path whose clearance has been computed
+        self._begun: tuple[list[State], list[int]] | None = None  # references and periods left as the period began
         self.cause = np.full(robots, "", object)
         self.counts = {name: np.zeros(robots, int) for name in INTERVENTIONS}
-        self._largest_errors, self.clearance = np.zeros((joints, robots)), np.full(robots, np.inf)
-        self._qpos, self._qvel, self._rest = np.zeros((3, joints, robots))
+        self.clearance = np.full(robots, np.inf)
+        self._qpos: list[float] = []
+        self._qvel: list[float] = []
+        self._measured: list[list[float]] = []  # angles whose clearance has not been computed
         self._is_tracked = np.ones(robots, bool)
 
     def start(self, qpos: np.ndarray, qvel: np.ndarray, start_pose: np.ndarray) -> np.ndarray:
@@ -134,8 +139,8 @@ class SafetyLayer:
         clearance = self._clearance(np.nan_to_num(qpos).T)
         self.cause[(self.cause == "") & ~(clearance >= self._config.margin - self._config.creep)] = "start clearance"
         qpos = np.where(np.isfinite(qpos), qpos, start_pose)
-        self.reference = Reference(qpos.copy(), np.zeros_like(qpos), np.zeros_like(qpos))
-        self._measurements.begin(qpos)
+        self._inner_loop.set_reference(Reference(qpos, np.zeros_like(qpos), np.zeros_like(qpos)))
+        self._measurements.begin(qpos.ravel().tolist())
         return self.cause
 
     def tick(self, action: np.ndarray, is_present: np.ndarray) -> None:
@@ -150,7 +155,7 @@ class SafetyLayer:
         """
         if self._begun is None:
             raise RuntimeError("tick: expected after `period` and before `work`")
-        reference, left = self._begun
+        states, left = self._begun
         is_active = self.cause == ""
         is_valid = np.all(np.abs(action) <= 1 + _ACTION_TOLERANCE, axis=0)  # False for NaN
         self.counts[INVALID] += is_active & is_present & ~is_valid
@@ -163,13 +168,23 @@ class SafetyLayer:
         self.counts[REPEATED] += is_missing & is_repeated
         self.counts[LATE] += is_missing & ~is_repeated
         self._pending = _Pending(is_active & (is_new | is_repeated) & self.has_action)
-        self._path.begin(reference, self._value, left)
-        self._path_clearance[:] = -np.inf  # what has not been checked is not safe
+        self._path.begin(joint_reference(states, self._size), self._value, np.array(left))
+        self._checked, self._path_clearance[:] = 0, -np.inf  # what has not been checked is not safe
+
+    @property
+    def reference(self) -> Reference:
+        """The motion that the arms track, [joints, robots] each."""
+        return self._inner_loop.reference
+
+    @property
+    def torque(self) -> np.ndarray:
+        """The torques [joints, robots] of the last period [N m]."""
+        return self._inner_loop.torque
 
     @property
     def tracking_error(self) -> np.ndarray:
         """The largest tracking error [robots] [rad]."""
-        return self._largest_errors.max(axis=0)
+        return self._measurements.tracking_error
 
     @property
     def is_checking(self) -> bool:
@@ -178,53 +193,39 @@ class SafetyLayer:
 
     def period(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         """The torques [N m] of a period, for measured angles [rad] and velocities [rad/s]."""
-        if self._pending is not None and self._pending.periods == self._config.check_periods:
-            self._accept(self._pending)
-        self._qpos, self._qvel, self._begun = qpos, qvel, (self.reference, self._left)
-        cause, error = self._measurements(qpos, qvel, self.reference, self.cause)
-        np.maximum(self._largest_errors, error, out=self._largest_errors, where=self._is_tracked)
+        inner_loop = self._inner_loop
+        self._qpos, self._qvel = qpos.ravel().tolist(), qvel.ravel().tolist()
+        self._begun = inner_loop.states, self._left
+        cause = self._measurements(self._qpos, self._qvel, inner_loop.states, self.cause)
         if cause is not None:
             self._stop(cause)
-        self._move_reference()
-        stiffness = self._stiffness
-        if self._measurements.any_lost:  # no torque where nothing is measured: the robot holds itself
-            is_lost = self._measurements.is_lost
-            stiffness = np.where(is_lost, 0.0, stiffness)
-            qpos, qvel = np.where(is_lost, self.reference.qpos, qpos), np.where(is_lost, self.reference.qvel, qvel)
-        target = Target(self._value, stiffness)
-        torque = joint_torque("joint_position", qpos, qvel, self.reference, target, self.torque, self._joints, np)
-        excess = qvel - np.minimum(np.maximum(qvel, -self._slow), self._slow)
-        beyond = qpos - np.minimum(np.maximum(qpos, self._joints.lower), self._joints.upper)
-        excess = np.where(beyond * qvel > 0, qvel, excess)
-        if np.count_nonzero(excess):
-            torque = self._slowed(torque, excess)
-        self.torque = torque
-        return self.torque
-
-    def _slowed(self, torque: np.ndarray, excess: np.ndarray) -> np.ndarray:
-        """Torques that also brake joints by an excess of their velocity, within the limits of the torque."""
-        joints = self._joints
-        braking = np.clip(torque - _SLOWING * joints.damping * excess, -joints.torque, joints.torque)
-        change = joints.torque_rate * PERIOD
-        return self.torque + np.clip(braking - self.torque, -change, change)
+        is_held = [left > 0 for left in self._left] * self._size[0]
+        self._left = [max(left - 1, 0) for left in self._left]
+        inner_loop.period(self._qpos, self._qvel, is_held, self._measurements.is_lost)
+        return inner_loop.torque
 
     def work(self) -> None:
-        """Computes a part of the check that is under way, and the clearances of the measured pose and of that part.
+        """Computes a part of the check that is under way, and the clearance of measured poses.
 
-        Each period has about the same work, also without a check: code that has not run for some milliseconds takes
-        several times as long. Only the first period of a check has none: in it the policy's action is taken.
+        It computes steps of the path in one period and clearances in the next one: so less code runs in a period, and
+        less of it is missing in the processor's caches. In the first period of a check the policy's action is taken, in
+        the last one the target is accepted or not.
         """
-        pending, first, path, self._begun = self._pending, 0, self._no_path, None
-        if pending is not None and pending.periods < self._config.check_periods:
-            pending.periods += 1
-            if pending.periods == 1:
-                return
-            first = len(self._path.path)
-            self._path.advance(self._steps, self._new_target)
-            path = self._path.path[first:]
-        clearance = self._clearances(np.concatenate([self._qpos[None], path]))
-        self._check_clearance(clearance[0])
-        self._path_clearance[first : first + len(path)] = clearance[1:]
+        self._begun, pending = None, self._pending
+        self._measured.append(self._qpos)
+        if pending is None:
+            if len(self._measured) > 1:
+                self._compute_clearances()
+            return
+        pending.periods += 1
+        turn, is_odd = divmod(pending.periods, 2)
+        is_last = pending.periods == self._config.check_periods
+        if not is_odd and turn <= len(self._parts):
+            self._path.advance(self._parts[turn - 1], self._new_target)
+        if (is_odd and turn) or is_last:
+            self._compute_clearances()
+        if is_last:
+            self._accept(pending)
 
     def stop(self, cause: str) -> None:
         """Makes all arms that are controlled brake and hold, for good."""
@@ -233,13 +234,26 @@ class SafetyLayer:
     def release(self, robots: np.ndarray, cause: str) -> None:
         """No longer controls some arms: their robots stopped by themselves."""
         if np.any(robots & (self.cause != cause)):
-            self.cause[robots], self._left[robots], self._is_tracked[robots] = cause, 0, False
+            self.cause[robots], self._is_tracked[robots] = cause, False
+            self._left = np.where(robots, 0, self._left).tolist()
+            self._measurements.release(robots)
 
-    def _check_clearance(self, measured: np.ndarray) -> None:
-        """Stops arms whose measured pose has no clearance left."""
-        clearance = np.where(np.isnan(measured), np.inf, measured)
-        np.minimum(self.clearance, clearance, out=self.clearance, where=self._is_tracked)
-        is_near = clearance < self._config.measured_margin
+    def _compute_clearances(self) -> None:
+        """The clearances of poses that were measured, and of angles of the path, since the last time."""
+        first, (joints, robots) = self._checked, self._size
+        path, measured = self._path.path[first:], np.reshape(self._measured, (-1, joints, robots))
+        poses = np.concatenate([measured, path]).transpose(0, 2, 1).reshape(-1, joints)
+        clearance = self._clearance(poses).reshape(-1, robots)
+        self._check_measured(clearance[: len(measured)])
+        self._checked = first + len(path)
+        self._path_clearance[first : self._checked] = clearance[len(measured) :]
+        self._measured = []
+
+    def _check_measured(self, clearance: np.ndarray) -> None:
+        """Stops arms for which one of some measured poses [poses, robots] has no clearance left."""
+        smallest = np.where(np.isnan(clearance), np.inf, clearance).min(axis=0)
+        np.minimum(self.clearance, smallest, out=self.clearance, where=self._is_tracked)
+        is_near = smallest < self._config.measured_margin
         if np.count_nonzero(is_near):
             self._stop(np.where(is_near, MEASURED_CLEARANCE, ""))
 
@@ -250,11 +264,6 @@ class SafetyLayer:
         stiffness = np.maximum(target.stiffness, self._config.min_stiffness)
         self._pending.target = Target(np.array(target.value), stiffness)
         return self._pending.target.value
-
-    def _clearances(self, poses: np.ndarray) -> np.ndarray:
-        """The clearances [samples, robots] of poses [samples, joints, robots]."""
-        samples, joints, robots = poses.shape
-        return self._clearance(poses.transpose(0, 2, 1).reshape(-1, joints)).reshape(samples, robots)
 
     def _is_safe(self, clearance: np.ndarray) -> np.ndarray:
         """Whether the clearance along each path is above the margin, or not less than where the path begins."""
@@ -270,33 +279,26 @@ class SafetyLayer:
         self.counts[COLLISION] += pending.is_candidate & ~is_safe
         self._value = np.where(is_accepted, pending.target.value, self._value)
         self._stiffness = np.where(is_accepted, pending.target.stiffness, self._stiffness)
-        self._left = np.where(is_accepted, self._hold, self._left)
+        self._inner_loop.set_targets(self._value, self._stiffness)
+        self._left = np.where(is_accepted, self._hold, self._left).tolist()
 
     def _stop(self, cause: np.ndarray) -> None:
         """Makes arms brake: those with a cause."""
         is_stopped = (self.cause == "") & (cause != "")
+        if not np.count_nonzero(is_stopped):
+            return
         self.cause[is_stopped] = cause[is_stopped]
-        self._left = np.where(is_stopped, 0, self._left)
-        self._stiffness[:, is_stopped] = 1.0
+        self._left = np.where(is_stopped, 0, self._left).tolist()
+        self._stiffness = np.where(is_stopped, 1.0, self._stiffness)
+        self._inner_loop.set_targets(self._value, self._stiffness)
         is_blocked = is_stopped & (cause == TRACKING)
         if np.count_nonzero(is_blocked):  # brakes from the measured motion: the reference would push the arm on
-            qvel = np.clip(self._qvel, -self._joints.velocity, self._joints.velocity)
-            measured = Reference(self._qpos, qvel, self.reference.qacc)
-            self.reference = Reference(
-                *(np.where(is_blocked, x, y) for x, y in zip(measured, self.reference, strict=True))
+            reference, most = self.reference, self._joints.velocity
+            qpos, qvel = np.reshape(self._qpos, self._size), np.clip(np.reshape(self._qvel, self._size), -most, most)
+            measured = Reference(qpos, qvel, reference.qacc)
+            self._inner_loop.set_reference(
+                Reference(*(np.where(is_blocked, x, y) for x, y in zip(measured, reference, strict=True)))
             )
-
-    def _move_reference(self) -> None:
-        """One period of all references, towards their targets or to rest."""
-        is_held = self._left > 0
-        held, count = self.reference, np.count_nonzero(is_held)
-        if count:
-            held = next_reference(self._mode, self.reference, self._value, self._limits, np)
-        if count < len(is_held):
-            braking = next_reference("joint_velocity", self.reference, self._rest, self._limits, np)
-            held = Reference(*(np.where(is_held, x, y) for x, y in zip(held, braking, strict=True)))
-        self.reference = held
-        self._left = self._left - is_held  # not in place: `_begun` has the last ones
 
 
 @dataclasses.dataclass

@@ -348,8 +348,9 @@ def test_a_robot_that_aborts_is_reported(bundle):
 def test_the_fake_robot_aborts_beyond_its_limits(bundle):
     fake = robot(bundle)
     fake.read()
+    fake.write(np.full(7, 2.0))
     with pytest.raises(RobotAbort, match="torque rate"):
-        fake.write(np.full(7, 2.0))
+        fake.read()
     for period in range(3000):
         try:
             fake.write(np.full(7, min(11.0, period)))
