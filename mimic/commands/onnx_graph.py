@@ -352,6 +352,12 @@ class _Graph:
         everywhere = self.node("Expand", positions, ints([1, *shape]))
         return self.node("GatherElements", self.batched(values), everywhere, axis=axis + 1)
 
+    def _clamp(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
+        low, values, high = inputs
+        if low.shape or high.shape:
+            raise NotImplementedError("onnx: expected a clamp between two numbers")
+        return self.node("Clip", values, low, high)
+
     def _argmin(self, inputs: list[Value], shape: tuple[int, ...], params: Mapping[str, Any]) -> str:
         (axis,) = params["axes"]
         return self.node("Cast", self.node("ArgMin", inputs[0], axis=axis + 1, keepdims=0), to=TensorProto.INT32)
@@ -367,6 +373,7 @@ class _Graph:
 
 _RULES: dict[str, Callable[[_Graph, list[Value], tuple[int, ...], Mapping[str, Any]], str]] = {
     "argmin": _Graph._argmin,
+    "clamp": _Graph._clamp,
     "atan2": _Graph._atan2,
     "broadcast_in_dim": _Graph._broadcast,
     "concatenate": _Graph._concatenate,

@@ -26,9 +26,9 @@ _READY = -1  # the tick of the first message
 _MAX_MESSAGE = 65_536  # bytes
 _COMMAND = "import sys; from mimic.deploy.policy_process import main; main(*sys.argv[1:])"
 _WATCH = 1.0  # s between two looks whether the inner loop still lives
-# From some time before an observation is due [s], the last answer is computed again some times at intervals [s]: caches
-# lose code and weights in a tick, and the evaluation would take several times as long.
-_REHEARSAL, _INTERVAL, _REHEARSALS = 0.002, 0.0002, 6
+# From the first of these times [s] before an observation is due to the second one, the last answer is computed again at
+# intervals [s]: caches lose code and weights in a tick, and the evaluation would take several times as long.
+_REHEARSAL, _REST, _INTERVAL = 0.004, 0.0004, 0.0001
 
 
 class LocalPolicy:
@@ -133,22 +133,22 @@ def main(folder: str, motion: str, descriptor: str, parent: str) -> None:
     policy = Policy(bundle, [int(motion)])
     connection.send(_TICK.pack(_READY))
     connection.settimeout(_WATCH)
-    message, rehearsals = b"", 0
+    message, due = b"", 0.0
     while os.getppid() == int(parent):
         try:
             message = connection.recv(_MAX_MESSAGE)
         except TimeoutError:
-            if message:
+            is_early = time.perf_counter() < due - _REST
+            if is_early:
                 _answer(policy, message, joints, is_rehearsal=True)
-            rehearsals += 1
-            connection.settimeout(_INTERVAL if rehearsals < _REHEARSALS else _WATCH)
+            connection.settimeout(_INTERVAL if is_early else _WATCH)
             continue
         except OSError:
             return
+        due = time.perf_counter() + bundle.control_dt
         with contextlib.suppress(OSError):
             connection.send(_answer(policy, message, joints))
-        rehearsals = 0
-        connection.settimeout(max(bundle.control_dt - _REHEARSAL, _INTERVAL))
+        connection.settimeout(max(due - _REHEARSAL - time.perf_counter(), _INTERVAL))
 
 
 def _answer(policy: Policy, message: bytes, joints: int, *, is_rehearsal: bool = False) -> bytes:

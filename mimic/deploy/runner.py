@@ -167,8 +167,9 @@ class _Loop:
         self._latency.append(time.perf_counter() - wall)
         if self._due and not self._layer.is_checking:
             self._receive(since)
-        self._layer.work()
-        if reference is not None:  # last, as the policy may run on the same core
+        if reference is None or self._layer.is_checking:  # at a tick only if it must: the policy may wait for this core
+            self._layer.work()
+        if reference is not None:
             self._policy.send(tick, state.qpos, state.qvel, Reference(*(x[:, 0] for x in reference)))
             self._tick, self._due = tick, True
         self._wall.append(time.perf_counter() - wall)

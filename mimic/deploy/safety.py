@@ -195,6 +195,7 @@ class SafetyLayer:
         """The torques [N m] of a period, for measured angles [rad] and velocities [rad/s]."""
         inner_loop = self._inner_loop
         self._qpos, self._qvel = qpos.ravel().tolist(), qvel.ravel().tolist()
+        self._measured.append(self._qpos)
         self._begun = inner_loop.states, self._left
         cause = self._measurements(self._qpos, self._qvel, inner_loop.states, self.cause)
         if cause is not None:
@@ -212,7 +213,6 @@ class SafetyLayer:
         the last one the target is accepted or not.
         """
         self._begun, pending = None, self._pending
-        self._measured.append(self._qpos)
         if pending is None:
             if len(self._measured) > 1:
                 self._compute_clearances()

@@ -11,12 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.control.clearance import FrameConstants, joint_frames, moved_points
+from mimic.control.clearance import FrameConstants
 
-# Rows of a cross product: a x b = _SIGNS @ ((_LEFT @ a) * (_RIGHT @ b)).
-_NEXT, _LAST = np.eye(3, dtype=np.float32)[[1, 2, 0]], np.eye(3, dtype=np.float32)[[2, 0, 1]]
-_LEFT, _RIGHT = np.concatenate([_NEXT, _LAST]), np.concatenate([_LAST, _NEXT])
-_SIGNS = np.concatenate([np.eye(3), -np.eye(3)], axis=1).astype(np.float32)
+# Parts of the matrices of `_motion_factors`: the motion, its rate of change and the angular velocity.
+_MOTION, _RATE, _ANGULAR, _SIZE = slice(0, 4), slice(4, 8), 8, 9
 _ON_AXIS = 1e-9  # m, or a fraction of a direction
 
 
@@ -73,29 +71,68 @@ def make_link_vector(
     Args:
       arm: the embodiment.
     """
-    links, joints = arm.num_links, arm.num_joints
-    constants, bodies = frame_constants(arm), [*arm.link_joint] * 2 + [*range(joints)] * 2
-    parts = ((arm.link_position, 1), (arm.link_rotation[:, :, 0], 0), (arm.joint_axis, 0), (arm.joint_anchor, 1))
-    vectors = np.concatenate([np.c_[x, np.full(len(x), homogeneous)] for x, homogeneous in parts])
-    # What does not move has a tiny deviation in a policy's statistics, which would magnify rounding.
-    bodies = [_carrier(arm, joint, vector) for joint, vector in zip(bodies, vectors, strict=True)]
-    moved, fixed = point_columns(arm, bodies, vectors)
-    ends = np.cumsum([links, links, joints])
-    moves = _moves(arm)
-    # v_i = omega_i x p_i + sum_j a_j x omega_j, of the joints j with anchors a_j that move link i.
-    sums = np.concatenate([np.eye(links, dtype=np.float32), moves])
-    unit = np.float32(1 / arm.chain_length)
+    joints, parents = arm.num_joints, arm.joint_parent
+    factors, constant = _motion_factors(arm)
+    columns, fixed = _state_columns(arm)
 
     def link_vector(qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]) -> Float[Array, " numbers"]:
-        points = moved_points(joint_frames(qpos, constants, jnp), moved, fixed)
-        position, direction, axis, anchor = jnp.split(points, ends, axis=1)
-        of_joints = axis * qvel
-        angular = of_joints @ moves
-        left, right = jnp.concatenate([angular, anchor], axis=1), jnp.concatenate([position, of_joints], axis=1)
-        linear = _SIGNS @ ((_LEFT @ left) * (_RIGHT @ right)) @ sums
-        return jnp.concatenate([unit * position, direction, unit * linear, angular], axis=1).T.ravel()
+        sine, cosine = jnp.sin(qpos), jnp.cos(qpos)
+        angles = jnp.concatenate([sine, cosine, qvel * sine, qvel * cosine, qvel])
+        motions = jnp.split((angles @ factors + constant).reshape(-1, _SIZE), joints)
+        states: list[Array] = []
+        for motion, parent in zip(motions, parents, strict=True):
+            states.append(motion[:, :3] if parent < 0 else motion @ states[parent])
+        return (jnp.matmul(columns, jnp.concatenate(states)) + fixed).ravel()
 
     return link_vector
+
+
+def _motion_factors(arm: Embodiment) -> tuple[Float[np.ndarray, "inputs numbers"], Float[np.ndarray, " numbers"]]:
+    """Of the joints' matrices, which a chain of products takes from the base to the tip, one below the other.
+
+    The motion P of a body, its rate of change Q and its angular velocity u follow from those of its parent by the
+    product [P Q u] [[M N w], [0 M 0], [0 0 1]], with the motion M of the joint, its rate of change N, and its axis
+    times its velocity w. All are transposed here. The first three columns are the state of a body on the base.
+
+    Returns:
+      factors, constant: inputs @ factors + constant are the numbers of all matrices. The inputs are sin(q), cos(q),
+      v sin(q), v cos(q) and v for the angles q and velocities v of all joints.
+    """
+    joints, frames = arm.num_joints, frame_constants(arm)
+    sine, cosine = frames.factors.reshape(2, joints, joints, 4, 4)
+    constant, factors = np.zeros((joints, _SIZE, _SIZE)), np.zeros((5, joints, joints, _SIZE, _SIZE))
+    constant[:, _MOTION, _MOTION] = constant[:, _RATE, _RATE] = frames.constant.reshape(joints, 4, 4)
+    constant[:, _ANGULAR, _ANGULAR] = 1
+    for part, matrix in ((0, sine), (1, cosine)):
+        factors[part, :, :, _MOTION, _MOTION] = factors[part, :, :, _RATE, _RATE] = matrix
+    factors[2, :, :, _MOTION, _RATE], factors[3, :, :, _MOTION, _RATE] = -cosine, sine
+    for joint, axis in enumerate(arm.joint_axis):
+        factors[4, joint, joint, :3, _ANGULAR] = axis
+    factors, constant = factors.swapaxes(-1, -2).reshape(5 * joints, -1), constant.swapaxes(-1, -2).ravel()
+    return factors.astype(np.float32), constant.astype(np.float32)
+
+
+def _state_columns(arm: Embodiment) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows 3"]]:
+    """The link states [rows, 3] are columns @ the joints' states + fixed; rows are in the order of `link_states`."""
+    links, unit = arm.num_links, 1 / arm.chain_length
+    columns, fixed = np.zeros((4, links, arm.num_joints, _SIZE)), np.zeros((4, links, 3))
+    for link, joint in enumerate(arm.link_joint):
+        position, direction = np.append(arm.link_position[link], 1), np.append(arm.link_rotation[link, :, 0], 0)
+        # What does not move has a tiny deviation in a policy's statistics, which would magnify rounding.
+        for row, part, vector, factor in (
+            (0, _MOTION, position, unit),
+            (1, _MOTION, direction, 1),
+            (2, _RATE, position, unit),
+        ):
+            carrier = _carrier(arm, joint, vector)
+            if carrier >= 0:
+                columns[row, link, carrier, part] = factor * vector
+            elif part == _MOTION:
+                fixed[row, link] = factor * vector[:3]
+        if joint >= 0:
+            columns[3, link, joint, _ANGULAR] = 1
+    shape = (4 * links, -1)
+    return columns.reshape(shape).astype(np.float32), fixed.reshape(shape).astype(np.float32)
 
 
 def _carrier(arm: Embodiment, joint: int, vector: np.ndarray) -> int:
@@ -106,12 +143,3 @@ def _carrier(arm: Embodiment, joint: int, vector: np.ndarray) -> int:
             break
         joint = arm.joint_parent[joint]
     return joint
-
-
-def _moves(arm: Embodiment) -> np.ndarray:
-    """Whether each joint moves each link, [joints, links], as numbers."""
-    moves = np.zeros((arm.num_joints, arm.num_links), np.float32)
-    for link, joint in enumerate(arm.link_joint):
-        while joint >= 0:
-            moves[joint, link], joint = 1.0, arm.joint_parent[joint]
-    return moves

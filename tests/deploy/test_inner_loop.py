@@ -29,7 +29,8 @@ def test_references_and_torques_are_those_of_the_arrays(mode):
     loop = InnerLoop(joints, is_position, np.full(size, np.inf))
     span = joints.upper - joints.lower
     reference = Reference(joints.lower - 0.1 + (span + 0.2) * rng.uniform(size=size), *rng.uniform(-1, 1, (2, *size)))
-    torque, stops = np.zeros(size), 0
+    torque, held, stops = np.zeros(size), np.ones(ROBOTS, bool), 0
+    value, stiffness = np.zeros((2, *size))
     loop.set_reference(reference)
     for period in range(PERIODS):
         if period % 50 == 0:
