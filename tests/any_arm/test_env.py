@@ -146,6 +146,7 @@ def test_a_relative_reward_compares_with_the_zero_action(compared, four_joints, 
     assert size > 0.01
 
 
+@pytest.mark.slow
 def test_a_baseline_that_ran_away_leaves_the_reward_finite(compared, four_joints):
     start = compared.start_of(four_joints, 0, jax.random.PRNGKey(0))
     assert start.baseline is not None

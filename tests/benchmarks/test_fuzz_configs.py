@@ -15,7 +15,7 @@ RUNS = 300  # of which every sixth and fifth is a checkpoint
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("kind", ["command_lines", "runs"])
+@pytest.mark.parametrize("kind", ["command_lines", pytest.param("runs", marks=pytest.mark.slow)])
 def test_odd_inputs_end_in_one_line(kind):
     numbers = range(COMMAND_LINES) if kind == "command_lines" else [n for n in range(RUNS) if n % 6 < 4]
     bad = [row for row in run_here(kind, numbers) if row["outcome"] not in GOOD]

@@ -93,6 +93,7 @@ def test_a_policy_of_the_papers_world_aborts(paper_run, tmp_path):
     assert report["control"] == "torque" and report["world"]["gravity"]
 
 
+@pytest.mark.slow
 def test_the_edges_of_the_world(hardware_run, tmp_path):
     report = evaluate(hardware_run, tmp_path / "new", episodes=1, edges=True)
     assert {"all ranges", "payload=0", "payload=3", "all: corners", "action_delay=3"} <= report["cases"].keys()
@@ -213,6 +214,7 @@ def test_tracking_needs_targets_other_than_torques(rejected, tmp_path):
     assert "controller: expected policy or hold for a run with an inner loop and control=torque, got tracking" in error
 
 
+@pytest.mark.slow
 def test_tracking_on_virtual_robots(hardware_run, tmp_path):
     """Much nearer than an untrained policy, which stays near the start pose."""
     rows = {}

@@ -140,6 +140,7 @@ def any_arm_run(run_dir, expert="fixed"):
     return AnyArmMapper.load(run_dir)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("expert", ["fixed", pytest.param("drawn", marks=pytest.mark.slow)])
 def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path, expert):
     """One file for arms of 7 and 4 joints and for a random one, with the descriptions that the command writes."""

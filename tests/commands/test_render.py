@@ -63,6 +63,7 @@ def curves(clip):
     return {curve.label: curve.values for curve in clip.curves}
 
 
+@pytest.mark.slow
 def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
     plan = prepare_clip(RenderConfig(run=str(mapper_run), demonstration=1, seed=5))
     clip, mapper = plan.compute(), mimic.PoseMapper.load(mapper_run)

@@ -38,6 +38,7 @@ def test_the_motions_load_and_do_not_jump(recorded, tmp_path):
     assert motions.torque is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_mapper", [False, True], ids=["optimised", "mapped"])
 def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows(with_mapper):
     """The expert's poses are random, so that the learner would jump at each step; the last joint's limit is unknown."""

@@ -130,6 +130,7 @@ def test_a_video_shows_the_whole_motion(finished):
     assert beyond.returncode == 2 and "expected 0 to 1, the held_out ones of the run, got 2" in beyond.stderr
 
 
+@pytest.mark.slow
 def test_resume_continues_from_the_last_checkpoint(finished, tmp_path):
     run_dir = shutil.copytree(finished[0], tmp_path / "run")
     result = command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
@@ -155,6 +156,7 @@ def test_a_resumed_run_ends_as_if_it_had_not_been_interrupted(finished, tmp_path
     assert not list((run_dir / "checkpoints").glob("*.partial*"))
 
 
+@pytest.mark.slow
 def test_a_run_without_a_checkpoint_starts_anew_when_resumed(finished, tmp_path):
     reference, _ = finished
     run_dir = tmp_path / "run"
@@ -178,6 +180,7 @@ def test_a_folder_without_a_config_is_no_run_yet(tmp_path):
         new_run_dir(config)
 
 
+@pytest.mark.slow
 def test_a_run_starts_from_the_parameters_of_another_run(finished, tmp_path):
     run_dir = tmp_path / "run"
     result = command("train", *TINY, "seed=1", "trainer.evaluations=1", f"init={finished[0]}", f"run_dir={run_dir}")
@@ -237,6 +240,7 @@ def test_a_folder_that_another_process_has_taken_is_not_written(finished, tmp_pa
     assert (tmp_path / "run" / "report.json").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_report_that_cannot_be_written_is_one_line(finished, tmp_path):
     run_dir = shutil.copytree(finished[0], tmp_path / "run")
     (run_dir / "report.json").unlink()
@@ -255,6 +259,7 @@ def test_a_run_that_another_process_writes_is_not_resumed(finished):
     assert len(result.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_training_that_diverges_stops_and_leaves_a_batch_to_replay(finished, tmp_path):
     """It starts from a policy whose actions are beyond float32, although its parameters are not."""
     start, run_dir = tmp_path / "start", tmp_path / "run"

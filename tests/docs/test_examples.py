@@ -105,7 +105,7 @@ def test_batches_and_gradients(said):
     assert float(after) < 0.7 * float(before)
 
 
-@example("03_imitate_poses", patience)
+@example("03_imitate_poses", patience, pytest.mark.slow)
 def test_imitate_poses(said, tmp_path):
     methods = ("imitate_pose", "gradient descent, one guess", "copied angles", "random")
     errors = [number(rf"\n{method} +\S+ +(\S+)%", said) for method in methods]
@@ -113,7 +113,7 @@ def test_imitate_poses(said, tmp_path):
     assert is_picture(tmp_path / "poses.png")
 
 
-@example("04_pose_mapper", patience)
+@example("04_pose_mapper", patience, pytest.mark.slow)
 def test_pose_mapper(said, tmp_path):
     assert number(r"for a random pose: (\S+)%", said) < 20
     optimiser, mapper = (
@@ -168,7 +168,7 @@ def test_own_arm(said, tmp_path):
     assert report["env"] == "pair" and report["optimality_gap"]["train"] < 1  # 1: holding the start pose; at first 2
 
 
-@example("08_other_tools", patience)
+@example("08_other_tools", patience, pytest.mark.slow)
 def test_other_tools(said, tmp_path):
     pytest.importorskip("onnxruntime")
     rewards = {name: number(rf"\n  {name} +(\S+)", said) for name in ("no torque", "the policy, by ONNX Runtime")}

@@ -93,6 +93,7 @@ def test_home_is_the_default_and_other_names_are_rejected():
         mimic.env_config("planar4dof", start="first")
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_charged_for_self_collision_starts_without():
     env = mimic.make("panda7dof", physics="fused", reward={"terms": {"self_collision": 1.0}}, **SETTINGS)
     qpos = np.zeros((2, 7))

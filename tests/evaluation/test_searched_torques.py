@@ -78,6 +78,7 @@ def test_no_update_makes_a_sequence_worse(evaluator):
     assert np.all(np.asarray(episodes.objective) < 0.5 * np.asarray(first))
 
 
+@pytest.mark.slow
 def test_the_objective_equals_the_distance_in_the_environment(evaluator):
     """With the loads that the environment draws. 2e-5: float32, and the five digits of the text."""
     loaded = evaluator_of([0.5, 0.5], randomization={"mass": [0.5, 2.0], "damping": [0.5, 2.0]})
@@ -163,6 +164,7 @@ def test_runaways_give_no_nan(evaluator):
     assert np.abs(np.asarray(episodes.qvel)[0]).max() < 1.0
 
 
+@pytest.mark.slow
 def test_the_report_of_a_search(tmp_path):
     """Of an untrained policy. 1e-5: float32, means in another order."""
     run = untrained_run(tmp_path / "run")

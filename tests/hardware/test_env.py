@@ -184,6 +184,7 @@ def test_worlds_out_of_range_are_rejected(fields, message):
         WorldConfig(**fields)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "fields"),
     [

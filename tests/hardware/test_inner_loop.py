@@ -164,7 +164,9 @@ def test_in_double_precision_only_rounding_is_left(name, x64):
     np.testing.assert_allclose(state.qpos, expected[-1], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("mode", "sample_axis"), [("torque", 1), ("joint_velocity", 0)])
+@pytest.mark.parametrize(
+    ("mode", "sample_axis"), [pytest.param("torque", 1, marks=pytest.mark.slow), ("joint_velocity", 0)]
+)
 def test_the_kernel_equals_the_arrays(arm_and_plant, mode, sample_axis, interpreted):
     """The GPU kernel, interpreted, on a batch with a partial block."""
     arm, plant = arm_and_plant

@@ -73,7 +73,12 @@ def values_and_gradients(arms, correspondence, weights, batch):
     return value, *gradients
 
 
-@pytest.mark.parametrize("case", CASES)
+QUICK = "fixed links", "few pairs", "rotation alone"
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=() if case in QUICK else pytest.mark.slow) for case in CASES]
+)
 def test_the_kernel_equals_the_composition(x64, long_kernel, case):
     arms, correspondence, weights = CASES[case]
     correspondence = overlap_correspondence(*arms) if correspondence is None else correspondence

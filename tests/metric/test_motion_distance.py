@@ -126,7 +126,11 @@ def test_one_expert_pose_serves_a_batch_of_learners():
 
 @pytest.mark.parametrize(
     "arm",
-    [planar_arm([0.5, 0.2, 0.3]), panda(), planar_arm(np.linspace(0.1, 0.3, LONG + 1))],
+    [
+        planar_arm([0.5, 0.2, 0.3]),
+        panda(),
+        pytest.param(planar_arm(np.linspace(0.1, 0.3, LONG + 1)), marks=pytest.mark.slow),
+    ],
     ids=["planar", "panda", "long"],
 )
 def test_zero_with_finite_gradients_at_a_match(arm):

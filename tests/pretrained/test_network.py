@@ -89,6 +89,7 @@ def test_the_mapper_to_any_arm_says_where_it_comes_from(any_arm):
     assert any_arm.env.arms.evaluated == [] and "ur5e" in report["arms"]
 
 
+@pytest.mark.slow
 def test_the_mapper_to_any_arm_reaches_its_recorded_distance_on_unseen_locks(any_arm):
     arms = {name: arm for name, arm in report_arms(any_arm.env)[UNSEEN].items() if name.startswith("locked")}
     poses = (

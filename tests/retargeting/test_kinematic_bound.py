@@ -153,6 +153,7 @@ def searched(expert, learner, qpos, qvel, correspondence, weights, starts=64, it
     return jax.jit(jax.vmap(search))(qpos, qvel)
 
 
+@pytest.mark.slow
 def test_no_longer_search_is_below_the_bound_where_minima_are_many():
     # Sums of minima over pairs: of descents from random poses, few end in the global minimum. Five descents a time,
     # refined with those of the neighbours, miss it by more than 1e-3 at 6 of these 17 steps.

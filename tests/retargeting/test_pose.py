@@ -111,6 +111,7 @@ def test_joint_limits_are_kept():
     assert held.any() and np.mean(solution.converged) > 0.95
 
 
+@pytest.mark.slow
 def test_distances_belong_to_the_poses_and_no_nearby_pose_is_better():
     expert, learner = PAIRS["panda 7->4"]
     qpos = poses(expert, 8)
@@ -169,9 +170,11 @@ def test_shapes_and_warm_starts():
     np.testing.assert_allclose(mapped.distance, warm.distance, atol=1e-6)
 
 
-@pytest.mark.parametrize("limits", ["none", "hardware"])
+@pytest.mark.parametrize("limits", ["none", pytest.param("hardware", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    "metric", [MetricConfig(translation=0.0, correspondence="overlap"), DEFAULT], ids=["directions", "default"]
+    "metric",
+    [MetricConfig(translation=0.0, correspondence="overlap"), pytest.param(DEFAULT, marks=pytest.mark.slow)],
+    ids=["directions", "default"],
 )
 def test_trajectories_do_not_jump(metric, limits):
     expert, learner = panda(limits=limits), panda(locked=(3, 6, 7), limits=limits)

@@ -70,7 +70,11 @@ def check_derivatives(learner, matrix, weights, seed=0, rotation: Any = "cosine"
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
     ("weights", "rotation"),
-    [(DIRECTIONS, "cosine"), (BOTH, "cosine"), (BOTH, "angle")],
+    [
+        pytest.param(DIRECTIONS, "cosine", marks=pytest.mark.slow),
+        (BOTH, "cosine"),
+        pytest.param(BOTH, "angle", marks=pytest.mark.slow),
+    ],
     ids=["directions", "both", "angles"],
 )
 def test_closed_derivatives_are_those_of_the_smoothed_distance(weights, rotation):

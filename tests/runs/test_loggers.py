@@ -66,6 +66,7 @@ def short_run(run_dir, logger):
     )
 
 
+@pytest.mark.slow
 def test_loggers_get_the_metrics_of_the_files_of_a_run(tmp_path, services):
     wandb, mlflow = services
     config = short_run(tmp_path / "run", ["local", "wandb", "mlflow"])

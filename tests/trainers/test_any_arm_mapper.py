@@ -125,6 +125,7 @@ def test_evaluate_repeats_the_report(trained, tmp_path):
     assert (out / "arms.csv").read_text() == (run_dir / "arms.csv").read_text()
 
 
+@pytest.mark.slow
 def test_splits_without_arms_are_left_out(tmp_path):
     """All arms are seen in training; and if the config names none that are, the report draws some."""
     trainer = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 1.0, "most_locked": 1, "unseen": []}))
@@ -170,6 +171,7 @@ def test_poses_of_a_learner_have_its_joints(mapper):
         assert one.learner.num_joints == joints
 
 
+@pytest.mark.slow
 def test_joints_that_a_config_locks_are_locked_by_the_mask(mapper):
     """As in training; the pose and its distance are those of the arm whose locked joints are no joints."""
     config = mimic.ArmConfig(locked={"joint2": 0.4, "joint5": -0.3})

@@ -111,6 +111,7 @@ def test_retargeted_motions_do_not_jump(trained, tmp_path):
     assert optimised["distance"] < mapped["distance"] < optimised["distance"] + 0.05
 
 
+@pytest.mark.slow
 def test_resume_continues(tmp_path):
     run_dir = tmp_path / "run"
     short = train(run_dir, epochs=4)

@@ -88,7 +88,10 @@ def test_a_loss_without_gradient_changes_nothing_but_the_episodes(one_batch):
     assert not np.array_equal(before.episodes.obs, after.episodes.obs)
 
 
-@pytest.mark.parametrize(("time", "entropy_cost"), [(7, 0.0), (40, 0.0), (1, 0.3)])
+@pytest.mark.parametrize(
+    ("time", "entropy_cost"),
+    [(7, 0.0), pytest.param(40, 0.0, marks=pytest.mark.slow), pytest.param(1, 0.3, marks=pytest.mark.slow)],
+)
 def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     """The entropy is that of a sample, drawn in the same order only for unrolls of one step."""
     sizes, unrolls = (5, 3), 6
@@ -202,6 +205,7 @@ def test_entropy_cost_and_discount_change_with_the_progress():
     assert constant.at(0.5) is constant and constant.final_discounting == 0.4
 
 
+@pytest.mark.slow
 def test_a_batch_learns_by_the_settings_of_its_progress():
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     small = {"num_envs": 4, "batch_size": 4, "num_minibatches": 1, "num_updates_per_batch": 1, "hidden_layers": [8]}

@@ -82,7 +82,9 @@ def case(x64):
     return Case(config, unrolls, order, jax.random.split(jax.random.PRNGKey(2), DEVICES))
 
 
-@pytest.mark.parametrize(("staggered", "unroll"), [(False, 1), (True, 1), (True, 2)])
+@pytest.mark.parametrize(
+    ("staggered", "unroll"), [(False, 1), pytest.param(True, 1, marks=pytest.mark.slow), (True, 2)]
+)
 def test_updates_equal_those_of_each_minibatch_in_turn(case, staggered, unroll):
     on_all = jax.jit(jax.vmap(functools.partial(case.on_device, staggered, unroll), axis_name="devices"))
     learners, metrics = on_all(case.unrolls, case.order, case.keys)

@@ -61,7 +61,7 @@ def check_safe(episodes):
     assert moved.mean() > 2  # rad: the arms moved
 
 
-@pytest.mark.parametrize("mode", ["joint_velocity", "joint_position"])
+@pytest.mark.parametrize("mode", ["joint_velocity", pytest.param("joint_position", marks=pytest.mark.slow)])
 def test_random_actions_are_safe(tmp_path, mode):
     check_safe(adversarial_episodes(tmp_path / "bundle", mode, 20, seed=5))
 
