@@ -42,6 +42,7 @@ def test_locked_variants_are_drawn_alike(panda):
     assert sum(counts) == 2800 and min(counts) > 50 and max(counts) < 150
 
 
+@pytest.mark.slow
 def test_a_limited_sampler_draws_that_many_arms():
     draw = jax.jit(jax.vmap(sampler.limited_sampler(sampler.random_arm, 5)))
     lengths = np.asarray(draw(jax.random.split(jax.random.PRNGKey(2), 200)).chain_length)

@@ -62,6 +62,7 @@ def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path):
     }
 
 
+@pytest.mark.slow
 def test_a_policy_is_evaluated_on_mjx_too(run_dir, tmp_path, monkeypatch, capsys):
     """Where MJX does not move the arm at all, its distance is that of holding the start pose."""
 

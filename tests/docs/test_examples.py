@@ -129,7 +129,7 @@ def test_pose_mapper(said, tmp_path):
     assert is_picture(tmp_path / "retargeted.png")
 
 
-@example("05_demonstrations")
+@example("05_demonstrations", pytest.mark.slow)
 def test_demonstrations(said, tmp_path):
     for line in re.findall(r"  maximum .*: +(.*)", said):
         assert all(0 < float(percent) <= 100 for percent in line.replace("%", "").split())

@@ -60,6 +60,7 @@ def test_an_equal_arm_starts_where_the_expert_does():
     assert float(env.states_distance(expert, states)) < 1e-3
 
 
+@pytest.mark.slow
 def test_holding_the_start_pose_and_videos_begin_there(evaluator):
     env = evaluator.env
     still = np.tile(env.start_poses[:, None], (1, 6, 1))

@@ -62,6 +62,7 @@ def test_terms_are_added_in_both_physics(terms, physics):
     assert layout[-1]["stop"] == env.observation_size and layout_of(plain)[-1]["stop"] == plain.observation_size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["planar4dof", "panda4dof"])
 def test_the_distance_gradient_is_that_of_finite_differences(name):
     env = mimic.make(name, physics="fused", observation={"terms": ["distance_gradient"]}, **SMALL)

@@ -59,6 +59,7 @@ def controller_of(action):
     return lambda state: action[state.pipeline_state.demonstration, state.pipeline_state.step]
 
 
+@pytest.mark.slow
 def test_an_arm_that_imitates_itself_finds_the_torques():
     """From zero torques. Both arms hold a torque for 0.1 s: 1e-3 of the hold distance is rounding and kinks."""
     evaluator = evaluator_of(LINKS, action_scale=2.0)

@@ -95,6 +95,7 @@ def test_the_kernel_equals_the_composition(x64, long_kernel, case):
         np.testing.assert_allclose(values, reference, atol=1e-13)  # rounding
 
 
+@pytest.mark.slow
 def test_the_kernel_takes_arms_of_any_shape(x64, long_kernel):
     arms = load_mjcf(random_arm(4, 9)), load_mjcf(random_arm(7, 6))
     metric = overlap_correspondence(*arms), ALL_WEIGHTS

@@ -93,6 +93,7 @@ def test_gradients_equal_finite_differences(x64):
         np.testing.assert_allclose(gradient, expected, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_all_ways_to_differentiate_agree(x64):
     """Forward, reverse, within and around `vmap`, by any of the arguments, and twice."""
     arms = EXPERT, LEARNER

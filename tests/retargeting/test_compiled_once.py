@@ -57,6 +57,7 @@ def test_functions_of_a_metric_config_are_equal_by_value(metric):
     assert events == []
 
 
+@pytest.mark.slow
 def test_other_values_are_not_mixed_up():
     """Arms, weights and correspondences of the same shapes give their own results."""
     expert, learner = arms()
@@ -84,6 +85,7 @@ def test_another_key_compiles_nothing():
     assert events == []
 
 
+@pytest.mark.slow
 def test_calls_inside_transforms():
     """jit, vmap and grad of a caller give what plain calls give; grad equals finite differences."""
     metric, poses = MetricConfig().build(*arms()).arguments, qpos(2)

@@ -201,6 +201,7 @@ def test_arms_do_not_intersect_themselves_or_the_floor():
     assert float(value) == pytest.approx(2 * (1 + 0.01 / 0.02) ** 2, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_smoothness_reduces_velocity_and_acceleration():
     times = np.linspace(0, 1, 30)[:, None]
     qpos = (np.array([1.0, -1.5, 0.5]) * np.sin(6 * times) + 0.2 * np.sin(60 * times)).astype(np.float32)

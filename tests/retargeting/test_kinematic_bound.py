@@ -164,6 +164,7 @@ def test_no_longer_search_is_below_the_bound_where_minima_are_many():
     assert jnp.all(bound <= searched(expert, learner, qpos, qvel, *metric) + 1e-3)  # what a step may be off
 
 
+@pytest.mark.slow
 def test_a_batch_is_a_loop():
     expert, learner = ARMS["planar 7->4"]
     qpos, qvel = (x[:, FEW] for x in demonstrations(7, 3))

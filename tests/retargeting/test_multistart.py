@@ -38,6 +38,7 @@ def loops(function, *arguments):
     return [e for e in jax.make_jaxpr(function)(*arguments).eqns if e.primitive.name == "scan"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "static"), [(1, True), (5, True), (5, False)])
 def test_one_loop_gives_the_poses_of_two(count, static, monkeypatch):
     """Also with a number of guesses that is not a multiple of those kept. 1e-6: float32."""

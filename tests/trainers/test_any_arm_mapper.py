@@ -77,6 +77,7 @@ def test_guesses_are_constant_poses_beside_the_proposals(mapper, guesses):
     assert len(np.unique(initial[0][2:], axis=0)) == guesses
 
 
+@pytest.mark.slow
 def test_more_guesses_are_never_worse(mapper):
     """By the nearest of all poses; with the same Newton steps."""
     learner, expert = mapper.arrays("panda4dof"), expert_pose(mapper.model.expert, jnp.full(MAX_JOINTS, 0.3))
@@ -115,6 +116,7 @@ def test_a_run_reports_each_arm(trained):
     assert {"arms.png", "training.png", "metrics.csv"} <= {path.name for path in run_dir.iterdir()}
 
 
+@pytest.mark.slow
 def test_evaluate_repeats_the_report(trained, tmp_path):
     run_dir, report = trained
     out = tmp_path / "again"

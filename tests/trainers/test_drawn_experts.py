@@ -91,6 +91,7 @@ def test_the_distance_is_that_of_both_arms(mapper):
     np.testing.assert_allclose(one.model.distance(jnp.asarray(qpos), learner_qpos), expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_empty_slots_of_an_expert_change_nothing(mapper):
     model, learner = mapper.model, mapper.arrays("panda")
     arm = mapper.arrays("panda3dof")

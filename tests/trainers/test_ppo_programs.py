@@ -186,6 +186,7 @@ assert not np.array_equal(*observed)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("physics", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_devices_see_different_arms_and_learn_the_same(physics):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
