@@ -104,10 +104,10 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
     is_expert[own_links : own_links + expert_size] = True
     link_vector, mean = make_link_vector(env.learner), np.array(statistics.mean)
     mean[own_links + expert_size :][:joints] += np.asarray(env.learner.home)  # the policy observes the difference
-    kernel = np.asarray(layers[0]["kernel"]) / np.asarray(statistics.std)[:, None]
+    first_kernel = np.asarray(layers[0]["kernel"]) / np.asarray(statistics.std)[:, None]
 
     def first_layer(part: np.ndarray, values: jax.Array) -> jax.Array:
-        return (values - mean[part]) @ kernel[part]
+        return (values - mean[part]) @ first_kernel[part]
 
     def features(expert: jax.Array) -> dict[str, jax.Array]:
         return {"features": first_layer(is_expert, expert) + layers[0]["bias"]}
@@ -118,8 +118,8 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
         hidden = features + first_layer(~is_expert, own)
         for layer in layers[1:-1]:
             hidden = jax.nn.silu(hidden) @ layer["kernel"] + layer["bias"]
-        mode, bias = (layers[-1][name][..., : env.action_size] for name in ("kernel", "bias"))  # no deviation
-        return {"action": jax.lax.clamp(-1.0, jnp.tanh(jax.nn.silu(hidden) @ mode + bias), 1.0)}
+        kernel, bias = (layers[-1][name][..., : env.action_size] for name in ("kernel", "bias"))  # no deviation
+        return {"action": jax.lax.clamp(-1.0, jnp.tanh(jax.nn.silu(hidden) @ kernel + bias), 1.0)}
 
     inputs: dict[str, int] = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
     inputs |= {"past_actions": SENT_ACTIONS * env.action_size, "features": len(layers[0]["bias"])}

@@ -59,15 +59,12 @@ class MeasurementCheck:
         """No longer notes the tracking errors of some robots [robots]."""
         self._is_tracked = (np.reshape(self._is_tracked, (-1, self._robots)) & ~robots).ravel().tolist()
 
-    def __call__(
-        self, qpos: list[float], qvel: list[float], states: list[State], known: np.ndarray
-    ) -> np.ndarray | None:
-        """The causes [robots] of arms that must stop, None if there are none.
+    def __call__(self, qpos: list[float], qvel: list[float], states: list[State]) -> np.ndarray | None:
+        """Why arms must stop [robots], empty for the others; None if all measurements are within their bounds.
 
         Args:
           qpos, qvel: measured [rad, rad/s].
           states: references at the same time.
-          known: [robots] causes for which arms have been stopped.
         """
         tracking, jump, largest = self._config.tracking, self._config.jump, self._largest_errors
         previous, self._previous, are_within = self._previous, qpos, True
@@ -86,14 +83,13 @@ class MeasurementCheck:
             self._fast[:] = 0
             return None
         reference = [state[0] for state in states]
-        return self._causes(np.reshape([qpos, qvel, previous, reference], (4, -1, self._robots)), known)
+        return self._causes(np.reshape([qpos, qvel, previous, reference], (4, -1, self._robots)))
 
-    def _causes(self, measured: np.ndarray, known: np.ndarray) -> np.ndarray:
+    def _causes(self, measured: np.ndarray) -> np.ndarray:
         """See `__call__`, where a value of a robot is not within its bound.
 
         Args:
           measured: angles, velocities, the angles before and the reference's [4, joints, robots].
-          known: [robots].
         """
         qpos, qvel, previous, reference = measured
         lower, upper, fastest = np.array(self._bounds).T.reshape(3, *qpos.shape)
@@ -105,7 +101,7 @@ class MeasurementCheck:
         largest = np.reshape(self._largest_errors, qpos.shape)
         self._largest_errors = np.where(is_noted, np.maximum(largest, error), largest).ravel().tolist()
         self.is_lost = (np.reshape(self.is_lost, qpos.shape) | ~is_finite | ~is_smooth).ravel().tolist()
-        cause = np.select(
+        causes = np.select(
             [
                 ~is_finite,
                 ~is_smooth,
@@ -116,4 +112,4 @@ class MeasurementCheck:
             [INVALID_STATE, JUMP, TRACKING, POSITION, VELOCITY],
             "",
         )
-        return np.where(known == "", cause, "").astype(object)
+        return causes.astype(object)

@@ -84,7 +84,7 @@ class SafetyLayer:
       cause: [robots] why the arm was stopped for good; empty while it is controlled.
       has_action: [robots] whether a valid action has ever arrived.
       counts: [robots] number of interventions, by kind.
-      clearance: [robots] smallest clearance of a measured pose [m], of every period.
+      clearance: [robots] smallest clearance of a measured pose [m], but for the last two periods.
     """
 
     def __init__(
@@ -197,7 +197,7 @@ class SafetyLayer:
         self._qpos, self._qvel = qpos.ravel().tolist(), qvel.ravel().tolist()
         self._measured.append(self._qpos)
         self._begun = inner_loop.states, self._left
-        cause = self._measurements(self._qpos, self._qvel, inner_loop.states, self.cause)
+        cause = self._measurements(self._qpos, self._qvel, inner_loop.states)
         if cause is not None:
             self._stop(cause)
         is_held = [left > 0 for left in self._left] * self._size[0]
@@ -229,7 +229,7 @@ class SafetyLayer:
 
     def stop(self, cause: str) -> None:
         """Makes all arms that are controlled brake and hold, for good."""
-        self._stop(np.where(self.cause == "", cause, ""))
+        self._stop(np.full(len(self.cause), cause, object))
 
     def release(self, robots: np.ndarray, cause: str) -> None:
         """No longer controls some arms: their robots stopped by themselves."""
@@ -283,7 +283,7 @@ class SafetyLayer:
         self._left = np.where(is_accepted, self._hold, self._left).tolist()
 
     def _stop(self, cause: np.ndarray) -> None:
-        """Makes arms brake: those with a cause."""
+        """Makes arms brake: those with a cause that have not been stopped yet."""
         is_stopped = (self.cause == "") & (cause != "")
         if not np.count_nonzero(is_stopped):
             return

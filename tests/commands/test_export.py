@@ -141,7 +141,7 @@ def any_arm_run(run_dir, expert="fixed"):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("expert", ["fixed", pytest.param("drawn", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("expert", ["fixed", "drawn"])
 def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path, expert):
     """One file for arms of 7 and 4 joints and for a random one, with the descriptions that the command writes."""
     mapper = any_arm_run(tmp_path / "run", expert)

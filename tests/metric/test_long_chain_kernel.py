@@ -35,6 +35,7 @@ CASES = {
     "long and short": (LONG_ARMS, None, ALL_WEIGHTS),
     "rotation alone": (LONG_ARMS, None, DistanceWeights(rotation=1.0)),
 }
+QUICK = "fixed links", "few pairs", "rotation alone"
 
 
 @pytest.fixture
@@ -71,9 +72,6 @@ def values_and_gradients(arms, correspondence, weights, batch):
 
     value, gradients = jax.jit(jax.vmap(jax.value_and_grad(distance, ARGUMENTS)))(*batch)
     return value, *gradients
-
-
-QUICK = "fixed links", "few pairs", "rotation alone"
 
 
 @pytest.mark.parametrize(

@@ -53,8 +53,8 @@ def test_an_equal_arm_finds_the_pose_itself(metric, tolerance):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("weights", [(0.5, 1.0), pytest.param((2.0, 1.0), marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["panda 7->4", pytest.param("panda 7->3", marks=pytest.mark.slow), "planar 7->4"])
+@pytest.mark.parametrize("weights", [(0.5, 1.0), (2.0, 1.0)])
+@pytest.mark.parametrize("name", ["panda 7->4", "panda 7->3", "planar 7->4"])
 def test_no_descent_of_the_distance_itself_gets_lower(name, weights, dtype):
     """By SciPy's simplex, without derivatives, from the minimum of the smoothed distance.
 

@@ -187,7 +187,7 @@ assert not np.array_equal(*observed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("physics", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("physics", ["fused", "mjx"])
 def test_devices_see_different_arms_and_learn_the_same(physics):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     settings = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
