@@ -1,8 +1,10 @@
-"""Times of `mimic.deploy` on one core: `python -m benchmarks.deploy [--out FILE] [--bundle FOLDER] [--motions N]`.
+"""Times of `mimic.deploy`: `python -m benchmarks.deploy [--out FILE] [--bundle FOLDER] [--motions N]`.
 
 A period of the inner loop lasts 1 ms. It is timed from a state to its torque, with the checks of the measurement, which
 is what a robot waits for; and to the end of its computation, with a part of the check of a target. The policy is timed
-in its own process on the same core, from an observation to the answer, at the rate at which the inner loop asks it.
+in its own process, at the rate at which the inner loop asks it: its evaluation, and from sending an observation to the
+answer, where it also waits for the core. It shares the core of the inner loop; with `--policy-core N` it has core N for
+itself and keeps it busy.
 Wall times include what other processes on the core cost; CPU times do not, but for what those evict from the caches.
 The last row is a loop of Python alone, which is as long each time: what its p99.9 is above its p50 is the machine's.
 
@@ -52,7 +54,7 @@ def untrained_bundle(folder: Path) -> Bundle:
     from mimic.trainers.run_models import save_models
 
     env = mimic.env_config("panda7dof", world="hardware", demonstrations={"count": 4, "held_out": 1})
-    config = TrainConfig(env, PPOConfig(preset="gpu"), compilation_cache="")
+    config = TrainConfig(env, PPOConfig(preset="inner_loop"), compilation_cache="")
     trainer = PPOTrainer(config, None)
     run = folder / "run"
     run.mkdir()
@@ -98,23 +100,25 @@ def _row(what: str, times: _Times, **more: int) -> Row:
     }
 
 
-def periods(bundle: Bundle, motions: int) -> Iterator[Row]:
+def periods(bundle: Bundle, motions: int, core: int | None) -> Iterator[Row]:
     """Periods of motions on a fake robot in real time, and the evaluations of the policy in its own process."""
-    latency, loop, policy = _Times(), _Times(), _Times()
+    latency, loop, policy, answer = _Times(), _Times(), _Times(), _Times()
     missed, interventions = 0, 0
     for motion in range(motions):
         index = motion % len(bundle.expert)
-        robot, connection = _robot(bundle), PolicyProcess(bundle, index)
+        robot, connection = _robot(bundle), PolicyProcess(bundle, index, core=core)
         report = run_controller(robot, bundle, index, policy=connection)
         assert not report.cause, report.cause
         latency.add(report.latency_s, [])
         loop.add(report.wall_s, report.cpu_s)
         policy.add(connection.wall_s[1:], connection.cpu_s[1:])  # the first has no tick before it
+        answer.add(connection.answer_s[1:], [])
         missed += missed_periods(robot.states)
         interventions += sum(report.interventions.values())
     yield _row("inner loop and safety layer, to the torque", latency)
     yield _row("to the end of the period", loop, missed=missed, interventions=interventions)
     yield _row("policy, in its own process", policy)
+    yield _row("from sending an observation to its answer", answer)
 
 
 def python_loop() -> Row:
@@ -143,20 +147,21 @@ def _core_awake() -> Iterator[None]:
             process.kill()
 
 
-def measure(bundle: Bundle, motions: int, awake: bool = False) -> Iterator[Row]:
+def measure(bundle: Bundle, motions: int, awake: bool = False, core: int | None = None) -> Iterator[Row]:
     with _core_awake() if awake else contextlib.nullcontext():
-        yield from periods(bundle, motions)
+        yield from periods(bundle, motions, core)
         yield python_loop()
 
 
 def main() -> None:
-    options = make_parser("deploy", __doc__, bundle=str, motions=20, awake=False).parse_args()
+    options = make_parser("deploy", __doc__, bundle=str, motions=20, awake=False, policy_core=int).parse_args()
     core = min(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     with tempfile.TemporaryDirectory() as folder:
         bundle = load_bundle(options.bundle) if options.bundle else untrained_bundle(Path(folder))
-        rows = measure(bundle, options.motions, options.awake)
-        content = {"unit": "ms", "real_time_priority": _priority(), "awake": options.awake}
+        rows = measure(bundle, options.motions, options.awake, options.policy_core)
+        content = {"unit": "ms", "real_time_priority": _priority()}
+        content |= {"awake": options.awake, "policy_core": options.policy_core}
         collect(options, rows, "rows", _COLUMNS, **content)
 
 

@@ -231,7 +231,11 @@ def run_training(
         steps, params = _train_and_log(config, trainer, run_dir, signals, restored, stopwatch, console)
         if on_trained:
             on_trained()
-        trained = steps - (restored.step if restored else 0)
+        last = max(checkpoint_steps(run_dir))
+        if steps < last:
+            unit = trainer.unit.replace("_", " ")
+            console.print(f"result: the parameters after {steps:,} {unit}; later ones were no better", highlight=False)
+        trained = last - (restored.step if restored else 0)
         return _evaluate(config, trainer, run_dir, steps, params, trained, stopwatch)
 
 

@@ -2,9 +2,13 @@
 
 Messages are datagrams of a pair of sockets, so that a policy that is killed or stopped at any moment leaves the inner
 loop nothing to wait for. Linux and macOS have such sockets.
+
+Caches lose the code and weights of a network in a tick, and an evaluation would take several times as long. So the
+process rehearses: before an observation is due, it computes its last answer again and again.
 """
 
 import contextlib
+import gc
 import os
 import signal
 import socket
@@ -13,6 +17,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,15 +25,32 @@ from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import Bundle, load_bundle
 from mimic.deploy.sessions import Policy
 
-_TICK = struct.Struct("<q")
-_ANSWER = struct.Struct("<qdd")  # the tick, and the wall and CPU time of its evaluation [s]; then the action follows
-_READY = -1  # the tick of the first message
+_OBSERVATION = struct.Struct("<qd")  # the tick and the time at which it is sent [s]; then the motions follow
+_ANSWER = struct.Struct(
+    "<qddd"
+)  # the tick, and times as the attributes of `PolicyProcess` [s]; then the action follows
+_READY = b"ready"  # the first message of the process
 _MAX_MESSAGE = 65_536  # bytes
 _COMMAND = "import sys; from mimic.deploy.policy_process import main; main(*sys.argv[1:])"
 _WATCH = 1.0  # s between two looks whether the inner loop still lives
-# From the first of these times [s] before an observation is due to the second one, the last answer is computed again at
-# intervals [s]: caches lose code and weights in a tick, and the evaluation would take several times as long.
-_REHEARSAL, _REST, _INTERVAL = 0.004, 0.0004, 0.0001
+
+
+class _Rehearsals(NamedTuple):
+    """When a process rehearses.
+
+    Attributes:
+      rest: fraction of a tick without rehearsals after an answer.
+      until: time before an observation is due at which they end [s]; negative: after it.
+      pause: pause between two of them [s].
+    """
+
+    rest: float
+    until: float
+    pause: float
+
+
+# On a core of its own the process never waits, but for the rest: Linux would throttle it at real-time priority.
+_SHARED_CORE, _OWN_CORE = _Rehearsals(0.92, 0.0004, 0.0001), _Rehearsals(0.1, -0.001, 0.0)
 
 
 class LocalPolicy:
@@ -59,26 +81,36 @@ class PolicyProcess:
       bundle: see `load_bundle`.
       motion: index of the motion.
       start_s: maximum time until the process is ready [s].
+      core: a core for this process alone, which it keeps busy; until `close`, the thread that creates it runs on its
+        other cores. None: any core, shared with other processes. Linux only.
 
     Attributes:
-      wall_s, cpu_s: times of the evaluations whose actions were received [s].
+      answer_s: times from sending an observation to its answer, of the actions that were received [s].
+      wall_s, cpu_s: times of these evaluations [s].
 
     Raises:
+      ValueError: no such core.
       RuntimeError: the process did not become ready.
     """
 
-    def __init__(self, bundle: Bundle, motion: int, start_s: float = 30.0):
+    def __init__(self, bundle: Bundle, motion: int, start_s: float = 30.0, core: int | None = None):
+        _check_core(core)
         self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         arguments = [str(bundle.folder), str(motion), str(other.fileno()), str(os.getpid())]
+        arguments += [] if core is None else [str(core)]
         with other:
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _COMMAND, *arguments], pass_fds=[other.fileno()], env=environment
             )
         self._size = bundle.action_size
+        self.answer_s: list[float] = []
         self.wall_s: list[float] = []
         self.cpu_s: list[float] = []
+        self._cores = None if core is None else os.sched_getaffinity(0)
         self._wait(start_s)
+        if self._cores is not None:
+            os.sched_setaffinity(0, self._cores - {core})
         self._socket.setblocking(False)
 
     @property
@@ -90,7 +122,7 @@ class PolicyProcess:
         """See `LocalPolicy`; the observation is dropped where the process does not read."""
         values = np.concatenate([qpos, qvel, reference.qpos, reference.qvel]).astype(np.float32)
         with contextlib.suppress(OSError):
-            self._socket.send(_TICK.pack(tick) + values.tobytes())
+            self._socket.send(_OBSERVATION.pack(tick, time.perf_counter()) + values.tobytes())
 
     def receive(self) -> tuple[int, np.ndarray] | None:
         """See `LocalPolicy`."""
@@ -100,13 +132,16 @@ class PolicyProcess:
                 message = self._socket.recv(_MAX_MESSAGE)
         if message is None or len(message) != _ANSWER.size + 4 * self._size:
             return None
-        tick, wall, cpu = _ANSWER.unpack_from(message)
+        tick, answer, wall, cpu = _ANSWER.unpack_from(message)
+        self.answer_s.append(answer)
         self.wall_s.append(wall)
         self.cpu_s.append(cpu)
         return tick, np.frombuffer(message, np.float32, offset=_ANSWER.size).astype(float)
 
     def close(self) -> None:
-        """Ends the process, also a stopped one."""
+        """Ends the process, also a stopped one; the thread may use all of its cores again."""
+        if self._cores is not None:
+            os.sched_setaffinity(0, self._cores)
         self._process.kill()
         self._process.wait()
         self._socket.close()
@@ -116,49 +151,74 @@ class PolicyProcess:
         end = time.monotonic() + start_s
         while time.monotonic() < end and self._process.poll() is None:
             with contextlib.suppress(TimeoutError):
-                if self._socket.recv(_MAX_MESSAGE) == _TICK.pack(_READY):
+                if self._socket.recv(_MAX_MESSAGE) == _READY:
                     return
         self.close()
         raise RuntimeError(f"policy: expected its process to be ready within {start_s:g} s, exit code "
                            f"{self._process.returncode}")  # fmt: skip
 
 
-def main(folder: str, motion: str, descriptor: str, parent: str) -> None:
+def _check_core(core: int | None) -> None:
+    """Raises a ValueError for a core that a process cannot have for itself."""
+    if core is None:
+        return
+    if not hasattr(os, "sched_setaffinity"):
+        raise ValueError(f"core: expected None where a process cannot choose its core (Linux only), got {core}")
+    if not 0 <= core < (os.cpu_count() or 1):
+        raise ValueError(f"core: expected one of the {os.cpu_count()} cores of this computer, from 0 on, got {core}")
+    if os.sched_getaffinity(0) == {core}:
+        raise ValueError(f"core: expected another core than that of the inner loop, got {core}")
+
+
+def main(folder: str, motion: str, descriptor: str, parent: str, core: str = "") -> None:
     """The process of a policy: it answers each observation with an action, until the inner loop has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in a terminal reaches it too: the inner loop ends it
     _yield_to_inner_loop()
+    if core:
+        os.sched_setaffinity(0, {int(core)})
     bundle = load_bundle(Path(folder))
-    joints, connection = bundle.num_joints, socket.socket(fileno=int(descriptor))
+    connection = socket.socket(fileno=int(descriptor))
     _warm_up(bundle)
     policy = Policy(bundle, [int(motion)])
-    connection.send(_TICK.pack(_READY))
+    gc.freeze()
+    gc.disable()  # an answer leaves no cycles of references
+    connection.send(_READY)
+    _answer_all(policy, bundle, connection, int(parent), _OWN_CORE if core else _SHARED_CORE)
+
+
+def _answer_all(
+    policy: Policy, bundle: Bundle, connection: socket.socket, parent: int, rehearsals: _Rehearsals
+) -> None:
+    """Answers observations, and rehearses before each, as long as the parent lives."""
     connection.settimeout(_WATCH)
     message, due = b"", 0.0
-    while os.getppid() == int(parent):
+    while os.getppid() == parent:
         try:
             message = connection.recv(_MAX_MESSAGE)
-        except TimeoutError:
-            is_early = time.perf_counter() < due - _REST
+        except (TimeoutError, BlockingIOError):
+            is_early = time.perf_counter() < due - rehearsals.until
             if is_early:
-                _answer(policy, message, joints, is_rehearsal=True)
-            connection.settimeout(_INTERVAL if is_early else _WATCH)
+                _answer(policy, message, bundle.num_joints, is_rehearsal=True)
+            connection.settimeout(rehearsals.pause if is_early else _WATCH)
             continue
         except OSError:
             return
-        due = time.perf_counter() + bundle.control_dt
+        received = time.perf_counter()
         with contextlib.suppress(OSError):
-            connection.send(_answer(policy, message, joints))
-        connection.settimeout(max(due - _REHEARSAL - time.perf_counter(), _INTERVAL))
+            connection.send(_answer(policy, message, bundle.num_joints))
+        due = received + bundle.control_dt
+        connection.settimeout(max(received + rehearsals.rest * bundle.control_dt - time.perf_counter(), 1e-4))
 
 
 def _answer(policy: Policy, message: bytes, joints: int, *, is_rehearsal: bool = False) -> bytes:
     """The message with the action for an observation."""
     wall, cpu = time.perf_counter(), time.thread_time()
-    values = np.frombuffer(message, np.float32, offset=_TICK.size).reshape(4, 1, joints)
-    (tick,) = _TICK.unpack_from(message)
+    tick, sent = _OBSERVATION.unpack_from(message)
+    values = np.frombuffer(message, np.float32, offset=_OBSERVATION.size).reshape(4, 1, joints)
     reference = Reference(values[2], values[3], values[3])
     action = policy.act(tick, values[0], values[1], reference, is_rehearsal=is_rehearsal).astype(np.float32)
-    return _ANSWER.pack(tick, time.perf_counter() - wall, time.thread_time() - cpu) + action.tobytes()
+    now = time.perf_counter()
+    return _ANSWER.pack(tick, now - sent, now - wall, time.thread_time() - cpu) + action.tobytes()
 
 
 def _yield_to_inner_loop() -> None:

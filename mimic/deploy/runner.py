@@ -87,6 +87,7 @@ def run_controller(
     *,
     config: SafetyConfig | None = None,
     policy: PolicyConnection | None = None,
+    policy_core: int | None = None,
 ) -> Report:
     """Runs a motion on a robot, from its start pose until the arm is at rest again.
 
@@ -99,15 +100,16 @@ def run_controller(
       motion: index or name of the motion.
       config: thresholds of the safety layer.
       policy: connection to the policy; default: the bundle's policy in a new process.
+      policy_core: of the new process, see `PolicyProcess`.
 
     Raises:
-      ValueError: there is no such motion, or the bundle's mode has no braking path.
+      ValueError: there is no such motion or core, or the bundle's mode has no braking path.
       RuntimeError: the policy's process does not start.
       KeyboardInterrupt: Ctrl-C, after the arm has been stopped.
     """
     index = bundle.motion_index(motion)
     layer = SafetyLayer(bundle, Clearance(bundle), config=config)
-    connection = policy or PolicyProcess(bundle, index)
+    connection = policy or PolicyProcess(bundle, index, core=policy_core)
     loop = _Loop(driver, bundle, layer, connection)
     try:
         with _interrupts_noted(loop), _without_collection():

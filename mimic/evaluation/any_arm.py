@@ -119,9 +119,15 @@ class ArmsEvaluator:
         """The arms of each split, as slices of all arms: "train" are those seen in training."""
         return {"train": slice(0, self._num_seen), "held_out": slice(self._num_seen, None)}
 
-    def rollout(self, controller: Controller) -> ArmRollouts:
-        """Runs a controller of any arm on every arm and demonstration. Call it under `jax.jit`."""
-        env, count = self.env, self.env.demonstrations.count
+    def rollout(self, controller: Controller, env: AnyArmEnv | None = None) -> ArmRollouts:
+        """Runs a controller of any arm on every arm and demonstration. Call it under `jax.jit`.
+
+        Args:
+          controller: the controller.
+          env: the environment on other demonstrations than those of the report.
+        """
+        env = env or self.env
+        count = env.demonstrations.count
         arms = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), self.arms)  # one batch, as in training
         demonstrations = jnp.tile(jnp.arange(count), len(self.names))
 

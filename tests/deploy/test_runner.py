@@ -2,6 +2,7 @@
 
 import json
 import os
+import pathlib
 import signal
 import subprocess
 import sys
@@ -48,9 +49,16 @@ def test_a_motion_is_run_in_simulated_time(bundle):
     assert json.loads(json.dumps(report.as_dict()))["is_complete"]
 
 
-def test_a_policy_in_its_own_process_gives_the_same_actions(bundle):
+needs_two_cores = pytest.mark.skipif(
+    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2, reason="needs two cores of Linux"
+)
+
+
+@pytest.mark.parametrize("has_own_core", [False, pytest.param(True, marks=needs_two_cores)])
+def test_a_policy_in_its_own_process_gives_the_same_actions(bundle, has_own_core):
     """Also where it waits for an observation for longer than a tick, and runs the network meanwhile."""
-    local, apart, zero = LocalPolicy(bundle, 1), PolicyProcess(bundle, 1), np.zeros(7)
+    core = max(os.sched_getaffinity(0)) if has_own_core else None
+    local, apart, zero = LocalPolicy(bundle, 1), PolicyProcess(bundle, 1, core=core), np.zeros(7)
     try:
         for tick in range(4):
             for policy in (local, apart):
@@ -64,7 +72,41 @@ def test_a_policy_in_its_own_process_gives_the_same_actions(bundle):
             np.testing.assert_allclose(received[1], expected[1], atol=1e-6)
     finally:
         apart.close()
-    assert len(apart.wall_s) == len(apart.cpu_s) == 4 and min(apart.cpu_s) > 0
+    assert len(apart.answer_s) == len(apart.wall_s) == len(apart.cpu_s) == 4 and min(apart.cpu_s) > 0
+    assert all(answer > wall for answer, wall in zip(apart.answer_s, apart.wall_s, strict=True))
+
+
+def cpu_time(pid):
+    """User and system time of a process [s]."""
+    fields = pathlib.Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
+@needs_two_cores
+def test_a_policy_with_a_core_of_its_own_keeps_it_busy_and_alone(bundle):
+    cores = os.sched_getaffinity(0)
+    core, zero = max(cores), np.zeros(7)
+    policy = PolicyProcess(bundle, 0, core=core)
+    try:
+        assert os.sched_getaffinity(policy.pid) == {core} and os.sched_getaffinity(0) == cores - {core}
+        before = cpu_time(policy.pid)
+        for tick in range(20):
+            policy.send(tick, bundle.start_pose, zero, Reference(zero, zero, zero))
+            time.sleep(bundle.control_dt)
+        # of 0.9; one that shares a core has some 0.1. Another process on the core may take half.
+        assert cpu_time(policy.pid) - before > 0.3 * 20 * bundle.control_dt
+    finally:
+        policy.close()
+    assert os.sched_getaffinity(0) == cores
+
+
+@needs_two_cores
+def test_a_core_that_the_policy_cannot_have_is_rejected(bundle, monkeypatch):
+    with pytest.raises(ValueError, match=r"core: expected one of the \d+ cores of this computer, from 0 on, got 1000"):
+        run_controller(robot(bundle), bundle, policy_core=1000)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    with pytest.raises(ValueError, match="core: expected another core than that of the inner loop, got 0"):
+        PolicyProcess(bundle, 0, core=0)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux only")

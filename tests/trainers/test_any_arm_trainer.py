@@ -10,6 +10,7 @@ import pytest
 import mimic
 from mimic.commands.fit import Run
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS
+from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.memory import check_training_memory
@@ -148,3 +149,21 @@ def test_it_goes_on_with_one_arm(finished, tmp_path):
     assert config.learner == "panda" and config.env.arms.most_locked == 0
     resumed = command("train", f"resume={tuned}", "trainer.num_timesteps=160")
     assert resumed.returncode == 0, resumed.stderr[-2000:]
+
+
+@pytest.mark.slow
+def test_fine_tuning_does_not_end_worse_than_it_began(finished, tmp_path):
+    """With a learning rate that destroys the policy, the result is the start, in the report and in what is kept."""
+    run_dir, _ = finished
+    tuned = tmp_path / "tuned"
+    learner = [f"init={run_dir}", "learner=panda", f"run_dir={tuned}"]
+    result = command("train", *learner, "trainer.num_timesteps=80", "trainer.learning_rate=0.9")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert "result: the parameters after 0 env steps; later ones were no better" in result.stdout
+    report = json.loads((tuned / "report.json").read_text())
+    assert report["env_steps"] == 0 and report["steps_per_second"] > 0 and checkpoint_steps(tuned) == [0]
+    whole = json.loads((run_dir / "report.json").read_text())["arms"]["whole"]
+    # 1e-3: the bound's search starts from other rollouts
+    assert report["arms"]["whole"]["gap"] == pytest.approx(whole["gap"], rel=1e-3)
+    resumed = command("train", f"resume={tuned}")
+    assert resumed.returncode == 2 and "has been trained for 0 of 80 steps" in resumed.stderr

@@ -33,9 +33,14 @@ from mimic.trainers.ppo.programs import Replay
 from mimic.trainers.ppo.trainer import PolicyOfManyArms, with_crossovers, with_saved_demonstrations
 from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
 
+_VALIDATION = 64  # training demonstrations by which a fine-tuning chooses its result: one arm, so they cost little
+
 
 class AnyArmPPOTrainer(Trainer):
     """Trains a policy of many arms, and evaluates it on those of `report_arms`, on held-out demonstrations.
+
+    The result of a fine-tuning, where the policy of another run is trained further on one arm, is the checkpoint with
+    the smallest mean distance on training demonstrations, and the start is one of them: it can end worse than it began.
 
     Args:
       config: the run's config.
@@ -67,11 +72,13 @@ class AnyArmPPOTrainer(Trainer):
             held_out = unseen
         arms = report_arms(config.env)
         evaluated = held_out.select(slice(0, EVALUATED_DEMONSTRATIONS))
-        self.evaluator = ArmsEvaluator(
-            AnyArmEnv(_without_baseline(self._env.config), self._env.sampler, evaluated),
-            arms,
-            lambda: self._controller_rollouts(),
-        )
+        env = AnyArmEnv(_without_baseline(self._env.config), self._env.sampler, evaluated)
+        self.evaluator = ArmsEvaluator(env, arms, lambda: self._controller_rollouts())
+        self._rollout_env, self._validated = env, 0
+        if config.learner and unseen is None:  # in one function with the report's, which takes long to compile
+            validation = training.select(slice(0, _VALIDATION))
+            self._rollout_env = AnyArmEnv(env.config, env.sampler, concatenate(validation, evaluated))
+            self._validated = validation.count
         self.env_config = self._env.config
         self.headline = f"{self._name}: {training.count} demonstrations, {self.settings.num_envs} arms in parallel"
         self.simulation = (
@@ -119,7 +126,7 @@ class AnyArmPPOTrainer(Trainer):
             def controller(state: State) -> Array:
                 return jnp.where(is_policy, policy(state), 0.0)
 
-            return self.evaluator.rollout(controller)
+            return self.evaluator.rollout(controller, self._rollout_env)
 
         return compiling(rollouts, self._params_shapes(), jax.ShapeDtypeStruct((), jnp.bool_))()
 
@@ -130,7 +137,18 @@ class AnyArmPPOTrainer(Trainer):
     def _run_controller(self) -> ArmRollouts:
         """The rollouts of the zero action, for which any parameters do."""
         unused = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._params_shapes())
-        return jax.device_get(self._rollouts()(jax.device_get(unused), jnp.asarray(False)))
+        return self._run(unused, is_policy=False)[1]
+
+    def _run(self, params: Params, *, is_policy: bool) -> tuple[ArmRollouts, ArmRollouts]:
+        """The rollouts on validation demonstrations, of which there may be none, and on those of the report."""
+        all_rollouts = jax.device_get(self._rollouts()(jax.device_get(params), jnp.asarray(is_policy)))
+        parts = slice(0, self._validated), slice(self._validated, None)
+        validation, report = (jax.tree.map(lambda x, part=part: x[:, part], all_rollouts) for part in parts)
+        return validation, report
+
+    def _validation_distance(self, params: Params) -> float:
+        """The mean distance on validation demonstrations."""
+        return float(self._run(params, is_policy=True)[0].distance.mean(dtype=float))
 
     def prepare_evaluation(self) -> None:
         """Starts to compile the evaluation and to compute the bounds, in this order."""
@@ -151,6 +169,7 @@ class AnyArmPPOTrainer(Trainer):
             signals=signals,
             restored=restored,
             on_compiling=self.prepare_evaluation,
+            score=self._validation_distance if self._validated else None,
         )
 
     def follow(self, restored: Checkpoint | None) -> None:
@@ -163,8 +182,7 @@ class AnyArmPPOTrainer(Trainer):
 
     def evaluate(self, params: Params) -> ArmsOutcome:
         """Runs the deterministic policy and the zero action once on each arm and demonstration."""
-        policy = self._rollouts()(jax.device_get(params), jnp.asarray(True))
-        return ArmsOutcome(jax.device_get(policy), self._controller_rollouts())
+        return ArmsOutcome(self._run(params, is_policy=True)[1], self._controller_rollouts())
 
     def run_controller(
         self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate

@@ -1,9 +1,12 @@
 """PPO on an imitation environment: networks, training epochs, checkpoints."""
 
+import contextlib
+import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import optax
@@ -11,7 +14,15 @@ from brax.training.agents.ppo import networks as ppo_networks
 
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.evaluator import Controller
-from mimic.runs.checkpoints import STATE_UNUSED, Checkpoint, checkpoint_steps, save_checkpoint, thin_checkpoints
+from mimic.runs.checkpoints import (
+    STATE_UNUSED,
+    Checkpoint,
+    DamagedCheckpoint,
+    checkpoint_steps,
+    load_checkpoint,
+    save_checkpoint,
+    thin_checkpoints,
+)
 from mimic.runs.divergence import Diverged, check_finite
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOSettings
@@ -29,6 +40,16 @@ from mimic.trainers.ppo.programs import (
     saved_leaves,
 )
 from mimic.trainers.trainer import OnEvaluation
+
+Score = Callable[[Params], float]  # of parameters, the smaller the better
+
+
+class _Best(NamedTuple):
+    """The checkpoint with the smallest score so far."""
+
+    score: float
+    step: int
+    params: Params
 
 
 def params_template(config: PPOSettings, observation_size: int, action_size: int) -> Params:
@@ -59,6 +80,7 @@ def train(
     signals: Signals,
     restored: Checkpoint | None = None,
     on_compiling: Callable[[], None] = lambda: None,
+    score: Score | None = None,
 ) -> tuple[int, Params]:
     """Trains a policy, and saves a checkpoint before each call of `on_evaluation`.
 
@@ -73,30 +95,55 @@ def train(
       restored: the checkpoint to continue from. With the training's state the result is that of a training that was not
         interrupted; without it, the optimizer and the environments start anew.
       on_compiling: called when the functions of the training start to compile; it may start work in other threads.
+      score: chooses the result: the checkpoint with the smallest value. None: the last checkpoint.
 
     Returns:
-      Environment steps and parameters at the end.
+      Environment steps and parameters of the result.
 
     Raises:
       Interrupted: a signal was received; a checkpoint has been written.
       Diverged: a number is not finite.
       OSError: a checkpoint cannot be written.
     """
+    best = _best_saved(run_dir, restored, score) if score and restored else None
     pending: list[Checkpoint] = []
     for checkpoint in _checkpoints(env, config, seed, restored, on_compiling, run_dir):
         if checkpoint.step not in checkpoint_steps(run_dir):
             save_checkpoint(run_dir, *checkpoint)
-            thin_checkpoints(run_dir, config.keep)
+            thin_checkpoints(run_dir, config.keep, best and best.step)
         pending.append(checkpoint)
         stop = False
         if checkpoint.metrics:  # the start is evaluated with the first epoch: the evaluation compiles until then
             stop = [on_evaluation(each.step, each.params, each.metrics) for each in pending][-1]
+            if score:
+                best = _better(best, pending, score)
             pending.clear()
         if checkpoint.step < config.total_steps:  # a finished training is not interrupted: there is nothing to resume
             signals.check()
         if stop:
             break
-    return checkpoint.step, checkpoint.params
+    return (best.step, best.params) if best else (checkpoint.step, checkpoint.params)
+
+
+def _better(best: _Best | None, checkpoints: Iterable[Checkpoint], score: Score) -> _Best | None:
+    """The best of the best so far and of some checkpoints; the earlier one of equal ones."""
+    for checkpoint in checkpoints:
+        value = score(checkpoint.params)
+        value = value if math.isfinite(value) else math.inf
+        if best is None or value < best.score:
+            best = _Best(value, checkpoint.step, checkpoint.params)
+    return best
+
+
+def _best_saved(run_dir: Path, restored: Checkpoint, score: Score) -> _Best | None:
+    """The best checkpoint of a resumed run before the restored one; None where there is none."""
+    best = None
+    for step in checkpoint_steps(run_dir):
+        if step < restored.step:
+            with contextlib.suppress(DamagedCheckpoint):
+                saved = Checkpoint(*load_checkpoint(run_dir, restored.params, step), None, {})
+                best = _better(best, [saved], score)
+    return best
 
 
 def follow(env: ImitationEnv, config: PPOSettings, *, seed: int, restored: Checkpoint | None = None) -> None:
