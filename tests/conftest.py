@@ -12,7 +12,7 @@ import pytest
 from jaxtyping import config as jaxtyping_config
 from jaxtyping import install_import_hook
 
-from tests.helpers.repository import REPOSITORY
+from tests.helpers.repository import REPOSITORY, SLOW_PARAMETERS
 
 # Not mimic.metric.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
 CORE = (
@@ -51,6 +51,15 @@ def pytest_configure(config: pytest.Config) -> None:
     from mimic import compat  # importing mimic after the hook is in place, and before JAX starts
 
     compat.prepare_cpu()
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest selects by marks
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks single parameters of tests as slow, where quicker ones of the same test run in `make test`."""
+    slow = set(SLOW_PARAMETERS.read_text().splitlines())
+    for item in items:
+        if item.nodeid in slow:
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture

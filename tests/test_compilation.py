@@ -94,6 +94,7 @@ def test_results_are_kept_by_value_and_not_for_ever():
     assert make(np.ones(2), {"a": (1.0, "x")}, functools.partial(np.sum, axis=0)) is not first  # dropped
 
 
+@pytest.mark.slow
 def test_kept_functions_release_memory():
     """Of a hundred arms, the functions of the last 32 stay."""
     alive = []

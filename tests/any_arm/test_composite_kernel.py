@@ -31,6 +31,7 @@ def batch():
         return arms, batch.qpos, 0.3 * batch.qvel * is_free, 0.3 * torque, Load(*load)
 
 
+@pytest.mark.slow
 def test_the_kernel_equals_the_looped_form(x64, interpreted, batch):
     arms, qpos, qvel, torque, load = batch
     assert (np.asarray(arms.is_free).sum(axis=1) < MAX_JOINTS).any() and (arms.is_free[:, 0] == 0).any()

@@ -68,6 +68,7 @@ def test_torques_above_the_maximum_keep_their_direction(x64, panda):
     np.testing.assert_allclose(limited / free[0] * free[0] / limited[0], free / free[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_far_targets_are_approached_at_the_velocity_limit_and_braked_before(x64, panda):
     """The angle never overshoots a target at rest by more than a step's rounding of the braking distance."""
     arm = lock_joints(panda, np.array([1, 0, 1, 1, 1, 1, 1, 0]))

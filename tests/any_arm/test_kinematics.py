@@ -116,6 +116,7 @@ def test_correspondence_is_that_by_arc_length(x64, batch):
         assert not actual[expert.num_links :].any() and not actual[:, learner.num_links :].any()
 
 
+@pytest.mark.slow
 def test_correspondence_of_drawn_arms_integrates_along_both_chains():
     """In single precision, of traced experts and learners, some without a link in the first slot: links by length."""
     drawn = jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(1), 128))

@@ -71,6 +71,7 @@ def harmful_case(number):
     return Case("test", lambda _: None, READS[number])
 
 
+@pytest.mark.slow
 def test_harm_is_counted_and_the_next_inputs_run(monkeypatch):
     monkeypatch.setitem(fuzzing.KINDS, "npz", ("tests.benchmarks.test_fuzz", "harmful_case"))
     monkeypatch.setattr(runner, "TIME_LIMIT", 5.0)

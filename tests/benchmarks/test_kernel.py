@@ -13,6 +13,7 @@ def rows():
     return [row for method in methods for row in kernel.sweep("links", {3: (arms, 8)}, method)]
 
 
+@pytest.mark.slow
 def test_all_methods_compute_the_same(rows):
     assert {(row["method"], row["quantity"]) for row in rows} >= {("mimic", "all"), ("matrices", "gradient")}
     for row in rows:

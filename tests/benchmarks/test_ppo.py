@@ -21,6 +21,7 @@ def test_the_first_epoch_is_not_counted():
     assert ppo.rates(100, [1.0, 8.0, 10.0, 12.0, 14.0]) == {"compile_s": 5.0, "steps_per_s": 50.0, "spread": 0.0}
 
 
+@pytest.mark.slow
 def test_what_cannot_run_says_why(monkeypatch, capsys):
     def absent(*_):
         raise ImportError("not here\nand more")

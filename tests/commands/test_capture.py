@@ -58,6 +58,7 @@ def both(clip):
     return clip.parent, done.stdout
 
 
+@pytest.mark.slow
 def test_demonstrations_of_both_arms_fit_the_bimanual_environment(both):
     folder, printed = both
     env = mimic.env_config("bimanual", expert={"model": str(folder / "both.xml")})
@@ -130,6 +131,7 @@ def test_bad_input_is_one_line(clip, tmp_path, arguments, message):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_nothing_is_overwritten(clip, tmp_path):
     (tmp_path / "a.xml").write_text("mine")
     done = run(tmp_path, "demonstrations", f"source={clip}", "out=a.npz")

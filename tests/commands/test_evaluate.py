@@ -79,6 +79,7 @@ def test_a_policy_is_evaluated_on_mjx_too(run_dir, tmp_path, monkeypatch, capsys
     assert "mjx" not in evaluate(run_dir, tmp_path / "hold", controller="hold")[0]
 
 
+@pytest.mark.slow
 def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_path):
     """1e-5: float32, the same distances from another compiled function."""
     unseen.of_length(HORIZON + 5).save(tmp_path / "unseen.npz")  # more steps than the run's demonstrations have

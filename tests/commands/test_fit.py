@@ -31,6 +31,7 @@ def fitted(tmp_path_factory):
     return mimic.fit(env, trainer=TRAINER, seed=3, run_dir=str(tmp_path_factory.mktemp("fit") / "run"), quiet=True), env
 
 
+@pytest.mark.slow
 def test_a_run_has_report_policy_and_plots(fitted, capsys):
     run, env = fitted
     assert capsys.readouterr().out == ""  # quiet
@@ -45,6 +46,7 @@ def test_a_run_has_report_policy_and_plots(fitted, capsys):
     np.testing.assert_array_equal(run.make_env().demonstrations.qpos, env.demonstrations.qpos)
 
 
+@pytest.mark.slow
 def test_a_run_is_evaluated_and_opened_again(fitted, capsys):
     run, _ = fitted
     report = mimic.Run(run.run_dir).evaluate(quiet=True)
@@ -54,6 +56,7 @@ def test_a_run_is_evaluated_and_opened_again(fitted, capsys):
         run.evaluate(masses=1.2)
 
 
+@pytest.mark.slow
 def test_a_run_without_a_report_is_one_line(fitted, tmp_path):
     (tmp_path / "config.yaml").write_text((fitted[0].run_dir / "config.yaml").read_text())
     with pytest.raises(ValueError, match="report.json' cannot be read"):
@@ -84,6 +87,7 @@ def test_a_bad_training_is_one_line_and_writes_nothing(arguments, message, tmp_p
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_other_demonstrations_than_those_of_the_config_are_rejected(fitted, tmp_path):
     env = fitted[1]
     other = env.with_demonstrations(training_and_held_out(env.config)[1])

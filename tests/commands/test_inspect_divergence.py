@@ -52,6 +52,7 @@ def diverged(tmp_path_factory):
         yield run_dir, trainer
 
 
+@pytest.mark.slow
 def test_the_first_bad_batch_is_found(diverged):
     """The update after the one with the huge rate has a value loss beyond float32."""
     run_dir, trainer = diverged
@@ -106,6 +107,7 @@ def test_a_replay_reproduces_the_divergence(diverged, shown):
     assert re.search(r"qvel \[rad/s\] │ +\d\S* │", output) and re.search(r"learning_rate +│ +0.001 │", output)
 
 
+@pytest.mark.slow
 def test_a_replay_that_is_finite_says_so(diverged, shown, monkeypatch):
     monkeypatch.setattr(training, "_learning_rate", lambda settings, progress: lambda count: settings.learning_rate)
     assert "replay on cpu: does not reproduce it, all is finite\n" in shown(diverged[0] / FILE)

@@ -169,6 +169,7 @@ def test_motions_of_another_length_are_rejected(files, tmp_path):
         prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
 
 
+@pytest.mark.slow
 def test_bad_input_for_a_mapper_is_rejected(mapper_run, files):
     bad: list[tuple[dict[str, Any], str]] = [
         ({"split": "train"}, "split: has no effect with a run of trainer=pose_mapper"),

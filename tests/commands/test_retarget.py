@@ -27,6 +27,7 @@ def command(*arguments, **more):
     return subprocess.run(arguments, capture_output=True, text=True, timeout=280, check=False, **more)
 
 
+@pytest.mark.slow
 def test_the_motions_load_and_do_not_jump(recorded, tmp_path):
     out = tmp_path / "learner.npz"
     result = command(f"demonstrations={recorded}", "learner=planar4dof", f"out={out}")

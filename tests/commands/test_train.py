@@ -97,6 +97,7 @@ def test_a_run_compiles_few_functions(finished):
     assert len(names) < 22  # 54 with brax's own training loop
 
 
+@pytest.mark.slow
 def test_evaluate_repeats_the_report(finished, tmp_path):
     run_dir, _ = finished
     out = tmp_path / "again"
@@ -140,6 +141,7 @@ def test_resume_continues_from_the_last_checkpoint(finished, tmp_path):
     assert again.returncode == 2 and "increase trainer.num_timesteps" in again.stderr
 
 
+@pytest.mark.slow
 def test_a_resumed_run_ends_as_if_it_had_not_been_interrupted(finished, tmp_path):
     """As after a SIGKILL while a checkpoint was written, and one before the report."""
     reference, _ = finished

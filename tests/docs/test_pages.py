@@ -31,6 +31,7 @@ def test_the_readme_is_short():
     assert len((REPOSITORY / "README.md").read_text().split()) <= 700
 
 
+@pytest.mark.slow
 def test_the_example_of_the_library_runs():
     scope: dict = {}
     exec(python(DOCS / "library.md")[0], scope)  # noqa: S102 - our own text

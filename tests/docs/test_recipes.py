@@ -19,6 +19,7 @@ def block_with(text):
     return blocks[0].text
 
 
+@pytest.mark.slow
 def test_the_pure_jax_loop_learns():
     """With more updates than the page has: the mean return of the last tenth is above that of the first."""
     env = mimic.make("planar4dof", **SMALL)

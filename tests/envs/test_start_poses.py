@@ -51,6 +51,7 @@ def test_each_episode_starts_at_rest_in_the_nearest_pose_of_its_demonstration(ev
         np.testing.assert_allclose(env.begin(start).obs, env.observe(start), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_equal_arm_starts_where_the_expert_does():
     arm = mimic.panda()
     qpos = np.random.default_rng(0).uniform(-1, 1, (3, arm.num_joints))

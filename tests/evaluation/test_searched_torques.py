@@ -68,6 +68,7 @@ def test_an_arm_that_imitates_itself_finds_the_torques():
     np.testing.assert_array_less(np.mean(best.distance, axis=1), 1e-3 * evaluator.hold_distance.mean(axis=1))
 
 
+@pytest.mark.slow
 def test_no_update_makes_a_sequence_worse(evaluator):
     descent, task = descent_and_task(evaluator)
     episodes = descent.start(task, random_actions(evaluator))
@@ -120,6 +121,7 @@ def test_the_gradient_is_that_of_the_objective(correspondence, adaptive):
         np.testing.assert_allclose(slope[:, step, joint], difference, atol=2e-3 * np.abs(slope).max())
 
 
+@pytest.mark.slow
 def test_updates_do_not_depend_on_how_many_sequences_are_differentiated_at_a_time(evaluator):
     """Three sequences, two at a time; the last round is filled up. 1e-4: float32, and a linear solve."""
     whole, parts = (

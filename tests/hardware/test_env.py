@@ -143,6 +143,7 @@ def test_each_mode_moves_the_arm_within_its_limits(control):
     assert np.all((state.qpos > lower) & (state.qpos < upper))
 
 
+@pytest.mark.slow
 def test_mjx_agrees_with_the_fused_loop():
     """With all of the hardware world but contacts, which do not occur here; MJX has MuJoCo's own stops."""
     env = mimic.make("panda4dof", demonstrations=FEW, world="hardware")
@@ -232,6 +233,7 @@ def test_the_last_observations_show_the_expert_as_an_exported_controller_does():
         np.testing.assert_allclose(expert_vector(states), np.concatenate(rows), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_rollouts_start_where_the_episodes_do():
     env = make(world="hardware", horizon=3)
     evaluator = Evaluator(env, env.demonstrations)

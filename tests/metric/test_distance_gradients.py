@@ -92,6 +92,7 @@ def test_gradients_are_finite_at_the_kinks(correspondence, weights, transform):
         assert not gradient[:2].any()
 
 
+@pytest.mark.slow
 def test_gradients_under_jit_and_vmap():
     """A cover of all correspondences, weights, measures and reductions, at the kinks and away from them."""
     cover = [

@@ -123,6 +123,7 @@ def test_distance_of_long_trees(x64, fingers):
         np.testing.assert_allclose(b, a, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_poses(x64, body, longer):
     """Those of the closed form against finite differences; no joint of one arm moves the other."""
     objective = pose_objective(longer, MetricConfig(translation=1.0).build(body, longer))

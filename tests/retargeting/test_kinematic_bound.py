@@ -85,6 +85,7 @@ def test_the_bound_is_the_distance_of_the_returned_motion():
     np.testing.assert_allclose(closest.distance, expected, rtol=1e-4, atol=1e-6)  # float32; fused in another order
 
 
+@pytest.mark.slow
 def test_the_bound_of_an_arm_and_itself_is_zero():
     arm = panda()
     motion = demonstration(7)

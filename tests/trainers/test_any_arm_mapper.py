@@ -61,6 +61,7 @@ def poses(count, seed=0):
     return np.random.default_rng(seed).uniform(-3, 3, (count, 7)).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guesses", [0, 5])
 def test_guesses_are_constant_poses_beside_the_proposals(mapper, guesses):
     model = dataclasses.replace(mapper.model, guesses=guesses)
@@ -88,6 +89,7 @@ def test_more_guesses_are_never_worse(mapper):
     assert many <= few
 
 
+@pytest.mark.slow
 def test_an_older_run_has_no_guesses(trained, tmp_path):
     run_dir = tmp_path / "run"
     shutil.copytree(trained[0], run_dir)
@@ -98,6 +100,7 @@ def test_an_older_run_has_no_guesses(trained, tmp_path):
     assert AnyArmMapper.load(run_dir).model.guesses == 0
 
 
+@pytest.mark.slow
 def test_a_run_reports_each_arm(trained):
     run_dir, report = trained
     assert report["training_poses"] == TINY["samples"] * TINY["epochs"]
@@ -188,6 +191,7 @@ def test_joints_that_a_config_locks_are_locked_by_the_mask(mapper):
     np.testing.assert_allclose(one.model.distance(jnp.asarray(qpos), learner_qpos), expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_nearest_pose_is_taken_and_locked_joints_stay(mapper):
     arm = lock_joints(mapper.arrays("panda"), np.eye(MAX_JOINTS)[3])
     (qpos,) = poses(1)
@@ -255,6 +259,7 @@ def test_the_optimum_is_the_nearest_pose_that_is_known():
     np.testing.assert_array_equal(best_poses(reference, mapped)[0, :, 0], [1.0, 0.0])
 
 
+@pytest.mark.slow
 def test_random_poses_leave_locked_joints_at_home(mapper):
     arm = dataclasses.replace(lock_joints(mapper.model.expert, np.eye(MAX_JOINTS)[0]), home=np.full(MAX_JOINTS, 0.5))
     drawn = jax.vmap(lambda key: random_pose(arm, key))(jax.random.split(jax.random.key(0), 200))
@@ -306,6 +311,7 @@ def test_a_metric_that_arrays_do_not_have_is_rejected(tmp_path):
         session.prepare_training(config, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 def test_bad_learners_and_poses_are_rejected(mapper):
     arms = stack_arms([mapper.arrays("panda")] * 2)
@@ -321,6 +327,7 @@ def test_bad_learners_and_poses_are_rejected(mapper):
             mapper(*arguments)
 
 
+@pytest.mark.slow
 def test_runs_of_the_other_kind_are_rejected(trained, tmp_path):
     with pytest.raises(ValueError, match="expected a run with one learner, got env=panda_family"):
         mimic.PoseMapper.load(trained[0])

@@ -82,6 +82,7 @@ def test_the_expert_is_that_of_the_environment_by_default(mapper):
     assert mapper.expert == mapper.own_expert.arm.embodiment and mapper.to("panda").expert.num_joints == 7
 
 
+@pytest.mark.slow
 def test_the_distance_is_that_of_both_arms(mapper):
     one, (qpos,) = mapper.to("panda3dof", FOUR), poses(1, 4)
     metric = mapper.env.metric.build(one.expert, one.learner)

@@ -72,6 +72,7 @@ def test_evaluate_repeats_the_report(trained, tmp_path):
         assert again[key] == pytest.approx(report[key], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_loaded_mapper_takes_one_pose_or_many(trained):
     run_dir, report = trained
     mapper = mimic.PoseMapper.load(run_dir)

@@ -229,6 +229,7 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
     assert max(jax.tree.leaves(apart)) > 1e-4  # Adam moves by 1e-3 an update, whatever the gradient's size
 
 
+@pytest.mark.slow
 def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
     """Compiled anew, its numbers may differ in the last bits: on a GPU, XLA chooses matrix products by their speed."""
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
@@ -243,6 +244,7 @@ def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
     assert lowered[0] == lowered[1]
 
 
+@pytest.mark.slow
 def test_schedules_of_a_restored_state_begin_at_its_updates():
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")

@@ -228,6 +228,7 @@ def family_run(tmp_path):
     return run_dir, files
 
 
+@pytest.mark.slow
 def test_a_run_keeps_all_of_many_arms(family_run, tmp_path):
     run_dir, files = family_run
     arms = report_arms(load_config(run_dir, saved_models=False).env)

@@ -76,6 +76,7 @@ def test_the_choices_are_the_named_learners_and_each_arm_without_locks(choices):
     assert shown_preset(presets, 1, {"a": 0.1}).name == "six"
 
 
+@pytest.mark.slow
 def test_arms_locks_and_weights_change_without_compiling(live, choices):
     rng, shown = np.random.default_rng(0), set()
     settle(live)
