@@ -231,7 +231,7 @@ def run_training(
         steps, params = _train_and_log(config, trainer, run_dir, signals, restored, stopwatch, console)
         if on_trained:
             on_trained()
-        last = max(checkpoint_steps(run_dir))
+        last = max([steps, *checkpoint_steps(run_dir)])
         if steps < last:
             unit = trainer.unit.replace("_", " ")
             console.print(f"result: the parameters after {steps:,} {unit}; later ones were no better", highlight=False)

@@ -15,6 +15,7 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -39,7 +40,7 @@ class _Rehearsals(NamedTuple):
     """When a process rehearses.
 
     Attributes:
-      rest: fraction of a tick without rehearsals after an answer.
+      rest: fraction of a tick without rehearsals, from an observation on.
       until: time before an observation is due at which they end [s]; negative: after it.
       pause: pause between two of them [s].
     """
@@ -81,8 +82,8 @@ class PolicyProcess:
       bundle: see `load_bundle`.
       motion: index of the motion.
       start_s: maximum time until the process is ready [s].
-      core: a core for this process alone, which it keeps busy; until `close`, the thread that creates it runs on its
-        other cores. None: any core, shared with other processes. Linux only.
+      core: a core that this process keeps busy; until `close`, the thread that creates it runs on its other cores.
+        None: any core, shared with other processes. Linux only.
 
     Attributes:
       answer_s: times from sending an observation to its answer, of the actions that were received [s].
@@ -94,10 +95,11 @@ class PolicyProcess:
     """
 
     def __init__(self, bundle: Bundle, motion: int, start_s: float = 30.0, core: int | None = None):
-        _check_core(core)
+        if core is not None:
+            _check_core(core)
         self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         arguments = [str(bundle.folder), str(motion), str(other.fileno()), str(os.getpid())]
-        arguments += [] if core is None else [str(core)]
+        arguments += [] if core is None else ["own core"]
         with other:
             environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
             self._process = subprocess.Popen(
@@ -107,10 +109,14 @@ class PolicyProcess:
         self.answer_s: list[float] = []
         self.wall_s: list[float] = []
         self.cpu_s: list[float] = []
-        self._cores = None if core is None else os.sched_getaffinity(0)
-        self._wait(start_s)
-        if self._cores is not None:
-            os.sched_setaffinity(0, self._cores - {core})
+        self._thread, self._left_core = threading.get_native_id(), None
+        try:
+            if core is not None:
+                self._leave(core)
+            self._wait(start_s)
+        except BaseException:  # Ctrl-C too
+            self.close()
+            raise
         self._socket.setblocking(False)
 
     @property
@@ -140,11 +146,24 @@ class PolicyProcess:
 
     def close(self) -> None:
         """Ends the process, also a stopped one; the thread may use all of its cores again."""
-        if self._cores is not None:
-            os.sched_setaffinity(0, self._cores)
         self._process.kill()
         self._process.wait()
         self._socket.close()
+        if self._left_core is not None:
+            with contextlib.suppress(OSError):  # the thread has ended, or the core is no longer allowed
+                os.sched_setaffinity(self._thread, os.sched_getaffinity(self._thread) | {self._left_core})
+        self._left_core = None
+
+    def _leave(self, core: int) -> None:
+        """Gives the process a core, which this thread leaves."""
+        try:
+            os.sched_setaffinity(self._process.pid, {core})
+        except OSError as error:
+            raise ValueError(f"core: expected a core that processes may use, got {core}") from error
+        allowed = os.sched_getaffinity(0)
+        if core in allowed:
+            os.sched_setaffinity(0, allowed - {core})
+            self._left_core = core
 
     def _wait(self, start_s: float) -> None:
         self._socket.settimeout(0.2)
@@ -153,29 +172,24 @@ class PolicyProcess:
             with contextlib.suppress(TimeoutError):
                 if self._socket.recv(_MAX_MESSAGE) == _READY:
                     return
-        self.close()
         raise RuntimeError(f"policy: expected its process to be ready within {start_s:g} s, exit code "
                            f"{self._process.returncode}")  # fmt: skip
 
 
-def _check_core(core: int | None) -> None:
+def _check_core(core: int) -> None:
     """Raises a ValueError for a core that a process cannot have for itself."""
-    if core is None:
-        return
     if not hasattr(os, "sched_setaffinity"):
         raise ValueError(f"core: expected None where a process cannot choose its core (Linux only), got {core}")
-    if not 0 <= core < (os.cpu_count() or 1):
-        raise ValueError(f"core: expected one of the {os.cpu_count()} cores of this computer, from 0 on, got {core}")
+    if core < 0:
+        raise ValueError(f"core: expected a number of a core, from 0 on, got {core}")
     if os.sched_getaffinity(0) == {core}:
         raise ValueError(f"core: expected another core than that of the inner loop, got {core}")
 
 
-def main(folder: str, motion: str, descriptor: str, parent: str, core: str = "") -> None:
+def main(folder: str, motion: str, descriptor: str, parent: str, own_core: str = "") -> None:
     """The process of a policy: it answers each observation with an action, until the inner loop has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in a terminal reaches it too: the inner loop ends it
     _yield_to_inner_loop()
-    if core:
-        os.sched_setaffinity(0, {int(core)})
     bundle = load_bundle(Path(folder))
     connection = socket.socket(fileno=int(descriptor))
     _warm_up(bundle)
@@ -183,7 +197,7 @@ def main(folder: str, motion: str, descriptor: str, parent: str, core: str = "")
     gc.freeze()
     gc.disable()  # an answer leaves no cycles of references
     connection.send(_READY)
-    _answer_all(policy, bundle, connection, int(parent), _OWN_CORE if core else _SHARED_CORE)
+    _answer_all(policy, bundle, connection, int(parent), _OWN_CORE if own_core else _SHARED_CORE)
 
 
 def _answer_all(

@@ -103,10 +103,12 @@ def run_controller(
       policy_core: of the new process, see `PolicyProcess`.
 
     Raises:
-      ValueError: there is no such motion or core, or the bundle's mode has no braking path.
+      ValueError: there is no such motion or core, a core for a given policy, or the bundle's mode has no braking path.
       RuntimeError: the policy's process does not start.
       KeyboardInterrupt: Ctrl-C, after the arm has been stopped.
     """
+    if policy is not None and policy_core is not None:
+        raise ValueError(f"policy_core: expected None with a given policy, got {policy_core}")
     index = bundle.motion_index(motion)
     layer = SafetyLayer(bundle, Clearance(bundle), config=config)
     connection = policy or PolicyProcess(bundle, index, core=policy_core)

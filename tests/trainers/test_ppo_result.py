@@ -10,7 +10,7 @@ from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import training
 
 
-def run(monkeypatch, run_dir, values, restored=None, score=lambda params: float(params["x"][0]), **settings):
+def run(monkeypatch, run_dir, values, restored=None, score=lambda params: float(params["x"][0]), last=None, **settings):
     """Trains where the parameter is one of `values` at each step; returns the result, its steps and those evaluated."""
 
     def checkpoints(_env, _config, _seed, restored, *_):
@@ -22,7 +22,7 @@ def run(monkeypatch, run_dir, values, restored=None, score=lambda params: float(
 
     def on_evaluation(step, _params, _metrics):
         evaluated.append(step)
-        return False
+        return step == last
 
     monkeypatch.setattr(training, "_checkpoints", checkpoints)
     config = PPOConfig(num_timesteps=len(values), **settings).resolve("cpu")
@@ -55,6 +55,19 @@ def test_the_result_has_the_smallest_score(monkeypatch, tmp_path, values, best):
 
 def test_without_a_score_the_last_checkpoint_is_the_result(monkeypatch, tmp_path):
     assert run(monkeypatch, tmp_path, [1.0, 2.0, 3.0], score=None)[:2] == (2, 3.0)
+
+
+def test_a_target_that_is_reached_ends_the_training_with_the_checkpoint_that_reached_it(monkeypatch, tmp_path):
+    assert run(monkeypatch, tmp_path, [1.0, 2.0, 3.0, 4.0], last=2) == (2, 3.0, [0, 1, 2])
+
+
+def test_a_damaged_checkpoint_is_not_the_result(monkeypatch, tmp_path, capsys):
+    values = [2.0, 1.0, 3.0]
+    run(monkeypatch, tmp_path, values)
+    (tmp_path / "checkpoints" / f"{1:012d}" / "checkpoint.json").write_text("{")
+    restored = Checkpoint(2, {"x": np.array([3.0])}, None, {"loss": 0.0})
+    assert run(monkeypatch, tmp_path, values, restored)[:2] == (0, 2.0)
+    assert "it cannot be the result" in capsys.readouterr().err
 
 
 def test_the_best_checkpoint_is_kept(monkeypatch, tmp_path):

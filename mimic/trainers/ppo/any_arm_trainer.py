@@ -40,7 +40,7 @@ class AnyArmPPOTrainer(Trainer):
     """Trains a policy of many arms, and evaluates it on those of `report_arms`, on held-out demonstrations.
 
     The result of a fine-tuning, where the policy of another run is trained further on one arm, is the checkpoint with
-    the smallest mean distance on training demonstrations, and the start is one of them: it can end worse than it began.
+    the smallest mean distance on training demonstrations, the start among them, as training can make it worse.
 
     Args:
       config: the run's config.
@@ -86,6 +86,7 @@ class AnyArmPPOTrainer(Trainer):
             f"report: {len(arms[SEEN])} arms seen in training and {len(arms[UNSEEN])} others, on {evaluated.count} "
             "held-out demonstrations"
         )
+        self._last: tuple[Params, Any] = None, None  # parameters and their rollouts
         self._rollouts = Background(self._compile)
         self._controller_rollouts = Background(self._run_controller)
 
@@ -141,9 +142,13 @@ class AnyArmPPOTrainer(Trainer):
 
     def _run(self, params: Params, *, is_policy: bool) -> tuple[ArmRollouts, ArmRollouts]:
         """The rollouts on validation demonstrations, of which there may be none, and on those of the report."""
+        last, rollouts = self._last  # of one moment: another thread may run the zero action
+        if last is params:  # a checkpoint is evaluated, then compared
+            return rollouts
         all_rollouts = jax.device_get(self._rollouts()(jax.device_get(params), jnp.asarray(is_policy)))
         parts = slice(0, self._validated), slice(self._validated, None)
         validation, report = (jax.tree.map(lambda x, part=part: x[:, part], all_rollouts) for part in parts)
+        self._last = params, (validation, report)
         return validation, report
 
     def _validation_distance(self, params: Params) -> float:

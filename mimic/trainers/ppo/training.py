@@ -1,6 +1,5 @@
 """PPO on an imitation environment: networks, training epochs, checkpoints."""
 
-import contextlib
 import math
 import sys
 import time
@@ -95,7 +94,8 @@ def train(
       restored: the checkpoint to continue from. With the training's state the result is that of a training that was not
         interrupted; without it, the optimizer and the environments start anew.
       on_compiling: called when the functions of the training start to compile; it may start work in other threads.
-      score: chooses the result: the checkpoint with the smallest value. None: the last checkpoint.
+      score: chooses the result: the checkpoint with the smallest value, unless `on_evaluation` ended the training.
+        None: the last checkpoint.
 
     Returns:
       Environment steps and parameters of the result.
@@ -105,24 +105,26 @@ def train(
       Diverged: a number is not finite.
       OSError: a checkpoint cannot be written.
     """
-    best = _best_saved(run_dir, restored, score) if score and restored else None
+    best: _Best | None = None
     pending: list[Checkpoint] = []
+    stop = False
     for checkpoint in _checkpoints(env, config, seed, restored, on_compiling, run_dir):
+        if score and restored and checkpoint.step == restored.step:
+            best = _best_saved(run_dir, restored, score)  # here: its function compiles as that of the training does
         if checkpoint.step not in checkpoint_steps(run_dir):
             save_checkpoint(run_dir, *checkpoint)
             thin_checkpoints(run_dir, config.keep, best and best.step)
         pending.append(checkpoint)
-        stop = False
         if checkpoint.metrics:  # the start is evaluated with the first epoch: the evaluation compiles until then
             stop = [on_evaluation(each.step, each.params, each.metrics) for each in pending][-1]
             if score:
-                best = _better(best, pending, score)
+                best = _better(best, pending, score)  # after the evaluation of the same parameters
             pending.clear()
         if checkpoint.step < config.total_steps:  # a finished training is not interrupted: there is nothing to resume
             signals.check()
         if stop:
             break
-    return (best.step, best.params) if best else (checkpoint.step, checkpoint.params)
+    return (best.step, best.params) if best and not stop else (checkpoint.step, checkpoint.params)
 
 
 def _better(best: _Best | None, checkpoints: Iterable[Checkpoint], score: Score) -> _Best | None:
@@ -140,9 +142,12 @@ def _best_saved(run_dir: Path, restored: Checkpoint, score: Score) -> _Best | No
     best = None
     for step in checkpoint_steps(run_dir):
         if step < restored.step:
-            with contextlib.suppress(DamagedCheckpoint):
+            try:
                 saved = Checkpoint(*load_checkpoint(run_dir, restored.params, step), None, {})
-                best = _better(best, [saved], score)
+            except DamagedCheckpoint as error:
+                print(f"warning: {error}; it cannot be the result", file=sys.stderr)
+                continue
+            best = _better(best, [saved], score)
     return best
 
 
