@@ -29,6 +29,8 @@ SETTINGS = {
     "hidden_layers": [8], "num_timesteps": 2 * BATCHES * 80, "evaluations": 2,
 }  # fmt: skip
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def diverged(tmp_path_factory):
@@ -52,7 +54,6 @@ def diverged(tmp_path_factory):
         yield run_dir, trainer
 
 
-@pytest.mark.slow
 def test_the_first_bad_batch_is_found(diverged):
     """The update after the one with the huge rate has a value loss beyond float32."""
     run_dir, trainer = diverged
@@ -107,7 +108,6 @@ def test_a_replay_reproduces_the_divergence(diverged, shown):
     assert re.search(r"qvel \[rad/s\] │ +\d\S* │", output) and re.search(r"learning_rate +│ +0.001 │", output)
 
 
-@pytest.mark.slow
 def test_a_replay_that_is_finite_says_so(diverged, shown, monkeypatch):
     monkeypatch.setattr(training, "_learning_rate", lambda settings, progress: lambda count: settings.learning_rate)
     assert "replay on cpu: does not reproduce it, all is finite\n" in shown(diverged[0] / FILE)

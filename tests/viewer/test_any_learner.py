@@ -19,6 +19,8 @@ from tests.helpers.original_model import ur_like
 TICK = 1 / 30
 POSE = np.array([0.4, 0.6, -0.3, -1.2, 0.5, 1.0, 0.2], np.float32)  # of the expert [rad]
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def mapper():
@@ -76,7 +78,6 @@ def test_the_choices_are_the_named_learners_and_each_arm_without_locks(choices):
     assert shown_preset(presets, 1, {"a": 0.1}).name == "six"
 
 
-@pytest.mark.slow
 def test_arms_locks_and_weights_change_without_compiling(live, choices):
     rng, shown = np.random.default_rng(0), set()
     settle(live)
