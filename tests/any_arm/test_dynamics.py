@@ -145,6 +145,7 @@ def test_every_lock_mask_of_the_panda_is_the_model_without_these_joints(x64):
         assert not actual[:, :7][~np.stack(free)].any() and not actual[:, 7:].any()
 
 
+@pytest.mark.slow
 def test_load_scales_masses_inertias_and_damping(x64, batch):
     mass, damping = 1.2, 0.8
     factors = np.full(FEW, mass), np.full(FEW, damping)

@@ -171,6 +171,7 @@ def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path, expert):
     assert json.loads(json_file.read_text())["joints"] == [f"joint{i}" for i in range(1, 8)]
 
 
+@pytest.mark.slow
 def test_a_description_is_the_arm(tmp_path):
     mapper = any_arm_run(tmp_path / "run")
     arm = mapper.arrays("panda4dof")

@@ -81,6 +81,7 @@ def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
     assert shown["holding the start pose"][0] == pytest.approx(float(stretched), abs=ROUNDING)
 
 
+@pytest.mark.slow
 def test_retargeted_motions_are_shown_as_they_are(files):
     clip = prepare_clip(RenderConfig(**files, demonstration=1)).compute()
     env = env_config("planar4dof")

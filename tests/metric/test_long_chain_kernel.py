@@ -112,6 +112,7 @@ def test_a_step_crosses_no_more_joints_than_it_must():
     assert len(joints_crossed(LONG_ARMS, overlap, PAPER_WEIGHTS)) == np.count_nonzero(overlap)
 
 
+@pytest.mark.slow
 def test_the_kernel_gives_zero_with_gradients_of_zero_at_a_match(long_kernel):
     arm = panda()
     distance = jax.vmap(jax.value_and_grad(motion_distance(arm, arm, 2 * np.eye(7), ALL_WEIGHTS), ARGUMENTS))

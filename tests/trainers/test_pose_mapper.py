@@ -151,6 +151,7 @@ def test_evaluation_poses_are_not_training_poses(tmp_path):
     assert not np.array_equal(jobs[0]._poses["train"], jobs[1]._poses["train"])
 
 
+@pytest.mark.slow
 def test_limited_joints_stay_within_their_limits():
     model = make_model(env_config("panda4dof", limits="hardware"), PoseMapperConfig(**SMALL).resolve())
     large = jax.tree.map(lambda x: 10 * x, model.init(jax.random.key(0)))  # most outputs near their ends
@@ -163,6 +164,7 @@ def test_limited_joints_stay_within_their_limits():
         mapper(np.array([3.0, 0, 0, -1, 0, 1, 0]))
 
 
+@pytest.mark.slow
 def test_weights_decay_and_biases_do_not():
     settings = {**SMALL, "learning_rate": 1e-2, "final_learning_rate": 1.0, "weight_decay": 0.5}
     model = make_model(env_config("planar4dof"), PoseMapperConfig(**settings).resolve())
