@@ -154,8 +154,11 @@ def measure(bundle: Bundle, motions: int, awake: bool = False, core: int | None 
 
 
 def main() -> None:
-    options = make_parser("deploy", __doc__, bundle=str, motions=20, awake=False, policy_core=int).parse_args()
+    parser = make_parser("deploy", __doc__, bundle=str, motions=20, awake=False, policy_core=int)
+    options = parser.parse_args()
     core = min(os.sched_getaffinity(0))
+    if options.policy_core == core:
+        parser.error(f"--policy-core: expected another core than that of the inner loop, got {core}")
     os.sched_setaffinity(0, {core})
     with tempfile.TemporaryDirectory() as folder:
         bundle = load_bundle(options.bundle) if options.bundle else untrained_bundle(Path(folder))

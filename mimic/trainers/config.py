@@ -70,7 +70,7 @@ PRESETS |= {name: {**PRESETS[base], **_OF_DRAWN_ARMS} for name, base in zip(_DRA
 PRESETS |= {name: {**PRESETS[base], **_OF_INNER_LOOP} for name, base in zip(_INNER_LOOP, _ONE_ARM, strict=True)}
 PRESETS["any_arm_cpu"] |= {"num_timesteps": 600_000, "evaluations": 5}  # eleven minutes on two cores
 PRESETS["any_arm"] |= {"num_timesteps": 30_000_000}  # 0.6 million arms; from 12 to 22 million steps on nothing changed
-# The smaller network costs 0.04 points of the gap, and its evaluation a quarter less time on a robot's computer.
+# Layers twice as wide have about the same gap (docs/hardware_world.md), and a robot's computer takes longer for them.
 PRESETS["inner_loop"] |= {"num_timesteps": 120_000_000, "hidden_layers": [256, 128]}
 # Factor on the number of evaluations with a target gap, so that training ends soon after the gap is reached: an
 # evaluation takes less time than the steps between two evaluations.
