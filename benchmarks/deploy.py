@@ -3,20 +3,18 @@
 A period of the inner loop lasts 1 ms. It is timed from a state to its torque, with the checks of the measurement, which
 is what a robot waits for; and to the end of its computation, with a part of the check of a target. The policy is timed
 in its own process, at the rate at which the inner loop asks it: its evaluation, and from sending an observation to the
-answer, where it also waits for the core. It shares the core of the inner loop; with `--policy-core N` it has core N for
-itself and keeps it busy.
+answer, where it also waits for the core. Together are the time to the torque at a tick and the evaluation of its
+observation. The policy shares the core of the inner loop; with `--policy-core N` it has core N for itself and keeps it
+busy.
 Wall times include what other processes on the core cost; CPU times do not, but for what those evict from the caches.
 The last row is a loop of Python alone, which is as long each time: what its p99.9 is above its p50 is the machine's.
 
-With `--awake` a process of the lowest priority keeps the core from halting between the periods, as a kernel with
-idle=poll does: a virtual machine may lose a core that halts to another one. It yields to every other process.
+With `--awake` a process of the lowest priority keeps the core of the inner loop from halting between the periods, as
+`cores` of `mimic.deploy.run_controller` does. The loop of Python has it too.
 """
 
-import contextlib
 import dataclasses
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -27,6 +25,7 @@ import numpy as np
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
 from mimic.deploy.bundle import Bundle, load_bundle
+from mimic.deploy.cores import awake_core
 from mimic.deploy.fake_robot import FakeRobot
 from mimic.deploy.policy_process import PolicyProcess
 from mimic.deploy.runner import missed_periods, run_controller
@@ -36,7 +35,6 @@ _COLUMNS = " ".join(
     ["what count", *(f"{kind}_{name}:.3f" for kind in ("cpu", "wall") for name in ("p50", "p99", "p999")), "missed"]
 )
 _LOOP, _LOOPS = 2000, 5000  # additions of a loop, and periods of it
-_AWAKE = "import os; os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0)); exec('while True: pass')"
 
 
 def untrained_bundle(folder: Path) -> Bundle:
@@ -100,24 +98,28 @@ def _row(what: str, times: _Times, **more: int) -> Row:
     }
 
 
-def periods(bundle: Bundle, motions: int, core: int | None) -> Iterator[Row]:
+def periods(bundle: Bundle, motions: int, core: int | None, policy_core: int | None) -> Iterator[Row]:
     """Periods of motions on a fake robot in real time, and the evaluations of the policy in its own process."""
-    latency, loop, policy, answer = _Times(), _Times(), _Times(), _Times()
+    latency, loop, policy, both, answer = _Times(), _Times(), _Times(), _Times(), _Times()
     missed, interventions = 0, 0
     for motion in range(motions):
         index = motion % len(bundle.expert)
-        robot, connection = _robot(bundle), PolicyProcess(bundle, index, core=core)
-        report = run_controller(robot, bundle, index, policy=connection)
+        with awake_core(core):
+            robot, connection = _robot(bundle), PolicyProcess(bundle, index, core=policy_core)
+            report = run_controller(robot, bundle, index, policy=connection)
         assert not report.cause, report.cause
         latency.add(report.latency_s, [])
         loop.add(report.wall_s, report.cpu_s)
         policy.add(connection.wall_s[1:], connection.cpu_s[1:])  # the first has no tick before it
+        ticks = zip(connection.ticks[1:], connection.wall_s[1:], strict=True)
+        both.add([report.latency_s[tick * bundle.periods] + seconds for tick, seconds in ticks], [])
         answer.add(connection.answer_s[1:], [])
         missed += missed_periods(robot.states)
         interventions += sum(report.interventions.values())
     yield _row("inner loop and safety layer, to the torque", latency)
     yield _row("to the end of the period", loop, missed=missed, interventions=interventions)
     yield _row("policy, in its own process", policy)
+    yield _row("torque and policy of a tick, together", both)
     yield _row("from sending an observation to its answer", answer)
 
 
@@ -137,19 +139,10 @@ def _priority() -> int:
     return os.sched_getparam(0).sched_priority
 
 
-@contextlib.contextmanager
-def _core_awake() -> Iterator[None]:
-    """Context in which the core of this process does not halt."""
-    with subprocess.Popen([sys.executable, "-c", _AWAKE]) as process:
-        try:
-            yield
-        finally:
-            process.kill()
-
-
-def measure(bundle: Bundle, motions: int, awake: bool = False, core: int | None = None) -> Iterator[Row]:
-    with _core_awake() if awake else contextlib.nullcontext():
-        yield from periods(bundle, motions, core)
+def measure(bundle: Bundle, motions: int, core: int | None, policy_core: int | None) -> Iterator[Row]:
+    """Rows of the table; `core` of the inner loop does not halt."""
+    yield from periods(bundle, motions, core, policy_core)
+    with awake_core(core):
         yield python_loop()
 
 
@@ -162,7 +155,7 @@ def main() -> None:
     os.sched_setaffinity(0, {core})
     with tempfile.TemporaryDirectory() as folder:
         bundle = load_bundle(options.bundle) if options.bundle else untrained_bundle(Path(folder))
-        rows = measure(bundle, options.motions, options.awake, options.policy_core)
+        rows = measure(bundle, options.motions, core if options.awake else None, options.policy_core)
         content = {"unit": "ms", "real_time_priority": _priority()}
         content |= {"awake": options.awake, "policy_core": options.policy_core}
         collect(options, rows, "rows", _COLUMNS, **content)

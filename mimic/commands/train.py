@@ -252,11 +252,11 @@ def _evaluate(
     with stopwatch.stage("evaluate"):
         outcome = trainer.evaluate(params)
         metrics = {**trainer.metrics(outcome), **trainer.details(outcome), **trainer.cross_check(params)}
+    trainer.save_outcome(run_dir, outcome)
+    report = make_report(config, trainer, metrics, stopwatch, steps, trained)
     for step in checkpoint_steps(run_dir):  # the last checkpoint is the result
         if step > steps:
             delete_checkpoint(run_dir, step)
-    trainer.save_outcome(run_dir, outcome)
-    report = make_report(config, trainer, metrics, stopwatch, steps, trained)
     write_report(run_dir, report)
     return report
 

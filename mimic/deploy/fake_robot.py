@@ -43,10 +43,10 @@ class FakeRobot:
 
     def read(self) -> RobotState:
         """See `Driver`."""
-        self._move()  # here, as a robot does this by itself while its controller computes
-        self._check()
         if self._is_paced:
             self._wait()
+        self._move()  # after the wait: the controller's other processes may use the core until then
+        self._check()
         time_s = (self._periods + self._missed) * PERIOD
         state = RobotState(time_s, self._qpos.copy(), self._qvel.copy(), self._torque.copy())
         self.states.append(state)
@@ -76,12 +76,13 @@ class FakeRobot:
     def _wait(self) -> None:
         now = time.perf_counter()
         self._started = self._started or now
-        due = self._started + self._periods * PERIOD
+        elapsed = (self._periods + (self._command is not None)) * PERIOD  # at the end of the commanded period
+        due = self._started + elapsed
         if now < due:
             time.sleep(due - now)
         else:  # periods that were missed are counted, and not made up for
             self._missed += int((now - due) / PERIOD)
-            self._started = now - self._periods * PERIOD
+            self._started = now - elapsed
 
     def _check(self) -> None:
         lower, upper = self._limits.position.T

@@ -8,6 +8,7 @@ process rehearses: before an observation is due, it computes its last answer aga
 """
 
 import contextlib
+import errno
 import gc
 import os
 import signal
@@ -24,6 +25,7 @@ import numpy as np
 
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import Bundle, load_bundle
+from mimic.deploy.cores import check_core
 from mimic.deploy.sessions import Policy
 
 _OBSERVATION = struct.Struct("<qd")  # the tick and the time at which it is sent [s]; then the motions follow
@@ -83,10 +85,11 @@ class PolicyProcess:
       motion: index of the motion.
       start_s: maximum time until the process is ready [s].
       core: a core that this process keeps busy; until `close`, the thread that creates it runs on its other cores.
-        None: any core, shared with other processes. Linux only.
+        None: any core of this thread, shared with other processes. Linux only.
 
     Attributes:
-      answer_s: times from sending an observation to its answer, of the actions that were received [s].
+      ticks: of the actions that were received.
+      answer_s: times from sending an observation to its answer, of these actions [s].
       wall_s, cpu_s: times of these evaluations [s].
 
     Raises:
@@ -96,7 +99,9 @@ class PolicyProcess:
 
     def __init__(self, bundle: Bundle, motion: int, start_s: float = 30.0, core: int | None = None):
         if core is not None:
-            _check_core(core)
+            check_core(core)
+            if os.sched_getaffinity(0) == {core}:
+                raise ValueError(f"core: expected another core than that of the inner loop, got {core}")
         self._socket, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         arguments = [str(bundle.folder), str(motion), str(other.fileno()), str(os.getpid())]
         arguments += [] if core is None else ["own core"]
@@ -106,6 +111,7 @@ class PolicyProcess:
                 [sys.executable, "-c", _COMMAND, *arguments], pass_fds=[other.fileno()], env=environment
             )
         self._size = bundle.action_size
+        self.ticks: list[int] = []
         self.answer_s: list[float] = []
         self.wall_s: list[float] = []
         self.cpu_s: list[float] = []
@@ -139,6 +145,7 @@ class PolicyProcess:
         if message is None or len(message) != _ANSWER.size + 4 * self._size:
             return None
         tick, answer, wall, cpu = _ANSWER.unpack_from(message)
+        self.ticks.append(tick)
         self.answer_s.append(answer)
         self.wall_s.append(wall)
         self.cpu_s.append(cpu)
@@ -159,7 +166,9 @@ class PolicyProcess:
         try:
             os.sched_setaffinity(self._process.pid, {core})
         except OSError as error:
-            raise ValueError(f"core: expected a core that processes may use, got {core}") from error
+            if error.errno != errno.EINVAL:
+                raise
+            raise ValueError(f"core: expected one that processes may use, got {core}") from error
         allowed = os.sched_getaffinity(0)
         if core in allowed:
             os.sched_setaffinity(0, allowed - {core})
@@ -174,16 +183,6 @@ class PolicyProcess:
                     return
         raise RuntimeError(f"policy: expected its process to be ready within {start_s:g} s, exit code "
                            f"{self._process.returncode}")  # fmt: skip
-
-
-def _check_core(core: int) -> None:
-    """Raises a ValueError for a core that a process cannot have for itself."""
-    if not hasattr(os, "sched_setaffinity"):
-        raise ValueError(f"core: expected None where a process cannot choose its core (Linux only), got {core}")
-    if core < 0:
-        raise ValueError(f"core: expected a number of a core, from 0 on, got {core}")
-    if os.sched_getaffinity(0) == {core}:
-        raise ValueError(f"core: expected another core than that of the inner loop, got {core}")
 
 
 def main(folder: str, motion: str, descriptor: str, parent: str, own_core: str = "") -> None:

@@ -15,6 +15,7 @@ from mimic.control.joint_control import PERIOD, Reference
 from mimic.deploy.bundle import Bundle
 from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
+from mimic.deploy.cores import awake_core
 from mimic.deploy.driver import Driver, RobotAbort, RobotState
 from mimic.deploy.policy_process import PolicyProcess
 from mimic.deploy.safety import INTERVENTIONS, INVALID, LATE, SafetyLayer
@@ -87,7 +88,7 @@ def run_controller(
     *,
     config: SafetyConfig | None = None,
     policy: PolicyConnection | None = None,
-    policy_core: int | None = None,
+    cores: tuple[int, int] | None = None,
 ) -> Report:
     """Runs a motion on a robot, from its start pose until the arm is at rest again.
 
@@ -100,30 +101,34 @@ def run_controller(
       motion: index or name of the motion.
       config: thresholds of the safety layer.
       policy: connection to the policy; default: the bundle's policy in a new process.
-      policy_core: of the new process, see `PolicyProcess`.
+      cores: of the inner loop and of the policy's new process, which may be the same; they do not halt during the run,
+        see `awake_core` and `PolicyProcess`. Linux only. Default: any cores.
 
     Raises:
-      ValueError: there is no such motion or core, a core for a given policy, or the bundle's mode has no braking path.
+      ValueError: there is no such motion or core, cores and a given policy, or the bundle's mode has no braking path.
       RuntimeError: the policy's process does not start.
+      OSError: these cores are not allowed.
       KeyboardInterrupt: Ctrl-C, after the arm has been stopped.
     """
-    if policy is not None and policy_core is not None:
-        raise ValueError(f"policy_core: expected None with a given policy, got {policy_core}")
+    if policy is not None and cores is not None:
+        raise ValueError(f"cores: expected None with a given policy, got {cores}")
+    core, policy_core = cores or (None, None)
     index = bundle.motion_index(motion)
     layer = SafetyLayer(bundle, Clearance(bundle), config=config)
-    connection = policy or PolicyProcess(bundle, index, core=policy_core)
-    loop = _Loop(driver, bundle, layer, connection)
-    try:
-        with _interrupts_noted(loop), _without_collection():
-            loop.run(bundle.start_poses[index])
-    except RobotAbort as abort:
-        return loop.report(abort.cause, aborted=True)
-    finally:
+    with awake_core(core):
+        connection = policy or PolicyProcess(bundle, index, core=None if policy_core == core else policy_core)
+        loop = _Loop(driver, bundle, layer, connection)
         try:
-            with contextlib.suppress(RobotAbort):
-                driver.stop()  # first: meanwhile the robot gets no commands
+            with _interrupts_noted(loop), _without_collection():
+                loop.run(bundle.start_poses[index])
+        except RobotAbort as abort:
+            return loop.report(abort.cause, aborted=True)
         finally:
-            connection.close()
+            try:
+                with contextlib.suppress(RobotAbort):
+                    driver.stop()  # first: meanwhile the robot gets no commands
+            finally:
+                connection.close()
     return loop.report(str(layer.cause[0]), aborted=False)
 
 

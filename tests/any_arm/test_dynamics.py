@@ -15,7 +15,7 @@ from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.arms.arm import ArmConfig, build_arm
 from tests.any_arm.cases import Batch, acceleration, assert_near, looped, padded, random_source, unrolled
 
-COUNT, FEW = 500, 64
+COUNT, FEW = 200, 64
 
 
 FORMS = {name: jax.jit(jax.vmap(function)) for name, function in {"kernel": unrolled, "looped": looped}.items()}

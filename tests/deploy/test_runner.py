@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from mimic.control.joint_control import Reference
+from mimic.deploy.cores import awake_core
 from mimic.deploy.driver import RobotAbort
 from mimic.deploy.fake_robot import FakeRobot
 from mimic.deploy.policy_process import LocalPolicy, PolicyProcess
@@ -101,18 +102,102 @@ def test_a_policy_with_a_core_of_its_own_keeps_it_busy_and_alone(bundle):
 
 
 @needs_two_cores
-def test_a_core_that_the_policy_cannot_have_is_rejected(bundle, monkeypatch):
+def test_a_core_that_nothing_can_have_is_rejected(bundle, monkeypatch):
     cores = os.sched_getaffinity(0)
-    with pytest.raises(ValueError, match="core: expected a core that processes may use, got 1000"):
-        run_controller(robot(bundle), bundle, policy_core=1000)
-    with pytest.raises(ValueError, match="core: expected a number of a core, from 0 on, got -1"):
-        run_controller(robot(bundle), bundle, policy_core=-1)
-    with pytest.raises(ValueError, match="policy_core: expected None with a given policy, got 1"):
-        run_controller(robot(bundle), bundle, policy=LocalPolicy(bundle, 0), policy_core=1)
+    first = min(cores)
+    for pair, expected in (
+        ((first, 1000), "one that processes may use, got 1000"),
+        ((first, -1), "a number of a core, from 0 on, got -1"),
+        ((1000, first), rf"one that this thread may use, of \[{first}.*\], got 1000"),
+        ((-1, first), "a number of a core, from 0 on, got -1"),
+    ):
+        with pytest.raises(ValueError, match=f"core: expected {expected}"):
+            run_controller(robot(bundle), bundle, cores=pair)
+    with pytest.raises(ValueError, match=r"cores: expected None with a given policy, got \(0, 1\)"):
+        run_controller(robot(bundle), bundle, policy=LocalPolicy(bundle, 0), cores=(0, 1))
     assert os.sched_getaffinity(0) == cores
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
     with pytest.raises(ValueError, match="core: expected another core than that of the inner loop, got 0"):
         PolicyProcess(bundle, 0, core=0)
+
+
+def children():
+    """Numbers of the processes that this thread has started and that have not ended."""
+    return set(map(int, pathlib.Path("/proc/thread-self/children").read_text().split()))
+
+
+def status(pid):
+    """State of a process, as "R" for running or ready to; "Z" where it has ended."""
+    try:
+        return pathlib.Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return "Z"
+
+
+class Watching(FakeRobot):
+    """A fake robot that notes in each read the cores of this thread, and the states of the processes it has started."""
+
+    def __init__(self, *arguments, **settings):
+        super().__init__(*arguments, **settings)
+        self.before, self.cores, self.seen, self.processes = children(), [], [], {}
+
+    def read(self):
+        self.cores.append(os.sched_getaffinity(0))
+        self.processes = self.processes or {
+            pid: (os.sched_getscheduler(pid), os.sched_getaffinity(pid)) for pid in children() - self.before
+        }
+        self.seen.append({pid: status(pid) for pid in self.processes})
+        return super().read()
+
+
+@needs_two_cores
+@pytest.mark.parametrize("is_shared", [True, False])
+def test_the_core_of_the_inner_loop_does_not_halt_during_a_run(bundle, is_shared):
+    cores = os.sched_getaffinity(0)
+    core = min(cores)
+    policy_core = core if is_shared else max(cores)
+    fake = Watching(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0, is_paced=True)
+    report = run_controller(fake, bundle, cores=(core, policy_core))
+    assert report.is_complete
+    assert all(used == {core} for used in fake.cores) and os.sched_getaffinity(0) == cores
+    (lowest,) = (pid for pid, (scheduler, _) in fake.processes.items() if scheduler == os.SCHED_IDLE)
+    (policy,) = fake.processes.keys() - {lowest}
+    assert fake.processes[lowest][1] == {core} and fake.processes[policy][1] == {policy_core}
+    states = [seen[lowest] for seen in fake.seen]
+    assert states.count("R") > 0.5 * len(states)  # it never waits, but for its start
+    assert children() == fake.before
+
+
+@needs_two_cores
+def test_cores_are_restored_after_a_run_of_a_policy_with_its_own_core(bundle):
+    cores = os.sched_getaffinity(0)
+    policy = PolicyProcess(bundle, 0, core=max(cores))
+    with awake_core(min(cores)):
+        run_controller(robot(bundle), bundle, policy=policy)
+    assert os.sched_getaffinity(0) == cores
+
+
+@needs_two_cores
+def test_what_keeps_a_core_awake_ends_with_a_killed_parent():
+    code = """
+        import os, time
+        from mimic.deploy.cores import awake_core
+        with awake_core(min(os.sched_getaffinity(0))):
+            (child,) = open("/proc/thread-self/children").read().split()
+            print(child, flush=True)
+            time.sleep(60)
+    """
+    command = [sys.executable, "-c", textwrap.dedent(code)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY) as process:
+        assert process.stdout is not None
+        child = process.stdout.readline().strip()
+        was = status(child) if child else "Z"
+        process.kill()
+    assert was != "Z"
+    end = time.monotonic() + 20
+    while status(child) != "Z" and time.monotonic() < end:
+        time.sleep(0.05)
+    assert status(child) == "Z"
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="Linux only")

@@ -63,7 +63,7 @@ def check_safe(episodes):
 
 @pytest.mark.parametrize("mode", ["joint_velocity", pytest.param("joint_position", marks=pytest.mark.slow)])
 def test_random_actions_are_safe(tmp_path, mode):
-    check_safe(adversarial_episodes(tmp_path / "bundle", mode, 20, seed=5))
+    check_safe(adversarial_episodes(tmp_path / "bundle", mode, 8, seed=5))
 
 
 @pytest.mark.slow
