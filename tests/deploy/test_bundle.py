@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mimic.control.joint_control import Reference
-from mimic.deploy.bundle import load_bundle
+from mimic.deploy.bundle import POLICY, load_bundle
 from mimic.deploy.clearance import Clearance
-from mimic.deploy.sessions import Policy
+from mimic.deploy.sessions import Policy, open_session
 from tests.helpers import bundles
 
 
@@ -29,14 +29,13 @@ def test_a_bundle_is_read(bundle):
 
 def test_a_policy_observes_what_it_was_exported_for(bundle, monkeypatch):
     """Its last actions, the newest first, and the expert at the next ticks, the last one repeated at the end."""
-    feeds = []
+    feeds, policy = [], Policy(bundle, [1, 0])
 
     class Spy:
-        def run(self, names, feed):
-            feeds.append(feed)
-            return [np.full((2, 7), len(feeds), np.float32)]
+        def run_with_iobinding(self, _):
+            feeds.append({name: values.copy() for name, values in policy._inputs.items()})
+            policy._action[:] = len(feeds)
 
-    policy = Policy(bundle, [1, 0])
     monkeypatch.setattr(policy, "_session", Spy())
     rows = np.zeros((2, 7))
     for tick in (0, 1, bundle.ticks):
@@ -49,6 +48,31 @@ def test_a_policy_observes_what_it_was_exported_for(bundle, monkeypatch):
     step = 2 * np.pi * bundles.CONTROL_DT
     np.testing.assert_allclose(phases[1], step * np.array([1, 2, 3]), rtol=1e-6)
     np.testing.assert_allclose(phases[2], step * bundle.ticks, rtol=1e-6)
+
+
+def test_a_policy_is_its_graph(tmp_path):
+    """As onnxruntime evaluates it with arguments and results, in a row of different observations."""
+
+    def of_all(values):
+        vectors = (values[name] for name in ("qpos", "qvel", "reference_qpos", "reference_qvel"))
+        own = sum((i + 1) * vector for i, vector in enumerate(vectors))
+        return 0.01 * own + 0.1 * values["past_actions"][7:14] + 0.01 * values["features"].sum()
+
+    bundle = bundles.make_bundle(tmp_path / "bundle", of_all)
+    policy, rng = Policy(bundle, [1, 0]), np.random.default_rng(0)
+    past = np.zeros((2, 7 * bundle.past_actions), np.float32)
+    sizes = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), 7)
+    sizes |= {"past_actions": past.shape[1], "features": bundle.features}
+    session = open_session(bundle.folder / POLICY, sizes, {"action": 7})
+    for tick in range(4):
+        values = rng.normal(size=(4, 2, 7)).astype(np.float32)
+        action = policy.act(tick, values[0], values[1], Reference(values[2], values[3], values[3]))
+        features = policy._inputs["features"]
+        feed = dict(zip(sizes, [*values, past, features], strict=True))
+        (expected,) = session.run(["action"], feed)
+        np.testing.assert_array_equal(action, expected)
+        assert 0 < np.abs(action).max() < 1 and not np.array_equal(action[0], action[1])
+        past = np.concatenate([expected, past[:, :-7]], axis=1)
 
 
 def test_the_clearance_is_that_of_the_arm(bundle):
