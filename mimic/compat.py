@@ -9,7 +9,7 @@ import io
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,17 @@ def prepare_cpu() -> None:
                      "without it kinematics run several hundred times slower", _SLOW_CPU_FLAG)  # fmt: skip
         return
     os.environ["XLA_FLAGS"] = f"{flags} {_SLOW_CPU_FLAG}".strip()
+
+
+def scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
+    """Numbers of the constants and of the carried values of a `jax.lax.scan`, by the parameters of its equation.
+
+    JAX 0.11 has groups of arguments instead of `num_consts` and `num_carry`: constants, carried values, and the rest.
+    """
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carried, _ = params["ft_in"].unpack()
+    return len(list(consts)), len(list(carried))
 
 
 def import_mujoco() -> None:

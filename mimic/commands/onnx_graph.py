@@ -28,6 +28,7 @@ from mimic.commands.onnx_operations import (
     read_value,
     used_nodes,
 )
+from mimic.compat import scan_sizes
 
 OPSET, IR_VERSION = 18, 8  # of 2022: reductions take axes as inputs; supported by all runtimes since then
 _TINY = np.float32(1e-30)  # replaces a divisor of 0: the quotient has the same arc tangent
@@ -127,6 +128,8 @@ class _Graph:
         name, shapes = primitive.name, [variable.aval.shape for variable in equation.outvars]
         if name == "split":
             return self._split(inputs[0], shapes, params["axis"])
+        if name == "unstack":
+            return self._unstack(inputs[0], shapes, params["axis"])
         if name == "sort":
             return self._sort(inputs, shapes, params)
         if name in ("copy", "optimization_barrier", "stop_gradient"):
@@ -138,7 +141,7 @@ class _Graph:
     def _loop(self, equation: Any, inputs: list[Value], is_read: Sequence[bool]) -> list[Value | None]:
         """A loop over a constant number of steps: what it carries, at its end; None for what is not read."""
         params, body = equation.params, equation.params["jaxpr"]
-        first, count = params["num_consts"], params["num_carry"]
+        first, count = scan_sizes(params)
         consts, carried = inputs[:first], inputs[first:]
         if len(carried) != count or any(is_read[count:]):
             raise NotImplementedError("onnx: expected a loop without values for each step")
@@ -228,6 +231,10 @@ class _Graph:
         inputs = [self.name(value), self.name(ints([shape[axis] for shape in shapes]))]
         self.nodes.append(helper.make_node("Split", inputs, names, axis=axis + 1))
         return [Tensor(name, shape) for name, shape in zip(names, shapes, strict=True)]
+
+    def _unstack(self, value: Value, shapes: list[tuple[int, ...]], axis: int) -> list[Value]:
+        parts = self._split(value, [(*shape[:axis], 1, *shape[axis:]) for shape in shapes], axis)
+        return [Tensor(self._reshape(part, shape), shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def _sort(self, inputs: list[Value], shapes: list[tuple[int, ...]], params: Mapping[str, Any]) -> list[Value]:
         """Arrays in the ascending order of the first one."""
@@ -397,4 +404,6 @@ _RULES: dict[str, Callable[[_Graph, list[Value], tuple[int, ...], Mapping[str, A
 
 
 def _supported() -> list[str]:
-    return sorted([*UNARY, *BINARY, *REDUCTIONS, *_RULES, "expand_dims", "reshape", "scan", "sort", "split", "squeeze"])
+    return sorted(
+        [*UNARY, *BINARY, *REDUCTIONS, *_RULES, "expand_dims", "reshape", "scan", "sort", "split", "squeeze", "unstack"]
+    )

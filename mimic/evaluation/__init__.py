@@ -1,1 +1,5 @@
 """Evaluation of controllers on demonstrations: rollouts, metrics, other controllers, plots."""
+
+from mimic import compat
+
+compat.import_mujoco()
