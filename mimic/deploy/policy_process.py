@@ -204,34 +204,50 @@ def _answer_all(
 ) -> None:
     """Answers observations, and rehearses before each, as long as the parent lives."""
     connection.settimeout(_WATCH)
-    message, due = b"", 0.0
+    answers, due = _Answers(policy), 0.0
     while os.getppid() == parent:
         try:
-            message = connection.recv(_MAX_MESSAGE)
+            connection.recvmsg_into(answers.message)
         except (TimeoutError, BlockingIOError):
             is_early = time.perf_counter() < due - rehearsals.until
             if is_early:
-                _answer(policy, message, bundle.num_joints, is_rehearsal=True)
+                answers.compute()
             connection.settimeout(rehearsals.pause if is_early else _WATCH)
             continue
         except OSError:
             return
         received = time.perf_counter()
         with contextlib.suppress(OSError):
-            connection.send(_answer(policy, message, bundle.num_joints))
+            connection.send(answers.compute())
+        answers.expect_next()
         due = received + bundle.control_dt
         connection.settimeout(max(received + rehearsals.rest * bundle.control_dt - time.perf_counter(), 1e-4))
 
 
-def _answer(policy: Policy, message: bytes, joints: int, *, is_rehearsal: bool = False) -> bytes:
-    """The message with the action for an observation."""
-    wall, cpu = time.perf_counter(), time.thread_time()
-    tick, sent = _OBSERVATION.unpack_from(message)
-    values = np.frombuffer(message, np.float32, offset=_OBSERVATION.size).reshape(4, 1, joints)
-    reference = Reference(values[2], values[3], values[3])
-    action = policy.act(tick, values[0], values[1], reference, is_rehearsal=is_rehearsal).astype(np.float32)
-    now = time.perf_counter()
-    return _ANSWER.pack(tick, now - sent, now - wall, time.thread_time() - cpu) + action.tobytes()
+class _Answers:
+    """The answers of a policy to the observations of one robot.
+
+    Attributes:
+      message: where an observation is received, as `PolicyProcess.send` wrote it: its head, and what is observed.
+    """
+
+    def __init__(self, policy: Policy):
+        self._policy, self._head = policy, bytearray(_OBSERVATION.size)
+        self.message = self._head, policy.observed.data
+
+    def compute(self) -> bytes:
+        """The message with the action for the observation; a rehearsal of the next answer calls it too."""
+        cpu, wall = time.thread_time(), time.perf_counter()
+        tick, sent = _OBSERVATION.unpack_from(self._head)
+        action = self._policy.evaluate(tick)
+        now = time.perf_counter()
+        return _ANSWER.pack(tick, now - sent, now - wall, time.thread_time() - cpu) + action.tobytes()
+
+    def expect_next(self) -> None:
+        """Ends a tick: its action is a past one, and rehearsals are of the next one."""
+        self._policy.remember()
+        tick, sent = _OBSERVATION.unpack_from(self._head)
+        _OBSERVATION.pack_into(self._head, 0, tick + 1, sent)
 
 
 def _yield_to_inner_loop() -> None:

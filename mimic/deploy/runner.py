@@ -170,10 +170,10 @@ class _Loop:
         wall, cpu = time.perf_counter(), time.thread_time()
         tick, since = divmod(period or 0, self._bundle.periods)  # after the end of the motion nothing is due
         is_tick = period is not None and since == 0
-        reference = self._layer.reference if is_tick else None  # of the same moment as the state
         torque = self._layer.period(state.qpos[:, None], state.qvel[:, None])
         self._driver.write(torque[:, 0])
         self._latency.append(time.perf_counter() - wall)
+        reference = self._layer.observed_reference if is_tick else None
         if self._due and not self._layer.is_checking:
             self._receive(since)
         if reference is None or self._layer.is_checking:  # at a tick only if it must: the policy may wait for this core

@@ -177,6 +177,12 @@ class SafetyLayer:
         return self._inner_loop.reference
 
     @property
+    def observed_reference(self) -> Reference:
+        """The motion that the arms tracked when their states were measured, between `period` and `work`."""
+        assert self._begun is not None
+        return joint_reference(self._begun[0], self._size)
+
+    @property
     def torque(self) -> np.ndarray:
         """The torques [joints, robots] of the last period [N m]."""
         return self._inner_loop.torque

@@ -12,6 +12,8 @@ from mimic.deploy.bundle import FEATURES, POLICY, Bundle
 if TYPE_CHECKING:
     import onnxruntime
 
+_OBSERVED = "qpos", "qvel", "reference_qpos", "reference_qvel"
+
 
 def open_session(path: Path | bytes, inputs: dict[str, int], outputs: dict[str, int]) -> "onnxruntime.InferenceSession":
     """A session on one thread.
@@ -56,39 +58,49 @@ class Policy:
     Args:
       bundle: see `load_bundle`.
       motions: indices of the motions.
+
+    Attributes:
+      observed: [4, robots, joints] measured and reference angles and velocities that `evaluate` reads.
     """
 
     def __init__(self, bundle: Bundle, motions: Sequence[int]):
-        joints, size = bundle.num_joints, bundle.action_size
+        joints, size, robots = bundle.num_joints, bundle.action_size, len(motions)
         self._features, self._row = _expert_features(bundle, motions)
-        sizes = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
-        sizes |= {"past_actions": bundle.past_actions * size, "features": bundle.features}
+        self.observed = np.zeros((4, robots, joints), np.float32)
+        self._inputs = {
+            "past_actions": np.zeros((robots, bundle.past_actions * size), np.float32),
+            "features": np.zeros((robots, bundle.features), np.float32),
+            **dict(zip(_OBSERVED, self.observed, strict=True)),
+        }
+        self._action = np.zeros((robots, size), np.float32)
+        sizes = {name: array.shape[-1] for name, array in self._inputs.items()}
         self._session = open_session(bundle.folder / POLICY, sizes, {"action": size})
-        self._inputs = {name: np.zeros((len(motions), length), np.float32) for name, length in sizes.items()}
-        self._action = np.zeros((len(motions), size), np.float32)
         self._binding = _bind(self._session, self._inputs, {"action": self._action})
-        self._last, self._size = bundle.ticks, size
+        self._tick, self._last, self._size = -1, bundle.ticks, size
 
-    def act(
-        self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference, *, is_rehearsal: bool = False
-    ) -> np.ndarray:
-        """The actions [robots, numbers] at a tick, of measured and reference motions [robots, joints].
+    def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
+        """The actions [robots, numbers] at a tick, of measured and reference motions [robots, joints]."""
+        for observed, values in zip(self.observed, (qpos, qvel, reference.qpos, reference.qvel), strict=True):
+            observed[:] = values
+        action = self.evaluate(tick).astype(float)
+        self.remember()
+        return action
 
-        A rehearsal is not among the past actions that the policy observes: it only brings code and weights into the
-        caches, so that the next call takes a fraction of the time.
-        """
-        inputs = self._inputs
-        inputs["qpos"][:] = qpos
-        inputs["qvel"][:] = qvel
-        inputs["reference_qpos"][:] = reference.qpos
-        inputs["reference_qvel"][:] = reference.qvel
-        np.take(self._features[min(tick, self._last)], self._row, axis=0, out=inputs["features"], mode="clip")
+    def evaluate(self, tick: int) -> np.ndarray:
+        """The actions [robots, numbers] at a tick, of what is observed; the next call overwrites them."""
+        if tick != self._tick:
+            features = self._features[min(tick, self._last)]
+            np.take(features, self._row, axis=0, out=self._inputs["features"], mode="clip")
+            self._tick = tick
         self._session.run_with_iobinding(self._binding)
-        past, size = inputs["past_actions"], self._size
-        if past.size and not is_rehearsal:
+        return self._action
+
+    def remember(self) -> None:
+        """Makes the last actions the newest of the past ones that the policy observes."""
+        past, size = self._inputs["past_actions"], self._size
+        if past.size:
             past[:, size:] = past[:, :-size]
             past[:, :size] = self._action
-        return self._action.astype(float)
 
 
 def _bind(

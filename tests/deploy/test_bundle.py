@@ -52,13 +52,7 @@ def test_a_policy_observes_what_it_was_exported_for(bundle, monkeypatch):
 
 def test_a_policy_is_its_graph(tmp_path):
     """As onnxruntime evaluates it with arguments and results, in a row of different observations."""
-
-    def of_all(values):
-        vectors = (values[name] for name in ("qpos", "qvel", "reference_qpos", "reference_qvel"))
-        own = sum((i + 1) * vector for i, vector in enumerate(vectors))
-        return 0.01 * own + 0.1 * values["past_actions"][7:14] + 0.01 * values["features"].sum()
-
-    bundle = bundles.make_bundle(tmp_path / "bundle", of_all)
+    bundle = bundles.make_bundle(tmp_path / "bundle", bundles.of_all)
     policy, rng = Policy(bundle, [1, 0]), np.random.default_rng(0)
     past = np.zeros((2, 7 * bundle.past_actions), np.float32)
     sizes = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), 7)

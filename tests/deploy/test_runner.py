@@ -56,20 +56,23 @@ needs_two_cores = pytest.mark.skipif(
 
 
 @pytest.mark.parametrize("has_own_core", [False, pytest.param(True, marks=needs_two_cores)])
-def test_a_policy_in_its_own_process_gives_the_same_actions(bundle, has_own_core):
+def test_a_policy_in_its_own_process_gives_the_same_actions(tmp_path, has_own_core):
     """Also where it waits for an observation for longer than a tick, and runs the network meanwhile."""
+    bundle = bundles.make_bundle(tmp_path / "bundle", bundles.of_all)
     core = max(os.sched_getaffinity(0)) if has_own_core else None
-    local, apart, zero = LocalPolicy(bundle, 1), PolicyProcess(bundle, 1, core=core), np.zeros(7)
+    local, apart, rng = LocalPolicy(bundle, 1), PolicyProcess(bundle, 1, core=core), np.random.default_rng(0)
     try:
-        for tick in range(4):
+        for tick in (0, 1, 2, 5):
+            observed = rng.normal(size=(4, 7)).astype(np.float32)
             for policy in (local, apart):
-                policy.send(tick, bundle.start_pose, zero, Reference(zero, zero, zero))
+                policy.send(tick, observed[0], observed[1], Reference(observed[2], observed[3], np.zeros(7)))
             end, received = time.monotonic() + 10, None
             while received is None and time.monotonic() < end:
                 time.sleep(0.1)
                 received = apart.receive()
             expected = local.receive()
             assert received is not None and expected is not None and received[0] == expected[0] == tick
+            assert 0.001 < np.abs(received[1]).max() < 1
             np.testing.assert_allclose(received[1], expected[1], atol=1e-6)
     finally:
         apart.close()
