@@ -6,11 +6,13 @@ in its own process, at the rate at which the inner loop asks it: its evaluation,
 answer, where it also waits for the core. Together are the time to the torque at a tick and the evaluation of its
 observation. The policy shares the core of the inner loop; with `--policy-core N` it has core N for itself and keeps it
 busy.
-Wall times include what other processes on the core cost; CPU times do not, but for what those evict from the caches.
+Wall times include what other processes on the core cost; CPU times, which the file has, do not.
 The last row is a loop of Python alone, which is as long each time: what its p99.9 is above its p50 is the machine's.
 
 With `--awake` a process of the lowest priority keeps the core of the inner loop from halting between the periods, as
-`cores` of `mimic.deploy.run_controller` does. The loop of Python has it too.
+with `cores` of `mimic.deploy.run_controller`. The loop of Python has it too. Here this process times a loop, to tell
+when the cores have their full speed: a virtual machine may share them with others. `full` is the fraction of the times
+that were measured then, and the columns after it are theirs alone.
 """
 
 import dataclasses
@@ -22,17 +24,19 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.common.core_speed import is_full_speed, loop_durations, measured_speeds
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
 from mimic.deploy.bundle import Bundle, load_bundle
-from mimic.deploy.cores import awake_core
+from mimic.deploy.driver import RobotState
 from mimic.deploy.fake_robot import FakeRobot
 from mimic.deploy.policy_process import PolicyProcess
 from mimic.deploy.runner import missed_periods, run_controller
 
-_PERCENTILES = (50, 99, 99.9)
+_PERCENTILES, _NAMES = (50, 99, 99.9), ("p50", "p99", "p999")
 _COLUMNS = " ".join(
-    ["what count", *(f"{kind}_{name}:.3f" for kind in ("cpu", "wall") for name in ("p50", "p99", "p999")), "missed"]
+    ["what count", *(f"wall_{name}:.3f" for name in _NAMES), "full:.2f", *(f"full_{name}:.3f" for name in _NAMES)]
+    + ["missed"]
 )
 _LOOP, _LOOPS = 2000, 5000  # additions of a loop, and periods of it
 
@@ -66,54 +70,68 @@ def untrained_bundle(folder: Path) -> Bundle:
     return load_bundle(folder / "bundle")
 
 
-def _robot(bundle: Bundle) -> FakeRobot:
-    return FakeRobot(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0, is_paced=True)
+class _Robot(FakeRobot):
+    """A fake robot in real time that notes when each state is read."""
+
+    def __init__(self, bundle: Bundle):
+        super().__init__(bundle.start_pose, bundle.limits, bundle.parameters.inertia, 1.0, is_paced=True)
+        self.times: list[float] = []
+
+    def read(self) -> RobotState:
+        state = super().read()
+        self.times.append(time.perf_counter())
+        return state
 
 
 @dataclasses.dataclass
 class _Times:
-    """Wall and CPU times [s] of the same events."""
+    """Wall and CPU times [s] of the same events, and durations of a loop on their cores at that time, where known."""
 
     wall: list[float] = dataclasses.field(default_factory=list)
     cpu: list[float] = dataclasses.field(default_factory=list)
-
-    def add(self, wall: list[float], cpu: list[float]) -> None:
-        self.wall += wall
-        self.cpu += cpu
+    loops: list[float] = dataclasses.field(default_factory=list)
 
 
 def _row(what: str, times: _Times, **more: int) -> Row:
-    names, wall = ("p50", "p99", "p999"), times.wall
-    seconds = {"wall": wall, **({"cpu": times.cpu} if times.cpu else {})}
-    return {
-        "what": what,
-        "count": len(wall),
-        **{
-            f"{kind}_{name}": float(1e3 * np.percentile(values, share))
-            for kind, values in seconds.items()
-            for name, share in zip(names, _PERCENTILES, strict=True)
-        },
-        "wall_max": 1e3 * max(wall),
-        **more,
-    }
+    wall = np.array(times.wall)
+    row = {"what": what, "count": len(wall), **_percentiles("wall", wall), **_percentiles("cpu", np.array(times.cpu))}
+    if times.loops:
+        is_full = is_full_speed(np.array(times.loops))
+        row |= {"full": float(np.mean(is_full)), **_percentiles("full", wall[is_full])}
+    return {**row, "wall_max": 1e3 * max(times.wall), **more}
+
+
+def _percentiles(kind: str, seconds: np.ndarray) -> Row:
+    shares = zip(_NAMES, _PERCENTILES, strict=True)
+    return {f"{kind}_{name}": float(1e3 * np.percentile(seconds, share)) for name, share in shares if len(seconds)}
 
 
 def periods(bundle: Bundle, motions: int, core: int | None, policy_core: int | None) -> Iterator[Row]:
     """Periods of motions on a fake robot in real time, and the evaluations of the policy in its own process."""
     latency, loop, policy, both, answer = _Times(), _Times(), _Times(), _Times(), _Times()
     missed, interventions = 0, 0
+    used = [] if core is None else [core, core if policy_core is None else policy_core]
     for motion in range(motions):
         index = motion % len(bundle.expert)
-        with awake_core(core):
-            robot, connection = _robot(bundle), PolicyProcess(bundle, index, core=policy_core)
+        with measured_speeds(used) as speeds:
+            robot, connection = _Robot(bundle), PolicyProcess(bundle, index, core=policy_core)
             report = run_controller(robot, bundle, index, policy=connection)
         assert not report.cause, report.cause
-        latency.add(report.latency_s, [])
-        loop.add(report.wall_s, report.cpu_s)
-        policy.add(connection.wall_s[1:], connection.cpu_s[1:])  # the first has no tick before it
-        ticks = zip(connection.ticks[1:], connection.wall_s[1:], strict=True)
-        both.add([report.latency_s[tick * bundle.periods] + seconds for tick, seconds in ticks], [])
-        answer.add(connection.answer_s[1:], [])
+        ticks = bundle.periods * np.array(connection.ticks[1:])  # the first has no tick before it
+        latency.wall += report.latency_s
+        loop.wall += report.wall_s
+        loop.cpu += report.cpu_s
+        policy.wall += connection.wall_s[1:]
+        policy.cpu += connection.cpu_s[1:]
+        both.wall += (np.array(report.latency_s)[ticks] + connection.wall_s[1:]).tolist()
+        answer.wall += connection.answer_s[1:]
+        if used:
+            of_loop, of_policy = (loop_durations(speeds[used_core], np.array(robot.times)) for used_core in used)
+            latency.loops += of_loop.tolist()
+            loop.loops += of_loop.tolist()
+            policy.loops += of_policy[ticks].tolist()
+            for times in both, answer:
+                times.loops += np.maximum(of_loop, of_policy)[ticks].tolist()
         missed += missed_periods(robot.states)
         interventions += sum(report.interventions.values())
     yield _row("inner loop and safety layer, to the torque", latency)
@@ -130,7 +148,8 @@ def python_loop() -> Row:
         time.sleep(0.0005)
         started, started_cpu = time.perf_counter(), time.thread_time()
         sum(range(_LOOP))
-        times.add([time.perf_counter() - started], [time.thread_time() - started_cpu])
+        times.wall.append(time.perf_counter() - started)
+        times.cpu.append(time.thread_time() - started_cpu)
     return _row("loop of Python alone", times)
 
 
@@ -142,7 +161,7 @@ def _priority() -> int:
 def measure(bundle: Bundle, motions: int, core: int | None, policy_core: int | None) -> Iterator[Row]:
     """Rows of the table; `core` of the inner loop does not halt."""
     yield from periods(bundle, motions, core, policy_core)
-    with awake_core(core):
+    with measured_speeds([] if core is None else [core]):
         yield python_loop()
 
 

@@ -53,7 +53,7 @@ class _Rehearsals(NamedTuple):
 
 
 # On a core of its own the process never waits, but for the rest: Linux would throttle it at real-time priority.
-_SHARED_CORE, _OWN_CORE = _Rehearsals(0.92, 0.0004, 0.0001), _Rehearsals(0.1, -0.001, 0.0)
+_SHARED_CORE, _OWN_CORE = _Rehearsals(0.7, 0.0002, 0.0001), _Rehearsals(0.1, -0.001, 0.0)
 
 
 class LocalPolicy:

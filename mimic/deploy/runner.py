@@ -112,7 +112,7 @@ def run_controller(
     """
     if policy is not None and cores is not None:
         raise ValueError(f"cores: expected None with a given policy, got {cores}")
-    core, policy_core = cores or (None, None)
+    core, policy_core = (None, None) if cores is None else _pair(cores)
     index = bundle.motion_index(motion)
     layer = SafetyLayer(bundle, Clearance(bundle), config=config)
     with awake_core(core):
@@ -130,6 +130,14 @@ def run_controller(
             finally:
                 connection.close()
     return loop.report(str(layer.cause[0]), aborted=False)
+
+
+def _pair(cores: Any) -> tuple[int, int]:
+    """Two cores, or a ValueError."""
+    numbers = tuple(cores) if isinstance(cores, tuple | list) else ()
+    if len(numbers) != 2 or any(type(number) is not int for number in numbers):
+        raise ValueError(f"cores: expected a pair of core numbers such as (0, 1), got {cores!r:.80}")
+    return numbers[0], numbers[1]
 
 
 class _Loop:

@@ -9,6 +9,7 @@ import sys
 import textwrap
 import threading
 import time
+from typing import cast
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_a_policy_with_a_core_of_its_own_keeps_it_busy_and_alone(bundle):
         for tick in range(20):
             policy.send(tick, bundle.start_pose, zero, Reference(zero, zero, zero))
             time.sleep(bundle.control_dt)
-        # of 0.9; one that shares a core has some 0.1. Another process on the core may take half.
+        # of 0.9; one that shares a core has some 0.2. Another process on the core may take half.
         assert cpu_time(policy.pid) - before > 0.3 * 20 * bundle.control_dt
     finally:
         policy.close()
@@ -116,6 +117,9 @@ def test_a_core_that_nothing_can_have_is_rejected(bundle, monkeypatch):
     ):
         with pytest.raises(ValueError, match=f"core: expected {expected}"):
             run_controller(robot(bundle), bundle, cores=pair)
+    for cores_given in (0, (0,), (0, 1.0), "01", (True, False)):
+        with pytest.raises(ValueError, match=r"cores: expected a pair of core numbers such as \(0, 1\)"):
+            run_controller(robot(bundle), bundle, cores=cast("tuple[int, int]", cores_given))
     with pytest.raises(ValueError, match=r"cores: expected None with a given policy, got \(0, 1\)"):
         run_controller(robot(bundle), bundle, policy=LocalPolicy(bundle, 0), cores=(0, 1))
     assert os.sched_getaffinity(0) == cores
