@@ -11,8 +11,8 @@ The last row is a loop of Python alone, which is as long each time: what its p99
 
 With `--awake` a process of the lowest priority keeps the core of the inner loop from halting between the periods, as
 with `cores` of `mimic.deploy.run_controller`. The loop of Python has it too. Here this process times a loop, to tell
-when the cores have their full speed: a virtual machine may share them with others. `full` is the fraction of the times
-that were measured then, and the columns after it are theirs alone.
+when the core has its full speed: a virtual machine may share it with others. `full` is the fraction of the times that
+were measured then, and the columns after it are theirs alone.
 """
 
 import dataclasses
@@ -101,6 +101,11 @@ def _row(what: str, times: _Times, **more: int) -> Row:
     return {**row, "wall_max": 1e3 * max(times.wall), **more}
 
 
+def _awake(core: int | None) -> list[int]:
+    """The cores that a loop of the lowest priority keeps busy; one on the policy's own core would take time from it."""
+    return [] if core is None else [core]
+
+
 def _percentiles(kind: str, seconds: np.ndarray) -> Row:
     shares = zip(_NAMES, _PERCENTILES, strict=True)
     return {f"{kind}_{name}": float(1e3 * np.percentile(seconds, share)) for name, share in shares if len(seconds)}
@@ -110,10 +115,9 @@ def periods(bundle: Bundle, motions: int, core: int | None, policy_core: int | N
     """Periods of motions on a fake robot in real time, and the evaluations of the policy in its own process."""
     latency, loop, policy, both, answer = _Times(), _Times(), _Times(), _Times(), _Times()
     missed, interventions = 0, 0
-    used = [] if core is None else [core, core if policy_core is None else policy_core]
     for motion in range(motions):
         index = motion % len(bundle.expert)
-        with measured_speeds(used) as speeds:
+        with measured_speeds(_awake(core)) as speeds:
             robot, connection = _Robot(bundle), PolicyProcess(bundle, index, core=policy_core)
             report = run_controller(robot, bundle, index, policy=connection)
         assert not report.cause, report.cause
@@ -125,13 +129,12 @@ def periods(bundle: Bundle, motions: int, core: int | None, policy_core: int | N
         policy.cpu += connection.cpu_s[1:]
         both.wall += (np.array(report.latency_s)[ticks] + connection.wall_s[1:]).tolist()
         answer.wall += connection.answer_s[1:]
-        if used:
-            of_loop, of_policy = (loop_durations(speeds[used_core], np.array(robot.times)) for used_core in used)
-            latency.loops += of_loop.tolist()
-            loop.loops += of_loop.tolist()
-            policy.loops += of_policy[ticks].tolist()
-            for times in both, answer:
-                times.loops += np.maximum(of_loop, of_policy)[ticks].tolist()
+        for samples in speeds.values():
+            loops = loop_durations(samples, np.array(robot.times))
+            latency.loops += loops.tolist()
+            loop.loops += loops.tolist()
+            for times in (policy, both, answer) if policy_core is None else ():
+                times.loops += loops[ticks].tolist()
         missed += missed_periods(robot.states)
         interventions += sum(report.interventions.values())
     yield _row("inner loop and safety layer, to the torque", latency)
@@ -161,7 +164,7 @@ def _priority() -> int:
 def measure(bundle: Bundle, motions: int, core: int | None, policy_core: int | None) -> Iterator[Row]:
     """Rows of the table; `core` of the inner loop does not halt."""
     yield from periods(bundle, motions, core, policy_core)
-    with measured_speeds([] if core is None else [core]):
+    with measured_speeds(_awake(core)):
         yield python_loop()
 
 
