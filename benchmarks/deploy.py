@@ -12,7 +12,8 @@ The last row is a loop of Python alone, which is as long each time: what its p99
 With `--awake` a process of the lowest priority keeps the core of the inner loop from halting between the periods, as
 with `cores` of `mimic.deploy.run_controller`. The loop of Python has it too. Here this process times a loop, to tell
 when the core has its full speed: a virtual machine may share it with others. `full` is the fraction of the times that
-were measured then, and the columns after it are theirs alone.
+were measured then, `full_p50` to `full_p999` are theirs alone, and the file has the duration of the loop at full speed.
+That is the shortest one of the run: where there was no full speed at all, it is longer than in other runs.
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.core_speed import is_full_speed, loop_durations, measured_speeds
+from benchmarks.common.core_speed import is_full_speed, loop_durations, measured_speed, shortest_loop
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect
 from mimic.deploy.bundle import Bundle, load_bundle
@@ -92,32 +93,32 @@ class _Times:
     loops: list[float] = dataclasses.field(default_factory=list)
 
 
-def _row(what: str, times: _Times, **more: int) -> Row:
+def _row(what: str, times: _Times, shortest: float = 0.0, **more: int) -> Row:
+    """Percentiles; `shortest` is the duration of the loop at full speed [s]."""
     wall = np.array(times.wall)
     row = {"what": what, "count": len(wall), **_percentiles("wall", wall), **_percentiles("cpu", np.array(times.cpu))}
     if times.loops:
-        is_full = is_full_speed(np.array(times.loops))
-        row |= {"full": float(np.mean(is_full)), **_percentiles("full", wall[is_full])}
+        is_full = is_full_speed(np.array(times.loops), shortest)
+        row |= {"full": float(np.mean(is_full)), "full_loop_us": 1e6 * shortest, **_percentiles("full", wall[is_full])}
     return {**row, "wall_max": 1e3 * max(times.wall), **more}
 
 
-def _awake(core: int | None) -> list[int]:
-    """The cores that a loop of the lowest priority keeps busy; one on the policy's own core would take time from it."""
-    return [] if core is None else [core]
-
-
 def _percentiles(kind: str, seconds: np.ndarray) -> Row:
-    shares = zip(_NAMES, _PERCENTILES, strict=True)
-    return {f"{kind}_{name}": float(1e3 * np.percentile(seconds, share)) for name, share in shares if len(seconds)}
+    """Those with at least one of the times beyond them."""
+    shares = [
+        (name, share) for name, share in zip(_NAMES, _PERCENTILES, strict=True) if len(seconds) * (100 - share) >= 100
+    ]
+    return {f"{kind}_{name}": float(1e3 * np.percentile(seconds, share)) for name, share in shares}
 
 
 def periods(bundle: Bundle, motions: int, core: int | None, policy_core: int | None) -> Iterator[Row]:
     """Periods of motions on a fake robot in real time, and the evaluations of the policy in its own process."""
     latency, loop, policy, both, answer = _Times(), _Times(), _Times(), _Times(), _Times()
     missed, interventions = 0, 0
+    shortest: list[float] = []
     for motion in range(motions):
         index = motion % len(bundle.expert)
-        with measured_speeds(_awake(core)) as speeds:
+        with measured_speed(core) as samples:  # not on the policy's own core, where it would take time from it
             robot, connection = _Robot(bundle), PolicyProcess(bundle, index, core=policy_core)
             report = run_controller(robot, bundle, index, policy=connection)
         assert not report.cause, report.cause
@@ -129,7 +130,8 @@ def periods(bundle: Bundle, motions: int, core: int | None, policy_core: int | N
         policy.cpu += connection.cpu_s[1:]
         both.wall += (np.array(report.latency_s)[ticks] + connection.wall_s[1:]).tolist()
         answer.wall += connection.answer_s[1:]
-        for samples in speeds.values():
+        if samples:
+            shortest.append(shortest_loop(samples))
             loops = loop_durations(samples, np.array(robot.times))
             latency.loops += loops.tolist()
             loop.loops += loops.tolist()
@@ -137,23 +139,29 @@ def periods(bundle: Bundle, motions: int, core: int | None, policy_core: int | N
                 times.loops += loops[ticks].tolist()
         missed += missed_periods(robot.states)
         interventions += sum(report.interventions.values())
-    yield _row("inner loop and safety layer, to the torque", latency)
-    yield _row("to the end of the period", loop, missed=missed, interventions=interventions)
-    yield _row("policy, in its own process", policy)
-    yield _row("torque and policy of a tick, together", both)
-    yield _row("from sending an observation to its answer", answer)
+    full = min(shortest, default=0.0)
+    yield _row("inner loop and safety layer, to the torque", latency, full)
+    yield _row("to the end of the period", loop, full, missed=missed, interventions=interventions)
+    yield _row("policy, in its own process", policy, full)
+    yield _row("torque and policy of a tick, together", both, full)
+    yield _row("from sending an observation to its answer", answer, full)
 
 
-def python_loop() -> Row:
+def python_loop(core: int | None) -> Row:
     """A loop that does the same in each period."""
-    times = _Times()
-    for _ in range(_LOOPS):
-        time.sleep(0.0005)
-        started, started_cpu = time.perf_counter(), time.thread_time()
-        sum(range(_LOOP))
-        times.wall.append(time.perf_counter() - started)
-        times.cpu.append(time.thread_time() - started_cpu)
-    return _row("loop of Python alone", times)
+    times, begun = _Times(), []
+    with measured_speed(core) as samples:
+        for _ in range(_LOOPS):
+            time.sleep(0.0005)
+            started, started_cpu = time.perf_counter(), time.thread_time()
+            sum(range(_LOOP))
+            begun.append(started)
+            times.wall.append(time.perf_counter() - started)
+            times.cpu.append(time.thread_time() - started_cpu)
+    if not samples:
+        return _row("loop of Python alone", times)
+    times.loops = loop_durations(samples, np.array(begun)).tolist()
+    return _row("loop of Python alone", times, shortest_loop(samples))
 
 
 def _priority() -> int:
@@ -164,8 +172,7 @@ def _priority() -> int:
 def measure(bundle: Bundle, motions: int, core: int | None, policy_core: int | None) -> Iterator[Row]:
     """Rows of the table; `core` of the inner loop does not halt."""
     yield from periods(bundle, motions, core, policy_core)
-    with measured_speeds(_awake(core)):
-        yield python_loop()
+    yield python_loop(core)
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 # Ends with its parent; Ctrl-C in a terminal reaches it too.
 _BUSY = """
 import os, signal, sys
+os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # itself, at once: it inherits a real-time priority
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 while os.getppid() == int(sys.argv[1]):
     for _ in range(10_000):

@@ -4,7 +4,7 @@ Messages are datagrams of a pair of sockets, so that a policy that is killed or 
 loop nothing to wait for. Linux and macOS have such sockets.
 
 Caches lose the code and weights of a network in a tick, and an evaluation would take several times as long. So the
-process rehearses: before an observation is due, it computes its last answer again and again.
+process rehearses: before an observation is due, it computes an answer from the last one again and again.
 """
 
 import contextlib
@@ -132,7 +132,7 @@ class PolicyProcess:
 
     def send(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> None:
         """See `LocalPolicy`; the observation is dropped where the process does not read."""
-        values = np.concatenate([qpos, qvel, reference.qpos, reference.qvel]).astype(np.float32)
+        values = np.concatenate([qpos, qvel, reference.qpos, reference.qvel]).astype(np.float32)  # `Policy.observed`
         with contextlib.suppress(OSError):
             self._socket.send(_OBSERVATION.pack(tick, time.perf_counter()) + values.tobytes())
 
@@ -207,7 +207,7 @@ def _answer_all(
     answers, due = _Answers(policy), 0.0
     while os.getppid() == parent:
         try:
-            connection.recvmsg_into(answers.message)
+            size, _, flags, _ = connection.recvmsg_into(answers.message)
         except (TimeoutError, BlockingIOError):
             is_early = time.perf_counter() < due - rehearsals.until
             if is_early:
@@ -217,6 +217,8 @@ def _answer_all(
         except OSError:
             return
         received = time.perf_counter()
+        if size != answers.size or flags & socket.MSG_TRUNC:
+            raise ValueError(f"observation: expected {answers.size} bytes, got {size} or more")
         with contextlib.suppress(OSError):
             connection.send(answers.compute())
         answers.expect_next()
@@ -228,12 +230,14 @@ class _Answers:
     """The answers of a policy to the observations of one robot.
 
     Attributes:
-      message: where an observation is received, as `PolicyProcess.send` wrote it: its head, and what is observed.
+      message: where an observation is received, as `PolicyProcess.send` wrote it: its head, and `Policy.observed`.
+      size: of a message [bytes].
     """
 
     def __init__(self, policy: Policy):
         self._policy, self._head = policy, bytearray(_OBSERVATION.size)
         self.message = self._head, policy.observed.data
+        self.size = len(self._head) + policy.observed.nbytes
 
     def compute(self) -> bytes:
         """The message with the action for the observation; a rehearsal of the next answer calls it too."""

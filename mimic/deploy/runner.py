@@ -105,14 +105,15 @@ def run_controller(
         see `awake_core` and `PolicyProcess`. Linux only. Default: any cores.
 
     Raises:
-      ValueError: there is no such motion or core, cores and a given policy, or the bundle's mode has no braking path.
+      ValueError: there is no such motion or core, cores that are not a pair, cores and a given policy, or the bundle's
+        mode has no braking path.
       RuntimeError: the policy's process does not start.
       OSError: these cores are not allowed.
       KeyboardInterrupt: Ctrl-C, after the arm has been stopped.
     """
     if policy is not None and cores is not None:
         raise ValueError(f"cores: expected None with a given policy, got {cores}")
-    core, policy_core = (None, None) if cores is None else _pair(cores)
+    core, policy_core = (None, None) if cores is None else _core_pair(cores)
     index = bundle.motion_index(motion)
     layer = SafetyLayer(bundle, Clearance(bundle), config=config)
     with awake_core(core):
@@ -132,12 +133,12 @@ def run_controller(
     return loop.report(str(layer.cause[0]), aborted=False)
 
 
-def _pair(cores: Any) -> tuple[int, int]:
+def _core_pair(cores: Any) -> tuple[int, int]:
     """Two cores, or a ValueError."""
     numbers = tuple(cores) if isinstance(cores, tuple | list) else ()
-    if len(numbers) != 2 or any(type(number) is not int for number in numbers):
+    if len(numbers) != 2 or not all(isinstance(x, int | np.integer) and not isinstance(x, bool) for x in numbers):
         raise ValueError(f"cores: expected a pair of core numbers such as (0, 1), got {cores!r:.80}")
-    return numbers[0], numbers[1]
+    return int(numbers[0]), int(numbers[1])
 
 
 class _Loop:

@@ -153,9 +153,7 @@ class SafetyLayer:
         Raises:
           RuntimeError: it is not called between `period` and `work`; nothing has changed then.
         """
-        if self._begun is None:
-            raise RuntimeError("tick: expected after `period` and before `work`")
-        states, left = self._begun
+        states, left = self._beginning("tick")
         is_active = self.cause == ""
         is_valid = np.all(np.abs(action) <= 1 + _ACTION_TOLERANCE, axis=0)  # False for NaN
         self.counts[INVALID] += is_active & is_present & ~is_valid
@@ -178,9 +176,12 @@ class SafetyLayer:
 
     @property
     def observed_reference(self) -> Reference:
-        """The motion that the arms tracked when their states were measured, between `period` and `work`."""
-        assert self._begun is not None
-        return joint_reference(self._begun[0], self._size)
+        """The motion that the arms tracked when the states of this period were measured, [joints, robots] each.
+
+        Raises:
+          RuntimeError: it is not read between `period` and `work`.
+        """
+        return joint_reference(self._beginning("observed_reference")[0], self._size)
 
     @property
     def torque(self) -> np.ndarray:
@@ -243,6 +244,12 @@ class SafetyLayer:
             self.cause[robots], self._is_tracked[robots] = cause, False
             self._left = np.where(robots, 0, self._left).tolist()
             self._measurements.release(robots)
+
+    def _beginning(self, name: str) -> tuple[list[State], list[int]]:
+        """The references and the periods left as the period began; `name` of what asks is for the error."""
+        if self._begun is None:
+            raise RuntimeError(f"{name}: expected after `period` and before `work`")
+        return self._begun
 
     def _compute_clearances(self) -> None:
         """The clearances of poses that were measured, and of angles of the path, since the last time."""

@@ -60,7 +60,8 @@ class Policy:
       motions: indices of the motions.
 
     Attributes:
-      observed: [4, robots, joints] measured and reference angles and velocities that `evaluate` reads.
+      observed: [4, robots, joints] what `evaluate` reads: measured angles and velocities, then those of the references
+        [rad, rad/s].
     """
 
     def __init__(self, bundle: Bundle, motions: Sequence[int]):
@@ -76,7 +77,8 @@ class Policy:
         sizes = {name: array.shape[-1] for name, array in self._inputs.items()}
         self._session = open_session(bundle.folder / POLICY, sizes, {"action": size})
         self._binding = _bind(self._session, self._inputs, {"action": self._action})
-        self._tick, self._last, self._size = -1, bundle.ticks, size
+        self._last, self._size = bundle.ticks, size
+        self._tick: int | None = None  # of the features
 
     def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
         """The actions [robots, numbers] at a tick, of measured and reference motions [robots, joints]."""

@@ -61,7 +61,7 @@ def test_a_policy_is_its_graph(tmp_path):
     for tick in range(4):
         values = rng.normal(size=(4, 2, 7)).astype(np.float32)
         action = policy.act(tick, values[0], values[1], Reference(values[2], values[3], values[3]))
-        features = policy._inputs["features"]
+        features = policy._features[tick, policy._row]
         feed = dict(zip(sizes, [*values, past, features], strict=True))
         (expected,) = session.run(["action"], feed)
         np.testing.assert_array_equal(action, expected)

@@ -20,7 +20,7 @@ from mimic.deploy.driver import RobotAbort
 from mimic.deploy.fake_robot import FakeRobot
 from mimic.deploy.policy_process import LocalPolicy, PolicyProcess
 from mimic.deploy.runner import missed_periods, run_controller
-from mimic.deploy.safety import COLLISION, INVALID, LATE, REPEATED
+from mimic.deploy.safety import COLLISION, INVALID, LATE, REPEATED, SafetyLayer
 from tests.helpers import bundles
 from tests.helpers.repository import REPOSITORY
 
@@ -79,6 +79,17 @@ def test_a_policy_in_its_own_process_gives_the_same_actions(tmp_path, has_own_co
         apart.close()
     assert len(apart.answer_s) == len(apart.wall_s) == len(apart.cpu_s) == 4 and min(apart.cpu_s) > 0
     assert all(answer > wall for answer, wall in zip(apart.answer_s, apart.wall_s, strict=True))
+
+
+@pytest.mark.parametrize("size", [16, 16 + 4 * 28 - 1, 16 + 4 * 28 + 1])
+def test_an_observation_of_another_size_ends_the_process(bundle, size):
+    """Part of the last observation would still be there."""
+    policy = PolicyProcess(bundle, 0)
+    try:
+        policy._socket.send(bytes(size))
+        assert policy._process.wait(10) == 1 and policy.receive() is None
+    finally:
+        policy.close()
 
 
 def cpu_time(pid):
@@ -385,8 +396,14 @@ def test_a_policy_without_valid_answers_is_counted(bundle, actions, kind):
     assert report.interventions[kind] > 0 and not report.is_complete and not report.cause
 
 
-def test_an_observation_is_sent_after_the_torque_and_has_the_state_before_it(bundle):
-    events = []
+def test_an_observation_is_sent_after_the_torque_and_has_the_state_before_it(bundle, monkeypatch):
+    events, references, period = [], [], SafetyLayer.period
+
+    def noted(layer, qpos, qvel):
+        references.append(layer.reference)
+        return period(layer, qpos, qvel)
+
+    monkeypatch.setattr(SafetyLayer, "period", noted)
 
     class Recording(FakeRobot):
         def write(self, torque):
@@ -405,9 +422,10 @@ def test_an_observation_is_sent_after_the_torque_and_has_the_state_before_it(bun
     assert len(sent) == report.ticks == bundles.TICKS and names[:2] == ["write", "send"]
     assert np.diff(sent).tolist() == [bundle.periods + 1] * (bundles.TICKS - 1)
     states = fake.states[:: bundle.periods][: bundles.TICKS]
-    for i, state in zip(sent, states, strict=True):
+    references = references[:: bundle.periods][: bundles.TICKS]
+    for i, state, reference in zip(sent, states, references, strict=True):
         np.testing.assert_array_equal(events[i][1], state.qpos)
-        assert np.abs(events[i][2].qpos - state.qpos).max() < 0.02
+        np.testing.assert_array_equal(events[i][2], np.array(reference)[:, :, 0])
     assert np.abs(events[sent[5]][2].qvel).max() > 0.1  # the reference moves, and the arm with it
 
 

@@ -95,6 +95,8 @@ def test_actions_are_taken_between_the_torque_and_the_work_of_a_period(layer):
     action = velocity(0, 0.5)[:, None]
     with pytest.raises(RuntimeError, match="tick: expected after `period` and before `work`"):
         layer.tick(action, ONE)
+    with pytest.raises(RuntimeError, match="observed_reference: expected after `period` and before `work`"):
+        _ = layer.observed_reference
     layer.period(layer.reference.qpos, layer.reference.qvel)
     layer.work()
     with pytest.raises(RuntimeError, match="tick: expected after `period`"):
