@@ -10,21 +10,21 @@ import numpy as np
 
 # Notes a time and the duration of a loop [s], the shortest one in each 4 ms, and prints all when it is terminated.
 _LOOP = """
-import os, signal, sys, time
+import math, os, signal, sys, time
 os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # itself, at once: it inherits a real-time priority
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
 ended, samples, clock = [], [], time.perf_counter
-best, begun = 1.0, clock()
+best, begun = math.inf, clock()
 print("ready", flush=True)
-while not ended and os.getppid() == int(sys.argv[1]):
-    while clock() < begun + 0.004:
-        start = clock()
-        sum(range(500))
-        best = min(best, clock() - start)
-    begun = clock()
-    samples.append((begun, best))
-    best = 1.0
+while not (ended and samples) and os.getppid() == int(sys.argv[1]):
+    start = clock()
+    sum(range(500))
+    end = clock()
+    best = min(best, end - start)
+    if end > begun + 0.004:
+        samples.append((end, best))
+        best, begun = math.inf, end
 for sample in samples:
     print(*sample)
 """
