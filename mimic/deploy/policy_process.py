@@ -218,7 +218,7 @@ def _answer_all(
             return
         received = time.perf_counter()
         if size != answers.size or flags & socket.MSG_TRUNC:
-            raise ValueError(f"observation: expected {answers.size} bytes, got {size} or more")
+            raise ValueError(f"observation: expected {answers.size} bytes, got {'more' if size == answers.size else size}")
         with contextlib.suppress(OSError):
             connection.send(answers.compute())
         answers.expect_next()
