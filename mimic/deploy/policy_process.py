@@ -218,7 +218,8 @@ def _answer_all(
             return
         received = time.perf_counter()
         if size != answers.size or flags & socket.MSG_TRUNC:
-            raise ValueError(f"observation: expected {answers.size} bytes, got {'more' if size == answers.size else size}")
+            got = "more" if size == answers.size else size
+            raise ValueError(f"observation: expected {answers.size} bytes, got {got}")
         with contextlib.suppress(OSError):
             connection.send(answers.compute())
         answers.expect_next()
