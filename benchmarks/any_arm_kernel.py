@@ -23,8 +23,8 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect, failure
 from benchmarks.common.timing import time_program
 from mimic.any_arm import composite_kernel, dynamics, physics
-from mimic.any_arm.arrays import MAX_JOINTS
-from mimic.any_arm.sampler import random_arm
+from mimic.arms.arrays import MAX_JOINTS
+from mimic.arms.sampler import random_arm
 from mimic.arms.arm import build_arm
 from mimic.control.joint_control import JointParameters, Reference, Target, action_target
 from mimic.envs import env_config

@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
-from mimic.any_arm.arrays import ArmArrays, stack_arms
+from mimic.arms.arrays import ArmArrays, stack_arms
 from mimic.any_arm.family import UNSEEN, report_arms
 from mimic.arms.arm import ArmConfig
 from mimic.runs.files import REPORT, read_json

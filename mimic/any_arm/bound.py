@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.any_arm.kinematics import link_states
 from mimic.any_arm.nearest import angle_limits, solve_free
 from mimic.metric.distance import DistanceWeights, Metric

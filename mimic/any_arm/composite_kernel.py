@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from mimic.any_arm import dynamics
-from mimic.any_arm.arrays import MAX_JOINTS
+from mimic.arms.arrays import MAX_JOINTS
 from mimic.any_arm.dynamics import PLANE, JointNumbers, Motion
 from mimic.any_arm.trigonometry import cosine_and_sine
 from mimic.envs.dynamics import acceleration_field

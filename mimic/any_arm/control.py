@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.any_arm.dynamics import inertia_and_bias, inertia_matrix
 from mimic.any_arm.nearest import NearestPose, solve_free
 from mimic.arms.arm import SPEED_FACTOR

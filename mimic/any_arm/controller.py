@@ -9,7 +9,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
 from mimic.any_arm.control import make_plan, max_speed, planned_torque
 from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import check_metric, correspondence

@@ -18,7 +18,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from mimic import compat
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.any_arm.control import Plan, make_plan, max_speed, planned_torque, torque_scale
 from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import (
@@ -29,7 +29,7 @@ from mimic.any_arm.kinematics import (
 )
 from mimic.any_arm.observation import observation_size, observe
 from mimic.any_arm.physics import make_advance
-from mimic.any_arm.sampler import Sampler
+from mimic.arms.sampler import Sampler
 from mimic.arms.arm import build_arm
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig

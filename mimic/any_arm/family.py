@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints
-from mimic.any_arm.sampler import (
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints
+from mimic.arms.sampler import (
     Sampler,
     limited_sampler,
     lock_masks,

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.any_arm.kinematics import link_states, make_metric
 from mimic.any_arm.nearest import NearestPose, angle_limits, nearest_pose
 from mimic.metric.distance import DistanceWeights

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.metric import spatial
 from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import overlaps_of_chains

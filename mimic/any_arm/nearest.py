@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import ArmArrays
+from mimic.arms.arrays import ArmArrays
 from mimic.any_arm.kinematics import joint_states, link_jacobians, link_states_in_frames
 from mimic.envs.dynamics import solve
 from mimic.metric.distance import DistanceWeights

@@ -6,7 +6,7 @@ Its length depends on neither the arm's joints nor its links. Nothing of it is k
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.any_arm.control import Plan
 from mimic.any_arm.goals import Goals
 from mimic.any_arm.kinematics import joint_states, link_states_in_frames

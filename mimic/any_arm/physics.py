@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.any_arm import composite_kernel, dynamics, looped_dynamics
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.envs.physics import Load, runge_kutta
 from mimic.metric import fused_kernel
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import ArmArrays
+from mimic.arms.arrays import ArmArrays
 from mimic.any_arm.kinematics import link_states
 from mimic.metric.similarity import SAMPLES, CentreLine, similarity
 

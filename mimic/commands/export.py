@@ -50,7 +50,7 @@ def export_run(
 
     Of a run whose learner is any arm, the function has an input `learner`: the description of an arm, which this
     function writes too. With the metadata's `learner_layout` it can also be made without mimic, see `ArmArrays` in
-    mimic/any_arm/arrays.py. Angles and torques are then [batch, 8], with those of locked joints, and 0 where the arm
+    mimic/arms/arrays.py. Angles and torques are then [batch, 8], with those of locked joints, and 0 where the arm
     has no joint. A policy of any arm is a step of its controller, with the poses that it follows as an input and an
     output; the metadata says what the inputs are.
 

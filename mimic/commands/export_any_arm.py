@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array
 from rich.console import Console
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.any_arm.control import make_plan, max_speed, planned_torque, torque_scale
-from mimic.any_arm.description import (
+from mimic.arms.description import (
     SUFFIXES,
     described_arm,
     description_layout,

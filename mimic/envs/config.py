@@ -116,7 +116,7 @@ class ArmsConfig:
       unseen: sets of locked joints that training leaves out, as in "2" or "1+4"; the report shows them apart.
       perturbed: weight of `models`, each drawn with another size, other masses, rotors, damping and velocity limits.
       models: arms to draw perturbed ones from: names or files, see `ArmConfig.model`.
-      random: weight of random arms, see `random_arm` in mimic/any_arm/sampler.py.
+      random: weight of random arms, see `random_arm` in mimic/arms/sampler.py.
       reward: "relative": how much nearer the arm is than with the controller that the zero action is; or "distance",
         without it. See `AnyArmEnv`.
       distinct: number of distinct arms in a training; 0 draws a new arm for each episode.

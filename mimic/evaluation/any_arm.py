@@ -14,7 +14,7 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, stack_arms
 from mimic.any_arm.bound import closest_motion
 from mimic.any_arm.env import AnyArmEnv, any_arm_state
 from mimic.any_arm.family import SEEN, UNSEEN

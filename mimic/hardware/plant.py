@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mimic.any_arm.arrays import ArmArrays, arm_arrays, body_moments, moments_of_joints
+from mimic.arms.arrays import ArmArrays, arm_arrays, body_moments, moments_of_joints
 from mimic.any_arm.dynamics import NUMBERS, joint_numbers
 from mimic.arms.arm import Arm, torque_scale
 from mimic.arms.drives import drives_of

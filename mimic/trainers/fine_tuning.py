@@ -7,7 +7,7 @@ from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.any_arm.arrays import masked_arrays
+from mimic.arms.arrays import masked_arrays
 from mimic.any_arm.family import arm_name
 from mimic.arms.arm import ArmConfig
 from mimic.config import to_dict, typed

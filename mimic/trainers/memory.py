@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import jax
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS
 from mimic.any_arm.observation import observation_size
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import ArmsConfig

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.any_arm.kinematics import correspondence, link_states, make_metric
 from mimic.any_arm.nearest import nearest_pose
 from mimic.any_arm.similarity import centre_line

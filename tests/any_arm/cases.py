@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from mimic.any_arm import composite_kernel, dynamics, looped_dynamics
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.arms.arm import Arm
 from mimic.arms.embodiment import load_arm
 from mimic.arms.mujoco_chain import base_pose

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, masked_arrays, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, masked_arrays, stack_arms
 from mimic.any_arm.dynamics import torque_of_arm
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.arm import ArmConfig, build_arm

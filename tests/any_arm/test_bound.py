@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.any_arm.arrays import arm_arrays, stack_arms
+from mimic.arms.arrays import arm_arrays, stack_arms
 from mimic.any_arm.bound import closest_motion
 from mimic.any_arm.kinematics import check_metric, correspondence, link_states, make_metric
 from mimic.arms.arm import ArmConfig, build_arm

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.any_arm.arrays import MAX_JOINTS, lock_joints
+from mimic.arms.arrays import MAX_JOINTS, lock_joints
 from mimic.any_arm.composite_kernel import gpu_kernel
 from mimic.any_arm.dynamics import joint_numbers
 from mimic.any_arm.physics import make_advance

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mimic.any_arm import control
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.any_arm.nearest import NearestPose
 from mimic.any_arm.physics import make_advance
 from mimic.arms.arm import ArmConfig, build_arm

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mimic.any_arm.arrays import arm_arrays
-from mimic.any_arm.description import description, save_description
+from mimic.arms.arrays import arm_arrays
+from mimic.arms.description import description, save_description
 from mimic.arms.arm import ArmConfig, build_arm
 
 

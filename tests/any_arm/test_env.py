@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.any_arm.controller import nearest_pose_controller
 from mimic.any_arm.env import AnyArmEnv, any_arm_state
 from mimic.any_arm.kinematics import link_states
-from mimic.any_arm.sampler import lock_masks, lock_sampler, random_arm
+from mimic.arms.sampler import lock_masks, lock_sampler, random_arm
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.wrappers import fresh_episodes

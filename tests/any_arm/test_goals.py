@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mimic.any_arm import goals
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.any_arm.goals import Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import correspondence, link_states
 from mimic.arms.arm import ArmConfig, build_arm

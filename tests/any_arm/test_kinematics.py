@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.any_arm.kinematics import correspondence, joint_states, link_jacobians, link_states, link_states_in_frames
-from mimic.any_arm.sampler import random_arm
+from mimic.arms.sampler import random_arm
 from mimic.arms.arm import ArmConfig, build_arm
 from tests.any_arm.cases import Batch, random_source
 from tests.helpers import random_arms

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, lock_joints
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.any_arm.kinematics import correspondence, link_states, make_metric
 from mimic.any_arm.nearest import angle_limits, nearest_pose, pose_quadratic
 from mimic.arms.arm import ArmConfig, build_arm

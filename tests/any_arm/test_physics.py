@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.any_arm.physics import make_advance
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs import physics

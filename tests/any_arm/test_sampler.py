@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.any_arm import sampler
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays
+from mimic.arms import sampler
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays
 from mimic.any_arm.dynamics import inertia_matrix
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.arm import ArmConfig, build_arm

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.any_arm.arrays import MAX_JOINTS, arm_arrays, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.any_arm.similarity import centre_line, motion_similarity
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.evaluation.rollout_metrics import measure_similarity

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.any_arm.description import described_arm, description, description_layout
-from mimic.any_arm.sampler import random_arm
+from mimic.arms.description import described_arm, description, description_layout
+from mimic.arms.sampler import random_arm
 from mimic.commands.config import ExportConfig
 from mimic.commands.export import exported_function
 from mimic.commands.export_controller import prepare_controller

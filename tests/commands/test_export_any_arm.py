@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.any_arm.arrays import MAX_JOINTS
-from mimic.any_arm.description import description, description_layout, description_size
+from mimic.arms.arrays import MAX_JOINTS
+from mimic.arms.description import description, description_layout, description_size
 from mimic.any_arm.env import any_arm_state
 from mimic.any_arm.goals import random_numbers
-from mimic.any_arm.sampler import random_arm
+from mimic.arms.sampler import random_arm
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
 from mimic.trainers.make import make_any_arm_trainer
 from mimic.trainers.pose_mapper.any_arm_mapper import describe_arm

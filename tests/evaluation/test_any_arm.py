@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mimic.any_arm.arrays import MAX_JOINTS
+from mimic.arms.arrays import MAX_JOINTS
 from mimic.any_arm.env import AnyArmEnv
 from mimic.any_arm.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.envs.imitation import training_and_held_out

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.any_arm.arrays import MAX_JOINTS, lock_joints, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, lock_joints, stack_arms
 from mimic.any_arm.family import arm_sampler
 from mimic.commands import retarget
 from mimic.commands import train as session

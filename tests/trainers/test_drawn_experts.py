@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, stack_arms
 from mimic.any_arm.family import arm_sampler
-from mimic.any_arm.sampler import random_arm
+from mimic.arms.sampler import random_arm
 from mimic.commands import retarget
 from mimic.commands import train as session
 from mimic.commands.config import RetargetConfig

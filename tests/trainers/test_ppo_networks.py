@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from brax.training.acme import running_statistics, specs
 
-from mimic.any_arm.arrays import MAX_JOINTS
+from mimic.arms.arrays import MAX_JOINTS
 from mimic.any_arm.observation import JOINT_FEATURES, observation_size
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.networks import Transformer

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import ArmArrays
+from mimic.arms.arrays import ArmArrays
 from mimic.any_arm.kinematics import correspondence
 from mimic.any_arm.nearest import nearest_pose
 from mimic.any_arm.similarity import motion_similarity

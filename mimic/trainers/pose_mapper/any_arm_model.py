@@ -10,7 +10,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
 from mimic.any_arm.kinematics import (
     check_metric,
     correspondence,

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from mimic.any_arm.arrays import ArmArrays, stack_arms
+from mimic.arms.arrays import ArmArrays, stack_arms
 from mimic.any_arm.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.compilation import Background, compiling
 from mimic.runs.checkpoints import Checkpoint

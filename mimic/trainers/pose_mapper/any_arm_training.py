@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import ArmArrays
-from mimic.any_arm.sampler import Sampler
+from mimic.arms.arrays import ArmArrays
+from mimic.arms.sampler import Sampler
 from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, Params, expert_pose
 from mimic.trainers.pose_mapper.training import Objective
 

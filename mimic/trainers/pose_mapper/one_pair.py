@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mimic.any_arm.arrays import MAX_JOINTS, ArmArrays, arm_arrays
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.arms.arm import Arm
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.config import MetricConfig

@@ -14,7 +14,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS
+from mimic.arms.arrays import MAX_JOINTS
 from mimic.any_arm.observation import JOINT_FEATURES
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.networks import Transformer

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import (
+from mimic.arms.arrays import (
     MAX_JOINTS,
     MAX_LINKS,
     ArmArrays,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic.any_arm.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.runs.files import write_atomically
 
 # Shapes of the fields of `ArmArrays` that a pose depends on, in the order of the vector; and of the other fields.
