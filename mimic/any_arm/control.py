@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.any_arm.dynamics import inertia_and_bias, inertia_matrix
-from mimic.any_arm.nearest import NearestPose, solve_free
+from mimic.retargeting.array_nearest import NearestPose, solve_free
 from mimic.arms.arm import SPEED_FACTOR
 
 # Weight of the velocity at the end of a step against the angle there, in units of the step. Without it the velocity

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
 from mimic.any_arm.control import make_plan, max_speed, planned_torque
-from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
+from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import check_metric, correspondence
 from mimic.any_arm.observation import observe
 from mimic.arms.arm import build_arm

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from mimic import compat
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.any_arm.control import Plan, make_plan, max_speed, planned_torque, torque_scale
-from mimic.any_arm.goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
+from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import (
     check_metric,
     correspondence,

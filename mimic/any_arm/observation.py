@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.any_arm.control import Plan
-from mimic.any_arm.goals import Goals
+from mimic.retargeting.array_goals import Goals
 from mimic.any_arm.kinematics import joint_states, link_states_in_frames
-from mimic.any_arm.nearest import angle_limits
+from mimic.retargeting.array_nearest import angle_limits
 from mimic.metric.kinematics import LinkStates
 
 JOINT_FEATURES = 18  # numbers of each joint; the first says whether it is free

@@ -21,7 +21,7 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort
 from mimic.envs.importing import import_demonstrations
 from mimic.envs.recording import record_demonstrations
-from mimic.envs.self_collision import smallest_clearances, touching_line
+from mimic.retargeting.self_collision import smallest_clearances, touching_line
 
 _PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 

@@ -21,7 +21,7 @@ from mimic.arms.description import (
     description_size,
     save_description,
 )
-from mimic.any_arm.goals import NEW_POSES, OTHERS, Problem, chosen_goal, first_goals, next_goals
+from mimic.retargeting.array_goals import NEW_POSES, OTHERS, Problem, chosen_goal, first_goals, next_goals
 from mimic.any_arm.kinematics import check_metric, correspondence, link_states
 from mimic.any_arm.observation import observation_size, observe
 from mimic.arms.arm import ArmConfig, build_arm

@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, stack_arms
-from mimic.any_arm.bound import closest_motion
+from mimic.retargeting.array_bound import closest_motion
 from mimic.any_arm.env import AnyArmEnv, any_arm_state
 from mimic.any_arm.family import SEEN, UNSEEN
 from mimic.any_arm.kinematics import link_states

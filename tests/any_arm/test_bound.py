@@ -9,7 +9,7 @@ import pytest
 
 import mimic
 from mimic.arms.arrays import arm_arrays, stack_arms
-from mimic.any_arm.bound import closest_motion
+from mimic.retargeting.array_bound import closest_motion
 from mimic.any_arm.kinematics import check_metric, correspondence, link_states, make_metric
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.metric.config import MetricConfig

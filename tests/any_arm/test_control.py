@@ -9,7 +9,7 @@ import pytest
 
 from mimic.any_arm import control
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
-from mimic.any_arm.nearest import NearestPose
+from mimic.retargeting.array_nearest import NearestPose
 from mimic.any_arm.physics import make_advance
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arm import torque_scale as scale_of_one_arm

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.any_arm import goals
+from mimic.retargeting import array_goals as goals
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
-from mimic.any_arm.goals import Problem, chosen_goal, first_goals, next_goals, random_numbers
+from mimic.retargeting.array_goals import Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import correspondence, link_states
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.metric.distance import DistanceWeights

@@ -119,7 +119,7 @@ def test_the_zero_action_is_near_the_bound_of_each_arm(env):
     locked = 1 - np.asarray(evaluator.arms.is_free)
     assert not (controller.qpos * locked[:, None, None]).any()
     references = evaluator.references()
-    # The search ends up to 2e-4 above the minimum, see `mimic.any_arm.bound`.
+    # The search ends up to 2e-4 above the minimum, see `mimic.retargeting.array_bound`.
     assert np.all(references.bound <= controller.distance + 5e-4)
     table = evaluator.table(ArmsOutcome(controller, controller))
     assert np.all(table["gap"] >= 0) and np.all(table["gap"] < 0.2)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import ArmArrays
 from mimic.any_arm.kinematics import correspondence
-from mimic.any_arm.nearest import nearest_pose
+from mimic.retargeting.array_nearest import nearest_pose
 from mimic.any_arm.similarity import motion_similarity
 from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, ExpertPose, Params, expert_pose
 from mimic.trainers.pose_mapper.any_arm_training import random_pose

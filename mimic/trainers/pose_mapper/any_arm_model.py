@@ -19,7 +19,7 @@ from mimic.any_arm.kinematics import (
     link_states_in_frames,
     make_metric,
 )
-from mimic.any_arm.nearest import angle_limits, nearest_pose
+from mimic.retargeting.array_nearest import angle_limits, nearest_pose
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
 from mimic.metric.distance import DistanceWeights

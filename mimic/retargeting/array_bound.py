@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.any_arm.kinematics import link_states
-from mimic.any_arm.nearest import angle_limits, solve_free
+from mimic.retargeting.array_nearest import angle_limits, solve_free
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates
 from mimic.retargeting.kinematic_bound import MIN_SPEED, ClosestMotion, SearchSpace, search_motion
