@@ -22,7 +22,7 @@ import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect, print_table
 from mimic.envs.imitation import ImitationEnv
-from mimic.envs.physics import Load, make_advance
+from mimic.physics.step import Load, make_advance
 
 ENVS = ("panda7dof", "panda4dof", "panda3dof")
 STEPS = 50  # control steps of a sequence

@@ -26,7 +26,7 @@ from benchmarks.common.record import Row, collect, failure
 from benchmarks.common.timing import Timing, time_call, time_program
 from benchmarks.peers import stock
 from mimic.envs.imitation import ImitationEnv
-from mimic.envs.physics import Load, make_advance
+from mimic.physics.step import Load, make_advance
 from mimic.envs.wrappers import wrap_for_training
 
 ENVS = ("panda7dof", "panda4dof", "panda3dof")

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.any_arm.dynamics import inertia_and_bias, inertia_matrix
+from mimic.physics.dynamics import inertia_and_bias, inertia_matrix
 from mimic.retargeting.array_nearest import NearestPose, solve_free
 from mimic.arms.arm import SPEED_FACTOR
 

@@ -28,13 +28,13 @@ from mimic.any_arm.kinematics import (
     make_metric,
 )
 from mimic.any_arm.observation import observation_size, observe
-from mimic.any_arm.physics import make_advance
+from mimic.physics.physics import make_advance
 from mimic.arms.sampler import Sampler
 from mimic.arms.arm import build_arm
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations
-from mimic.envs.physics import Load, PhysicsChoice
+from mimic.physics.step import Load, PhysicsChoice
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import LinkStates
 

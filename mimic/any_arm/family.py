@@ -18,7 +18,7 @@ from mimic.arms.sampler import (
 )
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.config import EnvConfig, ObservationConfig, RandomizationConfig, RewardConfig
-from mimic.envs.world import WorldConfig
+from mimic.physics.world import WorldConfig
 
 SEEN, UNSEEN = "seen", "unseen"
 _RANDOM_ARMS = 16  # in a report

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from mimic.arms.arm import Arm, ArmConfig, build_arm, finite_velocity_limit
 from mimic.arms.embodiment import snap_to_units
-from mimic.envs.dynamics import pseudo_inertia
+from mimic.physics.chain_dynamics import pseudo_inertia
 from mimic.metric.spatial import array_library
 
 MAX_JOINTS, MAX_LINKS = 8, 12
@@ -42,7 +42,7 @@ class ArmArrays:
       offset: [joints, 2] a and b above [m].
       reference: [joints] angle that is added to the joint's angle [rad].
       first_moment: [joints, 2] x and y of the sum of m r over the points of the joint's body [kg m], as in `Inertia` of
-        mimic/envs/dynamics.py: the mass on the axis is part of the parent body.
+        mimic/physics/chain_dynamics.py: the mass on the axis is part of the parent body.
       second_moment: [joints, 5] xx, yy, xy, xz and yz of the sum of m r r^T [kg m^2].
       armature: [joints] rotor inertia [kg m^2].
       damping: [joints] viscous damping [N m s/rad].

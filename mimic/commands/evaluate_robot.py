@@ -19,7 +19,7 @@ from mimic.config import new_folder
 from mimic.deploy.bundle import MOTIONS
 from mimic.deploy.safety import COLLISION, LATE, check_supported
 from mimic.envs import env_config
-from mimic.envs.world import WorldConfig
+from mimic.physics.world import WorldConfig
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.evaluation.tracking_controllers import run_tracking

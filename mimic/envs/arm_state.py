@@ -6,7 +6,7 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mimic.envs.physics import Load
+from mimic.physics.step import Load
 
 
 @struct.dataclass

@@ -9,7 +9,7 @@ from mimic.config import check_choice
 from mimic.control.joint_control import MODES
 from mimic.envs.recording import KINDS
 from mimic.envs.start_poses import START_POSES
-from mimic.envs.world import WorldConfig
+from mimic.physics.world import WorldConfig
 from mimic.metric.config import MetricConfig
 from mimic.ranges import check_ranges, number
 
@@ -180,7 +180,7 @@ class EnvConfig:
       control_dt: duration of a control step [s]; the torque is constant within it.
       substeps: physics steps in a control step; with an inner loop there is one for each of its periods of 1 ms.
       physics: "mjx"; "fused": the same equations in one fused kernel, many times faster; or "auto": "fused" where it
-        covers the learner exactly, otherwise "mjx", see `choose_physics` in mimic/envs/physics.py.
+        covers the learner exactly, otherwise "mjx", see `choose_physics` in mimic/physics/step.py.
       control: what an action is: "torque", which is constant in a control step (paper); or the target of an inner loop
         at 1 kHz: "joint_position", "joint_velocity" or "joint_impedance", see `mimic.control`.
       world: gravity, friction, load, sensors and delays.

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from mimic.any_arm.controller import ControllerWithMemory
 from mimic.envs.imitation import ImitationEnv, arm_state
-from mimic.envs.physics import Load
+from mimic.physics.step import Load
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.rollout_metrics import gaps

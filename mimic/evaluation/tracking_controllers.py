@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from mimic.any_arm.controller import nearest_pose_controller
 from mimic.arms.simulation_model import effective_inertia
 from mimic.control.joint_control import action_towards
-from mimic.envs import dynamics
+from mimic.physics import chain_dynamics as dynamics
 from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.evaluation.evaluator import Controller, Evaluator, Motions, Rollouts
 from mimic.hardware.env import HardwareEnv

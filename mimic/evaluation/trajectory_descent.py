@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.envs.imitation import ImitationEnv
-from mimic.envs.physics import Load, make_advance
+from mimic.physics.step import Load, make_advance
 from mimic.metric.distance import PARTS, PairDistances, Weights, pair_distances
 from mimic.metric.kinematics import LinkStates, link_states
 

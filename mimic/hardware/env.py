@@ -15,12 +15,12 @@ from mimic.envs.arm_state import ArmState
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations
 from mimic.envs.imitation import ImitationEnv
-from mimic.envs.physics import PhysicsChoice
-from mimic.envs.world import MAX_DELAY
-from mimic.hardware.inner_loop import LoopState, make_inner_loop
-from mimic.hardware.mjx_loop import MjxLoop, make_mjx_loop
-from mimic.hardware.mujoco_world import mujoco_world
-from mimic.hardware.plant import Draw, draw_episode, make_plant
+from mimic.physics.step import PhysicsChoice
+from mimic.physics.world import MAX_DELAY
+from mimic.physics.inner_loop import LoopState, make_inner_loop
+from mimic.physics.mjx_loop import MjxLoop, make_mjx_loop
+from mimic.physics.mujoco_world import mujoco_world
+from mimic.physics.plant import Draw, draw_episode, make_plant
 from mimic.hardware.state import HardwareState
 from mimic.metric.kinematics import LinkStates, link_states
 

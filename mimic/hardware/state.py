@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from mimic.control.joint_control import Reference, Target
 from mimic.envs.arm_state import ArmState
-from mimic.hardware.plant import Draw
+from mimic.physics.plant import Draw
 
 
 @struct.dataclass(kw_only=True)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from mimic.envs.world import WorldConfig
+from mimic.physics.world import WorldConfig
 
 _INTERVALS = ("gravity_error", "payload", "payload_lever", "link_mass", "friction", "motor_gain")
 _DELAYS = ("observation_delay", "action_delay")

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from mimic.control.joint_control import PERIOD, friction_torque
-from mimic.hardware.mujoco_world import FLOOR, disabled, loaded_fields
+from mimic.physics.mujoco_world import FLOOR, disabled, loaded_fields
 from mimic.virtual_robot.arm_model import RobotModel
 from mimic.virtual_robot.draws import World
 

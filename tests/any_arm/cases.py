@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mimic.any_arm import composite_kernel, dynamics, looped_dynamics
+from mimic.physics import composite_kernel, dynamics, looped_dynamics
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.arms.arm import Arm
 from mimic.arms.embodiment import load_arm

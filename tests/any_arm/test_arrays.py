@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, masked_arrays, stack_arms
-from mimic.any_arm.dynamics import torque_of_arm
+from mimic.physics.dynamics import torque_of_arm
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.arm import ArmConfig, build_arm
 from tests.any_arm.cases import acceleration, arm_of, assert_near, looped, padded, random_motion, unrolled

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mimic.arms.arrays import MAX_JOINTS, lock_joints
-from mimic.any_arm.composite_kernel import gpu_kernel
-from mimic.any_arm.dynamics import joint_numbers
-from mimic.any_arm.physics import make_advance
-from mimic.any_arm.trigonometry import cosine_and_sine
-from mimic.envs.physics import Load
+from mimic.physics.composite_kernel import gpu_kernel
+from mimic.physics.dynamics import joint_numbers
+from mimic.physics.physics import make_advance
+from mimic.physics.trigonometry import cosine_and_sine
+from mimic.physics.step import Load
 from mimic.metric.fused_kernel import LaunchConfig
 from tests.any_arm.cases import Batch, random_source
 

@@ -10,10 +10,10 @@ import pytest
 from mimic.any_arm import control
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.retargeting.array_nearest import NearestPose
-from mimic.any_arm.physics import make_advance
+from mimic.physics.physics import make_advance
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arm import torque_scale as scale_of_one_arm
-from mimic.envs.physics import Load
+from mimic.physics.step import Load
 
 DT = 0.1
 UNLIMITED: Any = np.full(MAX_JOINTS, 1e9)

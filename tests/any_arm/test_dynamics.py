@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.any_arm import dynamics
+from mimic.physics import dynamics
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.arms.arm import ArmConfig, build_arm
 from tests.any_arm.cases import Batch, acceleration, assert_near, looped, padded, random_source, unrolled

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
-from mimic.any_arm.physics import make_advance
+from mimic.physics.physics import make_advance
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.envs import physics
-from mimic.envs.physics import Load
+from mimic.physics import step as physics
+from mimic.physics.step import Load
 from tests.any_arm.cases import assert_near, padded
 from tests.helpers.lowering import gpu_program
 

@@ -11,7 +11,7 @@ import pytest
 
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
-from mimic.envs import physics
+from mimic.physics import step as physics
 from mimic.envs.imitation import training_and_held_out
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig

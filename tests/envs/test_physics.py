@@ -9,9 +9,9 @@ import pytest
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.simulation_model import simulation_model
-from mimic.envs import dynamics
+from mimic.physics import chain_dynamics as dynamics
 from mimic.envs.config import PHYSICS
-from mimic.envs.physics import Load, PhysicsChoice, choose_physics, make_advance
+from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
 from mimic.metric import fused_kernel
 from tests.helpers.lowering import gpu_program
 from tests.helpers.random_arms import SEEDS, random_arm

@@ -12,7 +12,7 @@ import pytest
 import mimic
 from mimic.envs import imitation
 from mimic.envs.config import RandomizationConfig
-from mimic.envs.physics import Load
+from mimic.physics.step import Load
 from mimic.envs.wrappers import wrap_for_training
 
 RANGES = {"mass": [0.5, 2.0], "damping": [1.0, 3.0]}

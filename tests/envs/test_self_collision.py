@@ -7,8 +7,8 @@ import pytest
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.retargeting.self_collision import smallest_clearances, touching_line
-from mimic.envs.world import WorldConfig
-from mimic.hardware.mujoco_world import FLOOR, mujoco_world
+from mimic.physics.world import WorldConfig
+from mimic.physics.mujoco_world import FLOOR, mujoco_world
 from mimic.retargeting.costs import changing_pairs
 
 POSES = 400

@@ -11,7 +11,7 @@ import mimic
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.envs.physics import Load
+from mimic.physics.step import Load
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.labels import SPLITS

@@ -10,7 +10,7 @@ import pytest
 import mimic
 from mimic.envs import imitation
 from mimic.envs.imitation import ImitationEnv
-from mimic.envs.world import WorldConfig
+from mimic.physics.world import WorldConfig
 from mimic.evaluation.evaluator import Evaluator
 from mimic.hardware.env import HardwareEnv, control_observation, expert_vector
 from mimic.making import make_env

@@ -13,9 +13,9 @@ from mimic.arms.arm import build_arm
 from mimic.control import joint_control
 from mimic.control.joint_control import MODES, PERIOD, JointParameters, Reference, Target
 from mimic.envs import env_config
-from mimic.envs.physics import Load
-from mimic.hardware.inner_loop import LoopState, flattened, gpu_kernel, make_inner_loop
-from mimic.hardware.plant import GRAVITY, Draw, end_of_last_link, make_plant
+from mimic.physics.step import Load
+from mimic.physics.inner_loop import LoopState, flattened, gpu_kernel, make_inner_loop
+from mimic.physics.plant import GRAVITY, Draw, end_of_last_link, make_plant
 from mimic.metric.fused_kernel import LaunchConfig
 from tests.helpers.lowering import gpu_program
 

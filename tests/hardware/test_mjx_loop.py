@@ -13,10 +13,10 @@ from mimic.arms.capsules import fit_capsules
 from mimic.control import joint_control
 from mimic.control.joint_control import Reference, Target
 from mimic.envs import env_config
-from mimic.hardware.inner_loop import LoopState
-from mimic.hardware.mjx_loop import make_mjx_loop
-from mimic.hardware.mujoco_world import mujoco_world
-from mimic.hardware.plant import make_plant
+from mimic.physics.inner_loop import LoopState
+from mimic.physics.mjx_loop import make_mjx_loop
+from mimic.physics.mujoco_world import mujoco_world
+from mimic.physics.plant import make_plant
 from tests.hardware.test_inner_loop import draw_for
 
 PERIODS, TICKS = 50, 12

@@ -9,8 +9,8 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
-from mimic.envs.world import WorldConfig
-from mimic.hardware.mujoco_world import disabled, loaded_fields, mujoco_world
+from mimic.physics.world import WorldConfig
+from mimic.physics.mujoco_world import disabled, loaded_fields, mujoco_world
 from mimic.retargeting.clearance import make_clearance
 from tests.hardware.test_inner_loop import NAMES, draw_for, make_arm_and_plant, mujoco_model
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mimic.arms.arm import ArmConfig
 from mimic.envs import env_config
-from mimic.envs.world import WorldConfig
+from mimic.physics.world import WorldConfig
 from mimic.virtual_robot.arm_model import robot_model
 from mimic.virtual_robot.draws import draw_world
 from mimic.virtual_robot.robots import VirtualRobots

@@ -12,7 +12,7 @@ import pytest
 from mimic.deploy.policy_process import LocalPolicy
 from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import COLLISION, LATE, REPEATED
-from mimic.envs.world import WorldConfig
+from mimic.physics.world import WorldConfig
 from mimic.virtual_robot import runs
 from mimic.virtual_robot.driver import VirtualRobot
 from mimic.virtual_robot.episodes import ABORTED, Channel, SafeController, run_episodes

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mimic.control.joint_control import PERIOD
-from mimic.envs.physics import Load, make_advance
-from mimic.envs.world import WorldConfig
+from mimic.physics.step import Load, make_advance
+from mimic.physics.world import WorldConfig
 from mimic.virtual_robot import robots as reflexes
 from mimic.virtual_robot.draws import edge_cases
 from tests.helpers.bundles import FOLDED, ON_FLOOR, panda

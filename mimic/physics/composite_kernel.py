@@ -1,4 +1,4 @@
-"""Steps of any arm in one GPU kernel: the equations of mimic/any_arm/dynamics.py for all joints, without loops.
+"""Steps of any arm in one GPU kernel: the equations of mimic/physics/dynamics.py for all joints, without loops.
 
 The compile time of a Triton kernel is almost that of its pass `coalesce`: the number of loads and stores times the
 square of the number of operations. So loops load the numbers and store the result: there are 7 loads and stores instead
@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mimic.any_arm import dynamics
+from mimic.physics import dynamics
 from mimic.arms.arrays import MAX_JOINTS
-from mimic.any_arm.dynamics import PLANE, JointNumbers, Motion
-from mimic.any_arm.trigonometry import cosine_and_sine
-from mimic.envs.dynamics import acceleration_field
-from mimic.envs.physics import runge_kutta
+from mimic.physics.dynamics import PLANE, JointNumbers, Motion
+from mimic.physics.trigonometry import cosine_and_sine
+from mimic.physics.chain_dynamics import acceleration_field
+from mimic.physics.step import runge_kutta
 from mimic.metric import fused_kernel
 from mimic.metric.spatial import ZERO, Scalar, Vector, add, minus, plus, times
 

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm import composite_kernel, dynamics, looped_dynamics
+from mimic.physics import composite_kernel, dynamics, looped_dynamics
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.envs.physics import Load, runge_kutta
+from mimic.physics.step import Load, runge_kutta
 from mimic.metric import fused_kernel
 
 AdvanceAny = Callable[[ArmArrays, Array, Array, Array, Load], tuple[Array, Array]]

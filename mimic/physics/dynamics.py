@@ -1,4 +1,4 @@
-"""Dynamics of any arm: the equations of mimic/envs/dynamics.py with the numbers of the arm as arguments.
+"""Dynamics of any arm: the equations of mimic/physics/chain_dynamics.py with the numbers of the arm as arguments.
 
 A transform between two frames is two rotations in a plane, see mimic/arms/arrays.py, which takes half as many
 operations as a general rotation. That matters twice: the compile time of a GPU kernel grows with their square.
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.envs.dynamics import acceleration_field, moment_of_field
+from mimic.physics.chain_dynamics import acceleration_field, moment_of_field
 from mimic.metric.spatial import ZERO, Rotation, Scalar, Vector, add, cross, minus, plus, rotate, times
 
 PLANE = tuple[Scalar, Scalar]  # cosine and sine

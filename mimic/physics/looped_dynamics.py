@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm import dynamics
-from mimic.envs.dynamics import acceleration_field
+from mimic.physics import dynamics
+from mimic.physics.chain_dynamics import acceleration_field
 from mimic.metric.spatial import add, vector
 
 Joints = Float[Array, "joints *batch"]
@@ -36,7 +36,7 @@ def acceleration(
       torque: joint torques [N m].
       mass: factor on the masses and inertias of all bodies.
       damping: factor on the damping of all joints.
-      base: three components of the base's acceleration, see mimic/any_arm/composite_kernel.py; 0 where None.
+      base: three components of the base's acceleration, see mimic/physics/composite_kernel.py; 0 where None.
     """
     joints = dynamics.joint_of(jnp.moveaxis(numbers, 1, 0))
     angles = qpos + joints.reference

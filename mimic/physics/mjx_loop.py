@@ -10,9 +10,9 @@ from mujoco import mjx
 
 from mimic.control import joint_control
 from mimic.control.joint_control import Target
-from mimic.hardware.inner_loop import LoopState, control
-from mimic.hardware.mujoco_world import MujocoWorld, loaded_fields
-from mimic.hardware.plant import Draw, Plant
+from mimic.physics.inner_loop import LoopState, control
+from mimic.physics.mujoco_world import MujocoWorld, loaded_fields
+from mimic.physics.plant import Draw, Plant
 
 MjxLoop = Callable[[Draw, LoopState, Target], LoopState]
 

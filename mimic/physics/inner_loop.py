@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.any_arm import composite_kernel, dynamics, looped_dynamics
-from mimic.any_arm.composite_kernel import read_rows, write_rows
+from mimic.physics import composite_kernel, dynamics, looped_dynamics
+from mimic.physics.composite_kernel import read_rows, write_rows
 from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
 from mimic.metric import fused_kernel
@@ -179,7 +179,7 @@ def gpu_kernel(
 ) -> Callable[..., tuple[Array, ...]]:
     """The loop as a Pallas kernel on arrays [samples, width]: (numbers, base, drive, motion, target) -> (motion,).
 
-    See `flattened`. As in mimic/any_arm/composite_kernel.py only loading and storing are loops over the joints. What is
+    See `flattened`. As in mimic/physics/composite_kernel.py only loading and storing are loops over the joints. What is
     the same in all episodes is part of the code, and what is constant in an episode is loaded once.
     """
     count = len(constants.minimum)

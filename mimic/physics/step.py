@@ -9,7 +9,7 @@ import mujoco
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from mimic.envs import dynamics
+from mimic.physics import chain_dynamics as dynamics
 from mimic.envs.config import AUTO
 from mimic.metric import fused_kernel
 from mimic.metric.kinematics import LONG
