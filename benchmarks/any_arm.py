@@ -23,7 +23,7 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints, stack_arms
 from mimic.retargeting.array_bound import closest_motion
-from mimic.any_arm.env import AnyArmEnv
+from mimic.envs.many_arms import AnyArmEnv
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.sampler import lock_masks, lock_sampler, random_arm
 from mimic.any_arm.similarity import motion_similarity

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv
     from mimic.envs.importing import import_demonstrations
     from mimic.envs.recording import record_demonstrations
-    from mimic.making import make
+    from mimic.envs.make import make
     from mimic.metric.correspondence import (
         arc_length_correspondence,
         hard_correspondence,

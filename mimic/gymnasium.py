@@ -24,7 +24,7 @@ compat.import_mjx()  # first, and quietly: brax imports it too
 from brax.envs.base import State  # noqa: E402
 
 from mimic.envs.imitation import ArmState, ImitationEnv  # noqa: E402
-from mimic.making import make_env  # noqa: E402
+from mimic.envs.make import make_env  # noqa: E402
 
 RENDER_MODES = ("rgb_array",)
 

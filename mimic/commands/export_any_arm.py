@@ -13,7 +13,7 @@ from jaxtyping import Array
 from rich.console import Console
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
-from mimic.any_arm.control import make_plan, max_speed, planned_torque, torque_scale
+from mimic.envs.many_arms_control import make_plan, max_speed, planned_torque, torque_scale
 from mimic.arms.description import (
     SUFFIXES,
     described_arm,
@@ -23,7 +23,7 @@ from mimic.arms.description import (
 )
 from mimic.retargeting.array_goals import NEW_POSES, OTHERS, Problem, chosen_goal, first_goals, next_goals
 from mimic.any_arm.kinematics import check_metric, correspondence, link_states
-from mimic.any_arm.observation import observation_size, observe
+from mimic.envs.many_arms_observation import observation_size, observe
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.exported_function import ExportedFunction, joint_ranges
 from mimic.config import new_file

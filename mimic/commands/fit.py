@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from mimic.any_arm.env import AnyArmEnv
+from mimic.envs.many_arms import AnyArmEnv
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_report
 from mimic.commands.report import show_report
@@ -21,7 +21,7 @@ from mimic.compilation import compilation_cache, use_compilation_cache
 from mimic.config import explain, merged, schema, typed
 from mimic.envs import EnvConfig, env_config
 from mimic.envs.imitation import ImitationEnv
-from mimic.making import make_env, make_family_env
+from mimic.envs.make import make_env, make_family_env
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import DEMONSTRATIONS, REPORT, read_json
 from mimic.runs.signals import Signals

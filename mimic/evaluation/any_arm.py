@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, stack_arms
 from mimic.retargeting.array_bound import closest_motion
-from mimic.any_arm.env import AnyArmEnv, any_arm_state
-from mimic.any_arm.family import SEEN, UNSEEN
+from mimic.envs.many_arms import AnyArmEnv, any_arm_state
+from mimic.envs.family import SEEN, UNSEEN
 from mimic.any_arm.kinematics import link_states
 from mimic.any_arm.similarity import motion_similarity
 from mimic.arms.arm import build_arm

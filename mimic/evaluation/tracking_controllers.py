@@ -16,8 +16,8 @@ from mimic.control.joint_control import action_towards
 from mimic.physics import chain_dynamics as dynamics
 from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.evaluation.evaluator import Controller, Evaluator, Motions, Rollouts
-from mimic.hardware.env import HardwareEnv
-from mimic.hardware.state import HardwareState
+from mimic.envs.world_env import HardwareEnv
+from mimic.envs.world_state import HardwareState
 from mimic.retargeting.motions import largest_jump, optimal_motions
 
 _FREQUENCIES = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)  # candidates [rad/s]; a torque is constant for 0.1 s

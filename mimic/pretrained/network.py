@@ -76,7 +76,7 @@ class Pretrained:
     def env(self) -> "ImitationEnv":
         """The environment, with its training demonstrations."""
         compat.import_mjx()
-        from mimic.making import make_env  # imports brax and MJX, which takes seconds
+        from mimic.envs.make import make_env  # imports brax and MJX, which takes seconds
 
         return make_env(self.config.env)
 

@@ -8,7 +8,7 @@ from typing import cast
 from omegaconf import DictConfig, OmegaConf
 
 from mimic.arms.arrays import masked_arrays
-from mimic.any_arm.family import arm_name
+from mimic.envs.family import arm_name
 from mimic.arms.arm import ArmConfig
 from mimic.config import to_dict, typed
 from mimic.envs.config import ArmsConfig, EnvConfig

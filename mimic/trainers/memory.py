@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import jax
 
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS
-from mimic.any_arm.observation import observation_size
+from mimic.envs.many_arms_observation import observation_size
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import ArmsConfig
 from mimic.memory import check_memory, device_memory, host_memory

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mimic.any_arm.family import arm_name
+from mimic.envs.family import arm_name
 from mimic.arms.arm import ArmConfig
 from mimic.arms.model_copy import copied_files
 from mimic.arms.model_source import file_digest, read_source

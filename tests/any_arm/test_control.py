@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.any_arm import control
+from mimic.envs import many_arms_control as control
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.retargeting.array_nearest import NearestPose
 from mimic.physics.physics import make_advance

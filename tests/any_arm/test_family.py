@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import pytest
 
 import mimic
-from mimic.any_arm.env import AnyArmEnv
-from mimic.any_arm.family import SEEN, UNSEEN, arm_name, arm_sampler, report_arms
+from mimic.envs.many_arms import AnyArmEnv
+from mimic.envs.family import SEEN, UNSEEN, arm_name, arm_sampler, report_arms
 from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import panda_path
 from mimic.envs.wrappers import wrap_for_training

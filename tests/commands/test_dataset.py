@@ -21,7 +21,7 @@ from mimic.commands.dataset_sources import file_episodes, rollout_episodes, step
 from mimic.datasets.episodes import ANGLE, VELOCITY
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.labels import SPLITS
-from mimic.making import make_env
+from mimic.envs.make import make_env
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.run_config import save_config
 from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run

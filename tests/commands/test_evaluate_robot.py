@@ -26,7 +26,7 @@ from mimic.deploy.policy_process import LocalPolicy
 from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import INTERVENTIONS
 from mimic.deploy.sessions import Policy
-from mimic.hardware.env import SENT_ACTIONS, HardwareEnv, control_observation
+from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv, control_observation
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.ppo import training

@@ -12,7 +12,7 @@ import pytest
 import mimic
 from mimic.arms.arrays import MAX_JOINTS
 from mimic.arms.description import description, description_layout, description_size
-from mimic.any_arm.env import any_arm_state
+from mimic.envs.many_arms import any_arm_state
 from mimic.retargeting.array_goals import random_numbers
 from mimic.arms.sampler import random_arm
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from mimic.arms.arrays import MAX_JOINTS
-from mimic.any_arm.env import AnyArmEnv
-from mimic.any_arm.family import SEEN, UNSEEN, arm_sampler, report_arms
+from mimic.envs.many_arms import AnyArmEnv
+from mimic.envs.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.envs.imitation import training_and_held_out
 from mimic.evaluation.any_arm import ArmReferences, ArmRollouts, ArmsEvaluator, ArmsOutcome
 from mimic.evaluation.arms_plot import plot_arms

@@ -7,7 +7,7 @@ import mimic
 from mimic.envs.imitation import training_and_held_out
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.tracking_controllers import run_controller, run_tracking
-from mimic.making import make_env
+from mimic.envs.make import make_env
 
 
 def make_evaluator(**fields) -> Evaluator:

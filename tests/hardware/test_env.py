@@ -12,8 +12,8 @@ from mimic.envs import imitation
 from mimic.envs.imitation import ImitationEnv
 from mimic.physics.world import WorldConfig
 from mimic.evaluation.evaluator import Evaluator
-from mimic.hardware.env import HardwareEnv, control_observation, expert_vector
-from mimic.making import make_env
+from mimic.envs.world_env import HardwareEnv, control_observation, expert_vector
+from mimic.envs.make import make_env
 
 FEW = {"count": 3, "held_out": 1}
 TICKS = 6

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.any_arm.family import UNSEEN, report_arms
+from mimic.envs.family import UNSEEN, report_arms
 from mimic.evaluation.evaluator import Evaluator
 from mimic.pretrained.files import PARAMETERS, read_params, write_network
 from mimic.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network

@@ -13,7 +13,7 @@ import pytest
 
 import mimic
 from mimic.arms.arrays import MAX_JOINTS, lock_joints, stack_arms
-from mimic.any_arm.family import arm_sampler
+from mimic.envs.family import arm_sampler
 from mimic.commands import retarget
 from mimic.commands import train as session
 from mimic.commands.config import EvaluateConfig, RetargetConfig

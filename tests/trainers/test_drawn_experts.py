@@ -12,7 +12,7 @@ import pytest
 
 import mimic
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, stack_arms
-from mimic.any_arm.family import arm_sampler
+from mimic.envs.family import arm_sampler
 from mimic.arms.sampler import random_arm
 from mimic.commands import retarget
 from mimic.commands import train as session

@@ -7,7 +7,7 @@ import pytest
 from brax.training.acme import running_statistics, specs
 
 from mimic.arms.arrays import MAX_JOINTS
-from mimic.any_arm.observation import JOINT_FEATURES, observation_size
+from mimic.envs.many_arms_observation import JOINT_FEATURES, observation_size
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.networks import Transformer
 from mimic.trainers.ppo.networks import make_networks

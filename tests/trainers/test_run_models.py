@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.any_arm.family import report_arms
+from mimic.envs.family import report_arms
 from mimic.arms.arm import build_arm
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation

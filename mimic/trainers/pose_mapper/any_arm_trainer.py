@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from mimic.arms.arrays import ArmArrays, stack_arms
-from mimic.any_arm.family import SEEN, UNSEEN, arm_sampler, report_arms
+from mimic.envs.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.compilation import Background, compiling
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import write_atomically

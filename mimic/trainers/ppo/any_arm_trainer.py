@@ -13,8 +13,8 @@ from brax.envs.base import State
 from jaxtyping import Array
 
 from mimic.any_arm.controller import ControllerWithMemory, nearest_pose_controller
-from mimic.any_arm.env import AnyArmEnv
-from mimic.any_arm.family import SEEN, UNSEEN, report_arms
+from mimic.envs.many_arms import AnyArmEnv
+from mimic.envs.family import SEEN, UNSEEN, report_arms
 from mimic.compilation import Background, compiling
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate
@@ -23,7 +23,7 @@ from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS, ArmRollouts, Arms
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.rollout_metrics import MIN_SPAN
-from mimic.making import make_family_env
+from mimic.envs.make import make_family_env
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals

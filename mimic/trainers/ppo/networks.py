@@ -15,7 +15,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS
-from mimic.any_arm.observation import JOINT_FEATURES
+from mimic.envs.many_arms_observation import JOINT_FEATURES
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.networks import Transformer
 
@@ -96,7 +96,7 @@ class JointPolicy(nn.Module):
         """Parameters of brax's normal distribution: means, then deviations before its softplus.
 
         Args:
-          observation: of `mimic.any_arm.observation.observe`, normalised.
+          observation: of `mimic.envs.many_arms_observation.observe`, normalised.
           is_free: 1 for a joint that moves, 0 for a locked one.
         """
         split = JOINT_FEATURES * MAX_JOINTS

@@ -18,7 +18,7 @@ from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.rollout_metrics import MIN_SPAN
-from mimic.making import make_env
+from mimic.envs.make import make_env
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals

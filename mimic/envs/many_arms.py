@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from mimic import compat
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
-from mimic.any_arm.control import Plan, make_plan, max_speed, planned_torque, torque_scale
+from mimic.envs.many_arms_control import Plan, make_plan, max_speed, planned_torque, torque_scale
 from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 from mimic.any_arm.kinematics import (
     check_metric,
@@ -27,7 +27,7 @@ from mimic.any_arm.kinematics import (
     link_states,
     make_metric,
 )
-from mimic.any_arm.observation import observation_size, observe
+from mimic.envs.many_arms_observation import observation_size, observe
 from mimic.physics.physics import make_advance
 from mimic.arms.sampler import Sampler
 from mimic.arms.arm import build_arm
@@ -74,7 +74,7 @@ class AnyArmEnv(Env):
     divided by the mean distance of holding the home pose. "relative": how much nearer the arm is than with zero actions
     since the start of the episode, see `relative_reward`; then the controller, which is simulated too, has the return 0
     on every arm, and all arms count alike. Action: for each joint slot a change of its acceleration in [-1, 1], see
-    `planned_torque`. Observation: see `mimic.any_arm.observation.observe`.
+    `planned_torque`. Observation: see `mimic.envs.many_arms_observation.observe`.
 
     Args:
       config: expert, metric, demonstrations and time steps; its learner is not used.
@@ -254,7 +254,7 @@ class AnyArmEnv(Env):
         return jax.tree.map(lambda table: table[demonstration, jnp.minimum(step, last)], self.expert_states)
 
     def observe(self, state: AnyArmState) -> Float[Array, " observation"]:
-        """The observation, see `mimic.any_arm.observation.observe`."""
+        """The observation, see `mimic.envs.many_arms_observation.observe`."""
         expert = self.expert_at(state.demonstration, state.step + 1)
         expert = jax.tree.map(lambda x: x[: self.expert.num_links], expert)
         inputs = state.qpos, state.qvel, state.goals, state.max_torque, state.plan

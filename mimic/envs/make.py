@@ -9,7 +9,7 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations
 
 if TYPE_CHECKING:
-    from mimic.any_arm.env import AnyArmEnv
+    from mimic.envs.many_arms import AnyArmEnv
     from mimic.envs.imitation import ImitationEnv
 
 
@@ -56,7 +56,7 @@ def make_env(config: EnvConfig, demonstrations: Demonstrations | None = None) ->
     config.check_one_learner()
     if not config.has_inner_loop:
         return env_class(config)(config, demonstrations)
-    from mimic.hardware.env import HardwareEnv
+    from mimic.envs.world_env import HardwareEnv
 
     if env_class(config) is not ImitationEnv:
         raise ValueError(f"environment: expected none with an inner loop (control, world), got {config.environment!r}")
@@ -73,8 +73,8 @@ def make_family_env(config: EnvConfig, demonstrations: Demonstrations | None = N
     Raises:
       ValueError: settings that such an environment does not have, arms or demonstrations that do not fit.
     """
-    from mimic.any_arm.env import AnyArmEnv
-    from mimic.any_arm.family import arm_sampler, check_family
+    from mimic.envs.many_arms import AnyArmEnv
+    from mimic.envs.family import arm_sampler, check_family
     from mimic.envs.imitation import training_and_held_out
 
     check_family(config)

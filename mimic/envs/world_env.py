@@ -21,7 +21,7 @@ from mimic.physics.inner_loop import LoopState, make_inner_loop
 from mimic.physics.mjx_loop import MjxLoop, make_mjx_loop
 from mimic.physics.mujoco_world import mujoco_world
 from mimic.physics.plant import Draw, draw_episode, make_plant
-from mimic.hardware.state import HardwareState
+from mimic.envs.world_state import HardwareState
 from mimic.metric.kinematics import LinkStates, link_states
 
 SENT_ACTIONS = 3  # that the policy observes: from them it tells how long its actions take
