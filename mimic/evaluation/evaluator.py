@@ -16,7 +16,7 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.any_arm.controller import ControllerWithMemory
+from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.compilation import Background, on_host
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv

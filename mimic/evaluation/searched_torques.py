@@ -9,7 +9,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.any_arm.controller import ControllerWithMemory
+from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.physics.step import Load
 from mimic.evaluation.config import SearchConfig

@@ -10,7 +10,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float, Int
 
-from mimic.any_arm.controller import nearest_pose_controller
+from mimic.evaluation.nearest_pose_controller import nearest_pose_controller
 from mimic.arms.simulation_model import effective_inertia
 from mimic.control.joint_control import action_towards
 from mimic.physics import chain_dynamics as dynamics

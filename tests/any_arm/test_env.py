@@ -10,7 +10,7 @@ import pytest
 
 import mimic
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
-from mimic.any_arm.controller import nearest_pose_controller
+from mimic.evaluation.nearest_pose_controller import nearest_pose_controller
 from mimic.envs.many_arms import AnyArmEnv, any_arm_state
 from mimic.any_arm.kinematics import link_states
 from mimic.arms.sampler import lock_masks, lock_sampler, random_arm

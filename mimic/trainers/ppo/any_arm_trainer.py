@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from brax.envs.base import State
 from jaxtyping import Array
 
-from mimic.any_arm.controller import ControllerWithMemory, nearest_pose_controller
+from mimic.evaluation.nearest_pose_controller import ControllerWithMemory, nearest_pose_controller
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.envs.family import SEEN, UNSEEN, report_arms
 from mimic.compilation import Background, compiling

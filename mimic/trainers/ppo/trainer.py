@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from mimic.any_arm.controller import ControllerWithMemory
+from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
