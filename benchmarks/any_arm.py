@@ -24,9 +24,9 @@ from benchmarks.common.record import Row, print_table, write_results
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints, stack_arms
 from mimic.retargeting.array_bound import closest_motion
 from mimic.envs.many_arms import AnyArmEnv
-from mimic.any_arm.kinematics import link_states
+from mimic.metric.array_kinematics import link_states
 from mimic.arms.sampler import lock_masks, lock_sampler, random_arm
-from mimic.any_arm.similarity import motion_similarity
+from mimic.metric.array_similarity import motion_similarity
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.named_arms import named_arms
 from mimic.envs import env_config

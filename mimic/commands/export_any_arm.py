@@ -22,7 +22,7 @@ from mimic.arms.description import (
     save_description,
 )
 from mimic.retargeting.array_goals import NEW_POSES, OTHERS, Problem, chosen_goal, first_goals, next_goals
-from mimic.any_arm.kinematics import check_metric, correspondence, link_states
+from mimic.metric.array_kinematics import check_metric, correspondence, link_states
 from mimic.envs.many_arms_observation import observation_size, observe
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.exported_function import ExportedFunction, joint_ranges

@@ -21,7 +21,7 @@ from mimic import compat
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.envs.many_arms_control import Plan, make_plan, max_speed, planned_torque, torque_scale
 from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
-from mimic.any_arm.kinematics import (
+from mimic.metric.array_kinematics import (
     check_metric,
     correspondence,
     link_states,

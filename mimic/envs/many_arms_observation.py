@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.envs.many_arms_control import Plan
 from mimic.retargeting.array_goals import Goals
-from mimic.any_arm.kinematics import joint_states, link_states_in_frames
+from mimic.metric.array_kinematics import joint_states, link_states_in_frames
 from mimic.retargeting.array_nearest import angle_limits
 from mimic.metric.kinematics import LinkStates
 

@@ -18,8 +18,8 @@ from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, stack_arms
 from mimic.retargeting.array_bound import closest_motion
 from mimic.envs.many_arms import AnyArmEnv, any_arm_state
 from mimic.envs.family import SEEN, UNSEEN
-from mimic.any_arm.kinematics import link_states
-from mimic.any_arm.similarity import motion_similarity
+from mimic.metric.array_kinematics import link_states
+from mimic.metric.array_similarity import motion_similarity
 from mimic.arms.arm import build_arm
 from mimic.compilation import Background, compiled_quickly, on_host
 from mimic.evaluation.evaluator import Controller

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
 from mimic.envs.many_arms_control import make_plan, max_speed, planned_torque
 from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
-from mimic.any_arm.kinematics import check_metric, correspondence
+from mimic.metric.array_kinematics import check_metric, correspondence
 from mimic.envs.many_arms_observation import observe
 from mimic.arms.arm import build_arm
 from mimic.envs.arm_state import arm_state

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.any_arm.kinematics import link_states
+from mimic.metric.array_kinematics import link_states
 from mimic.retargeting.array_nearest import angle_limits, solve_free
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates

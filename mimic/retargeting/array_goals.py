@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.any_arm.kinematics import link_states, make_metric
+from mimic.metric.array_kinematics import link_states, make_metric
 from mimic.retargeting.array_nearest import NearestPose, angle_limits, nearest_pose
 from mimic.metric.distance import DistanceWeights
 from mimic.metric.kinematics import LinkStates

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import ArmArrays
-from mimic.any_arm.kinematics import joint_states, link_jacobians, link_states_in_frames
+from mimic.metric.array_kinematics import joint_states, link_jacobians, link_states_in_frames
 from mimic.physics.chain_dynamics import solve
 from mimic.metric.distance import DistanceWeights
 from mimic.metric.kinematics import LinkStates

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
-from mimic.any_arm.kinematics import correspondence, link_states, make_metric
+from mimic.metric.array_kinematics import correspondence, link_states, make_metric
 from mimic.retargeting.array_nearest import nearest_pose
-from mimic.any_arm.similarity import centre_line
+from mimic.metric.array_similarity import centre_line
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.metric.distance import DistanceWeights
 from mimic.metric.similarity import similarity

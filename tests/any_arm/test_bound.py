@@ -10,7 +10,7 @@ import pytest
 import mimic
 from mimic.arms.arrays import arm_arrays, stack_arms
 from mimic.retargeting.array_bound import closest_motion
-from mimic.any_arm.kinematics import check_metric, correspondence, link_states, make_metric
+from mimic.metric.array_kinematics import check_metric, correspondence, link_states, make_metric
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.metric.config import MetricConfig
 from tests.any_arm.cases import padded

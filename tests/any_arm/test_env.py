@@ -12,7 +12,7 @@ import mimic
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.evaluation.nearest_pose_controller import nearest_pose_controller
 from mimic.envs.many_arms import AnyArmEnv, any_arm_state
-from mimic.any_arm.kinematics import link_states
+from mimic.metric.array_kinematics import link_states
 from mimic.arms.sampler import lock_masks, lock_sampler, random_arm
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.imitation import training_and_held_out

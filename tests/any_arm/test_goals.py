@@ -8,7 +8,7 @@ import pytest
 from mimic.retargeting import array_goals as goals
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
 from mimic.retargeting.array_goals import Problem, chosen_goal, first_goals, next_goals, random_numbers
-from mimic.any_arm.kinematics import correspondence, link_states
+from mimic.metric.array_kinematics import correspondence, link_states
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.metric.distance import DistanceWeights
 

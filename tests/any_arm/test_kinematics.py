@@ -10,7 +10,7 @@ import pytest
 
 import mimic
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
-from mimic.any_arm.kinematics import correspondence, joint_states, link_jacobians, link_states, link_states_in_frames
+from mimic.metric.array_kinematics import correspondence, joint_states, link_jacobians, link_states, link_states_in_frames
 from mimic.arms.sampler import random_arm
 from mimic.arms.arm import ArmConfig, build_arm
 from tests.any_arm.cases import Batch, random_source

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
-from mimic.any_arm.kinematics import correspondence, link_states, make_metric
+from mimic.metric.array_kinematics import correspondence, link_states, make_metric
 from mimic.retargeting.array_nearest import angle_limits, nearest_pose, pose_quadratic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.metric.distance import DistanceWeights

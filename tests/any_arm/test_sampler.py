@@ -9,7 +9,7 @@ import pytest
 from mimic.arms import sampler
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays
 from mimic.physics.dynamics import inertia_matrix
-from mimic.any_arm.kinematics import link_states
+from mimic.metric.array_kinematics import link_states
 from mimic.arms.arm import ArmConfig, build_arm
 
 COUNT = 500

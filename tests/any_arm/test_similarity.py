@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
-from mimic.any_arm.similarity import centre_line, motion_similarity
+from mimic.metric.array_similarity import centre_line, motion_similarity
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.evaluation.rollout_metrics import measure_similarity
 from mimic.metric.similarity import MEASURES, centre_line_table

@@ -11,7 +11,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
-from mimic.any_arm.kinematics import (
+from mimic.metric.array_kinematics import (
     check_metric,
     correspondence,
     joint_states,

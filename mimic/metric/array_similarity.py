@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import ArmArrays
-from mimic.any_arm.kinematics import link_states
+from mimic.metric.array_kinematics import link_states
 from mimic.metric.similarity import SAMPLES, CentreLine, similarity
 
 
