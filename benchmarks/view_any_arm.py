@@ -33,7 +33,7 @@ def prepare(learners: str) -> tuple[Any, Any, Any, Any]:
     import mimic
     from mimic.commands.config import ViewConfig
     from mimic.envs.config import ArmsConfig
-    from mimic.viewer.any_learner import AnyLearnerFunctions, read_learners
+    from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
 
     mapper = mimic.load("any_arm", "pose_mapper")
     config = ViewConfig(mapper="any_arm", learners=learners.strip("[]").split(","))

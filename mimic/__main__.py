@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     if name not in commands():
         print(f"error: {_unknown(name)}", file=sys.stderr)
         return BAD_INPUT
-    from mimic import cli
+    from mimic.commands import cli
 
     sys.argv = [f"mimic.{name}", *rest]
     cli.run(importlib.import_module(f"mimic.{name}").prepare, name)

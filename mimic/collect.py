@@ -1,6 +1,6 @@
 """`python -m mimic.collect DIR`: collects runs in one table and plot, with confidence intervals over seeds."""
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.commands.config import CollectConfig
 
 

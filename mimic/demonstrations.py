@@ -1,6 +1,6 @@
 """`python -m mimic.demonstrations out=FILE.npz`: records an expert with its torques, or imports motions."""
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.commands.config import RecordingConfig
 
 

@@ -1,6 +1,6 @@
 """`python -m mimic.evaluate run=DIR`: evaluates a trained policy, or another controller in its place."""
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.commands.config import EvaluateConfig
 
 

@@ -1,6 +1,6 @@
 """`python -m mimic.figures out=DIR`: draws the figures of the metric and of pose retargeting."""
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.commands.config import FiguresConfig
 
 

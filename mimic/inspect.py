@@ -1,6 +1,7 @@
 """`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and kinematic bound."""
 
-from mimic import cli, compat
+from mimic.commands import cli
+from mimic import compat
 from mimic.commands.config import InspectConfig
 
 

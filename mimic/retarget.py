@@ -1,6 +1,6 @@
 """`python -m mimic.retarget demonstrations=FILE learner=ENV out=FILE`: retargets motions to another arm."""
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.commands.config import RetargetConfig
 
 

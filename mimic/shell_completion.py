@@ -16,7 +16,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.config import BAD_INPUT
 
 _BASH = r"""# eval "$(mimic completion bash)"

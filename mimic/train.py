@@ -2,7 +2,7 @@
 
 import time
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.distributed.process_group import join

@@ -1,6 +1,6 @@
 """`python -m mimic.view`: shows expert and learner live in the browser."""
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.commands.config import ViewConfig
 
 

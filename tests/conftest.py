@@ -125,7 +125,7 @@ def rejected(monkeypatch, capsys, tmp_path):
     """A function that runs a command in an empty folder and returns the line that it is rejected with."""
 
     def run(name, *arguments):
-        from mimic import cli
+        from mimic.commands import cli
 
         folder = tmp_path / "empty"
         folder.mkdir()

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 import mimic
-from mimic import cli, train
+from mimic.commands import cli
+from mimic import train
 from mimic.__main__ import main
 from tests.helpers.repository import REPOSITORY
 

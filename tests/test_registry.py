@@ -145,7 +145,7 @@ def test_a_registered_environment_is_composed(monkeypatch):
     from hydra import compose, initialize_config_module
     from hydra.core.config_store import ConfigStore
 
-    from mimic import cli
+    from mimic.commands import cli
 
     mimic.register("environment", "short", {"horizon": 7, "learner": "panda"})
     store = ConfigStore.instance()

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from mimic import cli
+from mimic.commands import cli
 
 HEAVY = ("brax", "mujoco.mjx", "orbax", "matplotlib", "tensorboardX", "mink", "optax", "scipy", "trimesh")
 REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_initialized()\nprint(*sys.modules)"

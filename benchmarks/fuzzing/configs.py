@@ -20,7 +20,7 @@ import numpy as np
 from numpy.random import Generator
 
 from benchmarks.fuzzing import ACCEPTED, OTHER_NUMBERS, Case
-from mimic import cli
+from mimic.commands import cli
 from mimic.commands import config as commands
 from mimic.config import flatten, to_dict
 from mimic.ranges import Range, all_ranges

@@ -97,7 +97,7 @@ def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
       ValueError: there is no such mapper, or a learner does not exist or does not fit it.
     """
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-    from mimic.viewer.any_learner import AnyLearnerFunctions, read_learners
+    from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
     from mimic.viewer.follower import shown_preset
 
     mapper, env = _load_mapper(config)

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import dynamic_imitation as study
 from benchmarks.common.processes import run_parallel
-from mimic import cli
+from mimic.commands import cli
 from mimic.metric.config import MetricConfig
 from tests.helpers.run_directories import write_run
 

@@ -6,7 +6,7 @@ import pytest
 from benchmarks import training
 from benchmarks.common.processes import time_to_goal
 from benchmarks.common.record import print_table
-from mimic import cli
+from mimic.commands import cli
 
 
 @pytest.mark.parametrize(

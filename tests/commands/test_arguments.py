@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.commands.arguments import check_arguments
 
 ODD = [

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic import cli
+from mimic.commands import cli
 from mimic.commands import dataset as command
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset import prepare_dataset

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.__main__ import commands
 from mimic.commands.key_help import explanations, key_lines
 from mimic.config import schema

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic import cli
+from mimic.commands import cli
 
 TIME = np.arange(0, 6.0, 0.02)  # s
 PHASE = np.arange(7)

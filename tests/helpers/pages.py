@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from mimic import cli
+from mimic.commands import cli
 from mimic.sweeps.sweeper import Sweeper
 from tests.helpers.repository import REPOSITORY
 

@@ -15,7 +15,8 @@ import pytest
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import HydraException
 
-from mimic import cli, train
+from mimic.commands import cli
+from mimic import train
 from mimic.sweeps.launchers import gpus_of
 from mimic.sweeps.run_command import RunCommand
 from mimic.sweeps.sweeper import Outcome, Sweeper, path_of, path_override

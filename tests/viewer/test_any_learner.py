@@ -10,7 +10,7 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.config import ViewConfig
 from mimic.envs.config import ArmsConfig
 from mimic.metric.similarity import centre_line, similarity
-from mimic.viewer.any_learner import AnyLearnerFunctions, read_learners
+from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
 from mimic.viewer.follower import shown_preset
 from mimic.viewer.live_session import LiveSession
 from tests.helpers.compilations import count_compilations
