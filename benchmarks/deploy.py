@@ -47,7 +47,7 @@ def untrained_bundle(folder: Path) -> Bundle:
     import jax
 
     import mimic
-    from mimic.commands.export_controller import export_controller
+    from mimic.trainers.export.export_controller import export_controller
     from mimic.runs.checkpoints import save_checkpoint
     from mimic.trainers.config import PPOConfig, TrainConfig
     from mimic.trainers.ppo import training

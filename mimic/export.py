@@ -6,9 +6,9 @@ from mimic.commands.config import ExportConfig
 
 
 def prepare(config: ExportConfig) -> cli.Work:
-    """Prepares an export. See `mimic.commands.export`."""
+    """Prepares an export. See `mimic.trainers.export.export`."""
     compat.import_mjx()
-    from mimic.commands import export  # slow to import, and not needed for --help
+    from mimic.trainers.export import export  # slow to import, and not needed for --help
 
     return export.prepare_export(config)
 

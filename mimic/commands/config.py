@@ -24,7 +24,7 @@ ROBOTS = ("virtual_panda", "virtual_robot")
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "tracking", "searched")
 ROBOT_CONTROLLERS = ("policy", "tracking")
 ARM_SIDES = ("left", "right")
-CONTROLLER = "controller"  # a format of a folder, see mimic/commands/export_controller.py
+CONTROLLER = "controller"  # a format of a folder, see mimic/trainers/export/export_controller.py
 EXPORT_FORMATS = ("onnx", "jax", CONTROLLER)
 DATASET_FORMATS = ("lerobot", "rosbag2")
 

@@ -136,7 +136,7 @@ def _policy(trained: TrainConfig, evaluator: Evaluator, run_dir: Path, steps: in
     if not trained.env.has_inner_loop:
         model = _torque_model(evaluator, run_dir, steps)
         return TorquePolicy(model, expert, trained.env.preview, trained.env.control_dt)
-    from mimic.commands.export_controller import export_controller
+    from mimic.trainers.export.export_controller import export_controller
 
     bundle = folder / "bundle"
     export_controller(run_dir, bundle, steps)
@@ -166,8 +166,8 @@ def _expert_table(evaluator: Evaluator) -> np.ndarray:
 
 def _torque_model(evaluator: Evaluator, run_dir: Path, steps: int) -> bytes:
     """The exported policy behind its observation, as ONNX: from qpos, qvel and expert to torque."""
-    from mimic.commands.export import exported_function
-    from mimic.commands.onnx_graph import to_onnx  # needs the extra "export"
+    from mimic.trainers.export.export import exported_function
+    from mimic.trainers.export.onnx_graph import to_onnx  # needs the extra "export"
 
     env = evaluator.env
     policy = exported_function(ExportConfig(str(run_dir), checkpoint=steps))

@@ -17,8 +17,8 @@ import mimic
 from mimic.commands.config import EvaluateConfig, ExportConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.commands.evaluate_robot import prepare_robot_evaluation, summary
-from mimic.commands.export import prepare_export
-from mimic.commands.export_controller import expert_table, export_controller, prepare_controller
+from mimic.trainers.export.export import prepare_export
+from mimic.trainers.export.export_controller import expert_table, export_controller, prepare_controller
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import load_bundle
 from mimic.deploy.fake_robot import FakeRobot

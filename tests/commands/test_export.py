@@ -12,8 +12,8 @@ import mimic
 from mimic.arms.description import described_arm, description, description_layout
 from mimic.arms.sampler import random_arm
 from mimic.commands.config import ExportConfig
-from mimic.commands.export import exported_function
-from mimic.commands.export_controller import prepare_controller
+from mimic.trainers.export.export import exported_function
+from mimic.trainers.export.export_controller import prepare_controller
 from mimic.metric.config import MetricConfig
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig

@@ -6,7 +6,7 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from mimic.commands.onnx_graph import to_onnx
+from mimic.trainers.export.onnx_graph import to_onnx
 
 
 def loop(x):

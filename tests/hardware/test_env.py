@@ -222,7 +222,7 @@ def test_start_poses_are_within_the_ranges_of_the_inner_loop(nominal):
 
 def test_the_last_observations_show_the_expert_as_an_exported_controller_does():
     """Demonstrations may be longer than an episode; what comes after it is unknown to both."""
-    from mimic.commands.export_controller import expert_table
+    from mimic.trainers.export.export_controller import expert_table
 
     env = make(horizon=8)
     short = make_env(dataclasses.replace(env.config, horizon=6), env.demonstrations)

@@ -11,7 +11,7 @@ import numpy as np
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.drives import drives_of
-from mimic.commands.onnx_graph import to_onnx
+from mimic.trainers.export.onnx_graph import to_onnx
 from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import JointParameters, action_size
 from mimic.deploy.bundle import load_bundle, write_bundle

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.commands.onnx_graph import to_onnx
+from mimic.trainers.export.onnx_graph import to_onnx
 from mimic.control.clearance import joint_frames, moved_points
 from mimic.deploy.sessions import open_session
 from mimic.metric.kinematics import forward_kinematics, link_states

@@ -94,7 +94,7 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
     The states of the expert are five sixths of an observation and known before a motion. The test of the export
     compares with `control_observation` and the policy of `training.make_controller`.
     """
-    from mimic.commands.onnx_graph import to_onnx  # needs the extra "export"
+    from mimic.trainers.export.onnx_graph import to_onnx  # needs the extra "export"
 
     statistics, policy, *_ = params
     layers = [policy["params"][f"hidden_{index}"] for index in range(len(policy["params"]))]

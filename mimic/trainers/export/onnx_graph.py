@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from mimic.commands.onnx_operations import (
+from mimic.trainers.export.onnx_operations import (
     BINARY,
     REDUCTIONS,
     UNARY,

@@ -25,7 +25,7 @@ from mimic.retargeting.array_goals import NEW_POSES, OTHERS, Problem, chosen_goa
 from mimic.metric.array_kinematics import check_metric, correspondence, link_states
 from mimic.envs.many_arms_observation import observation_size, observe
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.commands.exported_function import ExportedFunction, joint_ranges
+from mimic.trainers.export.exported_function import ExportedFunction, joint_ranges
 from mimic.config import new_file
 from mimic.distribution import VERSION
 from mimic.runs.checkpoints import load_checkpoint

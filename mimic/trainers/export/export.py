@@ -14,9 +14,9 @@ from rich.console import Console
 
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
-from mimic.commands.export_any_arm import any_arm_function, description_writer
-from mimic.commands.export_controller import prepare_controller
-from mimic.commands.exported_function import ExportedFunction, joint_ranges
+from mimic.trainers.export.export_any_arm import any_arm_function, description_writer
+from mimic.trainers.export.export_controller import prepare_controller
+from mimic.trainers.export.exported_function import ExportedFunction, joint_ranges
 from mimic.config import check_choice, new_file, new_folder
 from mimic.distribution import VERSION, install_command
 from mimic.envs import env_config
@@ -262,7 +262,7 @@ def _write(exported: ExportedFunction, out: Path, format: str) -> None:
 
 
 def _onnx_bytes(exported: ExportedFunction) -> bytes:
-    from mimic.commands.onnx_graph import to_onnx  # needs the extra "export"
+    from mimic.trainers.export.onnx_graph import to_onnx  # needs the extra "export"
 
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in exported.metadata.items()}
     model = to_onnx(
