@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm
     from mimic.arms.rendering import ArmScene
     from mimic.trainers.export.export import export_run
-    from mimic.commands.fit import Run, fit
+    from mimic.trainers.fit import Run, fit
     from mimic.envs import env_config, environments
     from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
     from mimic.envs.imitation import ImitationEnv

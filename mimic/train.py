@@ -11,13 +11,13 @@ _process_started = [cli.process_started()]  # start time of the first run; later
 
 
 def prepare(config: TrainConfig) -> cli.Work:
-    """Prepares a training run. See `mimic.commands.train`."""
+    """Prepares a training run. See `mimic.trainers.run_training`."""
     prepare_started = time.perf_counter()
     if config.distributed.coordinator and cli.is_sweep():
         raise ValueError("distributed: expected one run, got a sweep; start each of its runs as a command of its own")
     group = join(config.distributed)
     cli.start_backend()
-    from mimic.commands import train  # slow to import, and not needed for --help
+    from mimic.trainers import run_training as train  # slow to import, and not needed for --help
 
     started = _process_started.pop() if _process_started else prepare_started
     signals = group.signals if group else Signals()

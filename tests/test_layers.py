@@ -152,11 +152,11 @@ def test_imports_that_run_down_pass(tmp_path):
     files = {
         "metric/distance.py": "import math\nfrom mimic import compat\nfrom ..arms.arm import arm\nfrom . import states",
         "commands/train.py": "def late():\n    from mimic.metric.distance import distance",
-        "train.py": "from mimic import cli\nfrom mimic.commands.train import prepare",
+        "train.py": "from mimic import cli\nfrom mimic.trainers.run_training import prepare",
     }
     imports = imports_of(_package(tmp_path, files))
     assert imports["mimic.metric.distance"] == {"mimic.compat", "mimic.arms.arm", "mimic.metric.states"}
-    assert imports["mimic.train"] == {"mimic.commands.cli", "mimic.commands.train"}
+    assert imports["mimic.train"] == {"mimic.commands.cli", "mimic.trainers.run_training"}
     assert not upward_imports(imports) and not circle(imports)
 
 

@@ -209,7 +209,7 @@ def _numbers(config: Any) -> list[float]:
 
 def _prepare_training(config: TrainConfig) -> None:
     """What `prepare_training` checks; for few physics steps also what it makes."""
-    from mimic.commands.train import prepare_training
+    from mimic.trainers.run_training import prepare_training
     from mimic.runs.loggers import check_loggers
     from mimic.trainers.memory import check_training_memory
     from mimic.trainers.run_config import new_run_dir
@@ -231,4 +231,4 @@ def _prepare_training(config: TrainConfig) -> None:
 
 def import_commands() -> None:
     """Imports what the first command would import."""
-    importlib.import_module("mimic.commands.train")
+    importlib.import_module("mimic.trainers.run_training")

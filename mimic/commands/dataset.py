@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset_sources import file_episodes, rollout_episodes
-from mimic.commands.progress import is_animated
+from mimic.trainers.progress import is_animated
 from mimic.compilation import use_compilation_cache
 from mimic.config import new_folder
 from mimic.datasets.episodes import Episodes, package_error

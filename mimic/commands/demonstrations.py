@@ -15,7 +15,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_fraction
-from mimic.commands.progress import is_animated
+from mimic.trainers.progress import is_animated
 from mimic.config import new_file
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort

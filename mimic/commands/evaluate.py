@@ -9,8 +9,8 @@ from typing import Any
 from rich.console import Console
 
 from mimic.commands.config import CONTROLLERS, EvaluateConfig
-from mimic.commands.progress import SearchProgress
-from mimic.commands.report import make_report, show_report
+from mimic.trainers.progress import SearchProgress
+from mimic.trainers.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
 from mimic.config import new_folder
 from mimic.distribution import install_command

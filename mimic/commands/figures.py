@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mimic.commands import train
+from mimic.trainers import run_training as train
 from mimic.commands.config import FiguresConfig
 from mimic.config import check_new
 from mimic.envs import env_config

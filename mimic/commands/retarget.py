@@ -16,7 +16,7 @@ from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import RetargetConfig
-from mimic.commands.progress import similarity_table
+from mimic.trainers.progress import similarity_table
 from mimic.config import new_file
 from mimic.envs import env_config
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import pretrained
-from mimic.commands import train
+from mimic.trainers import run_training as train
 from mimic.envs import env_config
 from mimic.pretrained.network import NETWORKS, read_any_arm_mapper, read_network
 from mimic.runs.files import REPORT, read_json

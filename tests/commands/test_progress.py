@@ -6,8 +6,8 @@ import re
 import pytest
 from rich.console import Console
 
-from mimic.commands import progress
-from mimic.commands.progress import SearchProgress, TrainingProgress
+from mimic.trainers import progress
+from mimic.trainers.progress import SearchProgress, TrainingProgress
 
 STATUS = "distance 0.1139  gap 234.6%, held out 255.2%"
 

@@ -14,7 +14,7 @@ from PIL import Image
 import mimic
 from mimic.arms.arm import build_arm
 from mimic.arms.rendering import ArmScene
-from mimic.commands import train
+from mimic.trainers import run_training as train
 from mimic.commands.clips import prepare_clip
 from mimic.commands.config import RenderConfig
 from mimic.commands.render import _write_video, draw_frames, prepare_video

@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from benchmarks.interruptions import differences
-from mimic.commands.train import prepare_training
+from mimic.trainers.run_training import prepare_training
 from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint, load_checkpoint, save_checkpoint
 from mimic.runs.lock import RunLock
 from mimic.trainers.config import TrainConfig

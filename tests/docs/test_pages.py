@@ -5,7 +5,7 @@ import re
 import pytest
 
 import mimic
-from mimic.commands import train
+from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from tests.helpers.pages import PAGES, REPOSITORY, Block, check, commands, module, read_blocks, run_page
 

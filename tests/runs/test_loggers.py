@@ -7,7 +7,7 @@ import types
 import pytest
 
 import mimic
-from mimic.commands import train
+from mimic.trainers import run_training as train
 from mimic.config import to_dict
 from mimic.runs.loggers import make_loggers
 from mimic.trainers.config import PoseMapperConfig, TrainConfig

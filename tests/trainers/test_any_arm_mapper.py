@@ -15,7 +15,7 @@ import mimic
 from mimic.arms.arrays import MAX_JOINTS, lock_joints, stack_arms
 from mimic.envs.family import arm_sampler
 from mimic.commands import retarget
-from mimic.commands import train as session
+from mimic.trainers import run_training as session
 from mimic.commands.config import EvaluateConfig, RetargetConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config

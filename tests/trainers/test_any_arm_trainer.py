@@ -8,7 +8,7 @@ import sys
 import pytest
 
 import mimic
-from mimic.commands.fit import Run
+from mimic.trainers.fit import Run
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS
 from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import PPOConfig, TrainConfig

@@ -15,7 +15,7 @@ from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, stack_arms
 from mimic.envs.family import arm_sampler
 from mimic.arms.sampler import random_arm
 from mimic.commands import retarget
-from mimic.commands import train as session
+from mimic.trainers import run_training as session
 from mimic.commands.config import RetargetConfig
 from mimic.envs import env_config
 from mimic.envs.config import ArmsConfig

@@ -10,7 +10,7 @@ import pytest
 
 import mimic
 from mimic.commands import retarget
-from mimic.commands import train as session
+from mimic.trainers import run_training as session
 from mimic.commands.config import EvaluateConfig, RetargetConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mimic.commands import train
+from mimic.trainers import run_training as train
 from mimic.envs import env_config
 from mimic.trainers.config import PPOConfig, TrainConfig
 

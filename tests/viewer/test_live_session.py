@@ -8,7 +8,7 @@ import pytest
 
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm, finite_velocity_limit
-from mimic.commands import train
+from mimic.trainers import run_training as train
 from mimic.envs import env_config
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.viewer import html

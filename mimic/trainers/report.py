@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
-from mimic.commands.progress import report_table, similarity_table
+from mimic.trainers.progress import report_table, similarity_table
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.provenance import hardware, versions
 from mimic.runs.stopwatch import Stopwatch

@@ -15,8 +15,8 @@ from rich.console import Console
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_report
-from mimic.commands.report import show_report
-from mimic.commands.train import run_training
+from mimic.trainers.report import show_report
+from mimic.trainers.run_training import run_training
 from mimic.compilation import compilation_cache, use_compilation_cache
 from mimic.config import explain, merged, schema, typed
 from mimic.envs import EnvConfig, env_config

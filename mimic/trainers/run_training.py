@@ -12,8 +12,8 @@ import jax
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from mimic.commands.progress import TrainingProgress
-from mimic.commands.report import make_report, show_report
+from mimic.trainers.progress import TrainingProgress
+from mimic.trainers.report import make_report, show_report
 from mimic.compilation import use_compilation_cache
 from mimic.config import check_writable, flatten, to_dict, typed
 from mimic.runs.autotuning import use_kept_choices
