@@ -24,7 +24,7 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect, failure
 from benchmarks.common.timing import summary_of_rates
 from benchmarks.peers import stock
-from mimic import compat
+from mimic.base import compat
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import wrap_for_training
 from mimic.trainers.config import PPOConfig, PPOSettings

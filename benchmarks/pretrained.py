@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import print_table
-from mimic.config import flatten, to_dict
+from mimic.base.config import flatten, to_dict
 from mimic.envs import env_config
 from mimic.metric.kinematics import link_state_table
 from mimic.pretrained.files import SOURCE, write_network

@@ -12,10 +12,10 @@ from mimic.runs import signals
 if signals.runs_as_command():  # a command ends in one line from here on: the imports below take a second
     signals.watch_signals()
 
-from mimic import compat  # noqa: E402
-from mimic.distribution import VERSION  # noqa: E402
+from mimic.base import compat  # noqa: E402
+from mimic.base.distribution import VERSION  # noqa: E402
 
-compat.prepare_cpu()  # before JAX starts its backend: see mimic.compat
+compat.prepare_cpu()  # before JAX starts its backend: see mimic.base.compat
 
 if TYPE_CHECKING:
     from mimic.arms.arm import ArmConfig, build_arm
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from mimic.metric.landscape import distance_landscape, local_minima
     from mimic.metric.motion_distance import motion_distance
     from mimic.pretrained.network import Pretrained, load
-    from mimic.registry import register
+    from mimic.base.registry import register
     from mimic.retargeting.costs import Costs
     from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound
     from mimic.retargeting.pose import PoseImitation, imitate_pose

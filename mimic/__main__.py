@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from mimic import __version__
-from mimic.config import BAD_INPUT, suggestion
+from mimic.base.config import BAD_INPUT, suggestion
 
 _ENTRY_POINT = re.compile(r"`python -m mimic\.(\w+)[^`]*`: (.*)\.")  # the docstring of an entry point
 _COMPLETION = "completion", "prints the completion of a shell: bash, zsh or fish"

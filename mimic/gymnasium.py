@@ -14,9 +14,9 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from mimic import compat
+from mimic.base import compat
 from mimic.arms.rendering import ArmScene
-from mimic.config import check_choice
+from mimic.base.config import check_choice
 from mimic.envs import env_config, environments
 
 compat.import_mjx()  # first, and quietly: brax imports it too

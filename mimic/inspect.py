@@ -1,7 +1,7 @@
 """`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and kinematic bound."""
 
 from mimic.commands import cli
-from mimic import compat
+from mimic.base import compat
 from mimic.commands.config import InspectConfig
 
 
@@ -16,7 +16,7 @@ def prepare(config: InspectConfig) -> cli.Work:
         from pathlib import Path
 
         from mimic.commands.capture import prepare_capture_inspection
-        from mimic.config import new_folder
+        from mimic.base.config import new_folder
 
         return prepare_capture_inspection(
             Path(config.clip).expanduser(), config.capture, new_folder("out", config.out) if config.out else None

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from mimic.commands import cli
-from mimic.config import BAD_INPUT
+from mimic.base.config import BAD_INPUT
 
 _BASH = r"""# eval "$(mimic completion bash)"
 _mimic() {

@@ -14,7 +14,7 @@ from jaxtyping import install_import_hook
 
 from tests.helpers.repository import REPOSITORY, SLOW_PARAMETERS
 
-# Not mimic.metric.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
+# Not mimic.base.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
 CORE = (
     "arms.chain",
     "arms.embodiment",
@@ -48,7 +48,7 @@ def pytest_configure(config: pytest.Config) -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it is ignored, by the commands that tests start too
 
     importlib.import_module("absl.logging")  # now: Hydra closes the stderr that this module finds
-    from mimic import compat  # importing mimic after the hook is in place, and before JAX starts
+    from mimic.base import compat  # importing mimic after the hook is in place, and before JAX starts
 
     compat.prepare_cpu()
 
@@ -79,7 +79,7 @@ def dtype(request: pytest.FixtureRequest):
 @pytest.fixture
 def interpreted(monkeypatch: pytest.MonkeyPatch):
     """Runs GPU kernels on the CPU, step by step."""
-    from mimic.metric import fused_kernel
+    from mimic.base import fused_kernel
 
     monkeypatch.setattr(fused_kernel.pl, "pallas_call", functools.partial(fused_kernel.pl.pallas_call, interpret=True))
 
@@ -108,7 +108,7 @@ def unchecked():
 @pytest.fixture
 def own_registry(monkeypatch: pytest.MonkeyPatch):
     """An empty registry for one test; installed plugins are not loaded."""
-    from mimic import registry
+    from mimic.base import registry
 
     monkeypatch.setattr(registry, "_registered", {kind: {} for kind in registry.KINDS})
     monkeypatch.setattr(registry, "_allowed", set())

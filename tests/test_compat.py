@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hydra.core.config_store import ConfigStore
 
-from mimic import compat
+from mimic.base import compat
 
 
 def test_lazy_modules_run_once_and_may_be_missing(tmp_path, monkeypatch):

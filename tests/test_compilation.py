@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic import compilation
-from mimic.compilation import Background, compiler_options
+from mimic.base import compilation
+from mimic.base.compilation import Background, compiler_options
 
 
 def test_background_functions_run_once():

@@ -5,8 +5,8 @@ import os
 import pytest
 from omegaconf import OmegaConf
 
-from mimic.config import to_dict
-from mimic.config_files import check_references, read_config
+from mimic.base.config import to_dict
+from mimic.base.config_files import check_references, read_config
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config
 

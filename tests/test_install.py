@@ -8,7 +8,7 @@ import tomllib
 
 import yaml
 
-from mimic import distribution
+from mimic.base import distribution
 from tests.helpers.repository import REPOSITORY
 
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]

@@ -10,7 +10,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from mimic.npz import MAX_BYTES, MAX_TEXT, read_arrays
+from mimic.base.npz import MAX_BYTES, MAX_TEXT, read_arrays
 
 ARRAYS = {"a": np.arange(12.0).reshape(3, 4), "names": np.array(["x", "yz"]), "n": np.array(3)}
 LOCAL, CENTRAL, END = b"PK\x03\x04", b"PK\x01\x02", b"PK\x05\x06"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mimic.commands import config as commands
-from mimic.ranges import Range, all_ranges, check_ranges, number, ranges
+from mimic.base.ranges import Range, all_ranges, check_ranges, number, ranges
 from mimic.trainers.config import (
     AnyArmMapperSettings,
     PoseMapperConfig,

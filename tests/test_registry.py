@@ -9,7 +9,7 @@ import pytest
 
 import mimic
 from mimic.commands.arguments import load_plugins
-from mimic.config import typed
+from mimic.base.config import typed
 from mimic.metric.config import MetricConfig
 
 pytestmark = pytest.mark.usefixtures("own_registry")

@@ -22,8 +22,8 @@ from numpy.random import Generator
 from benchmarks.fuzzing import ACCEPTED, OTHER_NUMBERS, Case
 from mimic.commands import cli
 from mimic.commands import config as commands
-from mimic.config import flatten, to_dict
-from mimic.ranges import Range, all_ranges
+from mimic.base.config import flatten, to_dict
+from mimic.base.ranges import Range, all_ranges
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 
 SEED = 2025

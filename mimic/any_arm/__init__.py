@@ -1,5 +1,5 @@
 """Serial arms as arrays of one shape: kinematics, metric and dynamics of any arm in one compiled function."""
 
-from mimic import compat
+from mimic.base import compat
 
 compat.import_mujoco()

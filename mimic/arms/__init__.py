@@ -1,5 +1,5 @@
 """Arms: embodiments, MJCF and URDF readers, and the models that simulate and draw an arm."""
 
-from mimic import compat
+from mimic.base import compat
 
 compat.import_mujoco()

@@ -19,8 +19,8 @@ from mimic.arms.model_files import read_spec
 from mimic.arms.mujoco_chain import base_pose
 from mimic.arms.named_arms import BUILT_IN, is_arm_name, named_arm
 from mimic.arms.simulation_model import effective_inertia, simulation_model
-from mimic.config import suggestion
-from mimic.ranges import check_ranges, number
+from mimic.base.config import suggestion
+from mimic.base.ranges import check_ranges, number
 
 # Planar arms are slender rods; relative to their size, their joints have about the effective inertia of the Panda's.
 _PLANAR_MASS = 1.0  # kg/m

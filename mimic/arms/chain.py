@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from mimic.config import check_choice
+from mimic.base.config import check_choice
 
 _log = logging.getLogger(__name__)
 SHORTEST_LINK = 1e-6  # m; below this a link has no direction

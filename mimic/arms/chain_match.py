@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import Literal
 
-from mimic.config import check_choice
+from mimic.base.config import check_choice
 
 ChainMatch = Literal["name", "order"]
 CHAIN_MATCHES = ("name", "order")

@@ -21,7 +21,7 @@ from mimic.arms.kinematic_tree import Tip
 from mimic.arms.model_files import model_name, read_model
 from mimic.arms.mujoco_chain import read_chain
 from mimic.arms.start_pose import with_home
-from mimic.config import check_choice
+from mimic.base.config import check_choice
 
 Limits = Literal["none", "hardware"]
 LIMITS = ("none", "hardware")
@@ -34,7 +34,7 @@ class Embodiment:
     A frozen pytree: the arrays are leaves, names and structure are static. The constructors return NumPy arrays in
     float64; functions compute in the dtype of the pose. Close over an arm rather than pass it as an argument of
     `jax.jit`: its numbers are then constants while JAX traces, which saves computation (up to 16 joints; see
-    `mimic.metric.spatial`).
+    `mimic.base.spatial`).
 
     Attributes:
       joint_axis: [num_joints, 3] unit axes in the zero pose.
@@ -319,7 +319,7 @@ def _locked_embodiment(chain: Chain, angles: dict[str, float], name: str, links:
 def snap_to_units(values: np.ndarray) -> np.ndarray:
     """Values within 1e-12 of -1, 0 or 1 set to these numbers exactly; others as they are.
 
-    Quaternions and sines leave such rounding errors. Exact zeros and ones cost nothing: see `mimic.metric.spatial`.
+    Quaternions and sines leave such rounding errors. Exact zeros and ones cost nothing: see `mimic.base.spatial`.
     """
     nearest = np.clip(np.round(values), -1, 1)
     return np.where(np.abs(values - nearest) < 1e-12, nearest, values)

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from mimic.config import suggestion
+from mimic.base.config import suggestion
 
 MENAGERIE = "MUJOCO_MENAGERIE"  # environment variable with the folder of a clone
 _CACHE, _DEFAULT_CACHE = "ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions"  # of robot_descriptions

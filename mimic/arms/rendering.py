@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mimic import compat
+from mimic.base import compat
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import Capsule, Colour, link_ends

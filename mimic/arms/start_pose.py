@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 
 from mimic.arms.chain import Joint, find_joint
-from mimic.config import suggestion
+from mimic.base.config import suggestion
 
 _ROUNDING = 1e-3  # rad; files round angles at the end of a range
 

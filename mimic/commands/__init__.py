@@ -1,5 +1,5 @@
 """The commands: mimic/NAME.py starts mimic/commands/NAME.py."""
 
-from mimic import compat
+from mimic.base import compat
 
 compat.import_mujoco()

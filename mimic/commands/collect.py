@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mimic.commands.config import CollectConfig
-from mimic.config import check_writable
+from mimic.base.config import check_writable
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import REPORT, write_atomically
 from mimic.sweeps.finished_runs import FinishedRun, LeftOut, QualityMetric, find_runs, quality_metric

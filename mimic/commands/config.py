@@ -10,12 +10,12 @@ from typing import Any
 from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import LIMITS
 from mimic.arms.named_arms import is_arm_name
-from mimic.config import check_choice
+from mimic.base.config import check_choice
 from mimic.envs import env_config, environments
 from mimic.envs.config import PHYSICS, ArmsConfig, EnvConfig
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
-from mimic.ranges import check_ranges, number, seed_number
+from mimic.base.ranges import check_ranges, number, seed_number
 from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
 

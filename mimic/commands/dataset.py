@@ -12,12 +12,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset_sources import file_episodes, rollout_episodes
 from mimic.trainers.progress import is_animated
-from mimic.compilation import use_compilation_cache
-from mimic.config import new_folder
+from mimic.base.compilation import use_compilation_cache
+from mimic.base.config import new_folder
 from mimic.datasets.episodes import Episodes, package_error
 from mimic.datasets.lerobot import action_of, frames_per_second, write_lerobot
 from mimic.datasets.rosbag2 import write_rosbag2
-from mimic.distribution import NAME, VERSION
+from mimic.base.distribution import NAME, VERSION
 from mimic.envs.demonstrations import load_demonstrations
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.checkpoints import load_checkpoint

@@ -16,7 +16,7 @@ from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_fraction
 from mimic.trainers.progress import is_animated
-from mimic.config import new_file
+from mimic.base.config import new_file
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort
 from mimic.envs.importing import import_demonstrations

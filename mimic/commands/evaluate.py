@@ -11,9 +11,9 @@ from rich.console import Console
 from mimic.commands.config import CONTROLLERS, EvaluateConfig
 from mimic.trainers.progress import SearchProgress
 from mimic.trainers.report import make_report, show_report
-from mimic.compilation import use_compilation_cache
-from mimic.config import new_folder
-from mimic.distribution import install_command
+from mimic.base.compilation import use_compilation_cache
+from mimic.base.config import new_folder
+from mimic.base.distribution import install_command
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint

@@ -15,7 +15,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from mimic.commands.config import EvaluateConfig, ExportConfig
-from mimic.config import new_folder
+from mimic.base.config import new_folder
 from mimic.deploy.bundle import MOTIONS
 from mimic.deploy.safety import COLLISION, LATE, check_supported
 from mimic.envs import env_config

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from mimic.trainers import run_training as train
 from mimic.commands.config import FiguresConfig
-from mimic.config import check_new
+from mimic.base.config import check_new
 from mimic.envs import env_config
 from mimic.paper_figures.poses import FIGURES, MAPPERS, save_figure
 from mimic.trainers.config import PoseMapperConfig, TrainConfig

@@ -24,7 +24,7 @@ from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.commands import arm_checks  # noqa: E402
 from mimic.commands.config import InspectConfig  # noqa: E402
 from mimic.trainers.progress import similarity_table  # noqa: E402
-from mimic.config import new_folder  # noqa: E402
+from mimic.base.config import new_folder  # noqa: E402
 from mimic.envs.config import EnvConfig  # noqa: E402
 from mimic.envs.demonstrations import Demonstrations  # noqa: E402
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402

@@ -17,7 +17,7 @@ from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.commands.config import RetargetConfig
 from mimic.trainers.progress import similarity_table
-from mimic.config import new_file
+from mimic.base.config import new_file
 from mimic.envs import env_config
 from mimic.envs.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity

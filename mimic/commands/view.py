@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import jax
 from rich.console import Console
 
-from mimic import compat
+from mimic.base import compat
 from mimic.arms.arm import ArmConfig
 from mimic.commands.config import ViewConfig
 from mimic.commands.view_capture import (
@@ -23,7 +23,7 @@ from mimic.commands.view_capture import (
     wait_for_arm,
 )
 from mimic.commands.view_server import check_port, is_installed, serve
-from mimic.distribution import install_command
+from mimic.base.distribution import install_command
 from mimic.envs.config import ArmsConfig, EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.run_config import load_config, policy_config, policy_run
@@ -53,7 +53,7 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
             f"{install_command('view')}"
         )
     check_port(config.host, config.port)
-    from mimic.compilation import use_compilation_cache
+    from mimic.base.compilation import use_compilation_cache
 
     use_compilation_cache(config.compilation_cache)
     if config.follow:

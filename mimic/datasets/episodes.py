@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mimic.distribution import install_command
+from mimic.base.distribution import install_command
 
 EXTRA = "datasets"  # of mimic: the packages that read and write these formats
 MAX_NUMBERS = 2**27  # that are read of a dataset: 1 GiB in double precision; seven joints for a day at 100 Hz

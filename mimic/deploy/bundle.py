@@ -13,7 +13,7 @@ import numpy as np
 from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import MODES, PERIOD, JointParameters, action_size
 from mimic.control.limits import JointLimits
-from mimic.npz import read_arrays
+from mimic.base.npz import read_arrays
 
 FORMAT = 2
 POLICY, FEATURES = "policy.onnx", "features.onnx"

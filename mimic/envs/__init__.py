@@ -7,8 +7,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mimic import registry
-from mimic.config import check_choice, explain, merged, schema, suggestion, to_dict, typed
+from mimic.base import registry
+from mimic.base.config import check_choice, explain, merged, schema, suggestion, to_dict, typed
 from mimic.envs.config import EnvConfig
 
 _PRESETS = importlib.resources.files("mimic") / "conf" / "env"

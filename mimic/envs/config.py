@@ -2,16 +2,16 @@
 
 import dataclasses
 
-from mimic import registry
+from mimic.base import registry
 from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
-from mimic.config import check_choice
+from mimic.base.config import check_choice
 from mimic.control.joint_control import MODES
 from mimic.envs.recording import KINDS
 from mimic.envs.start_poses import START_POSES
 from mimic.physics.world import WorldConfig
 from mimic.metric.config import MetricConfig
-from mimic.ranges import check_ranges, number
+from mimic.base.ranges import check_ranges, number
 
 PHYSICS = ("mjx", "fused")
 AUTO = "auto"

@@ -12,7 +12,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Float, Int
 
-from mimic import compat, registry
+from mimic.base import compat, registry
 from mimic.arms.arm import Arm, build_arm, torque_scale
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment

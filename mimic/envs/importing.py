@@ -13,7 +13,7 @@ from mimic.datasets.episodes import Motion
 from mimic.datasets.lerobot_reading import is_lerobot, read_lerobot
 from mimic.datasets.rosbag2 import BAG_FILES, is_rosbag2, read_rosbag2
 from mimic.envs.demonstrations import MAX_VALUE, Demonstrations, check_effort
-from mimic.npz import read_arrays
+from mimic.base.npz import read_arrays
 
 SOURCES = (".csv", ".npz", *BAG_FILES)
 _TIME, _DEMONSTRATION = ("time", "t"), "demonstration"  # columns of a table

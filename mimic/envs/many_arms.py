@@ -17,7 +17,7 @@ from brax.envs.base import Env, State
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from mimic import compat
+from mimic.base import compat
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.envs.many_arms_control import Plan, make_plan, max_speed, planned_torque, torque_scale
 from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers

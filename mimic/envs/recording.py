@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from mimic.arms.arm import Arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
-from mimic.config import check_choice
+from mimic.base.config import check_choice
 from mimic.envs.demonstrations import Demonstrations
 
 KINDS = ("pd", "reach")

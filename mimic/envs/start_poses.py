@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.compilation import on_host
+from mimic.base.compilation import on_host
 from mimic.retargeting.costs import Costs
 from mimic.retargeting.pose import imitate_pose
 

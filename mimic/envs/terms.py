@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic import registry
+from mimic.base import registry
 from mimic.envs.arm_state import ArmState
 from mimic.envs.config import OBSERVATION_TERMS, REWARD_TERMS
 from mimic.envs.start_poses import CLEARANCE

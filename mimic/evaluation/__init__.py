@@ -1,5 +1,5 @@
 """Evaluation of controllers on demonstrations: rollouts, metrics, other controllers, plots."""
 
-from mimic import compat
+from mimic.base import compat
 
 compat.import_mujoco()

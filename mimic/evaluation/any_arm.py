@@ -21,7 +21,7 @@ from mimic.envs.family import SEEN, UNSEEN
 from mimic.metric.array_kinematics import link_states
 from mimic.metric.array_similarity import motion_similarity
 from mimic.arms.arm import build_arm
-from mimic.compilation import Background, compiled_quickly, on_host
+from mimic.base.compilation import Background, compiled_quickly, on_host
 from mimic.evaluation.evaluator import Controller
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.metric.kinematics import LinkStates

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from mimic.ranges import check_ranges, number
+from mimic.base.ranges import check_ranges, number
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
-from mimic.compilation import Background, on_host
+from mimic.base.compilation import Background, on_host
 from mimic.envs.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.labels import SPLITS

@@ -1,5 +1,5 @@
 """Environments of a robot as it is: an inner loop at 1 kHz, gravity, friction, payload, sensors and delays."""
 
-from mimic import compat
+from mimic.base import compat
 
 compat.import_mujoco()

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.metric import spatial
+from mimic.base import spatial
 from mimic.metric.distance import PARTS
 from mimic.metric.kinematics import JointFrame, LinkVectors, joint_frames, link_vectors
-from mimic.metric.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract, times
+from mimic.base.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract, times
 
 _ROTATION = PARTS.index("rotation")
 _REST = LinkVectors(ZERO, ZERO, ZERO, ZERO)

@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.metric import spatial
+from mimic.base import spatial
 from mimic.metric.config import MetricConfig
 from mimic.metric.correspondence import overlaps_of_chains
 from mimic.metric.distance import DistanceWeights, Metric

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.npz import read_arrays
+from mimic.base.npz import read_arrays
 
 SUFFIXES = (".csv", ".npz")
 ARRAY = "correspondence"  # of an npz file

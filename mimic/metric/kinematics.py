@@ -13,8 +13,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.metric import spatial
-from mimic.metric.spatial import Rotation, Vector
+from mimic.base import spatial
+from mimic.base.spatial import Rotation, Vector
 
 
 @struct.dataclass

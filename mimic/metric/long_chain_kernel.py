@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mimic.arms.embodiment import Embodiment
-from mimic.metric import fused_kernel, spatial
+from mimic.base import fused_kernel, spatial
 from mimic.metric.analytic_gradient import NO_ADJOINTS, Adjoints, by_joint, compare_part, with_link
 from mimic.metric.kinematics import BASE, JointFrame, LinkVectors, child_frame, link_state
-from mimic.metric.spatial import ZERO, Scalar, Vector, plus, subtract
+from mimic.base.spatial import ZERO, Scalar, Vector, plus, subtract
 
 _VECTORS = 4  # of an arm in a row of numbers: the last two of the link
 _PER_ARM = 3 * _VECTORS

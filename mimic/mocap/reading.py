@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mimic.config import check_choice
+from mimic.base.config import check_choice
 from mimic.mocap.arms import find_arms
 from mimic.mocap.bvh import joint_positions, read_bvh
 from mimic.mocap.conventions import STATED_ARM_LENGTH, UNITS, UPS, arm_length, guessed_units, guessed_up, z_up

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mimic.npz import read_arrays
+from mimic.base.npz import read_arrays
 
 _MAX_BYTES = 2**30
 _MAX_POINTS = 2000

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from mimic.arms.embodiment import snap_to_units
-from mimic.metric.spatial import (
+from mimic.base.spatial import (
     IDENTITY,
     ZERO,
     Rotation,

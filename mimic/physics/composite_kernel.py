@@ -20,8 +20,8 @@ from mimic.physics.dynamics import PLANE, JointNumbers, Motion
 from mimic.physics.trigonometry import cosine_and_sine
 from mimic.physics.chain_dynamics import acceleration_field
 from mimic.physics.step import runge_kutta
-from mimic.metric import fused_kernel
-from mimic.metric.spatial import ZERO, Scalar, Vector, add, minus, plus, times
+from mimic.base import fused_kernel
+from mimic.base.spatial import ZERO, Scalar, Vector, add, minus, plus, times
 
 LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest measured on an H100
 

@@ -16,7 +16,7 @@ from mimic.physics import composite_kernel, dynamics, looped_dynamics
 from mimic.physics.composite_kernel import read_rows, write_rows
 from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
-from mimic.metric import fused_kernel
+from mimic.base import fused_kernel
 
 
 class JointConstants(NamedTuple):

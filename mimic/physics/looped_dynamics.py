@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from mimic.physics import dynamics
 from mimic.physics.chain_dynamics import acceleration_field
-from mimic.metric.spatial import add, vector
+from mimic.base.spatial import add, vector
 
 Joints = Float[Array, "joints *batch"]
 _Turns = tuple[Joints, Joints]  # cosine and sine of the rotation of each joint

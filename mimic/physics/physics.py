@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from mimic.physics import composite_kernel, dynamics, looped_dynamics
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.physics.step import Load, runge_kutta
-from mimic.metric import fused_kernel
+from mimic.base import fused_kernel
 
 AdvanceAny = Callable[[ArmArrays, Array, Array, Array, Load], tuple[Array, Array]]
 

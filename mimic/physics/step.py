@@ -11,7 +11,7 @@ from mujoco import mjx
 
 from mimic.physics import chain_dynamics as dynamics
 from mimic.envs.config import AUTO
-from mimic.metric import fused_kernel
+from mimic.base import fused_kernel
 from mimic.metric.kinematics import LONG
 
 _LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest by measurement

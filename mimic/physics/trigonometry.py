@@ -9,7 +9,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from mimic.metric.spatial import Scalar
+from mimic.base.spatial import Scalar
 
 # Pi as a sum. The first two numbers have 8 bits each, so that products with up to 16 bits are exact.
 _PI = 3.140625, 0.0009670257568359375, 6.27832957178498e-07

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from mimic.ranges import check_ranges, number
+from mimic.base.ranges import check_ranges, number
 
 MAX_DELAY = 3  # ticks
 

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mimic.npz import read_arrays
+from mimic.base.npz import read_arrays
 from mimic.runs.files import REPORT, read_json, write_report
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, save_config

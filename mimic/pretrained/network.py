@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic import compat
+from mimic.base import compat
 from mimic.arms.embodiment import Embodiment
-from mimic.config import check_choice
+from mimic.base.config import check_choice
 from mimic.envs import env_config
 from mimic.pretrained.files import SOURCE, read_config_and_report, read_params
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig

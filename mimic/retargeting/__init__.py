@@ -1,5 +1,5 @@
 """Retargeting of poses and motions from one arm to another: by optimisation, in closed form, and by baselines."""
 
-from mimic import compat
+from mimic.base import compat
 
 compat.import_mujoco()

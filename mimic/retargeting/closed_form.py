@@ -12,7 +12,7 @@ respect to a rotation, and c_i f'' (e x t_i)(e x t_i)^T in the second one.
 A length has a kink at 0, where Newton's method would divide by it; a sum of lengths often has its minimum there, at
 links that match exactly. The smoothed length is 0 with derivative 0 at a match, and its error is at most s.
 
-The computation is on scalar components (see `mimic.metric.spatial`). Rotating joint k moves all distal links: with its
+The computation is on scalar components (see `mimic.base.spatial`). Rotating joint k moves all distal links: with its
 axis a and a point c on it, a link's position by J = a x (p - c) = m + a x p, m = c x a. Sums over the distal links are
 accumulated from the tips to the base, as for a composite rigid body: the force g = grad h, the moments M of force and
 pull, and the stiffness of position.
@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from mimic.metric import spatial
+from mimic.base import spatial
 from mimic.metric.distance import RotationMeasure
-from mimic.metric.spatial import Rotation, Scalar, Vector
+from mimic.base.spatial import Rotation, Scalar, Vector
 from mimic.retargeting.optimizers import Derivatives
 
 

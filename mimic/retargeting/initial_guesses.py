@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.compilation import by_value, compiled_quickly, has_tracer
+from mimic.base.compilation import by_value, compiled_quickly, has_tracer
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.retargeting.pose_objective import PoseObjective, Target
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic import compat
+from mimic.base import compat
 from mimic.retargeting.closed_form import ROUGH_SMOOTHING, SMOOTHING, Smoothing
 from mimic.retargeting.optimizers import (
     Derivatives,

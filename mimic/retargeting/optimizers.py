@@ -1,6 +1,6 @@
 """Minimisers of a smooth function of joint angles within limits, from one start or from a batch of them.
 
-They compute on scalar components (see `mimic.metric.spatial`), so that a batch of descents is elementwise: its lanes
+They compute on scalar components (see `mimic.base.spatial`), so that a batch of descents is elementwise: its lanes
 are the last axes of the start, and the objective gets joint angles of the shape of the lanes.
 """
 
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mimic import compat
-from mimic.metric.spatial import Scalar, minus, plus, times
+from mimic.base import compat
+from mimic.base.spatial import Scalar, minus, plus, times
 
 _MAX_STEP = 1.0  # rad, of a joint in one Newton step
 _FIRST_DAMPING, _LESS, _MORE = 1e-2, 0.2, 8.0  # of the Hessian: initial value, factors after a success and a failure
@@ -104,7 +104,7 @@ def newton_step(objective: Objective, state: NewtonState, limits: Limits, index:
       objective: to minimise.
       state: before the step.
       limits: of the joints [rad].
-      index: of a loop, for `mimic.compat.stored`.
+      index: of a loop, for `mimic.base.compat.stored`.
     """
     qpos, here, damping = state
     bounds = _bounds(limits, len(qpos))

@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.compilation import compiled_once
-from mimic.config import check_choice
+from mimic.base.compilation import compiled_once
+from mimic.base.config import check_choice
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import resting_link_states
-from mimic.metric.spatial import array_library
+from mimic.base.spatial import array_library
 from mimic.retargeting.costs import Costs, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.multistart import Descents, Method, best_descent
@@ -72,7 +72,7 @@ def imitate_pose(
     (saddle-free Newton); "gradient_descent" is the paper's descent with a constant step.
 
     The first call compiles; later calls with equal arms, metric, options and shapes do not, see
-    `mimic.compilation.by_value`. Functions in the metric are compared by identity: make a `lambda` once.
+    `mimic.base.compilation.by_value`. Functions in the metric are compared by identity: make a `lambda` once.
 
     Args:
       expert: n joints.

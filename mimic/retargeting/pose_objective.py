@@ -12,10 +12,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Int
 
 from mimic.arms.embodiment import Embodiment, in_chain_lengths
-from mimic.metric import spatial
+from mimic.base import spatial
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
-from mimic.metric.spatial import Vector
+from mimic.base.spatial import Vector
 from mimic.retargeting.closed_form import (
     SMOOTHING,
     Body,

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.compilation import compiled_once
+from mimic.base.compilation import compiled_once
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.closed_form import ROUGH_SMOOTHING

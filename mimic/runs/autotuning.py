@@ -14,7 +14,7 @@ from pathlib import Path
 
 import jax
 
-from mimic.compilation import compilation_cache
+from mimic.base.compilation import compilation_cache
 from mimic.runs.files import read_json, write_atomically
 
 FILE = "autotuning.json"

@@ -22,7 +22,7 @@ import jaxlib
 import numpy as np
 import orbax.checkpoint as ocp
 
-from mimic.npz import read_arrays
+from mimic.base.npz import read_arrays
 from mimic.runs.autotuning import keep_choices
 from mimic.runs.files import write_atomically
 

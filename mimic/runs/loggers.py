@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from mimic.distribution import install_command
+from mimic.base.distribution import install_command
 
 
 class Logger(Protocol):

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from mimic import compat
+from mimic.base import compat
 from mimic.runs.files import METRICS, write_atomically
 
 

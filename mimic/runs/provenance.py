@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from mimic import distribution
+from mimic.base import distribution
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 

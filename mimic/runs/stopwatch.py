@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from mimic.compilation import WAITED
+from mimic.base.compilation import WAITED
 
 
 class Stopwatch:

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mimic import registry
-from mimic.config import flatten, to_dict
-from mimic.distribution import VERSION, recorded_version
+from mimic.base import registry
+from mimic.base.config import flatten, to_dict
+from mimic.base.distribution import VERSION, recorded_version
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import CONFIG, METRICS, REPORT, read_json
 from mimic.sweeps.sweeper import LOGS, SWEEP

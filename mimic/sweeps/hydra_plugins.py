@@ -16,7 +16,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.plugin import Plugin
 
-from mimic.config_files import read_config
+from mimic.base.config_files import read_config
 
 _PACKAGE, _MODULE = "hydra_plugins", "mimic"
 

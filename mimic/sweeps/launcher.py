@@ -14,7 +14,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
-from mimic.distribution import install_command
+from mimic.base.distribution import install_command
 from mimic.runs.signals import Signals, exit_hook, noted_signals
 from mimic.sweeps.run_command import RunCommand
 from mimic.sweeps.sweeper import FAILED, LOGS, Outcome, path_of

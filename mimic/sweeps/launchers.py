@@ -17,7 +17,7 @@ from typing import Any
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from mimic.ranges import Range
+from mimic.base.ranges import Range
 from mimic.sweeps.hydra_plugins import register, target
 from mimic.sweeps.launcher import LOCAL, CommandLauncher
 from mimic.sweeps.run_command import RunCommand

@@ -23,8 +23,8 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.config import check_writable
-from mimic.config_files import check_references
+from mimic.base.config import check_writable
+from mimic.base.config_files import check_references
 from mimic.runs.files import CONFIG, REPORT, read_json
 from mimic.runs.signals import exit_hook
 from mimic.sweeps.hydra_plugins import register, target

@@ -5,10 +5,10 @@ from typing import Any, ClassVar
 
 from omegaconf import MISSING
 
-from mimic import registry
-from mimic.config import check_choice
+from mimic.base import registry
+from mimic.base.config import check_choice
 from mimic.envs.config import EnvConfig
-from mimic.ranges import check_ranges, number, seed_number
+from mimic.base.ranges import check_ranges, number, seed_number
 from mimic.trainers.distributed.process_group import DistributedConfig
 
 NETWORKS = ("mlp", "joints")

@@ -17,8 +17,8 @@ from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_report
 from mimic.trainers.report import show_report
 from mimic.trainers.run_training import run_training
-from mimic.compilation import compilation_cache, use_compilation_cache
-from mimic.config import explain, merged, schema, typed
+from mimic.base.compilation import compilation_cache, use_compilation_cache
+from mimic.base.config import explain, merged, schema, typed
 from mimic.envs import EnvConfig, env_config
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.make import make_env, make_family_env

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mimic import compat, registry
+from mimic.base import compat, registry
 from mimic.envs.demonstrations import Demonstrations
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.fine_tuning import with_one_learner

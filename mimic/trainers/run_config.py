@@ -8,10 +8,10 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic import registry
+from mimic.base import registry
 from mimic.arms.arm import BUILT_IN
-from mimic.config import check_new, check_writable, explain, merged, schema, to_dict, typed
-from mimic.config_files import check_references, read_config
+from mimic.base.config import check_new, check_writable, explain, merged, schema, to_dict, typed
+from mimic.base.config_files import check_references, read_config
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
 from mimic.runs.lock import LOCK

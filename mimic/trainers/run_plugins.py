@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from mimic import registry
+from mimic.base import registry
 from mimic.runs.files import read_json, write_atomically
 from mimic.trainers.config import BUILT_IN_TRAINERS, TrainConfig
 

@@ -14,8 +14,8 @@ from rich.console import Console
 
 from mimic.trainers.progress import TrainingProgress
 from mimic.trainers.report import make_report, show_report
-from mimic.compilation import use_compilation_cache
-from mimic.config import check_writable, flatten, to_dict, typed
+from mimic.base.compilation import use_compilation_cache
+from mimic.base.config import check_writable, flatten, to_dict, typed
 from mimic.runs.autotuning import use_kept_choices
 from mimic.runs.checkpoints import (
     Checkpoint,

@@ -1,5 +1,5 @@
 """The live view in the browser."""
 
-from mimic import compat
+from mimic.base import compat
 
 compat.import_mujoco()

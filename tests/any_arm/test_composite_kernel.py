@@ -11,7 +11,7 @@ from mimic.physics.dynamics import joint_numbers
 from mimic.physics.physics import make_advance
 from mimic.physics.trigonometry import cosine_and_sine
 from mimic.physics.step import Load
-from mimic.metric.fused_kernel import LaunchConfig
+from mimic.base.fused_kernel import LaunchConfig
 from tests.any_arm.cases import Batch, random_source
 
 TIMESTEP, SUBSTEPS = 0.005, 2

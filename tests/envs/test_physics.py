@@ -12,7 +12,7 @@ from mimic.arms.simulation_model import simulation_model
 from mimic.physics import chain_dynamics as dynamics
 from mimic.envs.config import PHYSICS
 from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
-from mimic.metric import fused_kernel
+from mimic.base import fused_kernel
 from tests.helpers.lowering import gpu_program
 from tests.helpers.random_arms import SEEDS, random_arm
 from tests.helpers.trees import torso

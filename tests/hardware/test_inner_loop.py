@@ -16,7 +16,7 @@ from mimic.envs import env_config
 from mimic.physics.step import Load
 from mimic.physics.inner_loop import LoopState, flattened, gpu_kernel, make_inner_loop
 from mimic.physics.plant import GRAVITY, Draw, end_of_last_link, make_plant
-from mimic.metric.fused_kernel import LaunchConfig
+from mimic.base.fused_kernel import LaunchConfig
 from tests.helpers.lowering import gpu_program
 
 PERIODS = 50

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from mimic import distribution
+from mimic.base import distribution
 from mimic.envs import env_config
 from mimic.runs.files import METRICS, REPORT
 from mimic.runs.provenance import versions

@@ -8,7 +8,8 @@ from jax.typing import DTypeLike
 
 from mimic import motion_distance
 from mimic.arms.embodiment import load_mjcf, panda, planar_arm
-from mimic.metric import fused_kernel, long_chain_kernel
+from mimic.base import fused_kernel
+from mimic.metric import long_chain_kernel
 from mimic.metric import motion_distance as motion_module
 from mimic.metric.correspondence import overlap_correspondence
 from mimic.metric.distance import PAPER_WEIGHTS, PARTS, DistanceWeights, embodiment_distance

@@ -8,7 +8,7 @@ from jax.typing import DTypeLike
 
 from mimic import motion_distance
 from mimic.arms.embodiment import load_mjcf, panda, planar_arm
-from mimic.metric import fused_kernel
+from mimic.base import fused_kernel
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
 from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
 from mimic.metric.kinematics import LONG, link_states

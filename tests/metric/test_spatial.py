@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.metric import spatial
+from mimic.base import spatial
 
 AXES = [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.6, 0.0, -0.8), (2 / 3, -1 / 3, 2 / 3)]
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic import compat
+from mimic.base import compat
 from mimic.arms.embodiment import planar_arm
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric

@@ -5,7 +5,7 @@ import json
 import jax
 import pytest
 
-from mimic.compilation import compilation_cache
+from mimic.base.compilation import compilation_cache
 from mimic.runs.autotuning import FILE, keep_choices, use_kept_choices
 
 FOLDER = "xla_gpu_per_fusion_autotune_cache_dir"

@@ -8,7 +8,7 @@ import pytest
 
 import mimic
 from mimic.trainers import run_training as train
-from mimic.config import to_dict
+from mimic.base.config import to_dict
 from mimic.runs.loggers import make_loggers
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from mimic.envs import env_config
-from mimic.memory import check_memory, device_memory, host_memory
+from mimic.base.memory import check_memory, device_memory, host_memory
 from mimic.trainers import memory
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.memory import check_training_memory

@@ -14,7 +14,7 @@ from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 
 import mimic
-from mimic.compilation import compiler_options
+from mimic.base.compilation import compiler_options
 from mimic.envs.imitation import arm_state
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import losses as ppo_loss

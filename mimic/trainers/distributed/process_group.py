@@ -19,8 +19,8 @@ from collections.abc import Callable
 
 import jax
 
-from mimic import compat
-from mimic.ranges import check_ranges, number
+from mimic.base import compat
+from mimic.base.ranges import check_ranges, number
 from mimic.runs.signals import EXIT_HOOKS, STOPPED_BY_SIGNAL, Signals, with_patience
 from mimic.trainers.distributed.heartbeats import Heartbeats
 from mimic.trainers.distributed.local_processes import LocalProcesses, gpu_count, local_process

@@ -26,8 +26,8 @@ from mimic.metric.array_kinematics import check_metric, correspondence, link_sta
 from mimic.envs.many_arms_observation import observation_size, observe
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.trainers.export.exported_function import ExportedFunction, joint_ranges
-from mimic.config import new_file
-from mimic.distribution import VERSION
+from mimic.base.config import new_file
+from mimic.base.distribution import VERSION
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.fine_tuning import with_one_learner

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from mimic.arms.arrays import ArmArrays, stack_arms
 from mimic.envs.family import SEEN, UNSEEN, arm_sampler, report_arms
-from mimic.compilation import Background, compiling
+from mimic.base.compilation import Background, compiling
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import write_atomically
 from mimic.runs.signals import Signals

@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
-from mimic.compilation import on_host
+from mimic.base.compilation import on_host
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric

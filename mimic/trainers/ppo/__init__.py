@@ -1,5 +1,5 @@
 """PPO on an imitation environment."""
 
-from mimic import compat
+from mimic.base import compat
 
 compat.import_mujoco()

@@ -15,7 +15,7 @@ from jaxtyping import Array
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory, nearest_pose_controller
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.envs.family import SEEN, UNSEEN, report_arms
-from mimic.compilation import Background, compiling
+from mimic.base.compilation import Background, compiling
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate
 from mimic.envs.imitation import ImitationEnv, training_and_held_out

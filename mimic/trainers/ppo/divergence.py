@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from mimic.npz import read_arrays
+from mimic.base.npz import read_arrays
 from mimic.runs.checkpoints import run_id
 from mimic.runs.divergence import FILE
 from mimic.trainers.ppo.programs import BatchRecord, Replay, TrainingState, of_all_processes, saved_leaves

@@ -22,7 +22,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from mimic.compilation import Background, a_process_for_each_gpu, compiler_options, in_background
+from mimic.base.compilation import Background, a_process_for_each_gpu, compiler_options, in_background
 from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.envs.wrappers import fresh_episodes
 from mimic.metric.kinematics import LinkStates

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
-from mimic.compilation import Background, compiling, on_host
+from mimic.base.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
 from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out

@@ -11,7 +11,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array
 
-from mimic.metric.spatial import Scalar, stack
+from mimic.base.spatial import Scalar, stack
 
 ScalarFunction = Callable[..., Sequence[Sequence[Scalar]]]
 
@@ -52,7 +52,7 @@ def fused(
 
     Args:
       function: takes a sequence of scalars for each vector and returns sequences of scalars. It must be elementwise,
-        like the functions of `mimic.metric.spatial`: in the kernel a scalar is a block of samples.
+        like the functions of `mimic.base.spatial`: in the kernel a scalar is a block of samples.
       widths: length of each returned sequence.
       plain: the same function on vectors, for other devices; `function` itself where None.
       launch: launch configuration of the kernel.

@@ -17,7 +17,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from mimic import compat
+from mimic.base import compat
 
 Scalar = Any  # a traced scalar, or a number
 Vector = tuple[Scalar, Scalar, Scalar]

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from mimic.config import check_writable
+from mimic.base.config import check_writable
 
 WAITED = "/mimic/prepared/wait"  # an event of `jax.monitoring`
 

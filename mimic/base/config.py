@@ -10,8 +10,8 @@ from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.config_files import check_references
-from mimic.ranges import ranges
+from mimic.base.config_files import check_references
+from mimic.base.ranges import ranges
 
 BAD_INPUT = 2  # exit code of a command whose input is rejected
 _LONGEST_IN_RUN = 200  # characters of the longest path within a run directory

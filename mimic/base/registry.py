@@ -49,7 +49,7 @@ def register(kind: str, name: str, thing: Any = None, *, replace: bool = False) 
       kind: "environment", "reward_term", "observation_term", "correspondence", "link_distance", "demonstrations" or
         "trainer".
       name: letters, digits, "_" and "-".
-      thing: a function or class, or for an environment a mapping; see `mimic.registry.KINDS`.
+      thing: a function or class, or for an environment a mapping; see `mimic.base.registry.KINDS`.
       replace: whether to replace what is registered under this name, as when a notebook's cell runs again.
 
     Returns:
