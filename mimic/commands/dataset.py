@@ -14,9 +14,9 @@ from mimic.commands.dataset_sources import file_episodes, rollout_episodes
 from mimic.trainers.progress import is_animated
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_folder
-from mimic.datasets.episodes import Episodes, package_error
-from mimic.datasets.lerobot import action_of, frames_per_second, write_lerobot
-from mimic.datasets.rosbag2 import write_rosbag2
+from mimic.motions.formats.episodes import Episodes, package_error
+from mimic.motions.formats.lerobot import action_of, frames_per_second, write_lerobot
+from mimic.motions.formats.rosbag2 import write_rosbag2
 from mimic.base.distribution import NAME, VERSION
 from mimic.envs.demonstrations import load_demonstrations
 from mimic.evaluation.labels import SPLITS

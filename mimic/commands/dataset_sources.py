@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mimic.datasets.episodes import ANGLE, TORQUE, VELOCITY, ArmMotions, Episodes
+from mimic.motions.formats.episodes import ANGLE, TORQUE, VELOCITY, ArmMotions, Episodes
 from mimic.envs.demonstrations import Demonstrations
 from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from mimic.arms.embodiment import Embodiment
-from mimic.datasets.episodes import Motion
-from mimic.datasets.lerobot_reading import is_lerobot, read_lerobot
-from mimic.datasets.rosbag2 import BAG_FILES, is_rosbag2, read_rosbag2
+from mimic.motions.formats.episodes import Motion
+from mimic.motions.formats.lerobot_reading import is_lerobot, read_lerobot
+from mimic.motions.formats.rosbag2 import BAG_FILES, is_rosbag2, read_rosbag2
 from mimic.envs.demonstrations import MAX_VALUE, Demonstrations, check_effort
 from mimic.base.npz import read_arrays
 

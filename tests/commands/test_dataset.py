@@ -18,7 +18,7 @@ from mimic.commands import dataset as command
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset import prepare_dataset
 from mimic.commands.dataset_sources import file_episodes, rollout_episodes, steps_before_runaway
-from mimic.datasets.episodes import ANGLE, VELOCITY
+from mimic.motions.formats.episodes import ANGLE, VELOCITY
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.labels import SPLITS
 from mimic.envs.make import make_env

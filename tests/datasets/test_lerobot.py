@@ -8,10 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from mimic.datasets import lerobot
-from mimic.datasets.episodes import ANGLE, TORQUE
-from mimic.datasets.lerobot import frames_per_second, write_lerobot
-from mimic.datasets.lerobot_reading import read_lerobot
+from mimic.motions.formats import lerobot
+from mimic.motions.formats.episodes import ANGLE, TORQUE
+from mimic.motions.formats.lerobot import frames_per_second, write_lerobot
+from mimic.motions.formats.lerobot_reading import read_lerobot
 from tests.helpers.episodes import COUNT, DT, EXPERT, LEARNER, STEPS, episodes, motions
 
 pa = pytest.importorskip("pyarrow")

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from mimic.datasets.lerobot import write_lerobot
-from mimic.datasets.lerobot_reading import is_lerobot, read_lerobot
+from mimic.motions.formats.lerobot import write_lerobot
+from mimic.motions.formats.lerobot_reading import is_lerobot, read_lerobot
 from tests.helpers.episodes import DT, EXPERT, LEARNER, STEPS, episodes, motions
 
 pa = pytest.importorskip("pyarrow")
@@ -119,7 +119,7 @@ def test_damaged_files_are_rejected(written, file, damage):
 
 
 def test_sizes_are_checked_before_anything_is_read(written, monkeypatch):
-    monkeypatch.setattr("mimic.datasets.lerobot_reading.MAX_NUMBERS", 16 * (3 + 6) - 1)
+    monkeypatch.setattr("mimic.motions.formats.lerobot_reading.MAX_NUMBERS", 16 * (3 + 6) - 1)
     with pytest.raises(ValueError, match="expected 1 to 143 numbers, got 144"):
         read_lerobot(written, EXPERT)
 

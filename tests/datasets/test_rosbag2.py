@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mimic.datasets.rosbag2 import is_rosbag2, read_rosbag2, write_rosbag2
+from mimic.motions.formats.rosbag2 import is_rosbag2, read_rosbag2, write_rosbag2
 from tests.helpers.episodes import COUNT, DT, EXPERT, LEARNER, STEPS, episodes, motions
 
 rosbags = pytest.importorskip("rosbags")
@@ -187,7 +187,7 @@ def test_damaged_bags_are_rejected(written, file, damage):
 
 
 def test_sizes_are_bounded(written, monkeypatch):
-    monkeypatch.setattr("mimic.datasets.rosbag2.MAX_NUMBERS", 50)
+    monkeypatch.setattr("mimic.motions.formats.rosbag2.MAX_NUMBERS", 50)
     with pytest.raises(ValueError, match="expected at most 50 numbers in all bags"):
         read_rosbag2(written, EXPERT)
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mimic.datasets.episodes import ArmMotions, Episodes
+from mimic.motions.formats.episodes import ArmMotions, Episodes
 
 STEPS, COUNT, DT = 6, 3, 0.1
 EXPERT, LEARNER = ("joint1", "joint2", "joint3"), ("joint1", "joint2")

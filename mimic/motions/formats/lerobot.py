@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mimic.datasets.episodes import ANGLE, EXPERT, VELOCITY, ArmMotions, Episodes, Quantity
+from mimic.motions.formats.episodes import ANGLE, EXPERT, VELOCITY, ArmMotions, Episodes, Quantity
 
 VERSION = "v3.0"
 INFO, STATS, TASKS, MIMIC = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/mimic.json"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mimic.datasets.episodes import (
+from mimic.motions.formats.episodes import (
     ANGLE,
     MAX_NUMBERS,
     TORQUE,

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mimic.datasets.episodes import ANGLE, EXPERT, MAX_NUMBERS, VELOCITY, Motion, choose_entry, package_error
-from mimic.datasets.lerobot import DATA_FOLDER, EPISODES_FOLDER, FINAL, INFO
+from mimic.motions.formats.episodes import ANGLE, EXPERT, MAX_NUMBERS, VELOCITY, Motion, choose_entry, package_error
+from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, FINAL, INFO
 from mimic.runs.files import read_json
 
 _TIME_TOLERANCE = 1e-4  # s: LeRobot's own, between a timestamp and that of its frame
