@@ -27,7 +27,7 @@ from benchmarks.figures import study_figures
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.collect import prepare_collection
 from mimic.commands.config import CollectConfig
-from mimic.envs.recording import KINDS, record_demonstrations
+from mimic.motions.recording import KINDS, record_demonstrations
 from mimic.runs.files import REPORT
 from mimic.sweeps.finished_runs import find_runs
 from mimic.sweeps.sweeper import path_override

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from mimic.trainers.export.export import export_run
     from mimic.trainers.fit import Run, fit
     from mimic.envs import env_config, environments
-    from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
+    from mimic.motions.demonstrations import Demonstrations, check_effort, load_demonstrations
     from mimic.envs.imitation import ImitationEnv
-    from mimic.envs.importing import import_demonstrations
-    from mimic.envs.recording import record_demonstrations
+    from mimic.motions.importing import import_demonstrations
+    from mimic.motions.recording import record_demonstrations
     from mimic.envs.make import make
     from mimic.metric.correspondence import (
         arc_length_correspondence,

@@ -17,7 +17,7 @@ from numpy.random import Generator
 
 import mimic
 from benchmarks.fuzzing import ACCEPTED, OTHER_NUMBERS, Case
-from mimic.envs.demonstrations import FORMAT
+from mimic.motions.demonstrations import FORMAT
 
 SEED = 25
 _FILE, _MARK = "motions.npz", "unpickled"

@@ -15,8 +15,8 @@ from mimic.arms.link_match import LinkMatch
 from mimic.commands.config import RenderConfig
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, load_demonstrations
-from mimic.envs.recording import record_demonstrations
+from mimic.motions.demonstrations import Demonstrations, load_demonstrations
+from mimic.motions.recording import record_demonstrations
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line_table, similarity

@@ -18,7 +18,7 @@ from mimic.motions.formats.episodes import Episodes, package_error
 from mimic.motions.formats.lerobot import action_of, frames_per_second, write_lerobot
 from mimic.motions.formats.rosbag2 import write_rosbag2
 from mimic.base.distribution import NAME, VERSION
-from mimic.envs.demonstrations import load_demonstrations
+from mimic.motions.demonstrations import load_demonstrations
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import written_atomically

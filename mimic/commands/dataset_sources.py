@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from mimic.motions.formats.episodes import ANGLE, TORQUE, VELOCITY, ArmMotions, Episodes
-from mimic.envs.demonstrations import Demonstrations
+from mimic.motions.demonstrations import Demonstrations
 from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
 

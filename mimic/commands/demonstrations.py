@@ -18,9 +18,9 @@ from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_f
 from mimic.trainers.progress import is_animated
 from mimic.base.config import new_file
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, check_effort
-from mimic.envs.importing import import_demonstrations
-from mimic.envs.recording import record_demonstrations
+from mimic.motions.demonstrations import Demonstrations, check_effort
+from mimic.motions.importing import import_demonstrations
+from mimic.motions.recording import record_demonstrations
 from mimic.retargeting.self_collision import smallest_clearances, touching_line
 
 _PLOT_SUFFIXES = (".png", ".pdf", ".svg")

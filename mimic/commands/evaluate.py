@@ -15,7 +15,7 @@ from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_folder
 from mimic.base.distribution import install_command
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import load_demonstrations
+from mimic.motions.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.stopwatch import Stopwatch

@@ -26,7 +26,7 @@ from mimic.commands.config import InspectConfig  # noqa: E402
 from mimic.trainers.progress import similarity_table  # noqa: E402
 from mimic.base.config import new_folder  # noqa: E402
 from mimic.envs.config import EnvConfig  # noqa: E402
-from mimic.envs.demonstrations import Demonstrations  # noqa: E402
+from mimic.motions.demonstrations import Demonstrations  # noqa: E402
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
 from mimic.paper_figures.pose_picture import nearest_poses, readable_poses, save_poses  # noqa: E402
 

@@ -19,7 +19,7 @@ from mimic.commands.config import RetargetConfig
 from mimic.trainers.progress import similarity_table
 from mimic.base.config import new_file
 from mimic.envs import env_config
-from mimic.envs.demonstrations import Demonstrations, load_demonstrations
+from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.costs import Costs

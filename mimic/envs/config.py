@@ -7,7 +7,7 @@ from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
 from mimic.base.config import check_choice
 from mimic.control.joint_control import MODES
-from mimic.envs.recording import KINDS
+from mimic.motions.recording import KINDS
 from mimic.envs.start_poses import START_POSES
 from mimic.physics.world import WorldConfig
 from mimic.metric.config import MetricConfig

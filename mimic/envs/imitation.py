@@ -18,9 +18,9 @@ from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, check_effort, load_demonstrations
+from mimic.motions.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
-from mimic.envs.recording import record_demonstrations
+from mimic.motions.recording import record_demonstrations
 from mimic.envs.start_poses import home_poses, nearest_poses
 from mimic.envs.terms import Transition, observation_layout_of_terms, observation_terms, observed, reward_terms
 from mimic.metric.distance import LinkDistance

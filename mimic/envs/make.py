@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 from mimic.base import compat
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations
+from mimic.motions.demonstrations import Demonstrations
 
 if TYPE_CHECKING:
     from mimic.envs.many_arms import AnyArmEnv

@@ -33,7 +33,7 @@ from mimic.arms.sampler import Sampler
 from mimic.arms.arm import build_arm
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations
+from mimic.motions.demonstrations import Demonstrations
 from mimic.physics.step import Load, PhysicsChoice
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import LinkStates

@@ -13,7 +13,7 @@ from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
 from mimic.envs.arm_state import ArmState
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations
+from mimic.motions.demonstrations import Demonstrations
 from mimic.envs.imitation import ImitationEnv
 from mimic.physics.step import PhysicsChoice
 from mimic.physics.world import MAX_DELAY

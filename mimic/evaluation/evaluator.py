@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.base.compilation import Background, on_host
-from mimic.envs.demonstrations import Demonstrations, concatenate
+from mimic.motions.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.rollout_metrics import WORST, Table, gaps, means_by_split, measure, measure_similarity

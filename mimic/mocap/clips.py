@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicHermiteSpline
 
-from mimic.envs.demonstrations import Demonstrations
+from mimic.motions.demonstrations import Demonstrations
 from mimic.mocap.ball_chain import AXES, ball_chain_motion
 from mimic.mocap.link_motion import CUTOFF, LinkMotion, motion_states
 

@@ -131,7 +131,7 @@ class PPOConfig(TrainerConfig):
       network: "mlp"; or "joints", a policy with a token for each joint, for environments with a drawn arm.
       hidden_layers: widths of the hidden layers of the policy and value networks; with network "joints" of the latter.
       crossovers: number of additional training demonstrations, mixed joint by joint from the recorded ones, see
-        `crossovers` in mimic/envs/demonstrations.py.
+        `crossovers` in mimic/motions/demonstrations.py.
       timed_critic: whether the value network also observes the elapsed fraction of the episode, on which the return
         depends. The policy never observes it.
       target_gap: training ends early when the optimality gap on the training demonstrations is at most this; 0 disables

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mimic.base import compat, registry
-from mimic.envs.demonstrations import Demonstrations
+from mimic.motions.demonstrations import Demonstrations
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.memory import check_training_memory

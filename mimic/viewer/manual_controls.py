@@ -9,8 +9,8 @@ import viser
 
 from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations
-from mimic.envs.recording import record_demonstrations
+from mimic.motions.demonstrations import Demonstrations
+from mimic.motions.recording import record_demonstrations
 from mimic.viewer.hand import hand_position
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.meshes import ArmShape

@@ -19,8 +19,8 @@ from mimic.commands.clips import prepare_clip
 from mimic.commands.config import RenderConfig
 from mimic.commands.render import _write_video, draw_frames, prepare_video
 from mimic.envs import env_config
-from mimic.envs.demonstrations import Demonstrations
-from mimic.envs.recording import record_demonstrations
+from mimic.motions.demonstrations import Demonstrations
+from mimic.motions.recording import record_demonstrations
 from mimic.metric.similarity import centre_line, similarity
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.envs.demonstrations import concatenate
+from mimic.motions.demonstrations import concatenate
 from mimic.envs.imitation import training_and_held_out
 
 

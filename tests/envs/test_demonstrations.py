@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.envs.demonstrations import crossovers
+from mimic.motions.demonstrations import crossovers
 
 
 def panda():

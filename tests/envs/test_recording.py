@@ -9,7 +9,7 @@ import pytest
 
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.envs.recording import KINDS
+from mimic.motions.recording import KINDS
 
 SUBSTEPS = 10  # of MuJoCo, a control step
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.envs.demonstrations import Demonstrations
+from mimic.motions.demonstrations import Demonstrations
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.envs.start_poses import CLEARANCE, nearest_poses
 from mimic.envs.wrappers import fresh_episodes

@@ -17,7 +17,7 @@ from mimic.envs.many_arms import AnyArmEnv
 from mimic.envs.family import SEEN, UNSEEN, report_arms
 from mimic.base.compilation import Background, compiling
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate
+from mimic.motions.demonstrations import Demonstrations, check_effort, concatenate
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS, ArmRollouts, ArmsEvaluator, ArmsOutcome
 from mimic.evaluation.config import SearchConfig

@@ -12,7 +12,7 @@ import jax
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.base.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
-from mimic.envs.demonstrations import Demonstrations, check_effort, concatenate, crossovers
+from mimic.motions.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from mimic.arms.arm import Arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.base.config import check_choice
-from mimic.envs.demonstrations import Demonstrations
+from mimic.motions.demonstrations import Demonstrations
 
 KINDS = ("pd", "reach")
 GOAL_SHARE = 0.5  # goals lie within this fraction of the way from the home pose to the joint limits

@@ -12,7 +12,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.formats.lerobot_reading import is_lerobot, read_lerobot
 from mimic.motions.formats.rosbag2 import BAG_FILES, is_rosbag2, read_rosbag2
-from mimic.envs.demonstrations import MAX_VALUE, Demonstrations, check_effort
+from mimic.motions.demonstrations import MAX_VALUE, Demonstrations, check_effort
 from mimic.base.npz import read_arrays
 
 SOURCES = (".csv", ".npz", *BAG_FILES)
