@@ -22,8 +22,8 @@ from mimic.commands.config import CaptureConfig
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.similarity import centre_line_table, similarity
-from mimic.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
-from mimic.mocap.link_motion import BOTH
+from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
+from mimic.motions.mocap.link_motion import BOTH
 from mimic.retargeting.costs import capsule_axes, changing_pairs, pair_distances
 
 _PAIR = ArmConfig("panda_pair")

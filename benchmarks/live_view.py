@@ -51,8 +51,8 @@ def pose_latency(clip: Path, samples: int, slow_down: float) -> Row:
     from mimic.arms.arm import ArmConfig, build_arm
     from mimic.commands.config import ViewConfig
     from mimic.commands.view_capture import _live_arm, _measured, _with_model, fixed_fraction
-    from mimic.mocap.live_points import Sample, parse_sample, sample_line
-    from mimic.mocap.reading import read_motion
+    from mimic.motions.mocap.live_points import Sample, parse_sample, sample_line
+    from mimic.motions.mocap.reading import read_motion
     from mimic.viewer.follower import compile_functions, initial_settings
 
     config = ViewConfig(source="tcp://localhost:1", learner="panda")

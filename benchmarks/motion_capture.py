@@ -34,9 +34,9 @@ from mimic.commands.config import CaptureConfig
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.similarity import centre_line_table, similarity
-from mimic.mocap.arms import SIDES
-from mimic.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
-from mimic.mocap.link_motion import TRUNK, LinkMotion
+from mimic.motions.mocap.arms import SIDES
+from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
+from mimic.motions.mocap.link_motion import TRUNK, LinkMotion
 from mimic.retargeting.pose_baselines import hand_ik, hold_home
 from mimic.retargeting.segment_alignment import Landmarks, align_segments
 from mimic.runs.signals import Signals

@@ -20,9 +20,9 @@ import numpy as np
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.fuzzing.captures import bvh_bytes, c3d_bytes, trc_bytes
-from mimic.mocap.bvh import joint_positions, read_bvh
-from mimic.mocap.conventions import UNITS
-from mimic.mocap.reading import read_motion
+from mimic.motions.mocap.bvh import joint_positions, read_bvh
+from mimic.motions.mocap.conventions import UNITS
+from mimic.motions.mocap.reading import read_motion
 
 LIMIT = 1e-6  # m
 _RATE, _FRAMES = 100.0, 40

@@ -14,8 +14,8 @@ import time
 
 import numpy as np
 
-from mimic.mocap.live_points import Sample, sample_line
-from mimic.mocap.reading import read_motion
+from mimic.motions.mocap.live_points import Sample, sample_line
+from mimic.motions.mocap.reading import read_motion
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("clip", help="BVH, C3D, TRC, CSV or npz file")

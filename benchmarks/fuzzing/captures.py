@@ -19,9 +19,9 @@ from benchmarks.fuzzing import ACCEPTED, OTHER_NUMBERS, Case
 from benchmarks.fuzzing.npz import BYTE_DAMAGES
 from mimic.commands.capture import body_lines, read_arm
 from mimic.commands.config import CaptureConfig
-from mimic.mocap.conventions import UNITS
-from mimic.mocap.points import PointMotion
-from mimic.mocap.reading import read_motion
+from mimic.motions.mocap.conventions import UNITS
+from mimic.motions.mocap.points import PointMotion
+from mimic.motions.mocap.reading import read_motion
 from tests.mocap.bodies import RATE, bvh_text, person
 
 SEED = 27

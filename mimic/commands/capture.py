@@ -14,13 +14,13 @@ from mimic.commands.config import ROBOT_WORLDS, CaptureConfig, RecordingConfig
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
 from mimic.metric.kinematics import link_state_table
-from mimic.mocap.arms import SIDES, find_arms
-from mimic.mocap.ball_chain import ball_chain_xml, zero_frames
-from mimic.mocap.clips import Windows, relative_speeds, slow_down_for, turned, windows
-from mimic.mocap.link_motion import BOTH, LinkMotion, arm_motion, rigid_error, sides
-from mimic.mocap.picture import draw_skeleton, draw_windows
-from mimic.mocap.points import PointMotion, bridge_gaps, gaps, jumps, segment_lengths
-from mimic.mocap.reading import read_motion
+from mimic.motions.mocap.arms import SIDES, find_arms
+from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
+from mimic.motions.mocap.clips import Windows, relative_speeds, slow_down_for, turned, windows
+from mimic.motions.mocap.link_motion import BOTH, LinkMotion, arm_motion, rigid_error, sides
+from mimic.motions.mocap.picture import draw_skeleton, draw_windows
+from mimic.motions.mocap.points import PointMotion, bridge_gaps, gaps, jumps, segment_lengths
+from mimic.motions.mocap.reading import read_motion
 
 MOTION_CAPTURE = (".bvh", ".c3d", ".trc")  # CSV and npz files may be those of joint angles
 _CHANGING = 0.02  # of a length: a segment that changes more is named

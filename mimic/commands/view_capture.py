@@ -16,12 +16,12 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.capture import fixed_fraction, read_arm, trunk_length
 from mimic.commands.config import CaptureConfig, ViewConfig
 from mimic.envs.config import EnvConfig
-from mimic.mocap.ball_chain import ball_chain_xml, zero_frames
-from mimic.mocap.clips import slow_down_for
-from mimic.mocap.conventions import UNITS
-from mimic.mocap.link_motion import LinkMotion
-from mimic.mocap.live_points import LiveArm, Sample, find_live_arms
-from mimic.mocap.point_socket import PointListener
+from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
+from mimic.motions.mocap.clips import slow_down_for
+from mimic.motions.mocap.conventions import UNITS
+from mimic.motions.mocap.link_motion import LinkMotion
+from mimic.motions.mocap.live_points import LiveArm, Sample, find_live_arms
+from mimic.motions.mocap.point_socket import PointListener
 from mimic.runs.signals import Signals, noted_signals
 from mimic.viewer.captured import Clip, ClipPlayer, PointFollower, make_clip
 from mimic.viewer.live_session import LiveSession

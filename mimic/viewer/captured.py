@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from mimic.mocap.ball_chain import ball_chain_motion
-from mimic.mocap.link_motion import LinkMotion
-from mimic.mocap.live_points import LiveArm
-from mimic.mocap.point_socket import PointListener
+from mimic.motions.mocap.ball_chain import ball_chain_motion
+from mimic.motions.mocap.link_motion import LinkMotion
+from mimic.motions.mocap.live_points import LiveArm
+from mimic.motions.mocap.point_socket import PointListener
 
 SILENCE = 1.0  # s without a sample, after which the sender counts as stopped
 PAUSE = 1.0  # s; after a longer one, the next pose may be anywhere

@@ -10,8 +10,8 @@ import pytest
 import mimic
 from mimic.commands.capture import read_arm, train_options
 from mimic.commands.config import CaptureConfig
-from mimic.mocap.clips import slow_down_for
-from mimic.mocap.link_motion import arm_motion
+from mimic.motions.mocap.clips import slow_down_for
+from mimic.motions.mocap.link_motion import arm_motion
 from tests.mocap.bodies import bvh_text, person
 
 

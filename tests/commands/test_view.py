@@ -19,7 +19,7 @@ from mimic.commands.capture import fixed_fraction
 from mimic.commands.config import ViewConfig
 from mimic.commands.view_capture import listen, wait_for_arm
 from mimic.envs import env_config
-from mimic.mocap.live_points import Sample, sample_line
+from mimic.motions.mocap.live_points import Sample, sample_line
 from mimic.runs.signals import Signals
 from tests.mocap.bodies import bvh_text, person
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mimic.mocap.points import PointMotion
+from mimic.motions.mocap.points import PointMotion
 
 # Name, parent and offset [m] of each joint at rest, y up, facing z, as many BVH files are.
 JOINTS = (

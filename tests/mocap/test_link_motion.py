@@ -7,10 +7,10 @@ import pytest
 
 import mimic
 from mimic.metric.kinematics import link_state_table
-from mimic.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
-from mimic.mocap.clips import relative_speeds, slow_down_for, turned, windows
-from mimic.mocap.link_motion import LinkMotion, arm_motion, low_pass, motion_states, resampled, rigid_error
-from mimic.mocap.points import bridge_gaps, gaps, jumps
+from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
+from mimic.motions.mocap.clips import relative_speeds, slow_down_for, turned, windows
+from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, low_pass, motion_states, resampled, rigid_error
+from mimic.motions.mocap.points import bridge_gaps, gaps, jumps
 from tests.mocap.bodies import RATE, person
 
 FIELDS = ("position", "direction", "linear_velocity", "angular_velocity")

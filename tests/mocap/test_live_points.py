@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mimic.mocap.ball_chain import ball_chain_motion, ball_chain_pose, ball_chain_xml, zero_frames
-from mimic.mocap.link_motion import arm_motion, motion_states
-from mimic.mocap.live_points import LiveArm, Sample, find_live_arms, parse_sample, sample_line
-from mimic.mocap.points import PointMotion
+from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_pose, ball_chain_xml, zero_frames
+from mimic.motions.mocap.link_motion import arm_motion, motion_states
+from mimic.motions.mocap.live_points import LiveArm, Sample, find_live_arms, parse_sample, sample_line
+from mimic.motions.mocap.points import PointMotion
 from tests.mocap.bodies import RATE, person
 
 TURN = 0.3, -0.2, 0.1
@@ -90,7 +90,7 @@ def test_poses_of_single_samples_are_those_of_the_motion(arm, samples, tmp_path)
 
 
 def test_live_links_are_those_of_a_clip(body, arm, samples):
-    from mimic.mocap.clips import turned
+    from mimic.motions.mocap.clips import turned
 
     clip = turned(arm_motion(body, "right", trunk=0.2, cutoff=np.inf), *TURN)
     live = arm.motion(samples)

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from mimic.mocap.point_socket import MAX_LINE, PointListener
+from mimic.motions.mocap.point_socket import MAX_LINE, PointListener
 
 
 @pytest.fixture

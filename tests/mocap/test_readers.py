@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mimic.mocap.arms import find_arms
-from mimic.mocap.bvh import joint_positions, read_bvh
-from mimic.mocap.conventions import UNITS, UPS, z_up
-from mimic.mocap.reading import read_motion
+from mimic.motions.mocap.arms import find_arms
+from mimic.motions.mocap.bvh import joint_positions, read_bvh
+from mimic.motions.mocap.conventions import UNITS, UPS, z_up
+from mimic.motions.mocap.reading import read_motion
 from tests.mocap.bodies import RATE, bvh_text, person
 
 SAMPLES = 80

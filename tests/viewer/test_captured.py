@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mimic.mocap.ball_chain import zero_frames
-from mimic.mocap.link_motion import arm_motion
-from mimic.mocap.live_points import LiveArm, Sample, find_live_arms
-from mimic.mocap.point_socket import Counts
+from mimic.motions.mocap.ball_chain import zero_frames
+from mimic.motions.mocap.link_motion import arm_motion
+from mimic.motions.mocap.live_points import LiveArm, Sample, find_live_arms
+from mimic.motions.mocap.point_socket import Counts
 from mimic.viewer.captured import Clip, ClipPlayer, PointFollower, make_clip
 from tests.mocap.bodies import RATE, person
 

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mimic.mocap.arms import ArmPoints, find_arms
-from mimic.mocap.ball_chain import ball_chain_pose
-from mimic.mocap.clips import turn_matrix, turned
-from mimic.mocap.conventions import UNITS, arm_length, guessed_units, z_up
-from mimic.mocap.link_motion import LinkMotion, arm_motion, link_ends_from_shoulder
-from mimic.mocap.points import PointMotion
+from mimic.motions.mocap.arms import ArmPoints, find_arms
+from mimic.motions.mocap.ball_chain import ball_chain_pose
+from mimic.motions.mocap.clips import turn_matrix, turned
+from mimic.motions.mocap.conventions import UNITS, arm_length, guessed_units, z_up
+from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, link_ends_from_shoulder
+from mimic.motions.mocap.points import PointMotion
 
 MAX_POINTS = 2000
 _MAX_NAME = 200  # characters

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from mimic.base.config import check_choice
-from mimic.mocap.arms import find_arms
-from mimic.mocap.bvh import joint_positions, read_bvh
-from mimic.mocap.conventions import STATED_ARM_LENGTH, UNITS, UPS, arm_length, guessed_units, guessed_up, z_up
-from mimic.mocap.points import PointMotion
-from mimic.mocap.tables import Table, read_csv, read_npz, read_trc
+from mimic.motions.mocap.arms import find_arms
+from mimic.motions.mocap.bvh import joint_positions, read_bvh
+from mimic.motions.mocap.conventions import STATED_ARM_LENGTH, UNITS, UPS, arm_length, guessed_units, guessed_up, z_up
+from mimic.motions.mocap.points import PointMotion
+from mimic.motions.mocap.tables import Table, read_csv, read_npz, read_trc
 
 KINDS = (".bvh", ".c3d", ".trc", ".csv", ".npz")
 _UNEVEN = 1e-3  # of an interval: larger differences between times are resampled
@@ -69,7 +69,7 @@ def _read(path: Path, suffix: str) -> tuple[Table, tuple[str, ...]]:
         names, parents = zip(*((joint.name, joint.parent) for joint in bvh.joints), strict=True)
         return Table(names, joint_positions(bvh), time, parents=parents), bvh.notes
     if suffix == ".c3d":
-        from mimic.mocap.c3d import read_c3d
+        from mimic.motions.mocap.c3d import read_c3d
 
         return read_c3d(path), ()
     return {".trc": read_trc, ".csv": read_csv, ".npz": read_npz}[suffix](path), ()

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mimic.mocap.tables import Table
+    from mimic.motions.mocap.tables import Table
 
 _CPU_SECONDS, _WALL_SECONDS = 60, 90  # an hour of 100 markers at 100 Hz takes some seconds
 _MEMORY = 4 * 2**30  # bytes of address space
@@ -27,7 +27,7 @@ def read_c3d(path: Path) -> "Table":
     Raises:
       ValueError: ezc3d is not installed, or it cannot read the file.
     """
-    from mimic.mocap.tables import read_npz
+    from mimic.motions.mocap.tables import read_npz
 
     with tempfile.TemporaryDirectory(prefix="mimic-c3d-") as folder:
         out = Path(folder) / "points.npz"

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mimic.mocap.points import PointMotion
+from mimic.motions.mocap.points import PointMotion
 
 SIDES = ("left", "right")
 _SHORT = 0.25  # of the forearm's length; a shorter segment beyond the wrist is not the hand

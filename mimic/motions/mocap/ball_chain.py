@@ -9,7 +9,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from mimic.mocap.link_motion import CUTOFF, LinkMotion, motion_states
+from mimic.motions.mocap.link_motion import CUTOFF, LinkMotion, motion_states
 
 AXES = ("z", "y", "x")  # of a link's joints in turn, in its zero frame, whose x-axis points along the link
 _RADIUS = 0.04  # of the capsules, of the length of the chain

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from scipy.interpolate import CubicHermiteSpline
 
 from mimic.motions.demonstrations import Demonstrations
-from mimic.mocap.ball_chain import AXES, ball_chain_motion
-from mimic.mocap.link_motion import CUTOFF, LinkMotion, motion_states
+from mimic.motions.mocap.ball_chain import AXES, ball_chain_motion
+from mimic.motions.mocap.link_motion import CUTOFF, LinkMotion, motion_states
 
 _SPEED_QUANTILE = 0.995  # of the samples; single faster ones do not slow the whole motion down
 

@@ -7,7 +7,7 @@ import threading
 import time
 from typing import NamedTuple
 
-from mimic.mocap.live_points import Sample, parse_sample
+from mimic.motions.mocap.live_points import Sample, parse_sample
 
 MAX_LINE = 256 * 1024  # bytes; a line of 2000 points has 150,000
 _RECEIVE = 64 * 1024  # bytes that are read from a connection in one call

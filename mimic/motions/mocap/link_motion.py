@@ -9,9 +9,9 @@ from jaxtyping import Float
 from scipy import signal
 
 from mimic.metric.kinematics import LinkStates
-from mimic.mocap.arms import SIDES, ArmPoints, find_arms
-from mimic.mocap.conventions import mean_point
-from mimic.mocap.points import PointMotion
+from mimic.motions.mocap.arms import SIDES, ArmPoints, find_arms
+from mimic.motions.mocap.conventions import mean_point
+from mimic.motions.mocap.points import PointMotion
 
 CUTOFF = 6.0  # Hz; usual for human motion (Winter, Biomechanics and Motor Control of Human Movement)
 ARM_LINKS = ("upper_arm", "forearm", "hand")

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from mimic.mocap.arms import ArmPoints
-from mimic.mocap.points import PointMotion
+from mimic.motions.mocap.arms import ArmPoints
+from mimic.motions.mocap.points import PointMotion
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "foot": 0.3048, "cmu": 0.0254 / 0.45}
 UPS = ("x", "y", "z", "-x", "-y", "-z")

@@ -9,10 +9,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 
-from mimic.mocap.arms import find_arms  # noqa: E402
-from mimic.mocap.conventions import mean_point  # noqa: E402
-from mimic.mocap.link_motion import LinkMotion  # noqa: E402
-from mimic.mocap.points import PointMotion  # noqa: E402
+from mimic.motions.mocap.arms import find_arms  # noqa: E402
+from mimic.motions.mocap.conventions import mean_point  # noqa: E402
+from mimic.motions.mocap.link_motion import LinkMotion  # noqa: E402
+from mimic.motions.mocap.points import PointMotion  # noqa: E402
 
 _COLOURS = {"left": "tab:blue", "right": "tab:orange"}
 _POSES = 5
