@@ -10,7 +10,7 @@ from mimic.trainers import run_training as train
 from mimic.commands.config import FiguresConfig
 from mimic.base.config import check_new
 from mimic.envs import env_config
-from mimic.paper_figures.poses import FIGURES, MAPPERS, save_figure
+from benchmarks.figures.poses import FIGURES, MAPPERS, save_figure
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
 

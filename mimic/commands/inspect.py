@@ -28,7 +28,7 @@ from mimic.base.config import new_folder  # noqa: E402
 from mimic.envs.config import EnvConfig  # noqa: E402
 from mimic.motions.demonstrations import Demonstrations  # noqa: E402
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
-from mimic.paper_figures.pose_picture import nearest_poses, readable_poses, save_poses  # noqa: E402
+from benchmarks.figures.pose_picture import nearest_poses, readable_poses, save_poses  # noqa: E402
 
 _PICTURE, _POSES, _RESULTS = "arms.png", "poses.png", "inspection.json"
 _SCENE = 800, 640  # pixels

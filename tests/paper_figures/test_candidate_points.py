@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mimic.arms.embodiment import planar_arm
-from mimic.paper_figures import candidate_points
-from mimic.paper_figures.planar_arms import joint_points
+from benchmarks.figures import candidate_points
+from benchmarks.figures.planar_arms import joint_points
 
 
 def test_candidate_points_and_frames_have_different_optima():

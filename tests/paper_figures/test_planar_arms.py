@@ -9,7 +9,7 @@ import pytest
 
 from mimic.arms.embodiment import planar_arm
 from mimic.arms.link_match import LinkMatch
-from mimic.paper_figures.planar_arms import draw_match, fit, joint_points
+from benchmarks.figures.planar_arms import draw_match, fit, joint_points
 
 EXPERT, LEARNER = planar_arm([0.5, 0.25, 0.25]), planar_arm([1.0, 1.0])
 POSES = np.array([0.3, 0.8, -0.4]), np.array([0.5, 0.2])

@@ -9,7 +9,7 @@ from PIL import Image
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.config import EnvConfig
 from mimic.metric.similarity import MEASURES
-from mimic.paper_figures.pose_picture import PANDA_POSES, nearest_poses, readable_poses, save_poses
+from benchmarks.figures.pose_picture import PANDA_POSES, nearest_poses, readable_poses, save_poses
 
 PLANAR = ArmConfig("planar", link_lengths=[0.5, 0.3, 0.2])
 
