@@ -24,8 +24,8 @@ from benchmarks.common.record import print_table
 from mimic.base.config import flatten, to_dict
 from mimic.envs import env_config
 from mimic.metric.kinematics import link_state_table
-from mimic.pretrained.files import SOURCE, write_network
-from mimic.pretrained.network import TRAINERS
+from mimic.trainers.pretrained.files import SOURCE, write_network
+from mimic.trainers.pretrained.network import TRAINERS
 from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import copy_joints
 from mimic.runs.checkpoints import load_checkpoint

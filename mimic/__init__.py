@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     )
     from mimic.metric.landscape import distance_landscape, local_minima
     from mimic.metric.motion_distance import motion_distance
-    from mimic.pretrained.network import Pretrained, load
+    from mimic.trainers.pretrained.network import Pretrained, load
     from mimic.base.registry import register
     from mimic.retargeting.costs import Costs
     from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound

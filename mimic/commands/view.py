@@ -120,7 +120,7 @@ def _load_mapper(config: ViewConfig) -> "tuple[Mapper | AnyArmMapper, EnvConfig]
     Raises:
       ValueError: see `PoseMapper.load` and `AnyArmMapper.load`.
     """
-    from mimic.pretrained.network import Pretrained, load, pretrained_names
+    from mimic.trainers.pretrained.network import Pretrained, load, pretrained_names
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.trainers.pose_mapper.model import PoseMapper
 

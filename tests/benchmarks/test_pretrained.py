@@ -11,7 +11,7 @@ import pytest
 from benchmarks import pretrained
 from mimic.trainers import run_training as train
 from mimic.envs import env_config
-from mimic.pretrained.network import NETWORKS, read_any_arm_mapper, read_network
+from mimic.trainers.pretrained.network import NETWORKS, read_any_arm_mapper, read_network
 from mimic.runs.files import REPORT, read_json
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.run_config import load_config

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.pretrained.network import names_of_one_learner
+from mimic.trainers.pretrained.network import names_of_one_learner
 from mimic.retargeting.pose_baselines import copy_joints
 from tests.helpers.repository import REPOSITORY
 

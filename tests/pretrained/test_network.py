@@ -11,8 +11,8 @@ import pytest
 import mimic
 from mimic.envs.family import UNSEEN, report_arms
 from mimic.evaluation.evaluator import Evaluator
-from mimic.pretrained.files import PARAMETERS, read_params, write_network
-from mimic.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network
+from mimic.trainers.pretrained.files import PARAMETERS, read_params, write_network
+from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network
 from mimic.runs.files import REPORT
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.any_arm_model import expert_pose

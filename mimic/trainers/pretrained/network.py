@@ -16,7 +16,7 @@ from mimic.base import compat
 from mimic.arms.embodiment import Embodiment
 from mimic.base.config import check_choice
 from mimic.envs import env_config
-from mimic.pretrained.files import SOURCE, read_config_and_report, read_params
+from mimic.trainers.pretrained.files import SOURCE, read_config_and_report, read_params
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 
 if TYPE_CHECKING:
