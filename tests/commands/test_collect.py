@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from mimic.commands.collect import prepare_collection
+from mimic.commands.collect.collect import prepare_collection
 from mimic.commands.config import CollectConfig
 from mimic.runs.files import REPORT
-from mimic.sweeps.seed_groups import mean_interval
+from mimic.commands.collect.collect.seed_groups import mean_interval
 from mimic.sweeps.sweeper import SWEEP
 from tests.helpers.run_directories import write_run
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mimic.runs.files import METRICS, REPORT
-from mimic.sweeps.finished_runs import find_runs
+from mimic.commands.collect.collect.finished_runs import find_runs
 from mimic.sweeps.sweeper import SWEEP
 from tests.helpers.run_directories import write_run
 

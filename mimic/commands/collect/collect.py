@@ -17,8 +17,8 @@ from mimic.commands.config import CollectConfig
 from mimic.base.config import check_writable
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import REPORT, write_atomically
-from mimic.sweeps.finished_runs import FinishedRun, LeftOut, QualityMetric, find_runs, quality_metric
-from mimic.sweeps.seed_groups import (
+from mimic.commands.collect.collect.finished_runs import FinishedRun, LeftOut, QualityMetric, find_runs, quality_metric
+from mimic.commands.collect.collect.seed_groups import (
     CONFIDENCE,
     METHOD,
     Interval,
@@ -66,7 +66,7 @@ def prepare_collection(config: CollectConfig) -> Callable[[], int]:
 
 
 def _collect(finished: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path, metric: QualityMetric) -> int:
-    from mimic.sweeps.plot import plot_collected  # imports matplotlib, which takes a second
+    from mimic.commands.collect.plot import plot_collected  # imports matplotlib, which takes a second
 
     groups = group_runs(finished)
     out.mkdir(parents=True, exist_ok=True)
