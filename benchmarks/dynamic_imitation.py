@@ -30,7 +30,7 @@ from mimic.commands.config import CollectConfig
 from mimic.motions.recording import KINDS, record_demonstrations
 from mimic.runs.files import REPORT
 from mimic.commands.collect.collect.finished_runs import find_runs
-from mimic.sweeps.sweeper import path_override
+from mimic.runs.sweeps.sweeper import path_override
 
 STUDY = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
 UNSEEN_SEED, UNSEEN = 1000, 32  # demonstrations that no run is trained on, the same for all

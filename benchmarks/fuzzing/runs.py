@@ -21,7 +21,7 @@ from mimic.commands.config import CollectConfig
 from mimic.base.config import flatten, to_dict
 from mimic.runs.checkpoints import FOLDER, load_checkpoint, save_checkpoint
 from mimic.runs.files import CONFIG, METRICS, REPORT, write_report
-from mimic.sweeps.sweeper import SWEEP
+from mimic.runs.sweeps.sweeper import SWEEP
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 from mimic.trainers.run_config import load_config, save_config

@@ -43,9 +43,9 @@ from mimic.base.config import BAD_INPUT, explain, schema, suggestion, typed
 from mimic.envs import registered_preset
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals
-from mimic.sweeps.hydra_plugins import bound_config_files
-from mimic.sweeps.launchers import check_launcher, register_launchers
-from mimic.sweeps.sweeper import FAILED, Outcome, register_sweeper
+from mimic.runs.sweeps.hydra_plugins import bound_config_files
+from mimic.runs.sweeps.launchers import check_launcher, register_launchers
+from mimic.runs.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import TrainConfig, trainer_config, trainers
 
 _LONGEST_MESSAGE = 1000  # characters: Hydra repeats the argument

@@ -11,7 +11,7 @@ from mimic.commands.collect.collect import prepare_collection
 from mimic.commands.config import CollectConfig
 from mimic.runs.files import REPORT
 from mimic.commands.collect.collect.seed_groups import mean_interval
-from mimic.sweeps.sweeper import SWEEP
+from mimic.runs.sweeps.sweeper import SWEEP
 from tests.helpers.run_directories import write_run
 
 

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from mimic.commands import cli
-from mimic.sweeps.sweeper import Sweeper
+from mimic.runs.sweeps.sweeper import Sweeper
 from tests.helpers.repository import REPOSITORY
 
 PAGES = [

@@ -6,7 +6,7 @@ import pytest
 
 from mimic.runs.files import METRICS, REPORT
 from mimic.commands.collect.collect.finished_runs import find_runs
-from mimic.sweeps.sweeper import SWEEP
+from mimic.runs.sweeps.sweeper import SWEEP
 from tests.helpers.run_directories import write_run
 
 HEADER = "step,quality/optimality_gap.train,quality/optimality_gap.held_out\n"

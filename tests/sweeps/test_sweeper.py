@@ -17,9 +17,9 @@ from hydra.errors import HydraException
 
 from mimic.commands import cli
 from mimic import train
-from mimic.sweeps.launchers import gpus_of
-from mimic.sweeps.run_command import RunCommand
-from mimic.sweeps.sweeper import Outcome, Sweeper, path_of, path_override
+from mimic.runs.sweeps.launchers import gpus_of
+from mimic.runs.sweeps.run_command import RunCommand
+from mimic.runs.sweeps.sweeper import Outcome, Sweeper, path_of, path_override
 from tests.helpers.run_directories import write_run
 from tests.helpers.tiny import TINY
 

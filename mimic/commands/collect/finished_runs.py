@@ -13,7 +13,7 @@ from mimic.base.config import flatten, to_dict
 from mimic.base.distribution import VERSION, recorded_version
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import CONFIG, METRICS, REPORT, read_json
-from mimic.sweeps.sweeper import LOGS, SWEEP
+from mimic.runs.sweeps.sweeper import LOGS, SWEEP
 from mimic.trainers.run_config import load_config
 
 # Keys that no result depends on.

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from mimic.runs.signals import NOTED, STOPPED_BY_SIGNAL
-from mimic.sweeps.sweeper import FAILED, Outcome, path_override
+from mimic.runs.sweeps.sweeper import FAILED, Outcome, path_override
 
 _POLL_S = 0.2
 _FORWARDED = tuple(number for number in NOTED if number.name in ("SIGTERM", "SIGHUP"))

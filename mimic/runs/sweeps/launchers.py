@@ -18,10 +18,10 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from mimic.base.ranges import Range
-from mimic.sweeps.hydra_plugins import register, target
-from mimic.sweeps.launcher import LOCAL, CommandLauncher
-from mimic.sweeps.run_command import RunCommand
-from mimic.sweeps.sweeper import MAX_RUNS, Outcome
+from mimic.runs.sweeps.hydra_plugins import register, target
+from mimic.runs.sweeps.launcher import LOCAL, CommandLauncher
+from mimic.runs.sweeps.run_command import RunCommand
+from mimic.runs.sweeps.sweeper import MAX_RUNS, Outcome
 
 _GPUS = "CUDA_VISIBLE_DEVICES"
 _NO_TIMEOUT_MIN = 365 * 24 * 60  # submitit requires a time limit

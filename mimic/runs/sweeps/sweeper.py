@@ -27,7 +27,7 @@ from mimic.base.config import check_writable
 from mimic.base.config_files import check_references
 from mimic.runs.files import CONFIG, REPORT, read_json
 from mimic.runs.signals import exit_hook
-from mimic.sweeps.hydra_plugins import register, target
+from mimic.runs.sweeps.hydra_plugins import register, target
 
 SWEEP, LOGS = "sweep.json", "logs"
 FAILED = 1

@@ -16,8 +16,8 @@ from omegaconf import DictConfig
 
 from mimic.base.distribution import install_command
 from mimic.runs.signals import Signals, exit_hook, noted_signals
-from mimic.sweeps.run_command import RunCommand
-from mimic.sweeps.sweeper import FAILED, LOGS, Outcome, path_of
+from mimic.runs.sweeps.run_command import RunCommand
+from mimic.runs.sweeps.sweeper import FAILED, LOGS, Outcome, path_of
 
 LOCAL = "basic"  # Hydra's own launcher: one run after the other, in the process of the sweep
 _POLL_S = 0.2
