@@ -9,7 +9,7 @@ from mimic.base import registry
 from mimic.base.config import check_choice
 from mimic.envs.config import EnvConfig
 from mimic.base.ranges import check_ranges, number, seed_number
-from mimic.trainers.distributed.process_group import DistributedConfig
+from mimic.runs.distributed.process_group import DistributedConfig
 
 NETWORKS = ("mlp", "joints")
 LOGGERS = ("local", "wandb", "mlflow")

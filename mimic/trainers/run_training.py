@@ -36,7 +36,7 @@ from mimic.runs.provenance import hardware
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.trainers.distributed.process_group import ProcessGroup
+from mimic.runs.distributed.process_group import ProcessGroup
 from mimic.trainers.fine_tuning import fine_tuned
 from mimic.trainers.make import make_trainer
 from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, run_schema, save_config

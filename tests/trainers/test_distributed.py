@@ -18,9 +18,9 @@ from omegaconf import OmegaConf
 import mimic
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.distributed import process_group
-from mimic.trainers.distributed.local_processes import LocalProcess, LocalProcesses, local_process
-from mimic.trainers.distributed.process_group import DistributedConfig
+from mimic.runs.distributed import process_group
+from mimic.runs.distributed.local_processes import LocalProcess, LocalProcesses, local_process
+from mimic.runs.distributed.process_group import DistributedConfig
 from mimic.trainers.ppo.divergence import load_divergence
 from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.training import make_networks
@@ -224,7 +224,7 @@ def test_input_that_both_processes_reject_is_one_line(tmp_path):
 
 def test_each_started_process_knows_its_place(monkeypatch):
     """Each is the same command; what it says last is kept, and it is killed if it does not end."""
-    program = "import sys; from mimic.trainers.distributed.local_processes import local_process;"
+    program = "import sys; from mimic.runs.distributed.local_processes import local_process;"
     program += " print('x' * 3000, local_process(), file=sys.stderr)"
     monkeypatch.setattr(sys, "orig_argv", ["python", "-c", program])
     others = LocalProcesses(3)
