@@ -29,11 +29,11 @@ from mimic.runs.files import write_report
 from mimic.runs.provenance import hardware, versions
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.ppo.trainer import PPOTrainer
-from mimic.virtual_robot.arm_model import RobotModel, robot_model
-from mimic.virtual_robot.draws import draw_world, edge_cases
-from mimic.virtual_robot.episodes import Episodes, TorquePolicy, TrackingPolicy
-from mimic.virtual_robot.robots import LIMIT_CAUSES, SELF_CONTACT
-from mimic.virtual_robot.runs import Task, run_tasks
+from mimic.evaluation.virtual_robot.arm_model import RobotModel, robot_model
+from mimic.evaluation.virtual_robot.draws import draw_world, edge_cases
+from mimic.evaluation.virtual_robot.episodes import Episodes, TorquePolicy, TrackingPolicy
+from mimic.evaluation.virtual_robot.robots import LIMIT_CAUSES, SELF_CONTACT
+from mimic.evaluation.virtual_robot.runs import Task, run_tasks
 
 ALL = "all ranges"
 _CHUNK = 500  # episodes whose distances are computed together

@@ -34,7 +34,7 @@ from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.trainer import PPOTrainer, run_environment
 from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.run_models import save_models
-from mimic.virtual_robot.episodes import Episodes
+from mimic.evaluation.virtual_robot.episodes import Episodes
 
 pytest.importorskip("onnxruntime")
 HORIZON, HELD_OUT = 10, 3

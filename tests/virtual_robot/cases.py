@@ -7,9 +7,9 @@ import numpy as np
 from mimic.arms.arm import ArmConfig
 from mimic.envs import env_config
 from mimic.physics.world import WorldConfig
-from mimic.virtual_robot.arm_model import robot_model
-from mimic.virtual_robot.draws import draw_world
-from mimic.virtual_robot.robots import VirtualRobots
+from mimic.evaluation.virtual_robot.arm_model import robot_model
+from mimic.evaluation.virtual_robot.draws import draw_world
+from mimic.evaluation.virtual_robot.robots import VirtualRobots
 from tests.helpers.bundles import panda
 
 IDEAL = WorldConfig()

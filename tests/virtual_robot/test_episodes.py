@@ -13,11 +13,11 @@ from mimic.deploy.policy_process import LocalPolicy
 from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import COLLISION, LATE, REPEATED
 from mimic.physics.world import WorldConfig
-from mimic.virtual_robot import runs
-from mimic.virtual_robot.driver import VirtualRobot
-from mimic.virtual_robot.episodes import ABORTED, Channel, SafeController, run_episodes
-from mimic.virtual_robot.robots import TORQUE_RATE, VirtualRobots
-from mimic.virtual_robot.runs import Task, groups, run_task, run_tasks
+from mimic.evaluation.virtual_robot import runs
+from mimic.evaluation.virtual_robot.driver import VirtualRobot
+from mimic.evaluation.virtual_robot.episodes import ABORTED, Channel, SafeController, run_episodes
+from mimic.evaluation.virtual_robot.robots import TORQUE_RATE, VirtualRobots
+from mimic.evaluation.virtual_robot.runs import Task, groups, run_task, run_tasks
 from tests.helpers import bundles
 from tests.virtual_robot.cases import hardware, model, virtual, world
 

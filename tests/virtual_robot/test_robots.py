@@ -11,8 +11,8 @@ import pytest
 from mimic.control.joint_control import PERIOD
 from mimic.physics.step import Load, make_advance
 from mimic.physics.world import WorldConfig
-from mimic.virtual_robot import robots as reflexes
-from mimic.virtual_robot.draws import edge_cases
+from mimic.evaluation.virtual_robot import robots as reflexes
+from mimic.evaluation.virtual_robot.draws import edge_cases
 from tests.helpers.bundles import FOLDED, ON_FLOOR, panda
 from tests.virtual_robot.cases import hardware, home, model, virtual, world
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from mimic.deploy.bundle import load_bundle
-from mimic.virtual_robot.arm_model import RobotModel
-from mimic.virtual_robot.draws import World
-from mimic.virtual_robot.episodes import (
+from mimic.evaluation.virtual_robot.arm_model import RobotModel
+from mimic.evaluation.virtual_robot.draws import World
+from mimic.evaluation.virtual_robot.episodes import (
     Episodes,
     SafeController,
     TorqueController,
@@ -22,7 +22,7 @@ from mimic.virtual_robot.episodes import (
     joined,
     run_episodes,
 )
-from mimic.virtual_robot.robots import VirtualRobots
+from mimic.evaluation.virtual_robot.robots import VirtualRobots
 
 GROUP = 100  # robots in lockstep: more are not faster
 # Environment variables, which NumPy's libraries read when it is imported.

@@ -12,8 +12,8 @@ from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
 from mimic.deploy.safety import INTERVENTIONS, SafetyLayer
 from mimic.deploy.sessions import Policy, open_session
-from mimic.virtual_robot.draws import World
-from mimic.virtual_robot.robots import VirtualRobots
+from mimic.evaluation.virtual_robot.draws import World
+from mimic.evaluation.virtual_robot.robots import VirtualRobots
 
 ABORTED = "aborted"  # the cause for which the safety layer no longer controls a robot
 

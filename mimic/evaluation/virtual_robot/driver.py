@@ -6,9 +6,9 @@ import numpy as np
 
 from mimic.control.joint_control import PERIOD
 from mimic.deploy.driver import RobotAbort, RobotState
-from mimic.virtual_robot.arm_model import RobotModel
-from mimic.virtual_robot.draws import World
-from mimic.virtual_robot.robots import VirtualRobots
+from mimic.evaluation.virtual_robot.arm_model import RobotModel
+from mimic.evaluation.virtual_robot.draws import World
+from mimic.evaluation.virtual_robot.robots import VirtualRobots
 
 
 class VirtualRobot:
