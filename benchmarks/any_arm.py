@@ -21,17 +21,17 @@ import numpy as np
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
-from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints, stack_arms
-from mimic.retargeting.array_bound import closest_motion
-from mimic.envs.many_arms import AnyArmEnv
-from mimic.metric.array_kinematics import link_states
-from mimic.arms.sampler import lock_masks, lock_sampler, random_arm
-from mimic.metric.array_similarity import motion_similarity
 from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints, stack_arms
 from mimic.arms.named_arms import named_arms
+from mimic.arms.sampler import lock_masks, lock_sampler, random_arm
 from mimic.envs import env_config
 from mimic.envs.imitation import training_and_held_out
+from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.rollout_metrics import MIN_SPAN
+from mimic.metric.array_kinematics import link_states
+from mimic.metric.array_similarity import motion_similarity
+from mimic.retargeting.array_bound import closest_motion
 
 REAL = ("ur5e", "ur10e", "iiwa", "iiwa14", "kinova3", "gen3", "sawyer", "jaco", "xarm7", "fetch")
 KINDS = ("presets", "locks", "real", "random")

@@ -22,13 +22,12 @@ import numpy as np
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, collect, failure
 from benchmarks.common.timing import time_program
-from mimic.physics import composite_kernel, dynamics, physics
+from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS
 from mimic.arms.sampler import random_arm
-from mimic.arms.arm import build_arm
 from mimic.control.joint_control import JointParameters, Reference, Target, action_target
 from mimic.envs import env_config
-from mimic.physics import inner_loop
+from mimic.physics import composite_kernel, dynamics, inner_loop, physics
 from mimic.physics.plant import draw_episode, make_plant
 
 TIMESTEP = 0.01  # s, of the physics

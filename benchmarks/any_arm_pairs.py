@@ -18,9 +18,9 @@ import numpy as np
 
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
+from mimic.arms.arm import ArmConfig
 from mimic.arms.arrays import ArmArrays, stack_arms
 from mimic.envs.family import UNSEEN, report_arms
-from mimic.arms.arm import ArmConfig
 from mimic.runs.files import REPORT, read_json
 from mimic.trainers.pose_mapper.any_arm_evaluation import METHODS, Pairs, make_reference, run_mapper, table_of_pairs
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper

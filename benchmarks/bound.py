@@ -25,8 +25,8 @@ from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.pose import planar
 from mimic.arms.arm import ArmConfig
 from mimic.envs.config import EnvConfig
-from mimic.motions.recording import record_demonstrations
 from mimic.metric.config import MetricConfig
+from mimic.motions.recording import record_demonstrations
 from mimic.retargeting.pose import pose_limits, shared_joints
 
 STEPS = 50

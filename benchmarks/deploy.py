@@ -47,9 +47,9 @@ def untrained_bundle(folder: Path) -> Bundle:
     import jax
 
     import mimic
-    from mimic.trainers.export.export_controller import export_controller
     from mimic.runs.checkpoints import save_checkpoint
     from mimic.trainers.config import PPOConfig, TrainConfig
+    from mimic.trainers.export.export_controller import export_controller
     from mimic.trainers.ppo import training
     from mimic.trainers.ppo.programs import initial_params
     from mimic.trainers.ppo.trainer import PPOTrainer

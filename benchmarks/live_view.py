@@ -34,7 +34,7 @@ _START_S = 180  # until the view is compiled
 
 def generated_clip(folder: Path) -> Path:
     """The file of the generated person."""
-    from tests.mocap.bodies import bvh_text
+    from tests.helpers.bodies import bvh_text
 
     path = folder / "person.bvh"
     path.write_text(bvh_text())

@@ -1,7 +1,7 @@
 """Makes the trained networks that come with mimic from run directories, and measures them.
 
     python -m mimic.train env=panda4dof env.physics=fused run_dir=runs/pretrained/panda4dof-ppo
-    python -m benchmarks.pretrained --runs runs/pretrained/* --out mimic/pretrained/networks [--half] [--commit HASH]
+    python -m benchmarks.pretrained --runs runs/pretrained/* --out mimic/trainers/pretrained/networks [--half] [--commit HASH]
 
 Each run directory becomes the folder ENV-KIND; one that exists is replaced, others stay. Every number of its report is
 that of the stored weights; `copying_distance` is that of copying the angles of joints with the same name. A mapper to
@@ -24,8 +24,6 @@ from benchmarks.common.record import print_table
 from mimic.base.config import flatten, to_dict
 from mimic.envs import env_config
 from mimic.metric.kinematics import link_state_table
-from mimic.trainers.pretrained.files import SOURCE, write_network
-from mimic.trainers.pretrained.network import TRAINERS
 from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import copy_joints
 from mimic.runs.checkpoints import load_checkpoint
@@ -34,6 +32,8 @@ from mimic.trainers.config import BUILT_IN_TRAINERS as CONFIGS
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
+from mimic.trainers.pretrained.files import SOURCE, write_network
+from mimic.trainers.pretrained.network import TRAINERS
 from mimic.trainers.run_config import load_config
 from mimic.trainers.trainer import Trainer
 

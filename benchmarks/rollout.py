@@ -26,8 +26,8 @@ from benchmarks.common.record import Row, collect, failure
 from benchmarks.common.timing import Timing, time_call, time_program
 from benchmarks.peers import stock
 from mimic.envs.imitation import ImitationEnv
-from mimic.physics.step import Load, make_advance
 from mimic.envs.wrappers import wrap_for_training
+from mimic.physics.step import Load, make_advance
 
 ENVS = ("panda7dof", "panda4dof", "panda3dof")
 ARMS = [512, 8192, 65536]

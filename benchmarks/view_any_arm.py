@@ -32,8 +32,8 @@ def prepare(learners: str) -> tuple[Any, Any, Any, Any]:
     """The environment, the learners, their presets and their compiled functions."""
     import mimic
     from mimic.commands.config import ViewConfig
-    from mimic.envs.config import ArmsConfig
     from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
+    from mimic.envs.config import ArmsConfig
 
     mapper = mimic.load("any_arm", "pose_mapper")
     config = ViewConfig(mapper="any_arm", learners=learners.strip("[]").split(","))

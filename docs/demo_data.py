@@ -18,7 +18,9 @@ FIRST = "panda4dof"  # the environment that the page shows first
 
 def scripts() -> dict[str, str]:
     """The scripts by name: a mapper of each environment of one learner, and "start", which starts the page."""
-    from mimic.trainers.pretrained.network import names_of_one_learner  # a second of imports, only where a site is built
+    from mimic.trainers.pretrained.network import (
+        names_of_one_learner,  # a second of imports, only where a site is built
+    )
 
     names = sorted(names_of_one_learner("pose_mapper"), key=lambda name: (name != FIRST, name))
     start = f'mimicDemo.start(document.getElementById("mimic-demo"), {json.dumps(names)});\n'

@@ -22,13 +22,9 @@ if TYPE_CHECKING:
     from mimic.arms.capsules import Capsules, fit_capsules
     from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm
     from mimic.arms.rendering import ArmScene
-    from mimic.trainers.export.export import export_run
-    from mimic.trainers.fit import Run, fit
+    from mimic.base.registry import register
     from mimic.envs import env_config, environments
-    from mimic.motions.demonstrations import Demonstrations, check_effort, load_demonstrations
     from mimic.envs.imitation import ImitationEnv
-    from mimic.motions.importing import import_demonstrations
-    from mimic.motions.recording import record_demonstrations
     from mimic.envs.make import make
     from mimic.metric.correspondence import (
         arc_length_correspondence,
@@ -56,14 +52,18 @@ if TYPE_CHECKING:
     )
     from mimic.metric.landscape import distance_landscape, local_minima
     from mimic.metric.motion_distance import motion_distance
-    from mimic.trainers.pretrained.network import Pretrained, load
-    from mimic.base.registry import register
+    from mimic.motions.demonstrations import Demonstrations, check_effort, load_demonstrations
+    from mimic.motions.importing import import_demonstrations
+    from mimic.motions.recording import record_demonstrations
     from mimic.retargeting.costs import Costs
     from mimic.retargeting.kinematic_bound import ClosestMotion, closest_motion, kinematic_bound
     from mimic.retargeting.pose import PoseImitation, imitate_pose
     from mimic.retargeting.trajectory import imitate_trajectory
+    from mimic.trainers.export.export import export_run
+    from mimic.trainers.fit import Run, fit
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.trainers.pose_mapper.model import PoseMapper
+    from mimic.trainers.pretrained.network import Pretrained, load
 
 __version__ = VERSION
 
@@ -132,14 +132,14 @@ _MODULES = {
     "arms.capsules": ("Capsules", "fit_capsules"),
     "arms.embodiment": ("Embodiment", "load_mjcf", "panda", "planar_arm"),
     "arms.rendering": ("ArmScene",),
-    "commands.export": ("export_run",),
-    "commands.fit": ("Run", "fit"),
+    "trainers.export.export": ("export_run",),
+    "trainers.fit": ("Run", "fit"),
     "envs": ("env_config", "environments"),
-    "envs.demonstrations": ("Demonstrations", "check_effort", "load_demonstrations"),
+    "motions.demonstrations": ("Demonstrations", "check_effort", "load_demonstrations"),
     "envs.imitation": ("ImitationEnv",),
-    "envs.importing": ("import_demonstrations",),
-    "envs.recording": ("record_demonstrations",),
-    "making": ("make",),
+    "motions.importing": ("import_demonstrations",),
+    "motions.recording": ("record_demonstrations",),
+    "envs.make": ("make",),
     "metric.correspondence": (
         "arc_length_correspondence",
         "hard_correspondence",
@@ -166,8 +166,8 @@ _MODULES = {
     ),
     "metric.landscape": ("distance_landscape", "local_minima"),
     "metric.motion_distance": ("motion_distance",),
-    "pretrained.network": ("Pretrained", "load"),
-    "registry": ("register",),
+    "trainers.pretrained.network": ("Pretrained", "load"),
+    "base.registry": ("register",),
     "retargeting.costs": ("Costs",),
     "retargeting.kinematic_bound": ("ClosestMotion", "closest_motion", "kinematic_bound"),
     "retargeting.pose": ("PoseImitation", "imitate_pose"),
@@ -180,7 +180,7 @@ _WITH_MJX = ("ImitationEnv", "Run", "export_run", "fit")  # MJX is imported firs
 _WITHOUT_MJX = [
     name for name in _MODULES if not {"rendering", "imitation", "commands", "trainers"} & {*name.split(".")}
 ]
-_FOLDERS = ("any_arm", "arms", "envs", "metric", "registry", "retargeting")  # attributes after `import mimic` alone
+_FOLDERS = ("arms", "envs", "metric", "retargeting")  # attributes after `import mimic` alone
 
 
 def __getattr__(name: str) -> Any:

@@ -1,7 +1,7 @@
 """`python -m mimic.dataset run=DIR out=DIR`: writes rollouts or demonstrations as a LeRobot dataset or as rosbag2."""
 
-from mimic.commands import cli
 from mimic.base import compat
+from mimic.commands import cli
 from mimic.commands.config import DatasetConfig
 
 

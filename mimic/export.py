@@ -1,7 +1,7 @@
 """`python -m mimic.export run=DIR out=FILE`: exports a policy or pose mapper to ONNX, or to StableHLO for JAX."""
 
-from mimic.commands import cli
 from mimic.base import compat
+from mimic.commands import cli
 from mimic.commands.config import ExportConfig
 
 

@@ -14,8 +14,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from mimic.base import compat
 from mimic.arms.rendering import ArmScene
+from mimic.base import compat
 from mimic.base.config import check_choice
 from mimic.envs import env_config, environments
 

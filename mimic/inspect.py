@@ -1,7 +1,7 @@
 """`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and kinematic bound."""
 
-from mimic.commands import cli
 from mimic.base import compat
+from mimic.commands import cli
 from mimic.commands.config import InspectConfig
 
 
@@ -15,8 +15,8 @@ def prepare(config: InspectConfig) -> cli.Work:
     if config.clip:
         from pathlib import Path
 
-        from mimic.commands.capture import prepare_capture_inspection
         from mimic.base.config import new_folder
+        from mimic.commands.capture import prepare_capture_inspection
 
         return prepare_capture_inspection(
             Path(config.clip).expanduser(), config.capture, new_folder("out", config.out) if config.out else None

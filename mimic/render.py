@@ -1,7 +1,7 @@
 """`python -m mimic.render run=DIR`: renders a video of expert and learner."""
 
-from mimic.commands import cli
 from mimic.base import compat
+from mimic.commands import cli
 from mimic.commands.config import RenderConfig
 
 

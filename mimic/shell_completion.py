@@ -16,8 +16,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mimic.commands import cli
 from mimic.base.config import BAD_INPUT
+from mimic.commands import cli
 
 _BASH = r"""# eval "$(mimic completion bash)"
 _mimic() {

@@ -3,9 +3,9 @@
 import time
 
 from mimic.commands import cli
+from mimic.runs.distributed.process_group import join
 from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainConfig
-from mimic.runs.distributed.process_group import join
 
 _process_started = [cli.process_started()]  # start time of the first run; later runs of a sweep start in `prepare`
 

@@ -13,12 +13,12 @@ import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 
+from benchmarks.figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR  # noqa: E402
 from mimic.arms.arm import Arm, ArmConfig  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig  # noqa: E402
 from mimic.metric.similarity import CentreLine, centre_line_table, similarity  # noqa: E402
-from benchmarks.figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR  # noqa: E402
 from mimic.retargeting.pose import imitate_pose  # noqa: E402
 
 # Joint positions of the Panda [rad] that show the whole arm and are within its joint ranges.

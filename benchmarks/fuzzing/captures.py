@@ -22,7 +22,7 @@ from mimic.commands.config import CaptureConfig
 from mimic.motions.mocap.conventions import UNITS
 from mimic.motions.mocap.points import PointMotion
 from mimic.motions.mocap.reading import read_motion
-from tests.mocap.bodies import RATE, bvh_text, person
+from tests.helpers.bodies import RATE, bvh_text, person
 
 SEED = 27
 _SAMPLES = 12

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.random import Generator
 
 from benchmarks.fuzzing import ACCEPTED, OTHER_NUMBERS, Case
-from mimic.commands import cli
-from mimic.commands import config as commands
 from mimic.base.config import flatten, to_dict
 from mimic.base.ranges import Range, all_ranges
+from mimic.commands import cli
+from mimic.commands import config as commands
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 
 SEED = 2025
@@ -209,10 +209,10 @@ def _numbers(config: Any) -> list[float]:
 
 def _prepare_training(config: TrainConfig) -> None:
     """What `prepare_training` checks; for few physics steps also what it makes."""
-    from mimic.trainers.run_training import prepare_training
     from mimic.runs.loggers import check_loggers
     from mimic.trainers.memory import check_training_memory
     from mimic.trainers.run_config import new_run_dir
+    from mimic.trainers.run_training import prepare_training
 
     demonstrations = config.env.demonstrations
     steps = (demonstrations.count + demonstrations.held_out) * config.env.horizon * config.env.substeps

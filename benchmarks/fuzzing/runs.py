@@ -16,9 +16,9 @@ from numpy.random import Generator
 import mimic
 from benchmarks.fuzzing import ACCEPTED, OTHER_NUMBERS, Case
 from benchmarks.fuzzing.configs import SECRET, SECRET_NAME
+from mimic.base.config import flatten, to_dict
 from mimic.commands.collect.collect import prepare_collection
 from mimic.commands.config import CollectConfig
-from mimic.base.config import flatten, to_dict
 from mimic.runs.checkpoints import FOLDER, load_checkpoint, save_checkpoint
 from mimic.runs.files import CONFIG, METRICS, REPORT, write_report
 from mimic.runs.sweeps.sweeper import SWEEP

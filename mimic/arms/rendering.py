@@ -12,11 +12,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mimic.base import compat
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import Capsule, Colour, link_ends
 from mimic.arms.visual_model import visual_spec
+from mimic.base import compat
 
 SPACING, FLAT_SPACING = 0.9, 1.5  # chain lengths between two arms; planar ones are seen from above, and reach sideways
 LOCKED = (0.85, 0.12, 0.10, 1.0)

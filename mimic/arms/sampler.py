@@ -21,7 +21,7 @@ from mimic.arms.arrays import (
 Sampler = Callable[[Array], ArmArrays]  # random key -> arm, in single precision
 
 _PARALLEL = 1e-4  # rad: axes at a smaller angle are parallel; single precision
-# The random arms. The ranges contain those of the arms of mimic and of robosuite: `tests/any_arm/test_sampler.py`.
+# The random arms. The ranges contain those of the arms of mimic and of robosuite: `tests/arms/test_sampler.py`.
 _MIN_JOINTS = 4
 _REACH = 0.5, 2.0  # m, sum of the link lengths
 _BASE_LINK = 0.7  # probability of a link from the base to the first joint

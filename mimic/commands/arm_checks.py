@@ -14,9 +14,9 @@ from jaxtyping import Float
 from mimic.arms.arm import DEFAULT_VELOCITY_LIMIT, Arm, ArmConfig, arm_spec, torque_scale, with_minimum_armature
 from mimic.arms.embodiment import load_arm
 from mimic.envs.config import EnvConfig
+from mimic.metric.kinematics import link_state_table
 from mimic.motions.demonstrations import Demonstrations
 from mimic.motions.recording import record_demonstrations
-from mimic.metric.kinematics import link_state_table
 from mimic.retargeting.kinematic_bound import closest_motion
 
 _DEMONSTRATIONS, _EVERY = 2, 5  # two demonstrations, every fifth step: a rough estimate within seconds

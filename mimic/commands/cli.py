@@ -25,6 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mimic import __version__
 from mimic.base import compat, registry
+from mimic.base.config import BAD_INPUT, explain, schema, suggestion, typed
 from mimic.commands.arguments import check_arguments, load_plugins
 from mimic.commands.config import (
     CollectConfig,
@@ -39,7 +40,6 @@ from mimic.commands.config import (
     ViewConfig,
 )
 from mimic.commands.key_help import key_lines
-from mimic.base.config import BAD_INPUT, explain, schema, suggestion, typed
 from mimic.envs import registered_preset
 from mimic.envs.config import EnvConfig
 from mimic.runs.signals import STOPPED_BY_SIGNAL, watched_signals

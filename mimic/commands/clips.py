@@ -15,11 +15,11 @@ from mimic.arms.link_match import LinkMatch
 from mimic.commands.config import RenderConfig
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
-from mimic.motions.demonstrations import Demonstrations, load_demonstrations
-from mimic.motions.recording import record_demonstrations
 from mimic.evaluation.rollout_frames import RolloutFrames, demonstration_index, interpolate
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line_table, similarity
+from mimic.motions.demonstrations import Demonstrations, load_demonstrations
+from mimic.motions.recording import record_demonstrations
 from mimic.retargeting.pose import imitate_pose, pose_limits
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_policy_trainer

@@ -11,11 +11,11 @@ from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import LIMITS
 from mimic.arms.named_arms import is_arm_name
 from mimic.base.config import check_choice
+from mimic.base.ranges import check_ranges, number, seed_number
 from mimic.envs import env_config, environments
 from mimic.envs.config import PHYSICS, ArmsConfig, EnvConfig
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
-from mimic.base.ranges import check_ranges, number, seed_number
 from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
 

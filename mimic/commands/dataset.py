@@ -9,20 +9,20 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mimic.commands.config import DatasetConfig
-from mimic.commands.dataset_sources import file_episodes, rollout_episodes
-from mimic.trainers.progress import is_animated
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_folder
+from mimic.base.distribution import NAME, VERSION
+from mimic.commands.config import DatasetConfig
+from mimic.commands.dataset_sources import file_episodes, rollout_episodes
+from mimic.evaluation.labels import SPLITS
+from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.episodes import Episodes, package_error
 from mimic.motions.formats.lerobot import action_of, frames_per_second, write_lerobot
 from mimic.motions.formats.rosbag2 import write_rosbag2
-from mimic.base.distribution import NAME, VERSION
-from mimic.motions.demonstrations import load_demonstrations
-from mimic.evaluation.labels import SPLITS
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import written_atomically
 from mimic.trainers.make import make_ppo_trainer
+from mimic.trainers.progress import is_animated
 from mimic.trainers.run_config import policy_run
 
 _PACKAGES = {"lerobot": "pyarrow", "rosbag2": "rosbags"}  # the package that writes each format

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from mimic.motions.formats.episodes import ANGLE, TORQUE, VELOCITY, ArmMotions, Episodes
-from mimic.motions.demonstrations import Demonstrations
 from mimic.evaluation.evaluator import Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
+from mimic.motions.demonstrations import Demonstrations
+from mimic.motions.formats.episodes import ANGLE, TORQUE, VELOCITY, ArmMotions, Episodes
 
 # What a policy commands, by `env.control`. The stiffness of joint_impedance is not written.
 _COMMANDS = {"torque": TORQUE, "joint_position": ANGLE, "joint_velocity": VELOCITY, "joint_impedance": ANGLE}

@@ -12,16 +12,16 @@ from rich.table import Table
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.base.config import new_file
 from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
 from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_fraction
-from mimic.trainers.progress import is_animated
-from mimic.base.config import new_file
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import Demonstrations, check_effort
 from mimic.motions.importing import import_demonstrations
 from mimic.motions.recording import record_demonstrations
 from mimic.retargeting.self_collision import smallest_clearances, touching_line
+from mimic.trainers.progress import is_animated
 
 _PLOT_SUFFIXES = (".png", ".pdf", ".svg")
 

@@ -12,8 +12,8 @@ from jaxtyping import Float  # noqa: E402
 from matplotlib.collections import LineCollection  # noqa: E402
 
 from mimic.arms.embodiment import Embodiment, segment_arm  # noqa: E402
-from mimic.motions.demonstrations import Demonstrations  # noqa: E402
 from mimic.metric.similarity import centre_line_table  # noqa: E402
+from mimic.motions.demonstrations import Demonstrations  # noqa: E402
 
 _COLOURS = {"angle": "tab:blue", "velocity": "tab:green", "torque": "tab:purple", "hand": "tab:orange"}
 _LIMIT: dict[str, Any] = {"color": "tab:red", "lw": 0.8, "ls": "--"}

@@ -8,12 +8,10 @@ from typing import Any
 
 from rich.console import Console
 
-from mimic.commands.config import CONTROLLERS, EvaluateConfig
-from mimic.trainers.progress import SearchProgress
-from mimic.trainers.report import make_report, show_report
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_folder
 from mimic.base.distribution import install_command
+from mimic.commands.config import CONTROLLERS, EvaluateConfig
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
@@ -22,6 +20,8 @@ from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.make import make_any_arm_trainer, make_ppo_trainer, make_trainer
+from mimic.trainers.progress import SearchProgress
+from mimic.trainers.report import make_report, show_report
 from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.trainer import Trainer
 

@@ -14,26 +14,26 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from mimic.commands.config import EvaluateConfig, ExportConfig
 from mimic.base.config import new_folder
+from mimic.commands.config import EvaluateConfig, ExportConfig
 from mimic.deploy.bundle import MOTIONS
 from mimic.deploy.safety import COLLISION, LATE, check_supported
 from mimic.envs import env_config
-from mimic.physics.world import WorldConfig
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.evaluation.tracking_controllers import run_tracking
-from mimic.metric.kinematics import link_state_table, link_states
-from mimic.runs.checkpoints import check_checkpoint
-from mimic.runs.files import write_report
-from mimic.runs.provenance import hardware, versions
-from mimic.trainers.config import TrainConfig
-from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.evaluation.virtual_robot.arm_model import RobotModel, robot_model
 from mimic.evaluation.virtual_robot.draws import draw_world, edge_cases
 from mimic.evaluation.virtual_robot.episodes import Episodes, TorquePolicy, TrackingPolicy
 from mimic.evaluation.virtual_robot.robots import LIMIT_CAUSES, SELF_CONTACT
 from mimic.evaluation.virtual_robot.runs import Task, run_tasks
+from mimic.metric.kinematics import link_state_table, link_states
+from mimic.physics.world import WorldConfig
+from mimic.runs.checkpoints import check_checkpoint
+from mimic.runs.files import write_report
+from mimic.runs.provenance import hardware, versions
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.ppo.trainer import PPOTrainer
 
 ALL = "all ranges"
 _CHUNK = 500  # episodes whose distances are computed together

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mimic.trainers import run_training as train
-from mimic.commands.config import FiguresConfig
-from mimic.base.config import check_new
-from mimic.envs import env_config
 from benchmarks.figures.poses import FIGURES, MAPPERS, save_figure
+from mimic.base.config import check_new
+from mimic.commands.config import FiguresConfig
+from mimic.envs import env_config
+from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.model import PoseMapper
 

@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from mimic.commands.config import InspectConfig
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import to_dict
+from mimic.commands.config import InspectConfig
 from mimic.runs.checkpoints import run_id
 from mimic.runs.files import CONFIG
 from mimic.runs.provenance import hardware

@@ -20,10 +20,10 @@ from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
 from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
-from mimic.commands.config import RenderConfig  # noqa: E402
 from mimic.base.compilation import use_compilation_cache  # noqa: E402
 from mimic.base.config import check_new  # noqa: E402
+from mimic.commands.clips import FRAMES_PER_SECOND, Clip, prepare_clip  # noqa: E402
+from mimic.commands.config import RenderConfig  # noqa: E402
 from mimic.evaluation.labels import similarity_texts  # noqa: E402
 
 _SIZE, _DPI = (1280, 640), 100  # pixels

@@ -15,18 +15,18 @@ from rich.table import Table
 from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
-from mimic.commands.config import RetargetConfig
-from mimic.trainers.progress import similarity_table
 from mimic.base.config import new_file
+from mimic.commands.config import RetargetConfig
 from mimic.envs import env_config
-from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.config import MetricConfig
+from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.retargeting.costs import Costs
 from mimic.retargeting.motions import largest_jump, optimal_motions
 from mimic.retargeting.pose import continuous_joints, wrap_angles
 from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper
 from mimic.trainers.pose_mapper.model import PoseMapper
+from mimic.trainers.progress import similarity_table
 
 
 # Above 40 lines because of its docstring.

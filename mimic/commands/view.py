@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import jax
 from rich.console import Console
 
-from mimic.base import compat
 from mimic.arms.arm import ArmConfig
+from mimic.base import compat
+from mimic.base.distribution import install_command
 from mimic.commands.config import ViewConfig
 from mimic.commands.view_capture import (
     CapturedExpert,
@@ -23,7 +24,6 @@ from mimic.commands.view_capture import (
     wait_for_arm,
 )
 from mimic.commands.view_server import check_port, is_installed, serve
-from mimic.base.distribution import install_command
 from mimic.envs.config import ArmsConfig, EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.run_config import load_config, policy_config, policy_run
@@ -96,8 +96,8 @@ def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
     Raises:
       ValueError: there is no such mapper, or a learner does not exist or does not fit it.
     """
-    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
+    from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.viewer.follower import shown_preset
 
     mapper, env = _load_mapper(config)
@@ -120,9 +120,9 @@ def _load_mapper(config: ViewConfig) -> "tuple[Mapper | AnyArmMapper, EnvConfig]
     Raises:
       ValueError: see `PoseMapper.load` and `AnyArmMapper.load`.
     """
-    from mimic.trainers.pretrained.network import Pretrained, load, pretrained_names
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.trainers.pose_mapper.model import PoseMapper
+    from mimic.trainers.pretrained.network import Pretrained, load, pretrained_names
 
     run_dir = Path(config.mapper).expanduser()
     if config.mapper in pretrained_names("pose_mapper") and not run_dir.exists():

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.metric.array_kinematics import correspondence, link_states, make_metric
-from mimic.retargeting.array_nearest import nearest_pose
 from mimic.metric.array_similarity import centre_line
-from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.metric.distance import DistanceWeights
 from mimic.metric.similarity import similarity
+from mimic.retargeting.array_nearest import nearest_pose
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
 from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, expert_pose
 from mimic.trainers.pose_mapper.any_arm_training import random_pose

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from mimic.base.npz import read_arrays
 from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import MODES, PERIOD, JointParameters, action_size
 from mimic.control.limits import JointLimits
-from mimic.base.npz import read_arrays
 
 FORMAT = 2
 POLICY, FEATURES = "policy.onnx", "features.onnx"

@@ -2,16 +2,16 @@
 
 import dataclasses
 
-from mimic.base import registry
 from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
+from mimic.base import registry
 from mimic.base.config import check_choice
-from mimic.control.joint_control import MODES
-from mimic.motions.recording import KINDS
-from mimic.envs.start_poses import START_POSES
-from mimic.physics.world import WorldConfig
-from mimic.metric.config import MetricConfig
 from mimic.base.ranges import check_ranges, number
+from mimic.control.joint_control import MODES
+from mimic.envs.start_poses import START_POSES
+from mimic.metric.config import MetricConfig
+from mimic.motions.recording import KINDS
+from mimic.physics.world import WorldConfig
 
 PHYSICS = ("mjx", "fused")
 AUTO = "auto"

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, lock_joints
 from mimic.arms.sampler import (
     Sampler,
@@ -16,7 +17,6 @@ from mimic.arms.sampler import (
     perturbed_sampler,
     random_arm,
 )
-from mimic.arms.arm import ArmConfig, build_arm
 from mimic.envs.config import EnvConfig, ObservationConfig, RandomizationConfig, RewardConfig
 from mimic.physics.world import WorldConfig
 

@@ -12,19 +12,19 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Bool, Float, Int
 
-from mimic.base import compat, registry
 from mimic.arms.arm import Arm, build_arm, torque_scale
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.base import compat, registry
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
-from mimic.motions.demonstrations import Demonstrations, check_effort, load_demonstrations
-from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
-from mimic.motions.recording import record_demonstrations
 from mimic.envs.start_poses import home_poses, nearest_poses
 from mimic.envs.terms import Transition, observation_layout_of_terms, observation_terms, observed, reward_terms
 from mimic.metric.distance import LinkDistance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
+from mimic.motions.demonstrations import Demonstrations, check_effort, load_demonstrations
+from mimic.motions.recording import record_demonstrations
+from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
 from mimic.retargeting.costs import changing_pairs
 
 # The limit penalty starts this margin inside a limit and is at its maximum a width further out; in rad for positions,

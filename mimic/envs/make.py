@@ -9,8 +9,8 @@ from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import Demonstrations
 
 if TYPE_CHECKING:
-    from mimic.envs.many_arms import AnyArmEnv
     from mimic.envs.imitation import ImitationEnv
+    from mimic.envs.many_arms import AnyArmEnv
 
 
 @overload
@@ -73,9 +73,9 @@ def make_family_env(config: EnvConfig, demonstrations: Demonstrations | None = N
     Raises:
       ValueError: settings that such an environment does not have, arms or demonstrations that do not fit.
     """
-    from mimic.envs.many_arms import AnyArmEnv
     from mimic.envs.family import arm_sampler, check_family
     from mimic.envs.imitation import training_and_held_out
+    from mimic.envs.many_arms import AnyArmEnv
 
     check_family(config)
     sampler = arm_sampler(config)

@@ -17,26 +17,26 @@ from brax.envs.base import Env, State
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from mimic.base import compat
+from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
+from mimic.arms.sampler import Sampler
+from mimic.base import compat
+from mimic.envs.arm_state import ArmState, arm_state
+from mimic.envs.config import EnvConfig
 from mimic.envs.many_arms_control import Plan, make_plan, max_speed, planned_torque, torque_scale
-from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
+from mimic.envs.many_arms_observation import observation_size, observe
 from mimic.metric.array_kinematics import (
     check_metric,
     correspondence,
     link_states,
     make_metric,
 )
-from mimic.envs.many_arms_observation import observation_size, observe
-from mimic.physics.physics import make_advance
-from mimic.arms.sampler import Sampler
-from mimic.arms.arm import build_arm
-from mimic.envs.arm_state import ArmState, arm_state
-from mimic.envs.config import EnvConfig
-from mimic.motions.demonstrations import Demonstrations
-from mimic.physics.step import Load, PhysicsChoice
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import LinkStates
+from mimic.motions.demonstrations import Demonstrations
+from mimic.physics.physics import make_advance
+from mimic.physics.step import Load, PhysicsChoice
+from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 
 _HOLD_SAMPLES = 5  # steps of a demonstration at which the distance of holding the home pose is computed
 _RUNAWAY = 3.0  # distance charged for each step after a runaway, as a multiple of that of holding the home pose

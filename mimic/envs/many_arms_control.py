@@ -5,10 +5,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mimic.arms.arm import SPEED_FACTOR
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.physics.dynamics import inertia_and_bias, inertia_matrix
 from mimic.retargeting.array_nearest import NearestPose, solve_free
-from mimic.arms.arm import SPEED_FACTOR
 
 # Weight of the velocity at the end of a step against the angle there, in units of the step. Without it the velocity
 # would alternate from step to step; 0.05 to 1 give optimality gaps of 0.14 to 0.17 % on panda4dof.

@@ -8,10 +8,10 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.envs.many_arms_control import Plan
-from mimic.retargeting.array_goals import Goals
 from mimic.metric.array_kinematics import joint_states, link_states_in_frames
-from mimic.retargeting.array_nearest import angle_limits
 from mimic.metric.kinematics import LinkStates
+from mimic.retargeting.array_goals import Goals
+from mimic.retargeting.array_nearest import angle_limits
 
 JOINT_FEATURES = 18  # numbers of each joint; the first says whether it is free
 _LINK_FEATURES, _EXPERT_FEATURES = 7, 12

@@ -13,16 +13,16 @@ from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
 from mimic.envs.arm_state import ArmState
 from mimic.envs.config import EnvConfig
-from mimic.motions.demonstrations import Demonstrations
 from mimic.envs.imitation import ImitationEnv
-from mimic.physics.step import PhysicsChoice
-from mimic.physics.world import MAX_DELAY
+from mimic.envs.world_state import HardwareState
+from mimic.metric.kinematics import LinkStates, link_states
+from mimic.motions.demonstrations import Demonstrations
 from mimic.physics.inner_loop import LoopState, make_inner_loop
 from mimic.physics.mjx_loop import MjxLoop, make_mjx_loop
 from mimic.physics.mujoco_world import mujoco_world
 from mimic.physics.plant import Draw, draw_episode, make_plant
-from mimic.envs.world_state import HardwareState
-from mimic.metric.kinematics import LinkStates, link_states
+from mimic.physics.step import PhysicsChoice
+from mimic.physics.world import MAX_DELAY
 
 SENT_ACTIONS = 3  # that the policy observes: from them it tells how long its actions take
 _DRAW, _START, _MEASURE, _LOSS = 5, 6, 7, 8  # folded into an episode's key, see mimic/envs/imitation.py

@@ -14,17 +14,17 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, stack_arms
-from mimic.retargeting.array_bound import closest_motion
-from mimic.envs.many_arms import AnyArmEnv, any_arm_state
-from mimic.envs.family import SEEN, UNSEEN
-from mimic.metric.array_kinematics import link_states
-from mimic.metric.array_similarity import motion_similarity
 from mimic.arms.arm import build_arm
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, stack_arms
 from mimic.base.compilation import Background, compiled_quickly, on_host
+from mimic.envs.family import SEEN, UNSEEN
+from mimic.envs.many_arms import AnyArmEnv, any_arm_state
 from mimic.evaluation.evaluator import Controller
 from mimic.evaluation.rollout_metrics import gaps
+from mimic.metric.array_kinematics import link_states
+from mimic.metric.array_similarity import motion_similarity
 from mimic.metric.kinematics import LinkStates
+from mimic.retargeting.array_bound import closest_motion
 from mimic.runs.files import write_atomically
 
 EVALUATED_DEMONSTRATIONS = 8  # of the held-out ones: with 29 arms, 232 rollouts and bounds

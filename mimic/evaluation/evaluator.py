@@ -16,14 +16,14 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
-from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.base.compilation import Background, on_host
-from mimic.motions.demonstrations import Demonstrations, concatenate
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.labels import SPLITS
+from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.evaluation.rollout_metrics import WORST, Table, gaps, means_by_split, measure, measure_similarity
 from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table
+from mimic.motions.demonstrations import Demonstrations, concatenate
 from mimic.retargeting.kinematic_bound import closest_motion
 from mimic.retargeting.pose import pose_limits, shared_joints
 from mimic.retargeting.pose_baselines import baseline_poses

@@ -9,14 +9,14 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
-from mimic.envs.many_arms_control import make_plan, max_speed, planned_torque
-from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
-from mimic.metric.array_kinematics import check_metric, correspondence
-from mimic.envs.many_arms_observation import observe
 from mimic.arms.arm import build_arm
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, masked_arrays
 from mimic.envs.arm_state import arm_state
 from mimic.envs.imitation import ImitationEnv
+from mimic.envs.many_arms_control import make_plan, max_speed, planned_torque
+from mimic.envs.many_arms_observation import observe
+from mimic.metric.array_kinematics import check_metric, correspondence
+from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 
 Policy = Callable[[Float[Array, " observation"]], Float[Array, " actions"]]
 

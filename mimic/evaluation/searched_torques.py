@@ -9,14 +9,14 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.envs.imitation import ImitationEnv, arm_state
-from mimic.physics.step import Load
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
+from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.evaluation.tracking_controllers import run_controller
 from mimic.evaluation.trajectory_descent import Task, TrajectoryDescent
+from mimic.physics.step import Load
 
 _NOISE = 0.3  # standard deviation of the noise on the policy's actions in additional starts
 _NOISE_STEPS = 5  # duration of a constant noise, long enough to move the arm off its path

@@ -10,14 +10,14 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float, Int
 
-from mimic.evaluation.nearest_pose_controller import nearest_pose_controller
 from mimic.arms.simulation_model import effective_inertia
 from mimic.control.joint_control import action_towards
-from mimic.physics import chain_dynamics as dynamics
 from mimic.envs.imitation import ImitationEnv, arm_state
-from mimic.evaluation.evaluator import Controller, Evaluator, Motions, Rollouts
 from mimic.envs.world_env import HardwareEnv
 from mimic.envs.world_state import HardwareState
+from mimic.evaluation.evaluator import Controller, Evaluator, Motions, Rollouts
+from mimic.evaluation.nearest_pose_controller import nearest_pose_controller
+from mimic.physics import chain_dynamics as dynamics
 from mimic.retargeting.motions import largest_jump, optimal_motions
 
 _FREQUENCIES = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)  # candidates [rad/s]; a torque is constant for 0.1 s

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.envs.imitation import ImitationEnv
-from mimic.physics.step import Load, make_advance
 from mimic.metric.distance import PARTS, PairDistances, Weights, pair_distances
 from mimic.metric.kinematics import LinkStates, link_states
+from mimic.physics.step import Load, make_advance
 
 _STEPS = (1.0, 0.5, 0.2, 0.05, 0.01)  # fractions of the full update; all are rolled out, and the best is used
 _DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-2, 1e-6, 1e3  # added to the curvature with respect to the action

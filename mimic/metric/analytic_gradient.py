@@ -17,9 +17,9 @@ from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
 from mimic.base import spatial
+from mimic.base.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract, times
 from mimic.metric.distance import PARTS
 from mimic.metric.kinematics import JointFrame, LinkVectors, joint_frames, link_vectors
-from mimic.base.spatial import ZERO, Scalar, Vector, add, cross, dot, plus, scale, subtract, times
 
 _ROTATION = PARTS.index("rotation")
 _REST = LinkVectors(ZERO, ZERO, ZERO, ZERO)

@@ -8,12 +8,13 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 
-from mimic.base import registry
 from mimic.arms.chain import LINKS
 from mimic.arms.chain_match import CHAIN_MATCHES, ChainMatch
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import LinkMatch
+from mimic.base import registry
 from mimic.base.config import check_choice
+from mimic.base.ranges import check_ranges, number
 from mimic.metric.correspondence import (
     arc_length_correspondence,
     hard_correspondence,
@@ -34,7 +35,6 @@ from mimic.metric.distance import (
     Weights,
     adaptive_weights,
 )
-from mimic.base.ranges import check_ranges, number
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")
 registry.reserve("correspondence", CORRESPONDENCES)

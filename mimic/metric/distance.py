@@ -12,8 +12,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
-from mimic.base.config import check_choice
 from mimic.base import spatial
+from mimic.base.config import check_choice
 from mimic.metric.kinematics import LinkStates
 
 RotationMeasure = Literal["cosine", "angle"]

@@ -18,9 +18,9 @@ from jaxtyping import Array, Float, Int
 
 from mimic.arms.embodiment import Embodiment
 from mimic.base import fused_kernel, spatial
+from mimic.base.spatial import ZERO, Scalar, Vector, plus, subtract
 from mimic.metric.analytic_gradient import NO_ADJOINTS, Adjoints, by_joint, compare_part, with_link
 from mimic.metric.kinematics import BASE, JointFrame, LinkVectors, child_frame, link_state
-from mimic.base.spatial import ZERO, Scalar, Vector, plus, subtract
 
 _VECTORS = 4  # of an arm in a row of numbers: the last two of the link
 _PER_ARM = 3 * _VECTORS

@@ -12,8 +12,8 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment, in_chain_lengths
-from mimic.metric import analytic_gradient, long_chain_kernel
 from mimic.base import fused_kernel
+from mimic.metric import analytic_gradient, long_chain_kernel
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
     PARTS,

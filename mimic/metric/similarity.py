@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment, segment_arm
-from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.base.spatial import array_library
+from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 
 SAMPLES = 64  # of a centre line
 MEASURES = ("centre_line_distance", "tangent_angle_deg", "frechet_distance", "hand_position_error", "hand_angle_deg")

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from mimic.arms.embodiment import Embodiment
+from mimic.base.npz import read_arrays
+from mimic.motions.demonstrations import MAX_VALUE, Demonstrations, check_effort
 from mimic.motions.formats.episodes import Motion
 from mimic.motions.formats.lerobot_reading import is_lerobot, read_lerobot
 from mimic.motions.formats.rosbag2 import BAG_FILES, is_rosbag2, read_rosbag2
-from mimic.motions.demonstrations import MAX_VALUE, Demonstrations, check_effort
-from mimic.base.npz import read_arrays
 
 SOURCES = (".csv", ".npz", *BAG_FILES)
 _TIME, _DEMONSTRATION = ("time", "t"), "demonstration"  # columns of a table

@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mimic.physics import dynamics
 from mimic.arms.arrays import MAX_JOINTS
-from mimic.physics.dynamics import PLANE, JointNumbers, Motion
-from mimic.physics.trigonometry import cosine_and_sine
-from mimic.physics.chain_dynamics import acceleration_field
-from mimic.physics.step import runge_kutta
 from mimic.base import fused_kernel
 from mimic.base.spatial import ZERO, Scalar, Vector, add, minus, plus, times
+from mimic.physics import dynamics
+from mimic.physics.chain_dynamics import acceleration_field
+from mimic.physics.dynamics import PLANE, JointNumbers, Motion
+from mimic.physics.step import runge_kutta
+from mimic.physics.trigonometry import cosine_and_sine
 
 LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest measured on an H100
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.physics.chain_dynamics import acceleration_field, moment_of_field
 from mimic.base.spatial import ZERO, Rotation, Scalar, Vector, add, cross, minus, plus, rotate, times
+from mimic.physics.chain_dynamics import acceleration_field, moment_of_field
 
 PLANE = tuple[Scalar, Scalar]  # cosine and sine
 Motion = tuple[Vector, Vector, Vector]  # angular velocity and acceleration, and linear acceleration of the origin

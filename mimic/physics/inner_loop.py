@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.physics import composite_kernel, dynamics, looped_dynamics
-from mimic.physics.composite_kernel import read_rows, write_rows
+from mimic.base import fused_kernel
 from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
-from mimic.base import fused_kernel
+from mimic.physics import composite_kernel, dynamics, looped_dynamics
+from mimic.physics.composite_kernel import read_rows, write_rows
 
 
 class JointConstants(NamedTuple):

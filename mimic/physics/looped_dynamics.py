@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mimic.base.spatial import add, vector
 from mimic.physics import dynamics
 from mimic.physics.chain_dynamics import acceleration_field
-from mimic.base.spatial import add, vector
 
 Joints = Float[Array, "joints *batch"]
 _Turns = tuple[Joints, Joints]  # cosine and sine of the rotation of each joint

@@ -14,8 +14,8 @@ from mimic.arms.arm import Arm
 from mimic.arms.capsules import Capsules
 from mimic.arms.simulation_model import simulation_spec
 from mimic.control.joint_control import PERIOD
-from mimic.physics.world import WorldConfig
 from mimic.physics.plant import GRAVITY, end_of_last_link
+from mimic.physics.world import WorldConfig
 from mimic.retargeting.costs import changing_pairs
 from mimic.retargeting.pose import pose_limits
 

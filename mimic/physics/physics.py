@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.physics import composite_kernel, dynamics, looped_dynamics
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.physics.step import Load, runge_kutta
 from mimic.base import fused_kernel
+from mimic.physics import composite_kernel, dynamics, looped_dynamics
+from mimic.physics.step import Load, runge_kutta
 
 AdvanceAny = Callable[[ArmArrays, Array, Array, Array, Load], tuple[Array, Array]]
 

@@ -8,17 +8,17 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mimic.arms.arrays import ArmArrays, arm_arrays, body_moments, moments_of_joints
-from mimic.physics.dynamics import NUMBERS, joint_numbers
 from mimic.arms.arm import Arm, torque_scale
+from mimic.arms.arrays import ArmArrays, arm_arrays, body_moments, moments_of_joints
 from mimic.arms.drives import drives_of
 from mimic.arms.simulation_model import joint_inertia
 from mimic.control.joint_control import PERIOD
 from mimic.control.limits import joint_parameters
 from mimic.envs.config import EnvConfig
+from mimic.physics.dynamics import NUMBERS, joint_numbers
+from mimic.physics.inner_loop import Episode, JointConstants
 from mimic.physics.step import Load
 from mimic.physics.world import WorldConfig
-from mimic.physics.inner_loop import Episode, JointConstants
 
 GRAVITY = 9.81  # m/s^2
 # Mechanical stops as critically damped springs: stiff, and slow enough for steps of 1 ms.

@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from mimic.base import spatial
-from mimic.metric.distance import RotationMeasure
 from mimic.base.spatial import Rotation, Scalar, Vector
+from mimic.metric.distance import RotationMeasure
 from mimic.retargeting.optimizers import Derivatives
 
 

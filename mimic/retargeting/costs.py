@@ -13,8 +13,8 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment
 from mimic.base import spatial
-from mimic.metric.kinematics import LinkStates, forward_kinematics, joint_frames
 from mimic.base.ranges import check_ranges, number
+from mimic.metric.kinematics import LinkStates, forward_kinematics, joint_frames
 from mimic.retargeting.closed_form import SMOOTHING, Smoothing
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 from mimic.retargeting.pose_objective import PoseObjective, Target

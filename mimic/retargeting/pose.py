@@ -15,9 +15,9 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.base.compilation import compiled_once
 from mimic.base.config import check_choice
+from mimic.base.spatial import array_library
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import resting_link_states
-from mimic.base.spatial import array_library
 from mimic.retargeting.costs import Costs, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.multistart import Descents, Method, best_descent

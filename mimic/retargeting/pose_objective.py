@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Int
 
 from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.base import spatial
+from mimic.base.spatial import Vector
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import LinkStates, joint_axes, joint_frames, link_states, link_vectors
-from mimic.base.spatial import Vector
 from mimic.retargeting.closed_form import (
     SMOOTHING,
     Body,

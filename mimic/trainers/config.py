@@ -7,8 +7,8 @@ from omegaconf import MISSING
 
 from mimic.base import registry
 from mimic.base.config import check_choice
-from mimic.envs.config import EnvConfig
 from mimic.base.ranges import check_ranges, number, seed_number
+from mimic.envs.config import EnvConfig
 from mimic.runs.distributed.process_group import DistributedConfig
 
 NETWORKS = ("mlp", "joints")

@@ -7,11 +7,11 @@ from typing import cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.arms.arrays import masked_arrays
-from mimic.envs.family import arm_name
 from mimic.arms.arm import ArmConfig
+from mimic.arms.arrays import masked_arrays
 from mimic.base.config import to_dict, typed
 from mimic.envs.config import ArmsConfig, EnvConfig
+from mimic.envs.family import arm_name
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, run_schema
 

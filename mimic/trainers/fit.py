@@ -12,23 +12,23 @@ import numpy as np
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
-from mimic.envs.many_arms import AnyArmEnv
-from mimic.commands.config import EvaluateConfig
-from mimic.commands.evaluate import prepare_report
-from mimic.trainers.report import show_report
-from mimic.trainers.run_training import run_training
 from mimic.base.compilation import compilation_cache, use_compilation_cache
 from mimic.base.config import explain, merged, schema, typed
+from mimic.commands.config import EvaluateConfig
+from mimic.commands.evaluate import prepare_report
 from mimic.envs import EnvConfig, env_config
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.make import make_env, make_family_env
+from mimic.envs.many_arms import AnyArmEnv
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import DEMONSTRATIONS, REPORT, read_json
 from mimic.runs.signals import Signals
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig, TrainerConfig, trainer_config, trainers
 from mimic.trainers.make import make_trainer
+from mimic.trainers.report import show_report
 from mimic.trainers.run_config import load_config, new_run_dir
+from mimic.trainers.run_training import run_training
 
 if TYPE_CHECKING:
     from PIL.Image import Image

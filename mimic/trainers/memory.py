@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import jax
 
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS
-from mimic.envs.many_arms_observation import observation_size
 from mimic.arms.embodiment import Embodiment
-from mimic.envs.config import ArmsConfig
 from mimic.base.memory import check_memory, device_memory, host_memory
+from mimic.envs.config import ArmsConfig
+from mimic.envs.many_arms_observation import observation_size
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 
 _FLOAT32, _FLOAT64 = 4, 8  # bytes

@@ -5,11 +5,11 @@ from typing import Any
 
 from rich.console import Console
 
-from mimic.trainers.progress import report_table, similarity_table
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.provenance import hardware, versions
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
+from mimic.trainers.progress import report_table, similarity_table
 from mimic.trainers.run_plugins import used_plugins
 from mimic.trainers.trainer import Trainer
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.base import registry
 from mimic.arms.arm import BUILT_IN
+from mimic.base import registry
 from mimic.base.config import check_new, check_writable, explain, merged, schema, to_dict, typed
 from mimic.base.config_files import check_references, read_config
 from mimic.runs.checkpoints import check_checkpoint

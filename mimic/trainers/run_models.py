@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mimic.envs.family import arm_name
 from mimic.arms.arm import ArmConfig
 from mimic.arms.model_copy import copied_files
 from mimic.arms.model_source import file_digest, read_source
 from mimic.envs.config import EnvConfig
+from mimic.envs.family import arm_name
 from mimic.runs.files import write_atomically
 
 MODELS, RECORD = "models", "models.json"

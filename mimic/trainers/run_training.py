@@ -12,8 +12,6 @@ import jax
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from mimic.trainers.progress import TrainingProgress
-from mimic.trainers.report import make_report, show_report
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import check_writable, flatten, to_dict, typed
 from mimic.runs.autotuning import use_kept_choices
@@ -26,6 +24,7 @@ from mimic.runs.checkpoints import (
     load_training,
     mark_damaged_after,
 )
+from mimic.runs.distributed.process_group import ProcessGroup
 from mimic.runs.divergence import EXIT_CODE as DIVERGED
 from mimic.runs.divergence import Diverged
 from mimic.runs.files import CONFIG, reported_steps, write_report
@@ -36,9 +35,10 @@ from mimic.runs.provenance import hardware
 from mimic.runs.signals import Interrupted, Signals, noted_signals
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
-from mimic.runs.distributed.process_group import ProcessGroup
 from mimic.trainers.fine_tuning import fine_tuned
 from mimic.trainers.make import make_trainer
+from mimic.trainers.progress import TrainingProgress
+from mimic.trainers.report import make_report, show_report
 from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, run_schema, save_config
 from mimic.trainers.run_correspondence import save_correspondence
 from mimic.trainers.run_models import own_arms, save_models

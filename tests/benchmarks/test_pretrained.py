@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks import pretrained
-from mimic.trainers import run_training as train
 from mimic.envs import env_config
-from mimic.trainers.pretrained.network import NETWORKS, read_any_arm_mapper, read_network
 from mimic.runs.files import REPORT, read_json
+from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.pretrained.network import NETWORKS, read_any_arm_mapper, read_network
 from mimic.trainers.run_config import load_config
 from tests.helpers import pages
 from tests.helpers.untrained_run import untrained_run

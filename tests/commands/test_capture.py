@@ -12,7 +12,7 @@ from mimic.commands.capture import read_arm, train_options
 from mimic.commands.config import CaptureConfig
 from mimic.motions.mocap.clips import slow_down_for
 from mimic.motions.mocap.link_motion import arm_motion
-from tests.mocap.bodies import bvh_text, person
+from tests.helpers.bodies import bvh_text, person
 
 
 def run(tmp_path, command, *arguments):

@@ -18,10 +18,10 @@ from mimic.commands import dataset as command
 from mimic.commands.config import DatasetConfig
 from mimic.commands.dataset import prepare_dataset
 from mimic.commands.dataset_sources import file_episodes, rollout_episodes, steps_before_runaway
-from mimic.motions.formats.episodes import ANGLE, VELOCITY
+from mimic.envs.make import make_env
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.labels import SPLITS
-from mimic.envs.make import make_env
+from mimic.motions.formats.episodes import ANGLE, VELOCITY
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.run_config import save_config
 from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run

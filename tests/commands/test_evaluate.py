@@ -11,8 +11,8 @@ import pytest
 
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
-from mimic.physics import step as physics
 from mimic.envs.imitation import training_and_held_out
+from mimic.physics import step as physics
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer

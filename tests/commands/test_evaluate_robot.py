@@ -17,8 +17,6 @@ import mimic
 from mimic.commands.config import EvaluateConfig, ExportConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.commands.evaluate_robot import prepare_robot_evaluation, summary
-from mimic.trainers.export.export import prepare_export
-from mimic.trainers.export.export_controller import expert_table, export_controller, prepare_controller
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import load_bundle
 from mimic.deploy.fake_robot import FakeRobot
@@ -27,14 +25,16 @@ from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import INTERVENTIONS
 from mimic.deploy.sessions import Policy
 from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv, control_observation
+from mimic.evaluation.virtual_robot.episodes import Episodes
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.export.export import prepare_export
+from mimic.trainers.export.export_controller import expert_table, export_controller, prepare_controller
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.trainer import PPOTrainer, run_environment
 from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.run_models import save_models
-from mimic.evaluation.virtual_robot.episodes import Episodes
 
 pytest.importorskip("onnxruntime")
 HORIZON, HELD_OUT = 10, 3

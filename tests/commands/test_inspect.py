@@ -11,9 +11,8 @@ import pytest
 from PIL import Image
 
 import mimic
-from mimic.commands import cli
 from mimic import inspect
-from mimic.commands import arm_checks
+from mimic.commands import arm_checks, cli
 from mimic.commands.config import InspectConfig
 from mimic.commands.inspect import train_command
 from mimic.envs.config import EnvConfig

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.commands import cli
 from mimic import inspect
+from mimic.commands import cli
 from mimic.runs.checkpoints import load_training
 from mimic.runs.divergence import FILE, Diverged
 from mimic.runs.signals import Signals

@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
-from mimic.commands import cli
 from mimic.__main__ import commands
-from mimic.commands.key_help import explanations, key_lines
 from mimic.base.config import schema
+from mimic.commands import cli
+from mimic.commands.key_help import explanations, key_lines
 from mimic.trainers.config import BUILT_IN_TRAINERS, MAPPER_PRESETS, PRESETS
 
 

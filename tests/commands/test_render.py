@@ -14,14 +14,14 @@ from PIL import Image
 import mimic
 from mimic.arms.arm import build_arm
 from mimic.arms.rendering import ArmScene
-from mimic.trainers import run_training as train
 from mimic.commands.clips import prepare_clip
 from mimic.commands.config import RenderConfig
 from mimic.commands.render import _write_video, draw_frames, prepare_video
 from mimic.envs import env_config
+from mimic.metric.similarity import centre_line, similarity
 from mimic.motions.demonstrations import Demonstrations
 from mimic.motions.recording import record_demonstrations
-from mimic.metric.similarity import centre_line, similarity
+from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 STEPS = 4  # of a motion: 0.4 s, 13 frames

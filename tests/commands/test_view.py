@@ -21,7 +21,7 @@ from mimic.commands.view_capture import listen, wait_for_arm
 from mimic.envs import env_config
 from mimic.motions.mocap.live_points import Sample, sample_line
 from mimic.runs.signals import Signals
-from tests.mocap.bodies import bvh_text, person
+from tests.helpers.bodies import bvh_text, person
 
 
 @pytest.mark.parametrize(

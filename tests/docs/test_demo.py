@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.trainers.pretrained.network import names_of_one_learner
 from mimic.retargeting.pose_baselines import copy_joints
+from mimic.trainers.pretrained.network import names_of_one_learner
 from tests.helpers.repository import REPOSITORY
 
 DEMO = REPOSITORY / "docs" / "demo"

@@ -12,8 +12,8 @@ import pytest
 import mimic
 from mimic.envs import imitation
 from mimic.envs.config import RandomizationConfig
-from mimic.physics.step import Load
 from mimic.envs.wrappers import wrap_for_training
+from mimic.physics.step import Load
 
 RANGES = {"mass": [0.5, 2.0], "damping": [1.0, 3.0]}
 ACTION = jnp.array([0.6, -0.4])

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.motions.demonstrations import Demonstrations
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.envs.start_poses import CLEARANCE, nearest_poses
 from mimic.envs.wrappers import fresh_episodes
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_frames import RolloutFrames
 from mimic.evaluation.searched_torques import _task
+from mimic.motions.demonstrations import Demonstrations
 from mimic.retargeting.costs import capsule_axes, pair_distances
 
 SETTINGS = {"demonstrations": {"count": 3, "held_out": 2}, "horizon": 6}

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from mimic.arms.arrays import MAX_JOINTS
-from mimic.envs.many_arms import AnyArmEnv
 from mimic.envs.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.envs.imitation import training_and_held_out
+from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.any_arm import ArmReferences, ArmRollouts, ArmsEvaluator, ArmsOutcome
 from mimic.evaluation.arms_plot import plot_arms
 from tests.helpers.untrained_family import HELD_OUT, HORIZON, family

@@ -11,12 +11,12 @@ import mimic
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.physics.step import Load
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.searched_torques import search_torques
 from mimic.evaluation.trajectory_descent import Task, TrajectoryDescent, _bounded_law
+from mimic.physics.step import Load
 from tests.helpers.untrained_run import untrained_run
 
 HORIZON = 20

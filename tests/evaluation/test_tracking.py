@@ -5,9 +5,9 @@ import pytest
 
 import mimic
 from mimic.envs.imitation import training_and_held_out
+from mimic.envs.make import make_env
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.tracking_controllers import run_controller, run_tracking
-from mimic.envs.make import make_env
 
 
 def make_evaluator(**fields) -> Evaluator:

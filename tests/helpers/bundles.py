@@ -11,13 +11,13 @@ import numpy as np
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.drives import drives_of
-from mimic.trainers.export.onnx_graph import to_onnx
 from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import JointParameters, action_size
 from mimic.deploy.bundle import load_bundle, write_bundle
 from mimic.envs import env_config
 from mimic.physics.plant import make_plant
 from mimic.retargeting.clearance import clearance_constants
+from mimic.trainers.export.onnx_graph import to_onnx
 
 ON_FLOOR = np.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])  # poses in which a Panda touches the floor, and itself
 FOLDED = np.array([0, 0.6, 0, -3.05, 2.8, 3.7, 0])

@@ -13,7 +13,7 @@ from mimic.arms.capsules import fit_capsules
 from mimic.control.clearance import clearance as control_clearance
 from mimic.retargeting.clearance import clearance_constants, make_clearance
 from mimic.retargeting.costs import capsule_axes, changing_pairs, pair_distances
-from tests.virtual_robot.cases import model
+from tests.helpers.virtual_robots import model
 
 CONFIGS = {"panda": ArmConfig(), "locked": ArmConfig(locked=[3, 6, 7]), "two arms": ArmConfig(model="panda_pair")}
 

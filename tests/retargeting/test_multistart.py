@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mimic.base import compat
 from mimic.arms.embodiment import planar_arm
+from mimic.base import compat
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import resting_link_states

@@ -7,9 +7,9 @@ import types
 import pytest
 
 import mimic
-from mimic.trainers import run_training as train
 from mimic.base.config import to_dict
 from mimic.runs.loggers import make_loggers
+from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
 

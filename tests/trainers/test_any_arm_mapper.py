@@ -13,14 +13,14 @@ import pytest
 
 import mimic
 from mimic.arms.arrays import MAX_JOINTS, lock_joints, stack_arms
-from mimic.envs.family import arm_sampler
 from mimic.commands import retarget
-from mimic.trainers import run_training as session
 from mimic.commands.config import EvaluateConfig, RetargetConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config
+from mimic.envs.family import arm_sampler
 from mimic.metric.similarity import MEASURES
 from mimic.runs.checkpoints import checkpoint_steps
+from mimic.trainers import run_training as session
 from mimic.trainers.config import AnyArmMapperSettings, PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.any_arm_evaluation import METHODS, Mapped, Reference, best_poses, table_of_pairs
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, load_mapper

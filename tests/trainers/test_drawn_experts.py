@@ -12,14 +12,14 @@ import pytest
 
 import mimic
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, stack_arms
-from mimic.envs.family import arm_sampler
 from mimic.arms.sampler import random_arm
 from mimic.commands import retarget
-from mimic.trainers import run_training as session
 from mimic.commands.config import RetargetConfig
 from mimic.envs import env_config
 from mimic.envs.config import ArmsConfig
+from mimic.envs.family import arm_sampler
 from mimic.runs.checkpoints import save_checkpoint
+from mimic.trainers import run_training as session
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.any_arm_evaluation import METHODS
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, load_mapper

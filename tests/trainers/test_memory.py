@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from mimic.envs import env_config
 from mimic.base.memory import check_memory, device_memory, host_memory
+from mimic.envs import env_config
 from mimic.trainers import memory
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.memory import check_training_memory

@@ -10,11 +10,11 @@ import pytest
 
 import mimic
 from mimic.commands import retarget
-from mimic.trainers import run_training as session
 from mimic.commands.config import EvaluateConfig, RetargetConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs import env_config
 from mimic.runs.checkpoints import checkpoint_steps
+from mimic.trainers import run_training as session
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model

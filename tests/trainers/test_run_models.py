@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.envs.family import report_arms
 from mimic.arms.arm import build_arm
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
+from mimic.envs.family import report_arms
 from mimic.runs.files import CONFIG
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, new_run_dir, save_config

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mimic.trainers import run_training as train
 from mimic.envs import env_config
+from mimic.trainers import run_training as train
 from mimic.trainers.config import PPOConfig, TrainConfig
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -10,7 +10,7 @@ from mimic.motions.mocap.link_motion import arm_motion
 from mimic.motions.mocap.live_points import LiveArm, Sample, find_live_arms
 from mimic.motions.mocap.point_socket import Counts
 from mimic.viewer.captured import Clip, ClipPlayer, PointFollower, make_clip
-from tests.mocap.bodies import RATE, person
+from tests.helpers.bodies import RATE, person
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import pytest
 
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm, finite_velocity_limit
-from mimic.trainers import run_training as train
 from mimic.envs import env_config
+from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.viewer import html
 from mimic.viewer.follower import Settings, initial_settings, learner_arm, step_towards

@@ -1,0 +1,1 @@
+"""`python -m mimic.collect`: the results of finished runs in one table."""

@@ -13,10 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from mimic.commands.config import CollectConfig
 from mimic.base.config import check_writable
-from mimic.evaluation.labels import SPLITS
-from mimic.runs.files import REPORT, write_atomically
 from mimic.commands.collect.collect.finished_runs import FinishedRun, LeftOut, QualityMetric, find_runs, quality_metric
 from mimic.commands.collect.collect.seed_groups import (
     CONFIDENCE,
@@ -27,6 +24,9 @@ from mimic.commands.collect.collect.seed_groups import (
     drop_repeated,
     group_runs,
 )
+from mimic.commands.config import CollectConfig
+from mimic.evaluation.labels import SPLITS
+from mimic.runs.files import REPORT, write_atomically
 
 NAME = "collected"
 SOME_LEFT_OUT = 1

@@ -8,8 +8,8 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.drives import JointFriction, drives_of
 from mimic.control.limits import JointLimits
-from mimic.physics.world import WorldConfig
 from mimic.physics.mujoco_world import MujocoWorld, mujoco_world
+from mimic.physics.world import WorldConfig
 
 # External torque at which a Panda's collision reflex stops it [N m], as in libfranka's examples of joint motions. Other
 # robots get the smallest of these, as a fraction of the torque limit.

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 
 from mimic.control.joint_control import PERIOD, friction_torque
-from mimic.physics.mujoco_world import FLOOR, disabled, loaded_fields
 from mimic.evaluation.virtual_robot.arm_model import RobotModel
 from mimic.evaluation.virtual_robot.draws import World
+from mimic.physics.mujoco_world import FLOOR, disabled, loaded_fields
 
 START_POSE, POSITION, VELOCITY = "start pose invalid", "joint position limit", "joint velocity limit"
 TORQUE, TORQUE_RATE, EXTERNAL_TORQUE = "torque limit", "torque rate", "external torque"

@@ -1,0 +1,1 @@
+"""Motions in the formats of other projects: LeRobot datasets and rosbag2."""

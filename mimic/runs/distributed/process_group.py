@@ -21,9 +21,9 @@ import jax
 
 from mimic.base import compat
 from mimic.base.ranges import check_ranges, number
+from mimic.runs.distributed.local_processes import LocalProcesses, gpu_count, local_process
 from mimic.runs.signals import EXIT_HOOKS, STOPPED_BY_SIGNAL, Signals, with_patience
 from mimic.trainers.distributed.heartbeats import Heartbeats
-from mimic.runs.distributed.local_processes import LocalProcesses, gpu_count, local_process
 from mimic.trainers.distributed.relay import Relay
 
 AUTO, LOCAL = "auto", "local"

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array
 from rich.console import Console
 
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
-from mimic.envs.many_arms_control import make_plan, max_speed, planned_torque, torque_scale
 from mimic.arms.description import (
     SUFFIXES,
     described_arm,
@@ -21,15 +21,15 @@ from mimic.arms.description import (
     description_size,
     save_description,
 )
-from mimic.retargeting.array_goals import NEW_POSES, OTHERS, Problem, chosen_goal, first_goals, next_goals
-from mimic.metric.array_kinematics import check_metric, correspondence, link_states
-from mimic.envs.many_arms_observation import observation_size, observe
-from mimic.arms.arm import ArmConfig, build_arm
-from mimic.trainers.export.exported_function import ExportedFunction, joint_ranges
 from mimic.base.config import new_file
 from mimic.base.distribution import VERSION
+from mimic.envs.many_arms_control import make_plan, max_speed, planned_torque, torque_scale
+from mimic.envs.many_arms_observation import observation_size, observe
+from mimic.metric.array_kinematics import check_metric, correspondence, link_states
+from mimic.retargeting.array_goals import NEW_POSES, OTHERS, Problem, chosen_goal, first_goals, next_goals
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.trainers.export.exported_function import ExportedFunction, joint_ranges
 from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, describe_arm
 from mimic.trainers.pose_mapper.any_arm_model import expert_pose

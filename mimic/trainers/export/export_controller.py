@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mimic.arms.drives import drives_of
+from mimic.base.distribution import VERSION
 from mimic.control import joint_control
 from mimic.control.joint_control import JointParameters
 from mimic.deploy.bundle import write_bundle
 from mimic.deploy.safety import check_supported
-from mimic.base.distribution import VERSION
 from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv
 from mimic.metric.kinematics import LinkStates
 from mimic.metric.matrix_kinematics import make_link_vector

@@ -14,6 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from mimic.base.compat import scan_sizes
 from mimic.trainers.export.onnx_operations import (
     BINARY,
     REDUCTIONS,
@@ -28,7 +29,6 @@ from mimic.trainers.export.onnx_operations import (
     read_value,
     used_nodes,
 )
-from mimic.base.compat import scan_sizes
 
 OPSET, IR_VERSION = 18, 8  # of 2022: reductions take axes as inputs; supported by all runtimes since then
 _TINY = np.float32(1e-30)  # replaces a divisor of 0: the quotient has the same arc tangent

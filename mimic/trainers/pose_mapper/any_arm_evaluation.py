@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import ArmArrays
 from mimic.metric.array_kinematics import correspondence
-from mimic.retargeting.array_nearest import nearest_pose
 from mimic.metric.array_similarity import motion_similarity
+from mimic.retargeting.array_nearest import nearest_pose
 from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, ExpertPose, Params, expert_pose
 from mimic.trainers.pose_mapper.any_arm_training import random_pose
 

@@ -14,8 +14,8 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, masked_arrays
 from mimic.arms.arm import Arm, ArmConfig, build_arm
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, masked_arrays
 from mimic.arms.embodiment import Embodiment
 from mimic.envs import env_config, environments
 from mimic.envs.config import ArmsConfig, EnvConfig

@@ -10,7 +10,9 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float
 
+from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
+from mimic.envs.config import EnvConfig
 from mimic.metric.array_kinematics import (
     check_metric,
     correspondence,
@@ -19,11 +21,9 @@ from mimic.metric.array_kinematics import (
     link_states_in_frames,
     make_metric,
 )
-from mimic.retargeting.array_nearest import angle_limits, nearest_pose
-from mimic.arms.arm import build_arm
-from mimic.envs.config import EnvConfig
 from mimic.metric.distance import DistanceWeights
 from mimic.metric.kinematics import LinkStates
+from mimic.retargeting.array_nearest import angle_limits, nearest_pose
 from mimic.trainers.config import AnyArmMapperSettings
 from mimic.trainers.networks import Transformer
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.arms.arm import Arm
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
 from mimic.arms.embodiment import Embodiment
 from mimic.metric.config import MetricConfig
 from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, ExpertPose, Params, expert_pose

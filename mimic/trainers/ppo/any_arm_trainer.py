@@ -12,18 +12,18 @@ import jax.numpy as jnp
 from brax.envs.base import State
 from jaxtyping import Array
 
-from mimic.evaluation.nearest_pose_controller import ControllerWithMemory, nearest_pose_controller
-from mimic.envs.many_arms import AnyArmEnv
-from mimic.envs.family import SEEN, UNSEEN, report_arms
 from mimic.base.compilation import Background, compiling
 from mimic.envs.config import EnvConfig
-from mimic.motions.demonstrations import Demonstrations, check_effort, concatenate
+from mimic.envs.family import SEEN, UNSEEN, report_arms
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
+from mimic.envs.make import make_family_env
+from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS, ArmRollouts, ArmsEvaluator, ArmsOutcome
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
+from mimic.evaluation.nearest_pose_controller import ControllerWithMemory, nearest_pose_controller
 from mimic.evaluation.rollout_metrics import MIN_SPAN
-from mimic.envs.make import make_family_env
+from mimic.motions.demonstrations import Demonstrations, check_effort, concatenate
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals

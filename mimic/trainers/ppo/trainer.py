@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 
 import jax
 
-from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.base.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
-from mimic.motions.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
+from mimic.envs.make import make_env
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
+from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.evaluation.rollout_metrics import MIN_SPAN
-from mimic.envs.make import make_env
+from mimic.motions.demonstrations import Demonstrations, check_effort, concatenate, crossovers
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.base import compat
 from mimic.arms.embodiment import Embodiment
+from mimic.base import compat
 from mimic.base.config import check_choice
 from mimic.envs import env_config
-from mimic.trainers.pretrained.files import SOURCE, read_config_and_report, read_params
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.pretrained.files import SOURCE, read_config_and_report, read_params
 
 if TYPE_CHECKING:
     from mimic.envs.imitation import ImitationEnv

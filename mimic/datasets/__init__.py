@@ -1,1 +1,0 @@
-"""Motions in the formats of other projects: LeRobot datasets and rosbag2."""

@@ -1,1 +1,0 @@
-"""Motion capture: points of a body over time, its arms, and their link states."""

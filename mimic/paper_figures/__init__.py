@@ -1,1 +1,0 @@
-"""Figures of the paper, computed and drawn by the code."""

@@ -1,1 +1,0 @@
-"""Sweeps: many runs of one command line, their launchers, and the collection of their results."""

@@ -1,0 +1,96 @@
+"""Environments whose learner is drawn for each episode: the arms of their report, and what they reject."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import mimic
+from mimic.arms.arm import ArmConfig
+from mimic.arms.embodiment import panda_path
+from mimic.envs.family import SEEN, UNSEEN, arm_name, arm_sampler, report_arms
+from mimic.envs.many_arms import AnyArmEnv
+from mimic.envs.wrappers import wrap_for_training
+from tests.helpers.untrained_family import family
+
+FAMILIES = "panda_family", "any_arm"
+SMALL = {"demonstrations": {"count": 2, "held_out": 1}, "horizon": 5}
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_make_returns_the_environment_of_any_arm(name):
+    env = mimic.make(name, **SMALL)
+    assert isinstance(env, AnyArmEnv) and env.demonstrations.count == 2
+    assert env.config.physics == env.backend == "fused"
+
+
+def test_registered_environments_of_many_arms_are_made_too(own_registry):
+    mimic.register("environment", "few", {"expert": "panda", "arms": {"locked": 1.0, "most_locked": 0}})
+    assert isinstance(mimic.make("few", **SMALL), AnyArmEnv)
+
+
+@pytest.mark.slow
+def test_brax_wraps_it_for_training():
+    env = mimic.make("panda_family", **SMALL)
+    wrapped = wrap_for_training(env, 6)
+    state = jax.eval_shape(wrapped.reset, jax.random.split(jax.random.PRNGKey(0), 3))
+    after = jax.eval_shape(wrapped.step, state, jnp.zeros((3, env.action_size)))
+    assert after.obs.shape == state.obs.shape == (3, env.observation_size)
+
+
+def test_the_report_has_each_arm_once():
+    arms = report_arms(family(arms={"random": 1.0}))
+    assert list(arms[SEEN]) == ["whole", "locked 1", "locked 7"]
+    assert list(arms[UNSEEN])[:5] == [f"locked {i}" for i in (2, 3, 4, 5, 6)]
+    assert [int(arm.is_free.sum()) for arm in arms[SEEN].values()] == [7, 6, 6]
+    assert list(arms[UNSEEN])[5:] == [f"random {i}" for i in range(16)]
+
+
+def test_arms_are_named_by_their_files(tmp_path):
+    names = "robots/ur5e/robot.xml", "robots/ur5e/arm.urdf"
+    assert [arm_name(ArmConfig(model=str(tmp_path / name))) for name in names] == ["ur5e", "arm"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"arms": {"expert": "drawn"}},
+            "arms.expert: expected fixed, because demonstrations are of one expert, got drawn",
+        ),
+        ({"physics": "mjx"}, "physics: expected auto or fused where the learner is drawn for each episode, got mjx"),
+        ({"start": "nearest"}, "start: expected home where .*, got nearest"),
+        ({"preview": 2}, "preview: expected 1 where .*, got 2"),
+        ({"randomization": {"mass": [0.5, 2]}}, r"randomization: expected the default where .*, got mass=\[0.5, 2.0\]"),
+        (
+            {"reward": {"terms": {"self_collision": 1.0}}},
+            "reward: expected the default where .*, got terms=.*self_coll",
+        ),
+        ({"observation": {"terms": ["distance_gradient"]}}, "observation: expected the default where .*, got terms="),
+    ],
+)
+def test_settings_of_one_learner_are_rejected(changes, message):
+    with pytest.raises(ValueError, match=message):
+        mimic.make("panda_family", **changes)
+
+
+def test_what_needs_one_learner_rejects_it():
+    config = mimic.env_config("panda_family")
+    for function in (config.build_arms, config.check_one_learner):
+        with pytest.raises(ValueError, match="env: expected an environment of one learner, got 'panda_family', which"):
+            function()
+
+
+def test_arms_that_cannot_be_reported_or_drawn_are_rejected(tmp_path):
+    files = [tmp_path / name / "arm.xml" for name in ("a", "b")]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text(Path(panda_path()).read_text())
+    twice = family(arms={"evaluated": [str(file) for file in files]})
+    with pytest.raises(ValueError, match="arms: expected models and evaluated of different names, got 'arm' twice"):
+        report_arms(twice)
+    with pytest.raises(ValueError, match="arms.unseen: expected at least one of the learner's 7 joints to move"):
+        arm_sampler(family(arms={"unseen": ["1+2+3+4+5+6+7"]}))
+    only_whole = arm_sampler(family(arms={"unseen": [str(i) for i in range(1, 8)]}))
+    assert only_whole(jax.random.PRNGKey(0)).is_free.sum() == 7

@@ -1,0 +1,159 @@
+"""Link states of any arm against those of its embodiment, and their derivatives."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
+from mimic.arms.sampler import random_arm
+from mimic.metric.array_kinematics import (
+    correspondence,
+    joint_states,
+    link_jacobians,
+    link_states,
+    link_states_in_frames,
+)
+from tests.helpers import random_arms
+from tests.helpers.array_cases import Batch, random_source
+
+# 1e-16 of each step from base to tip, times speeds of up to 30 rad/s; link lengths round at 1e-16 of a metre too.
+ATOL = 1e-11
+FIELDS = ("position", "direction", "linear_velocity", "angular_velocity")
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """Three arms of each number of joints."""
+    return Batch([random_source(seed) for seed in range(3 * MAX_JOINTS)])
+
+
+@pytest.fixture(scope="module")
+def states(batch):
+    with jax.enable_x64(True):
+        return jax.tree.map(np.asarray, jax.jit(jax.vmap(link_states))(batch.arrays, batch.qpos, batch.qvel))
+
+
+def test_links_are_those_of_mujoco(batch, states):
+    for i, (source, arm, (qpos, qvel, *_)) in enumerate(zip(batch.sources, batch.arms, batch.motions, strict=True)):
+        expected = random_arms.links(source, random_arms.posed(source, qpos, qvel), arm.embodiment.link_names)
+        unit = float(arm.embodiment.chain_length)
+        for name, values in expected.items():
+            scale = unit if name in ("position", "linear_velocity") else 1.0
+            actual = getattr(states, name)[i, : arm.embodiment.num_links]
+            np.testing.assert_allclose(scale * actual, values, rtol=0, atol=ATOL)
+
+
+def test_links_are_those_of_the_embodiment(x64, batch, states):
+    """Of one arm of each number of joints, for the time that each takes to trace."""
+    for i in range(MAX_JOINTS):
+        arm, (qpos, qvel, *_) = batch.arms[i], batch.motions[i]
+        expected = mimic.link_states(arm.embodiment, qpos, qvel)
+        for name in FIELDS:
+            actual = getattr(states, name)[i, : arm.embodiment.num_links]
+            np.testing.assert_allclose(actual, getattr(expected, name), rtol=0, atol=ATOL)
+
+
+def test_empty_slots_of_links_rest_at_the_base(batch, states):
+    for i, arm in enumerate(batch.arms):
+        empty = slice(arm.embodiment.num_links, None)
+        for name in ("position", "linear_velocity", "angular_velocity"):
+            assert not getattr(states, name)[i, empty].any()
+        np.testing.assert_array_equal(states.direction[i, empty], np.eye(3)[[0] * len(states.direction[i, empty])])
+
+
+def test_links_without_velocity(x64, batch, states):
+    arm, qpos = jax.tree.map(lambda x: x[-1], batch.arrays), batch.qpos[-1]
+    rest = link_states(arm, qpos)
+    for name in ("position", "direction"):
+        np.testing.assert_allclose(getattr(rest, name), getattr(states, name)[-1], rtol=0, atol=ATOL)
+    assert not np.any(rest.linear_velocity) and not np.any(rest.angular_velocity)
+
+
+def test_axes_of_the_joints_are_those_of_the_embodiment(x64, batch):
+    for i, arm in enumerate(batch.arms):
+        frames = joint_states(jax.tree.map(lambda x, i=i: x[i], batch.arrays), jnp.zeros(MAX_JOINTS))
+        count = arm.embodiment.num_joints
+        axes, origins = frames.rotation[1 : count + 1, :, 2], frames.origin[1 : count + 1]
+        np.testing.assert_allclose(axes, arm.embodiment.joint_axis, atol=ATOL)
+        moment_arms = np.cross(arm.embodiment.joint_anchor - origins, axes)  # 0 for a point on the axis
+        np.testing.assert_allclose(moment_arms, 0, atol=ATOL)
+
+
+def test_jacobians_are_the_derivatives_and_0_for_locked_joints(x64, batch):
+    locked = np.arange(MAX_JOINTS) == 2
+    arm = lock_joints(jax.tree.map(lambda x: x[-1], batch.arrays), locked)  # of 8 joints
+    qpos = batch.qpos[-1]
+    frames = joint_states(arm, qpos)
+    actual = link_jacobians(arm, frames, link_states_in_frames(arm, frames))
+    expected = jax.jacfwd(lambda qpos: link_states(arm, qpos))(qpos)
+    for jacobian, derivative in ((actual.position, expected.position), (actual.direction, expected.direction)):
+        np.testing.assert_allclose(jacobian[~locked], np.moveaxis(derivative, -1, 0)[~locked], rtol=0, atol=ATOL)
+        assert not np.any(jacobian[2]) and np.any(derivative[..., 2])
+
+
+def test_velocities_are_the_jacobians_times_qvel(x64, batch):
+    arm = jax.tree.map(lambda x: x[-1], batch.arrays)
+    qpos, qvel = batch.qpos[-1], batch.qvel[-1]
+    frames = joint_states(arm, qpos, qvel)
+    states = link_states_in_frames(arm, frames)
+    jacobian = link_jacobians(arm, frames, states)
+    assert states.direction is not None and states.angular_velocity is not None
+    np.testing.assert_allclose(np.tensordot(qvel, jacobian.position, 1), states.linear_velocity, atol=ATOL)
+    turning = jnp.cross(states.angular_velocity, states.direction)
+    np.testing.assert_allclose(np.tensordot(qvel, jacobian.direction, 1), turning, atol=ATOL)
+
+
+def test_correspondence_is_that_by_arc_length(x64, batch):
+    """Up to the weights of empty slots: the mean over all pairs of slots is the mean over the pairs of links."""
+    for i, j in ((3, 7), (12, 4), (5, 5)):
+        expert, learner = (batch.arms[k].embodiment for k in (i, j))
+        expected = np.asarray(mimic.arc_length_correspondence(expert, learner))
+        arrays = [jax.tree.map(lambda x, k=k: x[k], batch.arrays) for k in (i, j)]
+        actual = np.asarray(correspondence(*arrays))
+        own = actual[: expert.num_links, : learner.num_links]
+        np.testing.assert_allclose(own / own.sum(), expected / expected.sum(), rtol=0, atol=ATOL)
+        assert actual.mean() == pytest.approx(1.0)
+        assert not actual[expert.num_links :].any() and not actual[:, learner.num_links :].any()
+
+
+@pytest.mark.slow
+def test_correspondence_of_drawn_arms_integrates_along_both_chains():
+    """In single precision, of traced experts and learners, some without a link in the first slot: links by length."""
+    drawn = jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(1), 128))
+    experts, learners = (jax.tree.map(lambda x, half=half: x[half], drawn) for half in (slice(64), slice(64, None)))
+    matrix = np.asarray(jax.jit(jax.vmap(correspondence))(experts, learners))
+    shares = matrix / matrix.sum(axis=(1, 2), keepdims=True)
+    for arms, axis in ((experts, 2), (learners, 1)):
+        lengths = np.asarray(arms.link_length)
+        assert (lengths[:, 0] == 0).any() and (lengths[:, 0] > 0).any()
+        # Ends are sums of up to 9 lengths, and an overlap is a difference of them: 20 roundings of 6e-8 each.
+        np.testing.assert_allclose(shares.sum(axis=axis), lengths / lengths.sum(1, keepdims=True), rtol=0, atol=2e-6)
+        empty = np.moveaxis(matrix, axis, -1)[lengths == 0]
+        assert not empty.any()
+
+
+def test_single_precision_and_locked_arms(x64):
+    """A locked joint keeps its angle: the links are those of the arm without this joint."""
+    panda = build_arm(ArmConfig(), limits="hardware")
+    reduced = build_arm(ArmConfig(locked=[3, 6]), limits="hardware")
+    free = ~np.isin(np.arange(7), (2, 5))
+    arm = arm_arrays(panda, free.tolist())
+    qpos, qvel = np.random.default_rng(0).uniform(-1, 1, (2, reduced.embodiment.num_joints))
+    all_qpos: Any = arm.home.copy()
+    all_qvel: Any = np.zeros(MAX_JOINTS)
+    all_qpos[:7][free], all_qvel[:7][free] = qpos, qvel
+    expected = mimic.link_states(reduced.embodiment, qpos, qvel)
+    single = stack_arms([arm.astype(np.float32)])
+    in_single = jax.vmap(link_states)(single, *(x[None].astype(np.float32) for x in (all_qpos, all_qvel)))
+    # float32: 6e-8 of each of about 20 steps, times speeds of 5 rad/s
+    for states, atol in ((link_states(arm, all_qpos, all_qvel), ATOL), (jax.tree.map(lambda x: x[0], in_single), 1e-5)):
+        for name in FIELDS:
+            actual = getattr(states, name)[: reduced.embodiment.num_links]
+            np.testing.assert_allclose(actual, getattr(expected, name), rtol=0, atol=atol)
+    assert {x.dtype for x in dataclasses.asdict(in_single).values()} == {np.dtype(np.float32)}

@@ -1,0 +1,183 @@
+"""The dynamics of any arm against C MuJoCo and Pinocchio in double precision."""
+
+import copy
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
+from mimic.physics import dynamics
+from tests.helpers.array_cases import Batch, acceleration, assert_near, looped, padded, random_source, unrolled
+
+COUNT, FEW = 200, 64
+
+
+FORMS = {name: jax.jit(jax.vmap(function)) for name, function in {"kernel": unrolled, "looped": looped}.items()}
+
+
+def both_forms(*arguments):
+    """Accelerations of any number of arms by each form; both are compiled for one number of arms."""
+    count = len(arguments[1])
+    arguments = jax.tree.map(lambda x: np.resize(x, (COUNT, *x.shape[1:])), arguments)
+    return {name: np.asarray(function(*arguments))[:count] for name, function in FORMS.items()}
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return Batch([random_source(seed) for seed in range(FEW)])
+
+
+def test_random_arms_accelerate_as_in_mujoco(x64):
+    """In the original models, which have all bodies and reference angles."""
+    batch = Batch([random_source(seed) for seed in range(COUNT)])
+    motions = zip(batch.sources, batch.motions, strict=True)
+    expected = [padded(acceleration(source, qpos, qvel, force)) for source, (qpos, qvel, _, force) in motions]
+    empty = np.arange(MAX_JOINTS) >= np.array([arm.model.nv for arm in batch.arms])[:, None]
+    for actual in both_forms(batch.arrays, batch.qpos, batch.qvel, batch.torque).values():
+        assert_near(actual, np.stack(expected))
+        assert_near(actual, batch.qacc)  # what `torque` was computed from
+        assert empty.any() and not actual[empty].any()
+
+
+def test_gravity_is_that_of_mujoco(x64, batch):
+    """As an acceleration of the base, in the frame of the first joint."""
+    gravity, expected = np.array([1.0, -2.0, -9.0]), []
+    for arm, (qpos, qvel, _, torque) in zip(batch.arms, batch.motions, strict=True):
+        model = copy.copy(arm.model)
+        model.opt.gravity = gravity
+        model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+        expected.append(padded(acceleration(model, qpos, qvel, torque)))
+    to_world = [
+        arm.T_world_base[:3, :3] @ frame for arm, frame in zip(batch.arms, batch.arrays.base_rotation, strict=True)
+    ]
+    base = tuple(np.stack([rotation.T @ -gravity for rotation in to_world]).T)
+    for form in (looped, unrolled):
+        actual = jax.jit(jax.vmap(lambda *x, form=form: form(*x[:4], base=x[4])))(
+            batch.arrays, batch.qpos, batch.qvel, batch.torque, base
+        )
+        assert_near(np.asarray(actual), np.stack(expected))
+
+
+def test_random_arms_include_the_hard_cases(batch):
+    assert {arm.model.nv for arm in batch.arms} == set(range(1, MAX_JOINTS + 1))
+    assert any(arm.model.body_jntnum.max() == 2 for arm in batch.arms)
+    assert any(arm.model.qpos0.any() for arm in batch.arms)
+
+
+def test_inverse_dynamics_are_those_of_mujoco(x64, batch):
+    actual = jax.vmap(dynamics.torque_of_arm)(batch.arrays, batch.qpos, batch.qvel, batch.qacc)
+    assert_near(np.asarray(actual), batch.torque)
+
+
+def test_inertia_matrix_is_that_of_mujoco(x64, batch):
+    actual = np.asarray(jax.vmap(dynamics.inertia_matrix)(batch.arrays, batch.qpos))
+    for matrix, arm, (qpos, *_) in zip(actual, batch.arms, batch.motions, strict=True):
+        data, size = mujoco.MjData(arm.model), arm.model.nv
+        data.qpos[:] = qpos
+        mujoco.mj_forward(arm.model, data)
+        reference = np.zeros((size, size))
+        for column, unit in zip(reference, np.eye(size), strict=True):
+            mujoco.mj_mulM(arm.model, data, column, unit)
+        np.testing.assert_allclose(matrix[:size, :size], reference, rtol=0, atol=1e-12)  # rounding of 10 kg m^2
+        np.testing.assert_array_equal(matrix[size:], np.eye(MAX_JOINTS)[size:])
+
+
+def pinocchio_model(pinocchio, model):
+    """A Pinocchio model of the bodies and joints of a model without gravity; its angles are relative to qpos0."""
+    result = pinocchio.Model()
+    result.gravity = pinocchio.Motion.Zero()
+    places = {0: (0, pinocchio.SE3.Identity())}  # of each body: its joint, and its frame in the joint's
+    for body in range(1, model.nbody):
+        parent, place = places[model.body_parentid[body]]
+        quaternion = pinocchio.Quaternion(*model.body_quat[body])
+        place = place * pinocchio.SE3(quaternion.matrix(), model.body_pos[body])
+        for joint in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+            anchor = pinocchio.SE3(np.eye(3), model.jnt_pos[joint])
+            revolute = pinocchio.JointModelRevoluteUnaligned(model.jnt_axis[joint])
+            parent = result.addJoint(parent, revolute, place * anchor, f"joint{joint}")
+            place = anchor.inverse()
+        axes = pinocchio.Quaternion(*model.body_iquat[body]).matrix()
+        tensor = axes @ np.diag(model.body_inertia[body]) @ axes.T
+        inertia = pinocchio.Inertia(model.body_mass[body], model.body_ipos[body], tensor)
+        result.appendBodyToJoint(parent, inertia, place)
+        places[body] = parent, place
+    result.armature = model.dof_armature
+    return result
+
+
+def test_random_arms_accelerate_as_in_pinocchio(x64, batch):
+    pinocchio = pytest.importorskip("pinocchio")
+    actual = both_forms(batch.arrays, batch.qpos, batch.qvel, batch.torque)["kernel"]
+    for row, arm, (qpos, qvel, _, force) in zip(actual, batch.arms, batch.motions, strict=True):
+        reference = pinocchio_model(pinocchio, arm.model)
+        force = force - arm.model.dof_damping * qvel
+        qacc = pinocchio.aba(reference, reference.createData(), qpos - arm.model.qpos0, qvel, force)
+        assert_near(row, padded(qacc))
+
+
+def test_every_lock_mask_of_the_panda_is_the_model_without_these_joints(x64):
+    """All 127 masks in one batch, at home poses other than 0."""
+    panda = build_arm(ArmConfig(), limits="hardware")
+    names = np.array(panda.embodiment.joint_names)
+    whole, rng = arm_arrays(panda), np.random.default_rng(0)
+    assert np.any(whole.home)
+    rows, expected = [], []
+    for free in itertools.islice(itertools.product((False, True), repeat=7), 1, None):
+        free = np.array(free)
+        reduced = build_arm(ArmConfig(locked=names[~free].tolist()), limits="hardware").model
+        state = rng.uniform(-np.pi, np.pi, free.sum()), *rng.normal(size=(2, free.sum()))
+        qpos, (qvel, torque, qacc) = whole.home.copy(), np.zeros((3, MAX_JOINTS))
+        for values, own in zip((qpos, qvel, torque, qacc), (*state, acceleration(reduced, *state)), strict=True):
+            values[:7][free] = own
+        torque[:7][~free] = 1.0  # it has no effect on a locked joint
+        rows.append((arm_arrays(panda, free.tolist()), lock_joints(whole, padded(~free)), qpos, qvel, torque, free))
+        expected.append(qacc)
+    arms, locked, *states, free = zip(*rows, strict=True)
+    jax.tree.map(np.testing.assert_array_equal, stack_arms(arms), stack_arms(locked))
+    for actual in both_forms(stack_arms(arms), *map(np.stack, states)).values():
+        assert_near(actual, np.stack(expected))
+        assert not actual[:, :7][~np.stack(free)].any() and not actual[:, 7:].any()
+
+
+@pytest.mark.slow
+def test_load_scales_masses_inertias_and_damping(x64, batch):
+    mass, damping = 1.2, 0.8
+    factors = np.full(FEW, mass), np.full(FEW, damping)
+    forms = both_forms(batch.arrays, batch.qpos, batch.qvel, batch.torque, *factors)
+    for *rows, arm, (qpos, qvel, _, force) in zip(*forms.values(), batch.arms, batch.motions, strict=True):
+        model = arm.model.__copy__()
+        model.body_mass[:], model.body_inertia[:] = mass * model.body_mass, mass * model.body_inertia
+        model.dof_damping[:] *= damping
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        for row in rows:
+            assert_near(row, padded(acceleration(model, qpos, qvel, force)))
+
+
+def test_a_locked_joint_without_inertia_is_harmless(x64):
+    """The pivot of a free one would be 0, as in MuJoCo."""
+    arm = arm_arrays(build_arm(ArmConfig()))
+    for values in (arm.first_moment, arm.second_moment, arm.armature):
+        values[6] = 0
+    arm = lock_joints(arm, np.arange(MAX_JOINTS) == 6)
+    state = np.full((3, MAX_JOINTS), 0.3)
+    for actual in both_forms(stack_arms([arm]), *state[:, None]).values():
+        torque = dynamics.torque_of_arm(arm, *map(jnp.asarray, (state[0], state[1], actual[0])))
+        np.testing.assert_allclose(torque[:6], 0.3, atol=1e-12)  # rounding
+        assert torque[6] == 0
+
+
+def test_damping_and_armature_enter_the_inverse(x64, batch):
+    """Each on its own, so that one cannot replace the other."""
+    arrays, state = batch.arrays, (batch.qpos, batch.qvel, batch.qacc)
+    torque = np.asarray(jax.vmap(dynamics.torque_of_arm)(arrays, *state))
+    for name, rate in (("damping", batch.qvel), ("armature", batch.qacc)):
+        without = dataclasses.replace(arrays, **{name: np.zeros_like(arrays.damping)})
+        change = torque - np.asarray(jax.vmap(dynamics.torque_of_arm)(without, *state))
+        expected = getattr(arrays, name) * rate * arrays.is_free
+        np.testing.assert_allclose(change, expected, atol=1e-9)  # rounding of torques up to 1000 N m

@@ -1,0 +1,98 @@
+"""The inner loop on MJX against C MuJoCo: stops, and contacts of links with the floor and with each other."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mimic.arms.arm import build_arm
+from mimic.arms.capsules import fit_capsules
+from mimic.control import joint_control
+from mimic.control.joint_control import Reference, Target
+from mimic.envs import env_config
+from mimic.physics.inner_loop import LoopState
+from mimic.physics.mjx_loop import make_mjx_loop
+from mimic.physics.mujoco_world import mujoco_world
+from mimic.physics.plant import make_plant
+from tests.physics.test_inner_loop import draw_for
+
+PERIODS, TICKS = 50, 12
+
+
+def push(joints: int, torque: np.ndarray) -> Target:
+    assert len(torque) == joints
+    return Target(torque, np.ones(joints))
+
+
+def in_mujoco(model, plant, draw, home, target):
+    """Angles after each tick, and the largest number of contacts, by C MuJoCo and the controller in NumPy."""
+    joints, data = model.nv, mujoco.MjData(model)
+    constants = plant.constants
+    data.qpos[:] = home
+    zero = np.zeros(joints)
+    reference, torque, rows, contacts = Reference(np.asarray(home), zero, zero), zero, [], 0
+    for _ in range(TICKS):
+        for _ in range(PERIODS):
+            torque = joint_control.joint_torque(
+                "torque", data.qpos, data.qvel, reference, target, torque, constants.parameters, np
+            )
+            level = np.asarray(draw.friction) * plant.friction
+            data.qfrc_applied[:] = torque - level * np.tanh(constants.friction_rate * data.qvel)
+            mujoco.mj_step(model, data)
+            contacts = max(contacts, data.ncon)
+        rows.append(data.qpos.copy())
+    return np.stack(rows), contacts
+
+
+@pytest.fixture(scope="module")
+def case():
+    config = env_config("panda4dof", world="nominal")
+    arm = build_arm(config.learner, config.limits)
+    plant, capsules = make_plant(config, arm), fit_capsules(config.learner, config.limits)
+    world = mujoco_world(arm, config.world, capsules)
+    draw = draw_for(arm.embodiment.num_joints)
+    ones = jnp.ones(arm.embodiment.num_joints)
+    nominal = {
+        "link_mass": ones,
+        "gain": ones,
+        "bias": 0 * ones,
+        "payload": jnp.zeros(()),
+        "payload_lever": jnp.zeros(()),
+    }
+    draw = dataclasses.replace(
+        draw, **nominal, gravity_error=jnp.zeros(()), load=type(draw.load)(jnp.ones(()), jnp.ones(()))
+    )
+    draw = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), draw)
+    return arm, plant, world, draw, jax.jit(make_mjx_loop("torque", plant, world, PERIODS))
+
+
+@pytest.mark.parametrize(
+    ("torque", "touches"),
+    [
+        ([0.0, 0.0, 20.0, 0.0], False),  # the elbow into its stop
+        ([0.0, 60.0, 20.0, 0.0], True),  # the hand onto the floor
+        ([0.0, 12.0, -10.0, 0.0], True),  # the forearm onto the base
+    ],
+)
+def test_stops_and_contacts_are_those_of_c_mujoco(case, torque, touches):
+    """Up to what two solvers differ: MJX iterates in single precision and finds the points of a contact on its own."""
+    arm, plant, world, draw, loop = case
+    joints, home = arm.embodiment.num_joints, np.asarray(arm.embodiment.home)
+    target = push(joints, np.array(torque))
+    model = world.model
+    model.opt.gravity[:] = 0.0  # the draw has no error of the compensation
+    expected, contacts = in_mujoco(model, plant, draw, home, target)
+    assert (contacts > 0) == touches
+    lower, upper = np.asarray(arm.embodiment.joint_range).T
+    assert touches or np.any((expected[-1] > upper - 0.01) | (expected[-1] < lower + 0.01))
+    zero = jnp.zeros(joints)
+    state = LoopState(jnp.asarray(home, jnp.float32), zero, Reference(jnp.asarray(home, jnp.float32), zero, zero), zero)
+    rows, wanted = [], jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), target)
+    for _ in range(TICKS):
+        state = loop(draw, state, wanted)
+        rows.append(state.qpos)
+    assert np.abs(np.stack(rows) - expected).max() < 0.02  # rad
+    assert np.abs(expected[-1] - home).max() > 0.2

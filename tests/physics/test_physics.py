@@ -1,0 +1,148 @@
+"""Steps of any arm against the compiled-in physics, and the GPU kernel, interpreted on the CPU."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
+from mimic.physics import step as physics
+from mimic.physics.physics import make_advance
+from mimic.physics.step import Load
+from tests.helpers.array_cases import assert_near, padded
+from tests.helpers.lowering import gpu_program
+
+TIMESTEP, SUBSTEPS, COUNT = 0.01, 10, 5
+ARMS = {
+    "panda": ArmConfig(),
+    "panda5": ArmConfig(locked=[3, 6]),
+    "planar": ArmConfig(model="planar", link_lengths=[0.4, 0.3, 0.2]),
+}
+
+
+def random_states(joints, dtype: Any = np.float64):
+    """Angles, velocities and torques of light motion: each [count, joints]."""
+    rng = np.random.default_rng(joints)
+    factors = np.array([3.0, 2.0, 0.3])[:, None, None]
+    return (factors * rng.uniform(-1, 1, (3, COUNT, joints))).astype(dtype)
+
+
+def loads(dtype: Any = np.float64):
+    return Load(jnp.linspace(0.8, 1.2, COUNT, dtype=dtype), jnp.linspace(1.5, 0.5, COUNT, dtype=dtype))
+
+
+def wide(states):
+    return [np.stack([padded(row) for row in x]) for x in states]
+
+
+def copies(arm, count=COUNT):
+    return stack_arms([arm] * count)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("panda", "fused"), ("panda5", "fused"), ("planar", "fused"), ("planar", "mjx")]
+)
+def test_steps_are_those_of_the_compiled_in_arm(x64, name, kind):
+    """Ten steps in double precision: the same equations, in another order."""
+    arm = build_arm(ARMS[name])
+    states = random_states(arm.model.nv)
+    expected = jax.jit(jax.vmap(physics.make_advance(arm.model, TIMESTEP, SUBSTEPS, kind)))(*states, loads())
+    actual = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(copies(arm_arrays(arm)), *wide(states), loads())
+    for values, reference in zip(actual, expected, strict=True):
+        values, own = np.asarray(values), arm.model.nv
+        assert_near(values[:, :own], np.asarray(reference), 1e-11)  # 1e-15 a step, amplified by the light wrist
+        assert not values[:, own:].any()  # empty slots stay at 0
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    """Arms of 2, 3, 5 and 7 joints and a locked Panda in one batch, in single precision."""
+    arms = [arm_arrays(build_arm(config)) for config in ARMS.values()]
+    arms += [arm_arrays(build_arm(ArmConfig()), np.array([1, 0, 1, 0, 1, 1, 0], bool).tolist())]
+    arms += [arm_arrays(build_arm(ArmConfig(model="planar", link_lengths=[0.5, 0.5])))]
+    arms = stack_arms(arms).astype(np.float32)
+    qpos, qvel, torque = random_states(MAX_JOINTS, np.float32)
+    return arms, qpos, qvel * arms.is_free, torque, loads(np.float32)
+
+
+def test_a_batch_steps_as_each_of_its_arms(mixed):
+    advance = make_advance(TIMESTEP, 2)
+    together, alone = jax.jit(jax.vmap(advance))(*mixed), jax.jit(advance)
+    for i in range(COUNT):
+        for batched, single in zip(together, alone(*jax.tree.map(lambda x, i=i: x[i], mixed)), strict=True):
+            np.testing.assert_allclose(batched[i], single, atol=1e-5)  # rounding of velocities up to 10 rad/s
+
+
+def test_locked_joints_and_empty_slots_rest_at_their_angle(mixed):
+    arms, start, *_ = mixed
+    qpos, qvel = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(*mixed)
+    rests = np.asarray(arms.is_free) == 0
+    assert rests.any() and np.all(np.isfinite(qpos)) and np.all(np.isfinite(qvel))
+    np.testing.assert_array_equal(np.asarray(qpos)[rests], start[rests])
+    assert not np.asarray(qvel)[rests].any()
+    assert np.all(np.asarray(qpos)[~rests] != start[~rests])
+
+
+def test_some_arguments_may_be_common_to_the_batch(mixed):
+    arms, qpos, qvel, torque, _ = mixed
+    advance = make_advance(TIMESTEP, 2)
+    arm, state = jax.tree.map(lambda x: x[0], arms), (qpos, qvel * arms.is_free[0])
+    common = jax.jit(jax.vmap(advance, (None, 0, 0, None, None)))(arm, *state, torque[0], Load())
+    each = jax.jit(jax.vmap(advance))(
+        copies(arm), *state, np.tile(torque[:1], (COUNT, 1)), Load(*jnp.ones((2, COUNT), jnp.float32))
+    )
+    for a, b in zip(common, each, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
+def test_gradients_are_finite_and_those_of_finite_differences(x64, mixed):
+    """Of each argument, for a batch: locked joints and empty slots give 0 and never NaN."""
+    advance = make_advance(TIMESTEP, 3)
+    arguments = jax.tree.map(lambda x: x.astype(np.float64) if x.dtype == np.float32 else x, mixed)
+
+    def total(arguments):
+        qpos, qvel = jax.vmap(advance)(*arguments)
+        return jnp.sum(jnp.sin(qpos) + 0.1 * qvel)
+
+    value_and_gradient = jax.jit(jax.value_and_grad(total, allow_int=True))
+    gradient = value_and_gradient(arguments)[1]
+    floats = [x for x in jax.tree.leaves(gradient) if x.dtype == np.float64]
+    assert all(np.all(np.isfinite(x)) for x in floats)
+    arms, gradient_of_arms = arguments[0], gradient[0]
+    empty = np.arange(MAX_JOINTS) >= np.array([7, 5, 3, 7, 2])[:, None]
+    for name in ("armature", "damping"):
+        by_slot = np.asarray(getattr(gradient_of_arms, name))
+        assert not by_slot[empty].any() and by_slot[arms.is_free == 1].all()
+    rng, step = np.random.default_rng(0), 1e-6
+
+    def moved(sign):
+        torque, damping = arguments[3] + sign * step * d_torque, arms.damping + sign * step * d_damping
+        changed = dataclasses.replace(arms, damping=damping)
+        return value_and_gradient((changed, *arguments[1:3], torque, arguments[4]))[0]
+
+    d_torque, d_damping = rng.normal(size=(2, COUNT, MAX_JOINTS))
+    expected = (moved(1) - moved(-1)) / (2 * step)
+    actual = np.sum(gradient[3] * d_torque) + np.sum(gradient_of_arms.damping * d_damping)
+    np.testing.assert_allclose(actual, expected, rtol=1e-6)  # 1e-16 / 1e-6, times a hundred, and the step squared
+
+
+def test_the_kernel_steps_as_the_plain_function_does(mixed, gpu_kernels):
+    """The GPU kernel, interpreted on the CPU, for a batch that is no multiple of its block."""
+    advance = make_advance(TIMESTEP, 1)
+    batch = jax.vmap(advance)(*mixed)
+    assert len(gpu_kernels) == 1
+    alone = jax.jit(advance)
+    for i in range(COUNT):
+        for batched, single in zip(batch, alone(*jax.tree.map(lambda x, i=i: x[i], mixed)), strict=True):
+            np.testing.assert_allclose(batched[i], single, atol=1e-5)  # rounding of velocities up to 10 rad/s
+
+
+def test_the_kernel_lowers_without_a_gpu(mixed):
+    batched = jax.jit(jax.vmap(make_advance(TIMESTEP, 2)))
+    assert "triton" in gpu_program(batched, *mixed)
+    assert "triton" not in batched.lower(*mixed).as_text()

@@ -1,0 +1,131 @@
+"""The kinematic bound of arms as arrays, against that of the same arms compiled in."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arrays import arm_arrays, stack_arms
+from mimic.metric.array_kinematics import check_metric, correspondence, link_states, make_metric
+from mimic.metric.config import MetricConfig
+from mimic.retargeting.array_bound import closest_motion
+from tests.helpers.array_cases import padded
+
+WEIGHTS = check_metric(MetricConfig())
+# Locked joints and limits: without limits the joints are continuous.
+pytestmark = pytest.mark.slow  # compiling the search for both kinds of arms takes over a minute
+
+LEARNERS = [((), "none"), ((2,), "hardware"), ((3, 6, 7), "none"), ((2, 3, 6, 7), "hardware")]
+FEW = np.array([0.2, 0.5, 0.9])  # times of a demonstration of length 1: time is not what is tested
+
+
+def demonstration(seed):
+    """Angles and velocities [T, 7] of a minimum-jerk motion of 5 s from the zero pose to a random goal."""
+    goal = np.random.default_rng(seed).uniform(-np.pi / 2, np.pi / 2, 7)
+    qpos = (10 * FEW**3 - 15 * FEW**4 + 6 * FEW**5)[:, None] * goal
+    qvel = (30 * FEW**2 - 60 * FEW**3 + 30 * FEW**4)[:, None] * goal / 5.0
+    return qpos.astype(np.float32), qvel.astype(np.float32)
+
+
+def arrays(locked, limits="none"):
+    free = ~np.isin(np.arange(1, 8), locked)
+    return arm_arrays(build_arm(ArmConfig(), limits), free).astype(np.float32)
+
+
+TRACES = []
+
+
+@jax.jit(compiler_options={"xla_backend_optimization_level": 1})  # which compiles faster
+def solve(arms, qpos, qvel):
+    """The closest motions of a batch of arms to the Panda, and their distances computed from these motions."""
+    expert = arrays(())
+
+    def of_arm(arm):
+        TRACES.append(arm)
+        metric = make_metric(WEIGHTS, correspondence(expert, arm))
+        states = jax.vmap(lambda *motion: link_states(expert, *motion))(qpos, qvel)
+        closest = closest_motion(arm, metric, states, qpos)
+        own_states = jax.vmap(lambda *motion: link_states(arm, *motion))(closest.qpos, closest.qvel)
+        return closest, jax.vmap(metric)(states, own_states)
+
+    return jax.vmap(of_arm)(arms)
+
+
+def solved(arms, seed=0):
+    motion = (np.stack([padded(row) for row in x]).astype(np.float32) for x in demonstration(seed))
+    return jax.tree.map(np.asarray, solve(arms, *motion))
+
+
+@pytest.fixture(scope="module")
+def batch():
+    """The arms above, their closest motions, and the distances of these."""
+    arms = stack_arms([arrays(*learner) for learner in LEARNERS])
+    return arms, *solved(arms)
+
+
+@pytest.mark.parametrize("row", range(1, len(LEARNERS)))
+def test_the_bound_is_that_of_the_arm_compiled_in(batch, row):
+    locked, limits = LEARNERS[row]
+    expert, learner = (
+        build_arm(ArmConfig(locked=list(joints)), limits).embodiment
+        for joints, limits in (((), "none"), (locked, limits))
+    )
+    metric = MetricConfig().build(expert, learner).arguments
+    expected = np.asarray(mimic.kinematic_bound(expert, learner, *demonstration(0), **metric))
+    actual = batch[1].distance[row]
+    # Both are results of a search, from other random poses; here both find the same poses. What is left is how near
+    # velocities come to kinks: 2e-6, and 1.4e-4 without their refinement.
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-5)
+    assert np.all(actual <= 1.01 * expected)
+
+
+def test_the_bound_of_an_arm_and_itself_is_zero(batch):
+    # The descents alone end 1e-4 above this kink. The refinement leaves 4e-7.
+    np.testing.assert_allclose(batch[1].distance[0], 0, atol=1e-5)
+
+
+def test_the_distance_is_that_of_the_returned_motion(batch):
+    _, closest, expected = batch
+    np.testing.assert_allclose(closest.distance, expected, rtol=1e-4, atol=1e-6)  # float32; fused in another order
+
+
+def test_locked_joints_and_empty_slots_do_not_move(batch):
+    """Although the guess moves them."""
+    arms, closest, _ = batch
+    rests = np.broadcast_to(arms.is_free[:, None] == 0, closest.qpos.shape)
+    home = np.broadcast_to(arms.home[:, None], closest.qpos.shape)
+    np.testing.assert_array_equal(closest.qpos[rests], home[rests])
+    assert not closest.qvel[rests].any()
+    assert np.all(closest.qpos[~rests] != home[~rests]) and np.all(closest.qvel[~rests])
+
+
+def test_angles_stay_within_the_joint_range(batch):
+    arms, closest, _ = batch
+    lower, upper = np.moveaxis(arms.joint_range[:, None], -1, 0)
+    within = (closest.qpos >= lower) & (closest.qpos <= upper)
+    assert all(within[row].all() for row, (_, limits) in enumerate(LEARNERS) if limits == "hardware")
+
+
+def test_other_arms_compile_nothing(batch):
+    """Neither other locked joints nor other lengths do; the results are those of these arms."""
+    arms = stack_arms([arrays(locked) for locked in ((1,), (4, 5), (6, 7))] + [arrays((2,), "hardware")])
+    longer = dataclasses.replace(arms, offset=np.float32(1.2) * arms.offset)
+    other = solved(longer)[0]
+    assert len(TRACES) == 1
+    assert np.all(other.distance[3] > 1.01 * batch[1].distance[1])  # the same arm but for its lengths
+
+
+def test_bad_input_is_rejected(unchecked):
+    arm = arrays(())
+    metric = make_metric(WEIGHTS, correspondence(arm, arm))
+    states = jax.vmap(lambda qpos: link_states(arm, qpos))(jnp.zeros((3, 8)))
+    for guess in (jnp.zeros((3, 7)), jnp.zeros((2, 8)), jnp.zeros(8)):
+        with pytest.raises(ValueError, match=r"guess: expected shape \(3, 8\)"):
+            closest_motion(arm, metric, states, guess)
+    for options in ({"starts": 0}, {"iterations": 0}):
+        with pytest.raises(ValueError, match="starts, iterations: expected at least 1, got"):
+            closest_motion(arm, metric, states, jnp.zeros((3, 8)), **options)

@@ -1,0 +1,71 @@
+"""The nearest pose of any arm by Newton steps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
+from mimic.metric.array_kinematics import correspondence, link_states, make_metric
+from mimic.metric.distance import DistanceWeights
+from mimic.retargeting.array_nearest import angle_limits, nearest_pose, pose_quadratic
+
+WEIGHTS = DistanceWeights(1.0, 1.0, 0.0, 0.0)
+LOCKED = np.array([0, 0, 1, 0, 0, 1, 1, 0])
+
+
+@pytest.fixture(scope="module")
+def panda():
+    return arm_arrays(build_arm(ArmConfig()))
+
+
+def motion(seed):
+    qpos, qvel = np.random.default_rng(seed).uniform(-1.5, 1.5, (2, MAX_JOINTS))
+    qpos[7:], qvel[7:] = 0, 0
+    return jnp.asarray(qpos), jnp.asarray(qvel)
+
+
+@pytest.mark.parametrize("locked", [np.zeros(MAX_JOINTS), LOCKED])
+def test_the_gradient_is_that_of_the_metric(x64, panda, locked):
+    learner, matrix = lock_joints(panda, locked), correspondence(panda, panda)
+    expert, qpos = link_states(panda, *motion(0)), motion(1)[0] * learner.is_free
+    metric = make_metric(WEIGHTS, matrix)
+    expected = jax.grad(lambda q: metric(expert, link_states(learner, q)))(qpos) * learner.is_free
+    near = pose_quadratic(learner, WEIGHTS, matrix, expert, qpos)
+    np.testing.assert_allclose(near.gradient, expected, rtol=0, atol=1e-13)  # rounding of a few hundred operations
+    np.testing.assert_allclose(near.hessian, near.hessian.T, rtol=0, atol=1e-15)
+    assert np.linalg.eigvalsh(near.hessian).min() > 0
+
+
+def test_steps_lead_to_an_equal_arm_and_its_velocity(x64, panda):
+    """The damping of the Hessian, 1e-3 of its mean, slows the steps and the velocity of joints that move little."""
+    qpos, qvel = motion(2)
+    expert, matrix = link_states(panda, qpos, qvel), correspondence(panda, panda)
+    start = qpos + 0.2 * motion(3)[0]
+    found, velocity, _ = nearest_pose(panda, WEIGHTS, matrix, expert, start, 60)
+    np.testing.assert_allclose(found[:6], qpos[:6], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(velocity[:6], qvel[:6], rtol=0, atol=0.05)
+    np.testing.assert_allclose(found[6], qpos[6], rtol=0, atol=0.1)  # it moves only the last link, by a few cm
+
+
+def test_steps_reduce_the_distance_and_leave_locked_joints(x64, panda):
+    learner, matrix = lock_joints(panda, LOCKED), correspondence(panda, panda)
+    metric, expert = make_metric(WEIGHTS, matrix), link_states(panda, *motion(4))
+    pose, distances = jnp.zeros(MAX_JOINTS), []
+    for _ in range(8):
+        distances.append(float(metric(expert, link_states(learner, pose))))
+        pose, velocity, _ = nearest_pose(learner, WEIGHTS, matrix, expert, pose, 1)
+        assert not np.asarray(pose)[LOCKED > 0].any() and not np.asarray(velocity)[LOCKED > 0].any()
+    assert np.all(np.diff(distances) < 0)
+
+
+def test_poses_stay_within_ranges(x64, panda):
+    qpos, qvel = motion(5)
+    ranges = np.where(np.arange(MAX_JOINTS)[:, None] == 1, [[-0.1, 0.2]], panda.joint_range)
+    learner = panda.replace(joint_range=ranges)
+    lower, upper = angle_limits(learner)
+    assert lower[1] == -0.1 and upper[1] == 0.2 and np.isinf(lower[0])  # the others rotate by a full revolution
+    expert, matrix = link_states(panda, qpos, qvel), correspondence(panda, panda)
+    found, *_ = nearest_pose(learner, WEIGHTS, matrix, expert, jnp.zeros(MAX_JOINTS), 10)
+    assert float(found[1]) in (-0.1, 0.2)

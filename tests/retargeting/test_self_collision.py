@@ -1,0 +1,52 @@
+"""Motions in which links touch, against the contacts of C MuJoCo."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from mimic.arms.arm import ArmConfig, build_arm
+from mimic.arms.capsules import fit_capsules
+from mimic.physics.mujoco_world import FLOOR, mujoco_world
+from mimic.physics.world import WorldConfig
+from mimic.retargeting.costs import changing_pairs
+from mimic.retargeting.self_collision import smallest_clearances, touching_line
+
+POSES = 400
+
+
+@pytest.mark.parametrize("locked", [(), (3, 6, 7)])
+def test_clearances_are_the_distances_of_mujocos_contacts(locked):
+    """Of the same capsules, whose contacts MuJoCo finds on its own; among the poses are many that touch."""
+    config = ArmConfig(locked=list(locked))
+    arm, capsules = build_arm(config, "hardware"), fit_capsules(config, "hardware")
+    model = mujoco_world(arm, WorldConfig(gravity=True, contacts=True), capsules).model
+    model.pair_margin[:] = 10.0  # reports distances, too
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    lower, upper = np.asarray(arm.embodiment.joint_range).T
+    poses, expected = rng.uniform(lower, upper, (POSES, len(lower))), []
+    counted = {
+        pair for pair, changes in zip(capsules.pairs, changing_pairs(arm.embodiment, capsules), strict=True) if changes
+    }
+    for qpos in poses:
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        expected.append(min(contact.dist for contact in data.contact if _counts(model, contact, counted)))
+    actual = smallest_clearances(arm.embodiment, capsules, poses[:, None])
+    expected = np.array(expected)
+    assert 20 < (expected < 0).sum() < POSES - 20
+    np.testing.assert_allclose(actual[expected > -0.02], expected[expected > -0.02], atol=2e-4)  # 0.1 mm: smoothing
+    assert np.all(actual[expected < -0.02] < 0)  # deep inside, the direction of a contact is arbitrary
+
+
+def _counts(model, contact, pairs) -> bool:
+    """Whether the clearance counts a contact: one with the floor, or of a pair whose distance the joints change."""
+    names = [model.geom(geom).name for geom in contact.geom]
+    return FLOOR in names or tuple(sorted(int(name.removeprefix("capsule")) for name in names)) in pairs
+
+
+def test_motions_that_touch_are_named():
+    line = touching_line(np.array([0.02, -0.01, 0.03, -0.002]))
+    assert line == (
+        "warning: links touch each other or the floor in 2 of 4 demonstrations: 1, 3; smallest clearance: -10 mm"
+    )
+    assert touching_line(np.array([0.02])).startswith("links touch neither each other nor the floor")

@@ -1,0 +1,350 @@
+"""Training over several processes: one run directory, and no process left running however it ends."""
+
+import contextlib
+import json
+import os
+import pathlib
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import jax
+import pytest
+from omegaconf import OmegaConf
+
+import mimic
+from mimic.runs.checkpoints import save_checkpoint
+from mimic.runs.distributed import process_group
+from mimic.runs.distributed.local_processes import LocalProcess, LocalProcesses, local_process
+from mimic.runs.distributed.process_group import DistributedConfig
+from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo.divergence import load_divergence
+from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.ppo.training import make_networks
+from mimic.trainers.run_config import run_schema
+from tests.helpers.repository import REPOSITORY
+from tests.helpers.tiny import TINY
+
+LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with many checkpoints
+
+
+def start(tmp_path, *arguments, slurm=False):
+    """Starts two processes of one training, each with its own CPU device."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    processes = []
+    for index in range(2):
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+        found = [f"distributed.coordinator=127.0.0.1:{port}", "distributed.processes=2", f"distributed.process={index}"]
+        if slurm:  # what srun tells its tasks; JAX makes the port of the job's number
+            found = ["distributed.coordinator=auto"]
+            environment |= {"SLURM_JOB_ID": str(port), "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "2"}
+            environment |= {"SLURM_PROCID": str(index), "SLURM_LOCALID": str(index)}
+        command = [sys.executable, "-m", "mimic.train", *TINY, *found, *arguments]
+        output = subprocess.PIPE
+        process = subprocess.Popen(
+            command, stdout=output, stderr=subprocess.STDOUT, text=True, env=environment, cwd=tmp_path
+        )
+        processes.append(process)
+    return processes
+
+
+def finish(processes):
+    """Exit code and output of each process; none may hang."""
+    try:
+        outputs = [process.communicate(timeout=280)[0] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [(process.returncode, output) for process, output in zip(processes, outputs, strict=True)]
+
+
+@pytest.mark.slow
+def test_two_processes_make_one_run_that_one_process_continues(tmp_path):
+    (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run"))
+    assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["env_steps"] >= 5000
+    assert (report["hardware"]["devices"], report["hardware"]["processes"]) == (2, 2)
+    assert len((tmp_path / "run" / "metrics.csv").read_text().splitlines()) == 1 + 4
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert "results: run" in shown and "results" not in silent
+    # Another number of processes goes on with it; here, one.
+    command = [sys.executable, "-m", "mimic.train", "resume=run", "trainer.num_timesteps=8000", "trainer.evaluations=1"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["env_steps"] >= 8000
+
+
+@pytest.mark.slow
+def test_the_variables_of_slurm_are_enough(tmp_path):
+    (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run", "trainer.evaluations=1", slurm=True))
+    assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["hardware"]["processes"] == 2
+
+
+@pytest.mark.slow
+def test_the_first_process_records_a_divergence(tmp_path):
+    """All take part in the search for the first batch that is not finite."""
+    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    networks = make_networks(PPOConfig(hidden_layers=[16]).resolve(), env.observation_size, env.action_size)
+    statistics, policy, value = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
+    (tmp_path / "start").mkdir()
+    save_checkpoint(tmp_path / "start", 0, (statistics, jax.tree.map(lambda x: 1e30 * x, policy), value))
+    (first, shown), (second, silent) = finish(start(tmp_path, "init=start", "run_dir=run"))
+    assert (first, second) == (3, 3), shown[-2000:] + silent[-2000:]
+    assert "replay it with: python -m mimic.inspect run/divergence.npz" in shown and "diverged" not in silent
+    recorded = load_divergence(tmp_path / "run" / "divergence.npz")
+    assert (str(recorded.finding), recorded.num_bad_arms) == ("action in step 1 of 20", 64) and recorded.devices == 2
+
+
+def alone(tmp_path, *arguments):
+    """One command that starts the other process itself."""
+    command = [sys.executable, "-m", "mimic.train", *TINY, "distributed.coordinator=local", *arguments]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, cwd=tmp_path
+    )
+
+
+def wait_for_checkpoint(tmp_path, processes):
+    until = time.monotonic() + 200
+    while time.monotonic() < until and not list(tmp_path.glob("run/checkpoints/0*[1-9]*")):
+        assert all(process.poll() is None for process in processes)
+        time.sleep(0.2)
+
+
+def started_by(process):
+    """Ids of the running processes of the training that it started."""
+    children = pathlib.Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    told = {child: pathlib.Path(f"/proc/{child}/environ") for child in children}
+    return [int(child) for child, given in told.items() if given.exists() and b"MIMIC_LOCAL" in given.read_bytes()]
+
+
+def there(process):
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(process, 0)
+        return True
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("physics", ["fused", "mjx"])
+def test_one_command_starts_all_processes_of_a_host(tmp_path, physics):
+    found = ["distributed.processes=2", f"env.physics={physics}"]
+    ((code, shown),) = finish([alone(tmp_path, *found, "run_dir=run")])
+    assert code == 0, shown[-2000:]
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert (report["hardware"]["devices"], report["hardware"]["processes"]) == (2, 2)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_all_that_one_command_started(tmp_path):
+    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
+    wait_for_checkpoint(tmp_path, [process])
+    (other,) = started_by(process)
+    process.send_signal(signal.SIGINT)
+    ((code, shown),) = finish([process])
+    assert code == 128 + signal.SIGINT, shown[-2000:]
+    assert shown.count("stopping at the next checkpoint") == 1 and "resume=run" in shown
+    assert not there(other)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("early", [False, True])
+def test_one_command_ends_if_a_process_of_it_is_lost(tmp_path, early):
+    """Early: before they are connected."""
+    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
+    if not early:
+        wait_for_checkpoint(tmp_path, [process])
+    while not started_by(process):
+        time.sleep(0.1)
+    (other,) = started_by(process)
+    os.kill(other, signal.SIGKILL)
+    lost = time.monotonic()
+    ((code, shown),) = finish([process])
+    assert code == 1 and "error: process 1 of the training failed" in shown, shown[-2000:]
+    assert "ended by signal 9" in shown
+    assert time.monotonic() - lost < 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+@pytest.mark.parametrize("lost", [0, 1])
+def test_all_end_within_a_minute_if_one_is_stopped_or_killed(tmp_path, number, lost):
+    processes = start(tmp_path, "run_dir=run", *LONG)
+    wait_for_checkpoint(tmp_path, processes)
+    os.kill(processes[lost].pid, number)
+    began = time.monotonic()
+    other = processes[1 - lost]
+    try:
+        shown = other.communicate(timeout=100)[0]
+        assert time.monotonic() - began < 60
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    assert other.returncode == 1 and shown.count(f"error: process {lost} of the training is lost") == 1, shown
+    assert "Traceback" not in shown and "stack trace" not in shown
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0, 1])
+def test_one_command_ends_if_a_process_of_it_is_stopped(tmp_path, lost):
+    process = alone(tmp_path, "distributed.processes=2", "run_dir=run", *LONG)
+    wait_for_checkpoint(tmp_path, [process])
+    (other,) = started_by(process)
+    os.kill([process.pid, other][lost], signal.SIGSTOP)
+    began = time.monotonic()
+    while lost == 0 and there(other) and state(other) != "Z":
+        assert time.monotonic() - began < 60
+        time.sleep(0.2)
+    if lost == 0:
+        process.send_signal(signal.SIGCONT)
+    ((code, shown),) = finish([process])
+    assert code == 1 and f"process {lost} of the training is lost or stopped" in shown, shown[-2000:]
+    assert time.monotonic() - began < 60 + 20 and not there(other)
+
+
+def state(process):
+    return pathlib.Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+@pytest.mark.slow
+def test_input_that_both_processes_reject_is_one_line(tmp_path):
+    process = alone(tmp_path, "distributed.processes=3", "run_dir=run")
+    ((code, shown),) = finish([process])
+    assert code == 2 and shown.count("expected a multiple of") == 1, shown
+
+
+def test_each_started_process_knows_its_place(monkeypatch):
+    """Each is the same command; what it says last is kept, and it is killed if it does not end."""
+    program = "import sys; from mimic.runs.distributed.local_processes import local_process;"
+    program += " print('x' * 3000, local_process(), file=sys.stderr)"
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-c", program])
+    others = LocalProcesses(3)
+    assert others.ended_at_start() is None
+    others.end(patience_s=60)
+    for index in (1, 2):
+        output = others.error_output(index)
+        assert output.startswith("xx") and len(output) <= 2000
+        assert output.endswith(str(LocalProcess(others.address, 3, index, os.getpid())))
+    monkeypatch.setattr(sys, "orig_argv", ["python", "-c", "import time; time.sleep(100)"])
+    others = LocalProcesses(3)
+    assert others.first_ended() is None and others.error_output(1) == ""
+    others.end(patience_s=0)
+    assert others.first_ended() == others.ended_at_start() == 1
+    assert others.error_output(1) == "ended by signal 9 (Killed)"
+
+
+def test_a_process_that_was_not_started_is_the_first(monkeypatch):
+    monkeypatch.delenv("MIMIC_LOCAL_PROCESS", raising=False)
+    assert local_process() is None
+
+
+def test_a_process_ends_with_the_first_one(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "none")  # this process goes on
+    monkeypatch.setenv("MIMIC_LOCAL_PROCESS", "127.0.0.1:1 2 1 1")
+    monkeypatch.setattr(os, "getppid", lambda: 2)
+    with pytest.raises(SystemExit):
+        local_process()
+
+
+@pytest.mark.parametrize(
+    ("asked", "gpus", "platforms", "expected"),
+    [
+        (None, 4, "", 4),
+        (2, 4, "", 2),
+        (2, 0, "", 2),
+        (8, 4, "cpu", 8),
+        (8, 4, "", "expected at most 4"),
+        (None, 0, "", "expected a number"),
+    ],
+)
+def test_there_is_a_gpu_for_each_process_of_a_host(monkeypatch, asked, gpus, platforms, expected):
+    monkeypatch.setattr(process_group, "gpu_count", lambda: gpus)
+    monkeypatch.setenv("JAX_PLATFORMS", platforms)
+    if isinstance(expected, int):
+        assert process_group.processes_here(asked) == expected
+    else:
+        with pytest.raises(ValueError, match=f"distributed.processes: {expected}"):
+            process_group.processes_here(asked)
+
+
+@pytest.mark.slow
+def test_the_other_processes_end_with_the_first_where_it_is_good_enough(tmp_path):
+    (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run", "trainer.target_gap=100"))
+    assert (first, second) == (0, 0), shown[-2000:] + silent[-2000:]
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["env_steps"] < 5000
+
+
+@pytest.mark.slow
+def test_a_signal_to_one_process_stops_all_after_a_checkpoint(tmp_path):
+    processes = start(tmp_path, "run_dir=run", *LONG)
+    wait_for_checkpoint(tmp_path, processes)
+    processes[1].send_signal(signal.SIGTERM)
+    (first, shown), (second, _) = finish(processes)
+    assert (first, second) == (128 + signal.SIGTERM, 128 + signal.SIGTERM), shown[-2000:]
+    assert "resume=run" in shown
+
+
+@pytest.mark.slow
+def test_a_process_with_bad_input_ends_the_others(tmp_path):
+    (tmp_path / "run" / "results").mkdir(parents=True)
+    (first, shown), (second, silent) = finish(start(tmp_path, "run_dir=run"))
+    assert first == 2 and "'run' exists" in shown
+    assert second == 1 and "error: process 0 of the training failed" in silent
+
+
+def test_the_page_shows_settings_that_exist():
+    """Every override on the page is a key of the command."""
+    page = (REPOSITORY / "docs" / "scaling.md").read_text()
+    keys = set(re.findall(r"\b((?:trainer|distributed|env)\.\w+)=", page))
+    config = run_schema("ppo")
+    assert {"distributed.coordinator", "trainer.num_envs"} <= keys
+    for key in keys:
+        parent, _, name = key.rpartition(".")
+        assert name in OmegaConf.select(config, parent), key
+
+
+@pytest.mark.parametrize(
+    "settings, reason",
+    [
+        ({"coordinator": "host"}, "expected HOST:PORT, auto or local, got 'host'"),
+        ({"coordinator": "host:1", "processes": 2}, "distributed.process: expected a number"),
+        ({"coordinator": "host:1", "process": 0}, "distributed.processes: expected a number"),
+        ({"coordinator": "host:1", "processes": 2, "process": 2}, "distributed.process: expected 0 to 1, got 2"),
+        (
+            {"coordinator": "host:1", "processes": 0, "process": 0},
+            "processes: expected a whole number from 1 to",
+        ),
+        ({"process": 1}, "distributed.process: not expected, got 1 with distributed.coordinator=''"),
+        ({"coordinator": "auto", "processes": 2}, "distributed.processes: not expected"),
+        ({"coordinator": "local", "processes": 2, "process": 0}, "distributed.process: not expected"),
+        (
+            {"coordinator": "local", "processes": 0},
+            "processes: expected a whole number from 1 to",
+        ),
+    ],
+)
+def test_bad_settings_are_rejected(settings, reason):
+    with pytest.raises(ValueError, match=reason):
+        DistributedConfig(**settings)
+
+
+def test_bad_settings_are_one_line(rejected):
+    number = ["distributed.processes=2", "distributed.process=2"]
+    assert "expected 0 to 1, got 2" in rejected("train", "distributed.coordinator=localhost:1", *number)
+
+
+def test_a_distributed_sweep_is_rejected(tmp_path):
+    alone = ["distributed.coordinator=localhost:1", "distributed.processes=1", "distributed.process=0"]
+    command = [sys.executable, "-m", "mimic.train", "-m", *alone, "seed=0,1"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False, cwd=tmp_path)
+    assert result.returncode == 1
+    assert len(re.findall("^failed: .*expected one run, got a sweep", result.stderr, re.MULTILINE)) == 2

@@ -1,0 +1,252 @@
+"""`python -m mimic.export`: exported networks give the results of JAX and describe their inputs and outputs."""
+
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import mimic
+from mimic.arms.description import described_arm, description, description_layout
+from mimic.arms.sampler import random_arm
+from mimic.commands.config import ExportConfig
+from mimic.metric.config import MetricConfig
+from mimic.runs.checkpoints import save_checkpoint
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.export.export import exported_function
+from mimic.trainers.export.export_controller import prepare_controller
+from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
+from mimic.trainers.pose_mapper.any_arm_model import make_any_arm_model
+from mimic.trainers.pose_mapper.model import PoseMapper, make_model
+from mimic.trainers.ppo import training
+from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.run_config import save_config
+
+pytest.importorskip("onnx")
+onnxruntime = pytest.importorskip("onnxruntime")
+TOLERANCE = 1e-5  # rad, or a fraction of the maximum torque: float32, sums in another order
+
+
+def policy_run(run_dir, name="panda4dof"):
+    """A run whose policy has random weights and random observation statistics."""
+    env = mimic.make(name, demonstrations={"count": 1, "held_out": 1})
+    config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
+    networks = training.make_networks(config, env.observation_size, env.action_size)
+    statistics, *networks = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
+    rng = np.random.default_rng(0)
+    statistics = statistics.replace(
+        mean=jnp.asarray(rng.normal(size=env.observation_size), jnp.float32),
+        std=jnp.asarray(rng.uniform(0.3, 2, env.observation_size), jnp.float32),
+    )
+    params = (statistics, *networks)
+    run_dir.mkdir()
+    save_config(run_dir, TrainConfig(env.config, config))
+    save_checkpoint(run_dir, 7, params)
+    return env, training.make_controller(config, env.observation_size, env.action_size)(params)
+
+
+def mapper_run(run_dir, name="panda4dof", preset="paper", metric=None, **settings):
+    """A run whose mapper has random weights."""
+    env = mimic.env_config(name, **({"metric": metric} if metric else {}), **settings)
+    config = PoseMapperConfig(preset=preset, hidden_layers=[16, 16]).resolve()
+    params = make_model(env, config).init(jax.random.key(3))
+    run_dir.mkdir()
+    save_config(run_dir, TrainConfig(env, config))
+    save_checkpoint(run_dir, 5, params)
+    return PoseMapper.load(run_dir)
+
+
+def session_of(path):
+    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+def random_poses(arm, count, seed=0):
+    lower, upper = np.asarray(arm.joint_range).T
+    return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
+
+
+@pytest.mark.parametrize("batch", [1, 33])
+def test_an_onnx_policy_equals_the_policy(tmp_path, batch):
+    env, controller = policy_run(tmp_path / "run")
+    path = mimic.export_run(tmp_path / "run", tmp_path / "policy.onnx")
+    session = session_of(path)
+    observations = np.random.default_rng(1).normal(size=(batch, env.observation_size)).astype(np.float32)
+    action, torque = session.run(["action", "torque"], {"observation": observations})
+    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), batch)).replace(obs=jnp.asarray(observations))
+    expected = controller(state)
+    assert np.asarray(expected).std() > 0.1  # a check that can fail
+    np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(torque, expected * env.torque_scale, rtol=TOLERANCE, atol=1e-4)  # N m, up to 87
+
+
+def test_the_metadata_describes_inputs_and_outputs(tmp_path):
+    env, _ = policy_run(tmp_path / "run")
+    session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "policy.onnx"))
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert metadata["env"] == "panda4dof" and metadata["mimic_version"] == mimic.__version__
+    assert json.loads(metadata["learner_joints"]) == ["joint1", "joint2", "joint4", "joint5"]
+    np.testing.assert_allclose(json.loads(metadata["torque_scale"]), env.torque_scale)
+    layout = {part["name"]: part for part in json.loads(metadata["observation_layout"])}
+    state = env.reset(jax.random.key(0))
+    own = mimic.link_states(env.learner, state.pipeline_state.qpos)
+    ahead = env.expert_at(state.pipeline_state.demonstration, jnp.array(1))
+    for whose, states in {"learner": own, "expert 1 steps ahead": ahead}.items():
+        for name, values in vars(states).items():
+            part = layout[f"{whose}: {name}"]
+            observed = state.obs[part["start"] : part["stop"]].reshape(part["shape"])
+            np.testing.assert_allclose(observed, values, atol=1e-6)
+    assert max(part["stop"] for part in layout.values()) == env.observation_size
+
+
+@pytest.mark.parametrize(
+    ("name", "preset", "metric"),
+    [
+        ("panda4dof", "paper", None),
+        ("panda4dof", "large", None),
+        ("planar4dof", "large", MetricConfig(adaptive=True)),
+        ("planar7dof", "large", MetricConfig(translation=1.0, correspondence="soft", rotation_measure="angle")),
+        ("panda3dof", "large", MetricConfig(translation=1.0, reduction="frobenius")),
+    ],
+)
+def test_an_onnx_pose_mapper_equals_the_mapper(tmp_path, name, preset, metric):
+    mapper = mapper_run(tmp_path / "run", name, preset, metric)
+    session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "mapper.onnx"))
+    poses = random_poses(mapper.expert, 200)
+    (outputs,) = session.run(None, {"expert_qpos": poses})
+    expected = mapper(poses)
+    # Where two heads are equally good, rounding decides; where a point is near the seam of the circle, it does too.
+    off = np.abs(np.angle(np.exp(1j * (outputs - np.asarray(expected))))).max(axis=1)
+    assert np.mean(off < TOLERANCE) >= (1.0 if preset == "paper" else 0.99)
+    assert len(np.unique(np.round(outputs, 3), axis=0)) > 100
+
+
+def test_a_mapper_of_an_environment_with_an_inner_loop_is_a_function(tmp_path):
+    mapper_run(tmp_path / "run", world="nominal")
+    assert exported_function(ExportConfig(str(tmp_path / "run"))).kind == "pose_mapper"
+    with pytest.raises(ValueError, match="trainer=ppo with .*, got one of trainer=pose_mapper with an inner loop"):
+        prepare_controller(tmp_path / "run")
+
+
+def any_arm_run(run_dir, expert="fixed"):
+    """A run whose mapper to any arm has random weights."""
+    env = mimic.env_config("any_arm", arms={"expert": expert})
+    config = PoseMapperConfig(width=16, layers=1, heads=2, guesses=1, refinements=2).resolve_any_arm()
+    params = make_any_arm_model(env, config).init(jax.random.key(3))
+    run_dir.mkdir()
+    save_config(run_dir, TrainConfig(env, config))
+    save_checkpoint(run_dir, 5, params)
+    return AnyArmMapper.load(run_dir)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("expert", ["fixed", "drawn"])
+def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path, expert):
+    """One file for arms of 7 and 4 joints and for a random one, with the descriptions that the command writes."""
+    mapper = any_arm_run(tmp_path / "run", expert)
+    session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "mapper.onnx"))
+    poses = random_poses(mapper.expert, 50)
+    json_file, npz_file = tmp_path / "panda.json", tmp_path / "panda4dof.npz"
+    mimic.export_run(tmp_path / "run", json_file, learner="panda")
+    mimic.export_run(tmp_path / "run", npz_file, learner="panda4dof")
+    arms = {
+        "panda": json.loads(json_file.read_text())["learner"],
+        "panda4dof": np.load(npz_file)["learner"],
+        "random": description(jax.device_get(random_arm(jax.random.PRNGKey(1)))),
+    }
+    for (name, vector), joints in zip(arms.items(), (7, 4, 7), strict=True):
+        batch = np.tile(np.asarray(vector, np.float32), (len(poses), 1))
+        (outputs,) = session.run(["learner_qpos"], {"expert_qpos": poses, "learner": batch})
+        expected = np.asarray(mapper(poses, jax.device_get(described_arm(jnp.asarray(batch[0])))))
+        off = np.abs(np.angle(np.exp(1j * (outputs - expected)))).max(axis=1)
+        assert np.mean(off < 1e-3) >= 0.95, name  # Newton steps magnify rounding errors
+        assert np.sum(np.ptp(expected, axis=0) > 0.1) == np.sum(np.ptp(outputs, axis=0) > 1e-6) == joints
+        if name != "random":
+            joints_of_arm = mapper.describe(name).joints
+            np.testing.assert_allclose(expected[:, joints_of_arm], mapper(poses, name), atol=1e-3)
+    metadata = session.get_modelmeta().custom_metadata_map
+    layout = json.loads(metadata["learner_layout"])
+    assert layout[-1]["stop"] == len(arms["panda"]) and json.loads(metadata["expert_joints"])[0] == "joint1"
+    assert json.loads(json_file.read_text())["joints"] == [f"joint{i}" for i in range(1, 8)]
+
+
+@pytest.mark.slow
+def test_a_description_is_the_arm(tmp_path):
+    mapper = any_arm_run(tmp_path / "run")
+    arm = mapper.arrays("panda4dof")
+    again = described_arm(jnp.asarray(description(arm)))
+    for part in description_layout():
+        np.testing.assert_array_equal(getattr(again, part["name"]), getattr(arm, part["name"]))
+
+
+def test_a_description_needs_a_file_for_it(rejected, tmp_path):
+    any_arm_run(tmp_path / "run")
+    message = rejected("export", f"run={tmp_path / 'run'}", f"out={tmp_path / 'new.onnx'}", "learner=panda")
+    assert "out: expected a file .json or .npz for the description of learner=panda" in message
+
+
+@pytest.mark.slow
+def test_jax_reads_a_mapper_to_any_arm(tmp_path):
+    pytest.importorskip("flatbuffers")
+    from jax import export
+
+    mapper = any_arm_run(tmp_path / "run")
+    path = mimic.export_run(tmp_path / "run", tmp_path / "mapper.jax", format="jax")
+    poses, arm = random_poses(mapper.expert, 9), mapper.arrays("panda")
+    function = export.deserialize(bytearray(path.read_bytes()))
+    outputs = function.call(poses, np.tile(description(arm), (9, 1)))["learner_qpos"]
+    np.testing.assert_allclose(outputs, mapper(poses, arm), atol=1e-3)
+
+
+def test_jax_reads_its_own_format(tmp_path):
+    pytest.importorskip("flatbuffers")
+    from jax import export
+
+    mapper = mapper_run(tmp_path / "run", preset="large")
+    path = mimic.export_run(tmp_path / "run", tmp_path / "mapper.jax", format="jax")
+    poses = random_poses(mapper.expert, 9)
+    outputs = export.deserialize(bytearray(path.read_bytes())).call(poses)["learner_qpos"]
+    np.testing.assert_allclose(outputs, mapper(poses), atol=TOLERANCE)
+    assert json.loads((tmp_path / "mapper.jax.json").read_text())["learner_joints"][2] == "joint4"
+
+
+def test_bad_input_is_rejected(rejected, tmp_path):
+    mapper_run(tmp_path / "run")
+    taken = tmp_path / "taken.onnx"
+    taken.write_text("")
+    run = f"run={tmp_path / 'run'}"
+    cases = [
+        ([], "out: expected a file"),
+        (["out=new.onnx"], "run: expected the run directory to export"),
+        (["out=new.onnx", "run=missing"], "'missing' is not a run directory"),
+        (["out=new.onnx", run, "checkpoint=6"], "has no checkpoint 6; it has 5"),
+        ([f"out={taken}", run], "exists; name a new file"),
+        (["out=no/new.onnx", run], "there is no folder 'no'"),
+        (["out=new.onnx", run, "format=tflite"], "expected one of onnx, jax, controller, got 'tflite'"),
+        (
+            ["out=new.onnx", run, "learner=panda3dof"],
+            "but the run's is panda-joint3-joint6-joint7 with joints",
+        ),
+        (
+            ["out=new.onnx", run, "learner=panda9dof"],
+            "unknown environment 'panda9dof'; valid are any_arm, bimanual, pair",
+        ),
+    ]
+    for arguments, message in cases:
+        assert message in rejected("export", *arguments)
+        (tmp_path / "empty").rmdir()
+
+
+def test_a_mapper_whose_arms_differ_from_its_config_is_rejected(rejected, tmp_path):
+    mapper_run(tmp_path / "run")
+    config = PoseMapperConfig(preset="paper", hidden_layers=[16, 16]).resolve()
+    save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda3dof"), config))
+    assert "it has other arms or another network" in rejected("export", f"run={tmp_path / 'run'}", "out=new.onnx")
+
+
+def test_a_missing_package_is_named(rejected, tmp_path, monkeypatch):
+    mapper_run(tmp_path / "run")
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    message = rejected("export", f"run={tmp_path / 'run'}", "out=new.onnx")
+    assert "format=onnx needs the package onnx: pip install 'mimic-arms[export]'" in message

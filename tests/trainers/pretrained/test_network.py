@@ -1,0 +1,229 @@
+"""The trained networks that come with mimic: they load, fit their environments, and reach their recorded metrics."""
+
+import dataclasses
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+
+import mimic
+from mimic.envs.family import UNSEEN, report_arms
+from mimic.evaluation.evaluator import Evaluator
+from mimic.runs.files import REPORT
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
+from mimic.trainers.pose_mapper.any_arm_model import expert_pose
+from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
+from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
+from mimic.trainers.pretrained.files import PARAMETERS, read_params, write_network
+from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network
+from tests.helpers.repository import REPOSITORY
+
+MAX_BYTES = 3_000_000  # of all of them: the package stays small
+OBSERVATION = 12 * (7 + 7 + 4)  # of planar4dof: four vectors for each link; expert now and next, learner
+DEFAULT = ("panda3dof", "panda4dof", "panda7dof", "planar4dof", "planar7dof")
+POLICIES, MAPPERS = (names_of_one_learner(kind) for kind in TRAINERS)
+FOLDERS = [f"{name}-{kind}" for kind in TRAINERS for name in names_of_one_learner(kind)]
+
+
+def quick(names):
+    """Names as parameters; only those of planar arms compile quickly enough for `make test`."""
+    return [pytest.param(name, marks=() if name.startswith("planar4") else pytest.mark.slow) for name in names]
+
+
+def test_each_default_environment_has_both_and_they_are_small():
+    assert MAPPERS == POLICIES == DEFAULT == pretrained_names("policy")
+    assert pretrained_names("pose_mapper") == ("any_arm", *DEFAULT)
+    assert sum(path.stat().st_size for path in NETWORKS.rglob("*") if path.is_file()) <= MAX_BYTES
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_each_says_where_it_comes_from(folder):
+    network = mimic.load(*folder.rsplit("-", 1))  # type: ignore[arg-type]
+    source = network.source
+    assert len(source["commit"]) == 40 and source["command"].startswith(f"python -m mimic.train env={network.name} ")
+    assert {"python", "jax", "numpy"} <= set(source["versions"]) and source["hardware"]["device"]
+    assert source["env_steps" if network.kind == "policy" else "training_poses"] > 0
+    best = network.report["lower_bound" if network.kind == "policy" else "optimal_distance"]["held_out"]
+    # Between equal arms copying is the optimum, and what the optimiser stops at is above it by less than 1e-4.
+    assert network.report["copying_distance"]["held_out"] >= best - 1e-4
+    assert network.name in repr(network) and len(repr(network)) < 100
+
+
+@pytest.mark.parametrize("name", quick(MAPPERS))
+def test_a_mapper_reaches_its_recorded_distance(name):
+    mapper = mimic.load(name, "pose_mapper")
+    poses = PoseMapperTrainer(mapper.config)._poses["held_out"]
+    distance = jax.jit(jax.vmap(mapper.function.model.distance))(poses, jax.jit(mapper)(poses))
+    # Another machine or version rounds differently, and then a few poses get the second of two nearest candidates.
+    assert float(distance.mean()) == pytest.approx(mapper.report["mean_distance"]["held_out"], rel=1e-3)
+    report = mapper.report
+    assert report["quality"]["held_out"] < 0.1 and distance.mean() < report["copying_distance"]["held_out"] + 0.05
+
+
+@pytest.mark.parametrize("name", quick(POLICIES))
+def test_a_policy_reaches_its_recorded_distance(name):
+    policy = mimic.load(name)
+    held_out = mimic.envs.imitation.training_and_held_out(policy.config.env)[1]
+    evaluator = Evaluator(policy.env.with_demonstrations(held_out), held_out)
+    rollouts = jax.jit(lambda: evaluator.rollout(lambda state: policy(state.obs)))()
+    # A rollout adds up what another machine rounds differently, and the demonstrations are recorded anew.
+    recorded = policy.report["mean_distance"]["held_out"]
+    distance = np.asarray(rollouts.distance)[: held_out.count].mean()
+    assert float(distance) == pytest.approx(recorded, rel=1e-3)
+    assert recorded < 0.5 * policy.report["hold_distance"]["held_out"]
+
+
+@pytest.fixture(scope="module")
+def any_arm():
+    return mimic.load("any_arm", "pose_mapper")
+
+
+def test_the_mapper_to_any_arm_says_where_it_comes_from(any_arm):
+    report = any_arm.report
+    assert len(report["source"]["commit"]) == 40 and report["training_poses"] > 2e7
+    command = "python -m mimic.train env=any_arm trainer=pose_mapper trainer.preset=any_arm env.arms.expert=drawn"
+    assert report["source"]["command"] == command and any_arm.model.expert_is_drawn
+    assert report["hardware"]["device"] and {"python", "jax", "numpy"} <= set(report["versions"])
+    assert any_arm.env.arms.evaluated == [] and "ur5e" in report["arms"]
+
+
+@pytest.mark.slow
+def test_the_mapper_to_any_arm_reaches_its_recorded_distance_on_unseen_locks(any_arm):
+    arms = {name: arm for name, arm in report_arms(any_arm.env)[UNSEEN].items() if name.startswith("locked")}
+    poses = (
+        AnyArmMapperTrainer(TrainConfig(any_arm.env, PoseMapperConfig(preset="any_arm")))._pairs["arms"].expert_qpos[0]
+    )
+    model = any_arm.model
+    distances = jax.jit(
+        jax.vmap(lambda pose, arm, qpos: model.distance(expert_pose(model.expert, pose), arm, qpos), (0, None, 0))
+    )
+    recorded = {name: any_arm.report["arms"][name] for name in arms}
+    assert len(arms) == 8 and not any(row["seen"] for row in recorded.values())
+    for name, arm in arms.items():
+        arrays = any_arm.arrays(arm)
+        distance = float(distances(poses, arrays, any_arm(poses[:, :7], arrays)).mean())
+        # Where two proposals are equally near, another machine may take the other one.
+        assert distance == pytest.approx(recorded[name]["mean_distance"], rel=2e-3)
+    # None of these arms was in the training: at most 0.2 % of the way from the optimum to a random pose.
+    quality, guesses = ([row[key] for row in recorded.values()] for key in ("quality", "quality_random_guesses"))
+    assert max(quality) < 0.002 and np.mean(quality) < np.mean(guesses)
+
+
+@pytest.mark.slow
+def test_the_mapper_to_any_arm_is_near_the_optimum_of_three_locked_joints(any_arm):
+    lower, upper = np.asarray(any_arm.expert.joint_range).T
+    poses = np.random.default_rng(0).uniform(lower, upper, (64, 7)).astype(np.float32)
+    mapper = any_arm.to("panda4dof")  # training has locked two joints at most
+    distance = jax.jit(jax.vmap(mapper.model.distance))
+    mapped = any_arm(poses, "panda4dof")
+    metric = mimic.env_config("panda4dof").metric.build(any_arm.expert, mapper.model.learner)
+    optimum = mimic.imitate_pose(any_arm.expert, mapper.model.learner, poses, **metric.arguments).qpos
+    difference = np.asarray(distance(poses, mapped) - distance(poses, optimum))
+    assert mapped.shape == (64, 4)
+    assert -0.01 < difference.mean() < 0.02  # a random pose is 1 farther
+
+
+def test_a_batch_is_the_same_as_its_samples():
+    networks = {7: mimic.load("planar4dof", "pose_mapper"), OBSERVATION: mimic.load("planar4dof")}
+    for size, network in networks.items():
+        inputs = np.random.default_rng(0).uniform(-3, 3, (5, size)).astype(np.float32)
+        outputs = jax.jit(network)(inputs)
+        assert outputs.shape == (5, 4)
+        np.testing.assert_allclose(outputs[2], jax.jit(network)(inputs[2]), atol=1e-5)  # float32 matrix products
+    assert np.abs(outputs).max() <= 1
+
+
+def test_inputs_of_another_size_are_reported():
+    with pytest.raises(ValueError, match=r"qpos: expected shape \[..., 7\] for planar7, got \(3,\)"):
+        mimic.load("planar4dof", "pose_mapper")(np.zeros(3))
+    policy = mimic.load("planar4dof")
+    with pytest.raises(ValueError, match=r"observation: expected shape \[..., \d+\], got \[3\]"):
+        policy(np.zeros(3))
+
+
+def test_unknown_names_are_listed():
+    with pytest.raises(ValueError, match="name: expected one of .*planar4dof.*, got 'panda5dof'"):
+        mimic.load("panda5dof")
+    with pytest.raises(ValueError, match="kind: expected one of policy, pose_mapper, got 'critic'"):
+        mimic.load("panda4dof", "critic")  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def copy(tmp_path):
+    return shutil.copytree(NETWORKS / "planar4dof-pose_mapper", tmp_path / "network")
+
+
+def test_damaged_folders_are_reported_in_one_line(copy):
+    with pytest.raises(ValueError, match="expected a network of trainer=ppo, got pose_mapper"):
+        read_network(copy, "policy")
+    report = (copy / REPORT).read_text()
+    (copy / REPORT).write_text("[]")
+    with pytest.raises(ValueError, match=r"report.json' cannot be read: expected an object") as error:
+        read_network(copy, "pose_mapper")
+    assert "\n" not in str(error.value)
+    (copy / REPORT).write_text(report)
+    content = (copy / PARAMETERS).read_bytes()
+    (copy / PARAMETERS).write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match=r"parameters.npz' cannot be read"):
+        read_network(copy, "pose_mapper")
+
+
+def test_parameters_of_another_network_are_reported(copy):
+    config = (copy / "config.yaml").read_text()
+    (copy / "config.yaml").write_text(config.replace("- 128\n", "- 64\n", 1))
+    with pytest.raises(ValueError, match=r"params/Dense_0/bias: expected shape \(64,\), got \(128,\)"):
+        read_network(copy, "pose_mapper")
+    (copy / "config.yaml").write_text(config.replace("inputs: link_states", "inputs: angles"))
+    with pytest.raises(ValueError, match=r"params/Dense_0/kernel: expected shape \(7, 128\), got \(42, 128\)"):
+        read_network(copy, "pose_mapper")
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_parameters_are_read_as_they_were_written(tmp_path, half):
+    mapper = mimic.load("planar4dof", "pose_mapper")
+    params = mapper.function.params
+    config = dataclasses.replace(mapper.config, run_dir="runs/mine")
+    write_network(tmp_path, config, params, {"env": "planar4dof", "source": {"gap": float("nan")}}, half=half)
+    read = read_params(tmp_path, params)
+    rounding = 2**-11 if half else 0  # of float16, relative
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=rounding, atol=rounding / 1000), read, params)
+    assert all(leaf.dtype == np.float32 for leaf in jax.tree.leaves(read))
+    assert json.loads((tmp_path / REPORT).read_text())["source"] == {"gap": None}
+    assert "runs/mine" not in (tmp_path / "config.yaml").read_text()
+
+
+def test_the_page_has_the_recorded_metrics():
+    lines = [f"| `{name}` | {policy_cells(mimic.load(name).report)} | {mapper_cells(name)} |" for name in POLICIES]
+    page = (REPOSITORY / "docs" / "pretrained.md").read_text()
+    for line in lines:
+        assert line in page, "docs/pretrained.md: expected the rows\n" + "\n".join(lines)
+
+
+def policy_cells(report):
+    gap, distances = report["optimality_gap"], ("mean_distance", "lower_bound", "copying_distance")
+    cells = " / ".join(f"{report[key]['held_out']:.3f}" for key in distances)
+    return f"{gap['train']:.1%} / {gap['held_out']:.1%} | {cells}"
+
+
+def mapper_cells(name):
+    report = mimic.load(name, "pose_mapper").report
+    distances = ("mean_distance", "optimal_distance", "copying_distance")
+    cells = " / ".join(f"{report[key]['held_out']:.3f}" for key in distances)
+    return f"{report['quality']['held_out']:.2%} | {cells}"
+
+
+def test_the_page_has_the_recorded_metrics_of_the_mapper_to_any_arm(any_arm):
+    page = (REPOSITORY / "docs" / "pretrained.md").read_text()
+    arms = any_arm.report["arms"]
+    groups = {}
+    for name, arm in arms.items():
+        group = "seen" if arm["seen"] else name.split()[0] if " " in name else "real"
+        groups.setdefault(group, []).append(arm)
+    assert [len(rows) for rows in groups.values()] == [21, 8, 7, 16]
+    for rows in groups.values():
+        quality = np.array([row["quality"] for row in rows])
+        guesses = np.array([row["quality_random_guesses"] for row in rows])
+        values = (f"{column.mean():.2%} / {column.max():.2%}" for column in (quality, guesses))
+        assert f"| {' | '.join(values)} |" in page

@@ -1,0 +1,337 @@
+"""`python -m mimic.train`: the run directory, evaluation, resuming and signals."""
+
+import csv
+import dataclasses
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import imageio_ffmpeg
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.interruptions import differences
+from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint, load_checkpoint, save_checkpoint
+from mimic.runs.lock import RunLock
+from mimic.trainers.config import TrainConfig
+from mimic.trainers.make import make_ppo_trainer
+from mimic.trainers.run_config import load_config, new_run_dir
+from mimic.trainers.run_training import prepare_training
+from tests.helpers.tiny import TINY
+
+BY_SPLIT = {
+    "optimality_gap", "mean_distance", "lower_bound", "hold_distance", "link_angle_error_deg", "angular_velocity_error",
+    "torque_rms", "torque_change", "torque_saturation", "position_violations", "speed_violations", "torque_violations",
+    "worst_demonstrations",
+}  # fmt: skip
+REPORT_KEYS = {"env", "trainer", "seed", "wall_time_s", "env_steps", "steps_per_second", "hardware", "versions"}
+
+
+def command(module, *arguments, **more):
+    return subprocess.run(
+        [sys.executable, "-m", f"mimic.{module}", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=280,
+        check=False,
+        **more,
+    )
+
+
+def rows_of(run_dir):
+    with (run_dir / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """One tiny run that logs what it compiles."""
+    run_dir = tmp_path_factory.mktemp("runs") / "tiny"
+    environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
+    result = command("train", *TINY, f"run_dir={run_dir}", "compilation_cache=", env=environment)
+    assert result.returncode == 0, result.stderr[-2000:]
+    return run_dir, result
+
+
+def test_a_run_directory_holds_everything(finished):
+    run_dir, _ = finished
+    names = {path.name for path in run_dir.iterdir()}
+    assert {"config.yaml", "report.json", "metrics.csv", "demonstrations.npz", "checkpoints", "tensorboard"} <= names
+    report = json.loads((run_dir / "report.json").read_text())
+    assert report.keys() >= REPORT_KEYS | BY_SPLIT
+    for key in BY_SPLIT:
+        assert report[key].keys() == {"train", "held_out"}
+    assert {"demonstrations.csv", "quality.png", "demonstrations.png", "training.png"} <= names
+    assert report["wall_time_s"].keys() == {"import", "build", "compile", "train", "evaluate", "total"}
+    assert report["env_steps"] >= 5000
+    assert report["physics"] == load_config(run_dir).env.physics == "fused"
+    assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 4
+
+
+def test_the_report_has_the_gap_on_mjx_too(finished):
+    """1e-3: the joint angles of both differ by 1e-4 rad after 5 s, and the distance is of that order."""
+    run_dir, result = finished
+    report = json.loads((run_dir / "report.json").read_text())
+    lines = result.stdout.splitlines()
+    assert lines[1] == (
+        "physics: fused (auto: it covers the learner exactly); the report evaluates the policy on MJX too"
+    )
+    for key in ("optimality_gap", "mean_distance"):
+        assert report["mjx"][key] == pytest.approx(report[key], rel=1e-3)
+    assert "evaluated on MJX" in result.stdout
+
+
+def test_a_run_compiles_few_functions(finished):
+    """Each takes a tenth of a second or more on a GPU."""
+    _, result = finished
+    names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", result.stderr)
+    for function in ("start", "epoch", "rollouts", "rollouts_on_mjx", "closest"):
+        assert names.count(function) == 1
+    assert len(names) < 22  # 54 with brax's own training loop
+
+
+@pytest.mark.slow
+def test_evaluate_repeats_the_report(finished, tmp_path):
+    run_dir, _ = finished
+    out = tmp_path / "again"
+    result = command("evaluate", f"run={run_dir}", f"out={out}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    pictures = {"quality.png", "demonstrations.png", "similarity.png"}
+    tables = {"demonstrations.csv", "quality.csv", "config.yaml"}
+    assert {path.name for path in out.iterdir()} == {"report.json", *tables, *pictures}
+    again, report = (json.loads((folder / "report.json").read_text()) for folder in (out, run_dir))
+    for key in BY_SPLIT - {"worst_demonstrations"}:
+        assert again[key] == pytest.approx(report[key], rel=1e-5)  # float32, in another process
+    for key, values in report["mjx"].items():
+        assert again["mjx"][key] == pytest.approx(values, rel=1e-5)
+    for split, gaps in report["worst_demonstrations"].items():
+        assert again["worst_demonstrations"][split] == pytest.approx(gaps, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_a_video_shows_the_whole_motion(finished):
+    run_dir, _ = finished
+    result = command("render", f"run={run_dir}", "demonstration=1", "gif=true")
+    assert result.returncode == 0, result.stderr[-2000:]
+    video = run_dir / "videos" / "held_out-1.mp4"
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
+    assert frames == 151 and seconds == pytest.approx(5, abs=0.1)  # 5 s at 30 frames a second, both ends
+    with Image.open(video.with_suffix(".gif")) as gif:
+        assert gif.n_frames == 51 and gif.size == (640, 320)  # type: ignore[attr-defined]
+    again = command("render", f"run={run_dir}", "demonstration=1")
+    assert again.returncode == 2 and "exists; name a new file" in again.stderr
+    beyond = command("render", f"run={run_dir}", "demonstration=2")
+    assert beyond.returncode == 2 and "expected 0 to 1, the held_out ones of the run, got 2" in beyond.stderr
+
+
+@pytest.mark.slow
+def test_resume_continues_from_the_last_checkpoint(finished, tmp_path):
+    run_dir = shutil.copytree(finished[0], tmp_path / "run")
+    result = command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert json.loads((run_dir / "report.json").read_text())["env_steps"] >= 8000
+    again = command("train", f"resume={run_dir}")
+    assert again.returncode == 2 and "increase trainer.num_timesteps" in again.stderr
+
+
+@pytest.mark.slow
+def test_a_resumed_run_ends_as_if_it_had_not_been_interrupted(finished, tmp_path):
+    """As after a SIGKILL while a checkpoint was written, and one before the report."""
+    reference, _ = finished
+    run_dir = shutil.copytree(reference, tmp_path / "run")
+    last = max(checkpoint_steps(run_dir))
+    delete_checkpoint(run_dir, last)
+    (run_dir / "checkpoints" / f"{last:012d}.partial").mkdir()
+    for _ in range(2):
+        (run_dir / "report.json").unlink()
+        result = command("train", f"resume={run_dir}")
+        assert result.returncode == 0, result.stderr[-2000:]
+        assert differences(reference, run_dir) == ""
+        assert json.loads((run_dir / "report.json").read_text())["env_steps"] == last
+    assert not list((run_dir / "checkpoints").glob("*.partial*"))
+
+
+@pytest.mark.slow
+def test_a_run_without_a_checkpoint_starts_anew_when_resumed(finished, tmp_path):
+    reference, _ = finished
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    for name in ("config.yaml", "demonstrations.npz"):
+        shutil.copy(reference / name, run_dir)
+    (run_dir / "metrics.csv").write_text("step,quality/opti")  # half of a header
+    result = command("train", f"resume={run_dir}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert differences(reference, run_dir) == ""
+
+
+def test_a_folder_without_a_config_is_no_run_yet(tmp_path):
+    """A process that was killed before it wrote the config."""
+    config = TrainConfig(run_dir=str(tmp_path))
+    for name in ("demonstrations.npz", "config.yaml.partial", ".lock"):
+        (tmp_path / name).touch()
+    assert new_run_dir(config) == tmp_path
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(ValueError, match="exists"):
+        new_run_dir(config)
+
+
+@pytest.mark.slow
+def test_a_run_starts_from_the_parameters_of_another_run(finished, tmp_path):
+    run_dir = tmp_path / "run"
+    result = command("train", *TINY, "seed=1", "trainer.evaluations=1", f"init={finished[0]}", f"run_dir={run_dir}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    with np.load(finished[0] / "checkpoints" / f"{max(checkpoint_steps(finished[0])):012d}" / "training.npz") as file:
+        policy = file["arr_0"]
+    with np.load(run_dir / "checkpoints" / f"{0:012d}" / "training.npz") as file:
+        np.testing.assert_array_equal(file["arr_0"], policy)
+    other = command("train", "env=panda3dof", f"init={finished[0]}", f"run_dir={tmp_path / 'other'}")
+    assert other.returncode == 2 and "another network" in other.stderr
+
+
+@pytest.mark.slow
+def test_a_damaged_last_checkpoint_is_trained_again(finished, tmp_path):
+    reference, _ = finished
+    run_dir = shutil.copytree(reference, tmp_path / "run")
+    state = run_dir / "checkpoints" / f"{max(checkpoint_steps(run_dir)):012d}" / "training.npz"
+    state.write_bytes(state.read_bytes() + b"0")
+    result = command("train", f"resume={run_dir}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert "is damaged" in result.stderr and differences(reference, run_dir) == ""
+
+
+@pytest.mark.slow
+def test_an_old_run_is_resumed_from_its_parameters(finished, tmp_path):
+    """Its checkpoints have neither state nor metrics. No row of metrics.csv is lost; a line says what starts anew."""
+    run_dir = shutil.copytree(finished[0], tmp_path / "run")
+    for step in checkpoint_steps(run_dir):
+        for name in ("training.npz", "checkpoint.json"):
+            (run_dir / "checkpoints" / f"{step:012d}" / name).unlink(missing_ok=True)
+    before = rows_of(run_dir)
+    result = command("train", f"resume={run_dir}", "trainer.num_timesteps=8000")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert "optimizer and environments start anew" in result.stderr
+    assert rows_of(run_dir)[: len(before)] == before and len(rows_of(run_dir)) > len(before)
+
+
+@pytest.mark.slow
+def test_init_is_kept_by_a_run_without_a_checkpoint(finished, tmp_path):
+    run_dir = tmp_path / "run"
+    result = command("train", *TINY, "trainer.evaluations=1", f"init={finished[0]}", f"run_dir={run_dir}")
+    assert result.returncode == 0, result.stderr[-2000:]
+    again = shutil.copytree(run_dir, tmp_path / "again")
+    shutil.rmtree(again / "checkpoints")
+    (again / "report.json").unlink()
+    assert command("train", f"resume={again}").returncode == 0
+    assert differences(run_dir, again) == ""
+
+
+def test_a_folder_that_another_process_has_taken_is_not_written(finished, tmp_path):
+    """Between the check of a new run and its start."""
+    config = dataclasses.replace(load_config(finished[0]), run_dir=str(tmp_path / "run"))
+    work = prepare_training(config, time.perf_counter())
+    shutil.copytree(finished[0], tmp_path / "run")
+    before = (tmp_path / "run" / "report.json").read_bytes()
+    assert work() == 2
+    assert (tmp_path / "run" / "report.json").read_bytes() == before
+
+
+@pytest.mark.slow
+def test_a_report_that_cannot_be_written_is_one_line(finished, tmp_path):
+    run_dir = shutil.copytree(finished[0], tmp_path / "run")
+    (run_dir / "report.json").unlink()
+    (run_dir / "report.json.partial").mkdir()
+    result = command("train", f"resume={run_dir}")
+    assert result.returncode == 1 and len(result.stderr.splitlines()) == 1 and "continue with: python" in result.stderr
+
+
+def test_a_run_that_another_process_writes_is_not_resumed(finished):
+    lock = RunLock(finished[0])
+    try:
+        result = command("train", f"resume={finished[0]}", "trainer.num_timesteps=8000")
+    finally:
+        lock.close()
+    assert result.returncode == 2 and f"is in use by process {os.getpid()} on" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_a_training_that_diverges_stops_and_leaves_a_batch_to_replay(finished, tmp_path):
+    """It starts from a policy whose actions are beyond float32, although its parameters are not."""
+    start, run_dir = tmp_path / "start", tmp_path / "run"
+    start.mkdir()
+    template = make_ppo_trainer(load_config(finished[0]), finished[0]).params_template()
+    step, (statistics, policy, value) = load_checkpoint(finished[0], template)
+    save_checkpoint(start, step, (statistics, jax.tree.map(lambda x: 1e30 * x, policy), value))
+    result = command("train", *TINY, f"init={start}", f"run_dir={run_dir}")
+    assert result.returncode == 3, result.stderr[-2000:]
+    file = run_dir / "divergence.npz"
+    (line,) = result.stderr.splitlines()
+    assert re.match(r"error: training diverged: \w+ is not finite after \d+ steps; the checkpoints before it", line)
+    assert line.endswith(f"; replay it with: python -m mimic.inspect {file}")
+    assert checkpoint_steps(run_dir) == [0] and not (run_dir / "report.json").exists()
+    assert "training diverged: looking for the first of 1 batches after 0 steps that is not finite" in result.stdout
+    replayed = command("inspect", str(file))
+    assert replayed.returncode == 0, replayed.stderr[-2000:]
+    assert replayed.stdout.startswith("first not finite: action in step 1 of 20, of 64 of 64 arms\n")
+    assert "replay on cpu: reproduces it, with the same metrics to the bit" in replayed.stdout
+
+
+@pytest.mark.slow
+def test_training_ends_at_the_target_gap(tmp_path):
+    run_dir = tmp_path / "early"
+    result = command("train", *TINY, f"run_dir={run_dir}", "trainer.target_gap=100")
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert len((run_dir / "metrics.csv").read_text().splitlines()) == 1 + 1
+    assert json.loads((run_dir / "report.json").read_text())["env_steps"] < 5000
+
+
+SLOW_SIGNALS = signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in SLOW_SIGNALS)]
+)
+def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
+    run_dir = tmp_path / "stopped"
+    arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mimic.train", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    # SIGINT as soon as there is something to lose, SIGTERM in the midst of training.
+    awaited = "config.yaml" if number == signal.SIGINT else "checkpoints/0*[1-9]*"
+    until = time.monotonic() + 200
+    while time.monotonic() < until and not list(run_dir.glob(awaited)):
+        assert process.poll() is None, process.communicate()[1][-2000:]
+        time.sleep(0.2)
+    process.send_signal(number)
+    out, error = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, error[-2000:]
+    assert f"resume={run_dir}" in out.replace("\n", "") and "stopping at the next checkpoint" in error
+    assert list((run_dir / "checkpoints").iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_leaves_no_partial_checkpoint(number, tmp_path):
+    run_dir = tmp_path / "stopped"
+    arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mimic.train", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    until = time.monotonic() + 200
+    while time.monotonic() < until and not list(run_dir.glob("config.yaml")):
+        assert process.poll() is None, process.communicate()[1][-2000:]
+        time.sleep(0.2)
+    for pause in (0.4, 0.0):
+        process.send_signal(number)
+        time.sleep(pause)
+    _, error = process.communicate(timeout=20)  # it does not wait for a checkpoint
+    assert process.returncode == 128 + number and error.splitlines()[1:] == [f"stopped by {number.name}"], error
+    assert all(path.name.isdigit() for path in run_dir.glob("checkpoints/*"))
