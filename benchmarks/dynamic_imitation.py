@@ -26,7 +26,7 @@ from benchmarks.common.record import WIDTH, Row, write_results
 from benchmarks.figures import study_figures
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.collect.collect import prepare_collection
-from mimic.commands.collect.collect.finished_runs import find_runs
+from mimic.commands.collect.finished_runs import find_runs
 from mimic.commands.config import CollectConfig
 from mimic.motions.recording import KINDS, record_demonstrations
 from mimic.runs.files import REPORT

@@ -1,7 +1,8 @@
 """Makes the trained networks that come with mimic from run directories, and measures them.
 
     python -m mimic.train env=panda4dof env.physics=fused run_dir=runs/pretrained/panda4dof-ppo
-    python -m benchmarks.pretrained --runs runs/pretrained/* --out mimic/trainers/pretrained/networks [--half] [--commit HASH]
+    python -m benchmarks.pretrained --runs runs/pretrained/* --out mimic/trainers/pretrained/networks \\
+        [--half] [--commit HASH]
 
 Each run directory becomes the folder ENV-KIND; one that exists is replaced, others stay. Every number of its report is
 that of the stored weights; `copying_distance` is that of copying the angles of joints with the same name. A mapper to

@@ -6,7 +6,7 @@ from mimic.commands.config import CollectConfig
 
 def prepare(config: CollectConfig) -> cli.Work:
     """Prepares a collection of runs. See `mimic.commands.collect.collect`."""
-    from mimic.commands.collect.collect import collect  # slow to import, and not needed for --help
+    from mimic.commands.collect import collect  # slow to import, and not needed for --help
 
     return collect.prepare_collection(config)
 

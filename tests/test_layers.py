@@ -14,26 +14,19 @@ from tests.helpers.repository import REPOSITORY
 
 # From the lowest up: a module may import its own layer and the layers before it.
 LAYERS = (
-    ("compat", "compilation", "config", "config_files", "distribution", "memory", "npz", "ranges", "registry"),
+    ("base",),
     ("control",),
     ("deploy",),
+    ("runs",),
     ("arms",),
     ("metric",),
-    ("runs",),
-    ("datasets",),
+    ("physics",),
+    ("motions",),
     ("retargeting",),
     ("envs",),
-    ("any_arm",),
-    ("hardware",),
-    ("making",),
-    ("virtual_robot",),
-    ("mocap",),
     ("evaluation",),
     ("trainers",),
-    ("pretrained",),
-    ("sweeps",),
     ("viewer",),
-    ("paper_figures",),
     ("commands",),
 )  # and above these the modules directly in the package: the entry points, cli, gymnasium, __init__
 DATA = ("conf",)  # packages for Hydra's sake, without code

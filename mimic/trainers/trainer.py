@@ -1,4 +1,4 @@
-"""The interface of a trainer: its inputs, its training and its evaluation. `mimic.trainers.run_training` does the rest."""
+"""The interface of a trainer: inputs, training and evaluation. `mimic.trainers.run_training` does the rest."""
 
 import abc
 from collections.abc import Callable, Mapping

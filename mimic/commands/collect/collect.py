@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from mimic.base.config import check_writable
-from mimic.commands.collect.collect.finished_runs import FinishedRun, LeftOut, QualityMetric, find_runs, quality_metric
-from mimic.commands.collect.collect.seed_groups import (
+from mimic.commands.collect.finished_runs import FinishedRun, LeftOut, QualityMetric, find_runs, quality_metric
+from mimic.commands.collect.seed_groups import (
     CONFIDENCE,
     METHOD,
     Interval,

@@ -13,8 +13,8 @@ import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 from matplotlib.lines import Line2D  # noqa: E402
 
-from mimic.commands.collect.collect.finished_runs import QualityMetric  # noqa: E402
-from mimic.commands.collect.collect.seed_groups import SeedGroup, mean_interval  # noqa: E402
+from mimic.commands.collect.finished_runs import QualityMetric  # noqa: E402
+from mimic.commands.collect.seed_groups import SeedGroup, mean_interval  # noqa: E402
 from mimic.evaluation.labels import SPLITS  # noqa: E402
 
 _LABELS = {"train": "training data", "held_out": "held-out data"}

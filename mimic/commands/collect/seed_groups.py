@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from mimic.commands.collect.collect.finished_runs import FinishedRun, LeftOut
+from mimic.commands.collect.finished_runs import FinishedRun, LeftOut
 
 CONFIDENCE = 0.95
 METHOD = (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mimic.commands.collect.collect import prepare_collection
-from mimic.commands.collect.collect.seed_groups import mean_interval
+from mimic.commands.collect.seed_groups import mean_interval
 from mimic.commands.config import CollectConfig
 from mimic.runs.files import REPORT
 from mimic.runs.sweeps.sweeper import SWEEP

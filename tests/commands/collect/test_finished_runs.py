@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mimic.commands.collect.collect.finished_runs import find_runs
+from mimic.commands.collect.finished_runs import find_runs
 from mimic.runs.files import METRICS, REPORT
 from mimic.runs.sweeps.sweeper import SWEEP
 from tests.helpers.run_directories import write_run
