@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from mimic.arms.embodiment import Embodiment, load_mjcf, panda, planar_arm
     from mimic.arms.rendering import ArmScene
     from mimic.base.registry import register
+    from mimic.commands.fit import Run, fit
     from mimic.envs import env_config, environments
     from mimic.envs.imitation import ImitationEnv
     from mimic.envs.make import make
@@ -60,7 +61,6 @@ if TYPE_CHECKING:
     from mimic.retargeting.pose import PoseImitation, imitate_pose
     from mimic.retargeting.trajectory import imitate_trajectory
     from mimic.trainers.export.export import export_run
-    from mimic.trainers.fit import Run, fit
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.trainers.pose_mapper.model import PoseMapper
     from mimic.trainers.pretrained.network import Pretrained, load
@@ -133,7 +133,7 @@ _MODULES = {
     "arms.embodiment": ("Embodiment", "load_mjcf", "panda", "planar_arm"),
     "arms.rendering": ("ArmScene",),
     "trainers.export.export": ("export_run",),
-    "trainers.fit": ("Run", "fit"),
+    "commands.fit": ("Run", "fit"),
     "envs": ("env_config", "environments"),
     "motions.demonstrations": ("Demonstrations", "check_effort", "load_demonstrations"),
     "envs.imitation": ("ImitationEnv",),

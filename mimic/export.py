@@ -2,7 +2,7 @@
 
 from mimic.base import compat
 from mimic.commands import cli
-from mimic.commands.config import ExportConfig
+from mimic.trainers.export.config import ExportConfig
 
 
 def prepare(config: ExportConfig) -> cli.Work:

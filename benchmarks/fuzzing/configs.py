@@ -25,6 +25,7 @@ from mimic.base.ranges import Range, all_ranges
 from mimic.commands import cli
 from mimic.commands import config as commands
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.export.config import ExportConfig
 
 SEED = 2025
 SECRET_NAME, SECRET = "SECRET_TOKEN", "fuzz-5e1f-secret"
@@ -33,7 +34,7 @@ _MAX_PREPARED_STEPS = 20_000  # physics steps: about a second
 _COMMANDS = {
     "evaluate": commands.EvaluateConfig,
     "render": commands.RenderConfig,
-    "export": commands.ExportConfig,
+    "export": ExportConfig,
     "dataset": commands.DatasetConfig,
     "demonstrations": commands.RecordingConfig,
     "inspect": commands.InspectConfig,

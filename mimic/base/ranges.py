@@ -104,6 +104,11 @@ def seed_number(default: int = 0) -> Any:
     return number(default, at_least=-(2**63), at_most=2**63 - 1)
 
 
+def checkpoint_number() -> Any:
+    """Field for the training steps of a checkpoint; None for the last one."""
+    return number(None, at_least=0, at_most=10**15)
+
+
 def ranges(config_class: type) -> dict[str, Range]:
     """The ranges of a dataclass by field, including those that its bases declare."""
     return {

@@ -23,15 +23,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from mimic import __version__
 from mimic.base import compat, registry
 from mimic.base.config import BAD_INPUT, explain, schema, suggestion, typed
+from mimic.base.distribution import VERSION
 from mimic.commands.arguments import check_arguments, load_plugins
 from mimic.commands.config import (
     CollectConfig,
     DatasetConfig,
     EvaluateConfig,
-    ExportConfig,
     FiguresConfig,
     InspectConfig,
     RecordingConfig,
@@ -47,6 +46,7 @@ from mimic.runs.sweeps.hydra_plugins import bound_config_files
 from mimic.runs.sweeps.launchers import check_launcher, register_launchers
 from mimic.runs.sweeps.sweeper import FAILED, Outcome, register_sweeper
 from mimic.trainers.config import TrainConfig, trainer_config, trainers
+from mimic.trainers.export.config import ExportConfig
 
 _LONGEST_MESSAGE = 1000  # characters: Hydra repeats the argument
 ARM_KEYS = {  # keys of each command whose value may be just the name or file of an arm
@@ -77,7 +77,7 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
       config_name: name of the command and of its config in mimic/conf.
     """
     if "--version" in sys.argv[1:]:  # Hydra would print its own
-        print(f"mimic {__version__}")
+        print(f"mimic {VERSION}")
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:

@@ -1,4 +1,4 @@
-"""Configs of the commands; the config of a training is in mimic/trainers/config.py.
+"""Configs of the commands; those of a training and of an export are in mimic/trainers.
 
 This module imports other configs only, so that `--help` stays fast.
 """
@@ -11,32 +11,21 @@ from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import LIMITS
 from mimic.arms.named_arms import is_arm_name
 from mimic.base.config import check_choice
-from mimic.base.ranges import check_ranges, number, seed_number
+from mimic.base.ranges import check_ranges, checkpoint_number, number, seed_number
 from mimic.envs import env_config, environments
 from mimic.envs.config import PHYSICS, ArmsConfig, EnvConfig
 from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
+from mimic.trainers.export.config import check_locked
 
 ROBOT_WORLDS = ("paper", "nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "tracking", "searched")
 ROBOT_CONTROLLERS = ("policy", "tracking")
 ARM_SIDES = ("left", "right")
-CONTROLLER = "controller"  # a format of a folder, see mimic/trainers/export/export_controller.py
-EXPORT_FORMATS = ("onnx", "jax", CONTROLLER)
 DATASET_FORMATS = ("lerobot", "rosbag2")
-
-
-def _steps() -> Any:
-    """Field for the steps of a checkpoint."""
-    return number(None, at_least=0, at_most=10**15)
-
-
-def _check_locked(locked: list[Any], learner: str) -> None:
-    if locked and not learner:
-        raise ValueError(f"locked: expected with learner=NAME, as in learner=panda locked=[2,4], got {locked}")
 
 
 def _factor() -> Any:
@@ -70,7 +59,7 @@ class EvaluateConfig:
     """
 
     run: str = ""
-    checkpoint: int | None = _steps()
+    checkpoint: int | None = checkpoint_number()
     controller: str = "policy"
     search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
     learner: str = ""
@@ -92,7 +81,7 @@ class EvaluateConfig:
         check_ranges(self)
         check_choice("controller", self.controller, CONTROLLERS)
         self._check_robot()
-        _check_locked(self.locked, self.learner)
+        check_locked(self.locked, self.learner)
         if self.physics:
             check_choice("physics", self.physics, PHYSICS)
 
@@ -163,7 +152,7 @@ class RenderConfig:
     """
 
     run: str = ""
-    checkpoint: int | None = _steps()
+    checkpoint: int | None = checkpoint_number()
     split: str = "held_out"
     demonstration: int = number(0, at_least=0, at_most=1_000_000)
     demonstrations: str = ""
@@ -179,34 +168,7 @@ class RenderConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
         check_choice("split", self.split, SPLITS)
-        _check_locked(self.locked, self.learner)
-
-
-@dataclasses.dataclass(frozen=True)
-class ExportConfig:
-    """Config of an export of a trained policy or pose mapper to a file.
-
-    Attributes:
-      run: run directory.
-      out: exported file, or folder of a controller; must not exist.
-      format: "onnx", "jax", or "controller": a policy with an inner loop and what a robot needs beside it.
-      learner: name of the environment that the run's arms must equal; of a run whose learner is any arm, an arm whose
-        description is written to `out` instead. Default "": not checked.
-      locked: numbers or names of the joints of this arm that are locked.
-      checkpoint: steps of the checkpoint. Default None: the last checkpoint.
-    """
-
-    run: str = ""
-    out: str = ""
-    format: str = "onnx"
-    learner: str = ""
-    locked: list[Any] = dataclasses.field(default_factory=list)
-    checkpoint: int | None = _steps()
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        check_choice("format", self.format, EXPORT_FORMATS)
-        _check_locked(self.locked, self.learner)
+        check_locked(self.locked, self.learner)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,7 +189,7 @@ class DatasetConfig:
     """
 
     run: str = ""
-    checkpoint: int | None = _steps()
+    checkpoint: int | None = checkpoint_number()
     split: str = ""
     demonstrations: str = ""
     retargeted: str = ""
@@ -435,7 +397,7 @@ class ViewConfig:
     source: str = ""
     arm: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
-    checkpoint: int | None = _steps()
+    checkpoint: int | None = checkpoint_number()
     follow: bool = False
     split: str = "held_out"
     host: str = "127.0.0.1"

@@ -15,7 +15,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from mimic.base.config import new_folder
-from mimic.commands.config import EvaluateConfig, ExportConfig
+from mimic.commands.config import EvaluateConfig
 from mimic.deploy.bundle import MOTIONS
 from mimic.deploy.safety import COLLISION, LATE, check_supported
 from mimic.envs import env_config
@@ -33,6 +33,7 @@ from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.provenance import hardware, versions
 from mimic.trainers.config import TrainConfig
+from mimic.trainers.export.config import ExportConfig
 from mimic.trainers.ppo.trainer import PPOTrainer
 
 ALL = "all ranges"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands.config import EvaluateConfig, ExportConfig
+from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.commands.evaluate_robot import prepare_robot_evaluation, summary
 from mimic.control.joint_control import Reference
@@ -28,6 +28,7 @@ from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv, control_observation
 from mimic.evaluation.virtual_robot.episodes import Episodes
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.export.config import ExportConfig
 from mimic.trainers.export.export import prepare_export
 from mimic.trainers.export.export_controller import expert_table, export_controller, prepare_controller
 from mimic.trainers.ppo import training

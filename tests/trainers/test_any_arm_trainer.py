@@ -8,10 +8,10 @@ import sys
 import pytest
 
 import mimic
+from mimic.commands.fit import Run
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS
 from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.fit import Run
 from mimic.trainers.make import make_trainer
 from mimic.trainers.memory import check_training_memory
 from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer

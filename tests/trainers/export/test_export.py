@@ -11,10 +11,10 @@ import pytest
 import mimic
 from mimic.arms.description import described_arm, description, description_layout
 from mimic.arms.sampler import random_arm
-from mimic.commands.config import ExportConfig
 from mimic.metric.config import MetricConfig
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.export.config import ExportConfig
 from mimic.trainers.export.export import exported_function
 from mimic.trainers.export.export_controller import prepare_controller
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
