@@ -15,7 +15,7 @@ REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_
     "code",
     [
         "import mimic, sys\nmimic.make",
-        "import sys\nfrom mimic import cli, train\nsys.argv = ['mimic.train', '--help']\n"
+        "import sys\nfrom mimic import train\nfrom mimic.commands import cli\nsys.argv = ['mimic.train', '--help']\n"
         "try:\n    cli.run(train.prepare, 'train')\nexcept SystemExit:\n    pass",
     ],
     ids=["name", "help"],
@@ -36,7 +36,8 @@ def test_import_mimic_imports_no_other_package():
 
 
 def test_pose_mappers_need_no_simulator():
-    code = "import sys\nfrom mimic.commands import retarget, train\nfrom mimic.evaluation import plots"
+    code = "import sys\nfrom mimic.commands import retarget\nfrom mimic.evaluation import plots"
+    code += "\nfrom mimic.trainers import run_training"
     code += "\nfrom mimic.trainers.pose_mapper import trainer\nprint(*sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     imported = set(result.stdout.splitlines()[-1].split())
@@ -45,7 +46,7 @@ def test_pose_mappers_need_no_simulator():
 
 def test_training_needs_no_meshes_and_no_contacts():
     """Those of MJX and brax are imported late, when something uses them."""
-    code = "import sys\nfrom mimic import compat\ncompat.import_mjx()\nfrom mimic.commands import train"
+    code = "import sys\nfrom mimic.base import compat\ncompat.import_mjx()\nfrom mimic.trainers import run_training"
     code += "\nfrom mimic.trainers.ppo import trainer"
     code += "\nprint(*sys.modules)"
     code += "\nimport jaxopt\nfrom mujoco.mjx._src import mesh\nassert mesh.trimesh.Trimesh and jaxopt.projection"
@@ -64,7 +65,7 @@ def test_names_that_need_mjx_are_imported_without_a_word(name):
 
 
 def test_the_process_started_before_now():
-    code = "import time\nfrom mimic import cli\nprint(time.perf_counter() - cli.process_started())"
+    code = "import time\nfrom mimic.commands import cli\nprint(time.perf_counter() - cli.process_started())"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert 0 <= float(result.stdout) < 60  # imports, on a busy machine; a wrong clock would be off by its uptime
     assert cli.process_started() == pytest.approx(cli.process_started(), abs=0.05)  # ticks of 0.01 s
