@@ -20,11 +20,11 @@ from mimic.arms.arm import ArmConfig
 from mimic.commands.capture import fixed_fraction, read_arm
 from mimic.commands.config import CaptureConfig
 from mimic.envs.config import EnvConfig
+from mimic.metric.capsule_distances import capsule_axes, changing_pairs, pair_distances
 from mimic.metric.config import MetricConfig
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
 from mimic.motions.mocap.link_motion import BOTH
-from mimic.retargeting.costs import capsule_axes, changing_pairs, pair_distances
 
 _PAIR = ArmConfig("panda_pair")
 _LIMITS = "none"  # as in env=bimanual

@@ -24,10 +24,11 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.pose import planar
 from mimic.arms.arm import ArmConfig
+from mimic.arms.pose_limits import pose_limits
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.motions.recording import record_demonstrations
-from mimic.retargeting.pose import pose_limits, shared_joints
+from mimic.retargeting.pose import shared_joints
 
 STEPS = 50
 ABSOLUTE, RELATIVE, ROUNDING = 1e-3, 1e-3, 1e-5

@@ -20,9 +20,10 @@ from benchmarks.common.record import Row, collect
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.metric.capsule_distances import capsule_axes, pair_distances
 from mimic.metric.config import MetricConfig
 from mimic.metric.similarity import centre_line_table, similarity
-from mimic.retargeting.costs import Costs, capsule_axes, home_cost, limit_cost, pair_distances
+from mimic.retargeting.costs import Costs, home_cost, limit_cost
 
 LIMITS = "hardware"
 EXPERT, LEARNER = ArmConfig(), ArmConfig(locked=[3, 6, 7])

@@ -59,7 +59,7 @@ def demo_data(name: str) -> dict[str, Any]:
 
 
 def _arm(arm: Any) -> dict[str, Any]:
-    from mimic.retargeting.pose import continuous_joints
+    from mimic.arms.pose_limits import continuous_joints
 
     joint = np.asarray(arm.link_joint)
     arrays = {

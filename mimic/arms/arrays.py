@@ -21,8 +21,8 @@ from jaxtyping import Float, Int
 
 from mimic.arms.arm import Arm, ArmConfig, build_arm, finite_velocity_limit
 from mimic.arms.embodiment import snap_to_units
+from mimic.arms.simulation_model import pseudo_inertia
 from mimic.base.spatial import array_library
-from mimic.physics.chain_dynamics import pseudo_inertia
 
 MAX_JOINTS, MAX_LINKS = 8, 12
 _PARALLEL = 1e-12  # rad: axes at a smaller angle are parallel, as `snap_to_units` rounds their sine to 0

@@ -135,3 +135,15 @@ def _rotated_back(anchor: np.ndarray, axis: np.ndarray, joint: Any, angle: float
     mujoco.mju_rotVecQuat(offset, anchor - joint.pos, inverse)
     mujoco.mju_rotVecQuat(rotated_axis, axis, inverse)
     return joint.pos + offset, rotated_axis
+
+
+def pseudo_inertia(
+    model: mujoco.MjModel, data: mujoco.MjData, body: int, frame: np.ndarray, origin: np.ndarray
+) -> np.ndarray:
+    """The sum of m p p^T over a body's points p = (x, y, z, 1) in a frame: second and first moments, and the mass."""
+    inertia = model.body_inertia[body]
+    result = np.zeros((4, 4))
+    axes = frame.T @ data.ximat[body].reshape(3, 3)
+    result[:3, :3] = axes @ np.diag(inertia.sum() / 2 - inertia) @ axes.T
+    centre = np.append(frame.T @ (data.xipos[body] - origin), 1.0)
+    return result + model.body_mass[body] * np.outer(centre, centre)

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from mimic.arms.arm import build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.link_match import LinkMatch
+from mimic.arms.pose_limits import pose_limits
 from mimic.commands.config import RenderConfig
 from mimic.envs import env_config
 from mimic.envs.config import EnvConfig
@@ -20,7 +21,7 @@ from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line_table, similarity
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.motions.recording import record_demonstrations
-from mimic.retargeting.pose import imitate_pose, pose_limits
+from mimic.retargeting.pose import imitate_pose
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.make import make_policy_trainer
 from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper, one_learner

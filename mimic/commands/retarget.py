@@ -15,6 +15,7 @@ from rich.table import Table
 from mimic.arms.arm import finite_velocity_limit
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints
 from mimic.base.config import new_file
 from mimic.commands.config import RetargetConfig
 from mimic.envs import env_config
@@ -23,7 +24,7 @@ from mimic.metric.config import MetricConfig
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
 from mimic.retargeting.costs import Costs
 from mimic.retargeting.motions import largest_jump, optimal_motions
-from mimic.retargeting.pose import continuous_joints, wrap_angles
+from mimic.retargeting.pose import wrap_angles
 from mimic.trainers.pose_mapper.any_arm_mapper import load_mapper
 from mimic.trainers.pose_mapper.model import PoseMapper
 from mimic.trainers.progress import similarity_table

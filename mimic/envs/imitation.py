@@ -20,12 +20,12 @@ from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
 from mimic.envs.start_poses import home_poses, nearest_poses
 from mimic.envs.terms import Transition, observation_layout_of_terms, observation_terms, observed, reward_terms
+from mimic.metric.capsule_distances import changing_pairs
 from mimic.metric.distance import LinkDistance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
 from mimic.motions.demonstrations import Demonstrations, check_effort, load_demonstrations
 from mimic.motions.recording import record_demonstrations
 from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
-from mimic.retargeting.costs import changing_pairs
 
 # The limit penalty starts this margin inside a limit and is at its maximum a width further out; in rad for positions,
 # as a fraction of the velocity limit for speeds.

@@ -11,8 +11,8 @@ from mimic.base import registry
 from mimic.envs.arm_state import ArmState
 from mimic.envs.config import OBSERVATION_TERMS, REWARD_TERMS
 from mimic.envs.start_poses import CLEARANCE
+from mimic.metric.capsule_distances import capsule_axes, intrusion, pair_distances
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.retargeting.costs import capsule_axes, intrusion, pair_distances
 
 Env = Any  # an `ImitationEnv`, which imports this module
 

@@ -16,6 +16,7 @@ from brax.envs.base import State
 from flax import struct
 from jaxtyping import Array, Float
 
+from mimic.arms.pose_limits import pose_limits
 from mimic.base.compilation import Background, on_host
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.labels import SPLITS
@@ -25,7 +26,7 @@ from mimic.metric.kinematics import link_state_table
 from mimic.metric.similarity import CentreLine, centre_line_table
 from mimic.motions.demonstrations import Demonstrations, concatenate
 from mimic.retargeting.kinematic_bound import closest_motion
-from mimic.retargeting.pose import pose_limits, shared_joints
+from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import baseline_poses
 from mimic.runs.files import write_atomically
 

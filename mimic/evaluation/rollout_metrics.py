@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import pose_limits
 from mimic.metric.kinematics import LinkStates
 from mimic.metric.similarity import CentreLine, centre_line_table, similarity
-from mimic.retargeting.pose import pose_limits
 from mimic.retargeting.pose_baselines import baseline_poses
 
 if TYPE_CHECKING:  # imports brax and MJX, which pose mappers do not need

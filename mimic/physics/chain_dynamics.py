@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from mimic.arms.embodiment import snap_to_units
+from mimic.arms.simulation_model import pseudo_inertia
 from mimic.base.spatial import (
     IDENTITY,
     ZERO,
@@ -381,15 +382,3 @@ def _frame(axis: np.ndarray, previous: np.ndarray) -> np.ndarray:
     x = normal - (normal @ axis) * axis
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(axis, x), axis], axis=1)
-
-
-def pseudo_inertia(
-    model: mujoco.MjModel, data: mujoco.MjData, body: int, frame: np.ndarray, origin: np.ndarray
-) -> np.ndarray:
-    """The sum of m p p^T over a body's points p = (x, y, z, 1) in a frame: second and first moments, and the mass."""
-    inertia = model.body_inertia[body]
-    result = np.zeros((4, 4))
-    axes = frame.T @ data.ximat[body].reshape(3, 3)
-    result[:3, :3] = axes @ np.diag(inertia.sum() / 2 - inertia) @ axes.T
-    centre = np.append(frame.T @ (data.xipos[body] - origin), 1.0)
-    return result + model.body_mass[body] * np.outer(centre, centre)

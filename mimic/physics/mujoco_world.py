@@ -12,12 +12,12 @@ from jaxtyping import Float
 
 from mimic.arms.arm import Arm
 from mimic.arms.capsules import Capsules
+from mimic.arms.pose_limits import pose_limits
 from mimic.arms.simulation_model import simulation_spec
 from mimic.control.joint_control import PERIOD
+from mimic.metric.capsule_distances import changing_pairs
 from mimic.physics.plant import GRAVITY, end_of_last_link
 from mimic.physics.world import WorldConfig
-from mimic.retargeting.costs import changing_pairs
-from mimic.retargeting.pose import pose_limits
 
 PAYLOAD, FLOOR = "payload", "floor"
 _SPHERE = 1e-6  # m, of the axis of a capsule

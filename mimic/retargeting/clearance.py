@@ -15,8 +15,8 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.control import clearance as control_clearance
 from mimic.control.clearance import ClearanceConstants
+from mimic.metric.capsule_distances import changing_pairs
 from mimic.metric.matrix_kinematics import frame_constants, point_columns
-from mimic.retargeting.costs import changing_pairs
 
 _TINY = 1e-12  # m^2, replaces the squared length of a capsule that is a sphere
 _PARALLEL = 1e-6  # of the squared sine of an angle: float32 resolves no smaller angle

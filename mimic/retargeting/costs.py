@@ -7,22 +7,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment
 from mimic.base import spatial
 from mimic.base.ranges import check_ranges, number
+from mimic.metric.capsule_distances import capsule_axes, intrusion, pair_distances
 from mimic.metric.kinematics import LinkStates, forward_kinematics, joint_frames
 from mimic.retargeting.closed_form import SMOOTHING, Smoothing
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
 from mimic.retargeting.pose_objective import PoseObjective, Target
 
 _NEAR_LIMIT = 0.1  # fraction of a joint's range at each end where `limits` counts
-_SMOOTHING = 1e-4  # m, of the distance of crossing segments, whose second derivative is infinite without
-_RANDOM_POSES, _CHANGE = 1000, 1e-3  # m, of a distance that joints change
-_SHORT = 1e-6  # m, axis of a capsule that is a sphere
 _FULL_TURN = 2 * np.pi - 1e-4  # rad; a joint with such a range has no limits, as for `continuous_joints`
 
 
@@ -156,65 +154,6 @@ def limit_cost(arm: Embodiment, qpos: Float[Array, " joints"]) -> Float[Array, "
     margin = _NEAR_LIMIT * (upper - lower)
     intrusion = jnp.maximum(0, 1 - jnp.minimum(qpos - lower, upper - qpos) / margin)
     return jnp.mean(jnp.where(upper - lower >= _FULL_TURN, 0, intrusion**2)).astype(qpos.dtype)
-
-
-def capsule_axes(arm: Embodiment, capsules: Capsules, qpos: Float[Array, " joints"]) -> tuple[Array, Array]:
-    """Ends [capsules, 3] of the capsules' axes in a pose [m]."""
-    frames = joint_frames(arm, qpos, None)
-    anchors = np.concatenate([np.zeros((1, 3)), np.asarray(arm.joint_anchor)])
-
-    def moved(points: np.ndarray) -> Array:
-        rows = []
-        for point, joint in zip(points, capsules.joint, strict=True):
-            frame, offset = frames[joint + 1], spatial.vector(point - anchors[joint + 1])
-            rows.append(spatial.add(frame.anchor, spatial.rotate(frame.rotation, offset)))
-        return spatial.stack(rows, qpos.dtype)
-
-    return moved(np.asarray(capsules.start)), moved(np.asarray(capsules.end))
-
-
-def pair_distances(capsules: Capsules, start: Array, end: Array) -> Float[Array, " pairs"]:
-    """Distance of each of the capsules' pairs [m], negative where they intersect."""
-    i, j = np.array(capsules.pairs).T
-    radii = jnp.asarray(capsules.radius[i] + capsules.radius[j], start.dtype)
-    return jax.vmap(segment_distance)(start[i], end[i], start[j], end[j]) - radii
-
-
-def changing_pairs(arm: Embodiment, capsules: Capsules) -> Bool[np.ndarray, " pairs"]:
-    """Whether the joints change the distance of each pair; two capsules of a Panda's wrist are always 2.0 cm apart."""
-    if not capsules.pairs:
-        return np.zeros(0, bool)
-    qpos = np.random.default_rng(0).uniform(-np.pi, np.pi, (_RANDOM_POSES, arm.num_joints))
-    with jax.ensure_compile_time_eval():
-        of_pose = jax.jit(jax.vmap(lambda q: pair_distances(capsules, *capsule_axes(arm, capsules, q))))
-        return np.ptp(np.asarray(of_pose(jnp.asarray(qpos, jnp.float32))), axis=0) > _CHANGE
-
-
-def segment_distance(
-    a: Float[Array, "3"], b: Float[Array, "3"], c: Float[Array, "3"], d: Float[Array, "3"]
-) -> Float[Array, ""]:
-    """Distance of the line segments a-b and c-d (Ericson 2005, section 5.1.9).
-
-    Smoothed where they cross, where it is 0.1 mm and its gradient 0.
-    """
-    u, v, w = b - a, d - c, a - c
-    tiny = _SHORT**2
-    uu, vv, uv, uw, vw = (jnp.sum(x * y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
-    scale = uu * vv
-    determinant = scale - uv * uv
-    is_parallel = determinant <= 1e-6 * scale  # float32 resolves no smaller angle
-    s = jnp.where(is_parallel, 0.5, (uv * vw - vv * uw) / jnp.where(is_parallel, 1, determinant))
-    s = jnp.clip(s, 0, 1)
-    t = jnp.clip((uv * s + vw) / jnp.maximum(vv, tiny), 0, 1)
-    s = jnp.clip((uv * t - uw) / jnp.maximum(uu, tiny), 0, 1)
-    t = jnp.clip((uv * s + vw) / jnp.maximum(vv, tiny), 0, 1)
-    difference = w + s * u - t * v
-    return jnp.sqrt(jnp.sum(difference * difference) + _SMOOTHING**2)
-
-
-def intrusion(distance: Float[Array, " pairs"], clearance: float) -> Float[Array, ""]:
-    """Sum of the squared fractions of the clearance that distances lack, see `Costs.self_collision`."""
-    return jnp.sum(jnp.maximum(0, 1 - distance / clearance) ** 2)
 
 
 def with_costs(

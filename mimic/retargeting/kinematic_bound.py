@@ -10,10 +10,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import pose_limits
 from mimic.base.compilation import compiled_once
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import LinkStates, link_states
-from mimic.retargeting.pose import pose_limits, shared_joints
+from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.quasi_newton import Descent, bfgs
 
 _POSES = 256  # random poses whose distances are compared to choose the initial guesses

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.compilation import compiled_once
 from mimic.base.config import check_choice
 from mimic.base.spatial import array_library
@@ -156,19 +157,6 @@ def _pose_solver(
         return jax.tree.map(lambda x: x.reshape(*batch.shape[:-1], *x.shape[1:]), solutions)
 
     return solve
-
-
-def pose_limits(arm: Embodiment, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper joint limits [rad]; infinite for `continuous_joints`."""
-    lower, upper = np.asarray(arm.joint_range).T
-    continuous = continuous_joints(arm)
-    return np.where(continuous, -np.inf, lower).astype(dtype), np.where(continuous, np.inf, upper).astype(dtype)
-
-
-def continuous_joints(arm: Embodiment) -> Bool[np.ndarray, " joints"]:
-    """Which joints can rotate by a full revolution: their range is 2 pi or more."""
-    lower, upper = np.asarray(arm.joint_range).T
-    return upper - lower >= 2 * np.pi - 1e-4  # models round pi in their text
 
 
 def wrap_angles(angles: Float[Any, "*batch joints"], where: Any = True, *, centre: Any = 0.0) -> Any:

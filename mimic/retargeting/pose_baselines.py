@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 
 from mimic.arms.embodiment import Embodiment, segment_arm
+from mimic.arms.pose_limits import pose_limits
 from mimic.metric.similarity import centre_line_table
-from mimic.retargeting.pose import checked_poses, pose_limits, shared_joints
+from mimic.retargeting.pose import checked_poses, shared_joints
 from mimic.retargeting.segment_alignment import Poses, align_segments
 
 IK_EVERY = 5  # inverse kinematics solves every fifth sample of a motion; a solve takes 0.1 ms

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import pose_limits
 from mimic.metric.kinematics import joint_frames
-from mimic.retargeting.pose import checked_poses, pose_limits, wrap_angles
+from mimic.retargeting.pose import checked_poses, wrap_angles
 from mimic.retargeting.subproblems import (
     PARALLEL,
     bend_to_angle,

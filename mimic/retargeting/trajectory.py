@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.compilation import compiled_once
 from mimic.metric.distance import Correspondence, Metric, Reduction, RotationMeasure, Weights
 from mimic.metric.kinematics import link_states
@@ -19,16 +20,7 @@ from mimic.retargeting.closed_form import ROUGH_SMOOTHING
 from mimic.retargeting.costs import Costs, smoothness_derivatives, sum_of, with_costs
 from mimic.retargeting.initial_guesses import RandomPoses, initial_guesses, random_poses, typical_distance
 from mimic.retargeting.optimizers import Derivatives, Scalars, Solution, Store, newton
-from mimic.retargeting.pose import (
-    FLAT,
-    ITERATIONS,
-    PoseImitation,
-    checked_poses,
-    continuous_joints,
-    pose_limits,
-    shared_joints,
-    wrap_angles,
-)
+from mimic.retargeting.pose import FLAT, ITERATIONS, PoseImitation, checked_poses, shared_joints, wrap_angles
 from mimic.retargeting.pose_objective import PoseObjective, Target, pose_objective
 
 _TRACKING_ITERATIONS = 6  # Newton steps from the pose at the neighbouring time

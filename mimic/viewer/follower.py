@@ -13,12 +13,13 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arm import Arm, build_arm
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import check_correspondence
 from mimic.metric.distance import DistanceWeights, Metric
 from mimic.metric.kinematics import link_states
 from mimic.metric.similarity import centre_line, similarity
-from mimic.retargeting.pose import continuous_joints, imitate_pose, wrap_angles
+from mimic.retargeting.pose import imitate_pose, wrap_angles
 
 Mapper = Callable[[Array], Array]  # pose of the expert -> pose of the learner
 

@@ -8,7 +8,7 @@ import pytest
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import bounding_capsule, fit_capsules
 from mimic.arms.embodiment import panda_path
-from mimic.retargeting.costs import capsule_axes, pair_distances
+from mimic.metric.capsule_distances import capsule_axes, pair_distances
 
 
 def distances_to_axis(points, start, end):

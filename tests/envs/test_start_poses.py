@@ -12,8 +12,8 @@ from mimic.envs.wrappers import fresh_episodes
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_frames import RolloutFrames
 from mimic.evaluation.searched_torques import _task
+from mimic.metric.capsule_distances import capsule_axes, pair_distances
 from mimic.motions.demonstrations import Demonstrations
-from mimic.retargeting.costs import capsule_axes, pair_distances
 
 SETTINGS = {"demonstrations": {"count": 3, "held_out": 2}, "horizon": 6}
 

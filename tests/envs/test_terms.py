@@ -12,7 +12,7 @@ import mimic
 from mimic.envs.imitation import layout_of
 from mimic.envs.make import make_env
 from mimic.envs.wrappers import fresh_episodes
-from mimic.retargeting.costs import capsule_axes
+from mimic.metric.capsule_distances import capsule_axes
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_plugins import used_plugins
 

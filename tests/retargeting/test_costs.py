@@ -12,17 +12,15 @@ import pytest
 from mimic.arms.arm import ArmConfig, arm_spec
 from mimic.arms.capsules import Capsules, fit_capsules
 from mimic.arms.embodiment import panda, planar_arm
+from mimic.metric.capsule_distances import capsule_axes, pair_distances, segment_distance
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.costs import (
     Costs,
     automatic_derivatives,
-    capsule_axes,
     hand_cost,
     home_cost,
     limit_cost,
-    pair_distances,
     pose_cost,
-    segment_distance,
     smoothness_derivatives,
 )
 from mimic.retargeting.pose import imitate_pose

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from mimic.arms.embodiment import planar_arm
+from mimic.arms.pose_limits import pose_limits
 from mimic.base import compat
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import resting_link_states
 from mimic.retargeting.multistart import Descents, best_descent
-from mimic.retargeting.pose import pose_limits
 from mimic.retargeting.pose_objective import pose_objective
 
 EXPERT, LEARNER = planar_arm([0.4, 0.35, 0.25]), planar_arm([0.6, 0.4])

@@ -6,9 +6,9 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
+from mimic.metric.capsule_distances import changing_pairs
 from mimic.physics.mujoco_world import FLOOR, mujoco_world
 from mimic.physics.world import WorldConfig
-from mimic.retargeting.costs import changing_pairs
 from mimic.retargeting.self_collision import smallest_clearances, touching_line
 
 POSES = 400

@@ -16,12 +16,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import continuous_joints, pose_limits
 from mimic.base.compilation import on_host
 from mimic.envs.config import EnvConfig
 from mimic.metric.config import MetricConfig
 from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
-from mimic.retargeting.pose import checked_poses, continuous_joints, pose_limits, wrap_angles
+from mimic.retargeting.pose import checked_poses, wrap_angles
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings
 from mimic.trainers.run_config import load_config
