@@ -1,17 +1,11 @@
 """`python -m mimic.inspect ARM.xml`: inspects an arm before training: joints, links, limits and kinematic bound."""
 
-from mimic.base import compat
 from mimic.commands import cli
 from mimic.commands.config import InspectConfig
 
 
 def prepare(config: InspectConfig) -> cli.Work:
-    """Prepares an inspection, see `mimic.commands.inspect`, or a replay, see `mimic.commands.inspect_divergence`."""
-    if config.divergence:
-        compat.import_mjx()
-        from mimic.commands import inspect_divergence
-
-        return inspect_divergence.prepare_replay(config)
+    """Prepares an inspection, see `mimic.commands.inspect`."""
     if config.clip:
         from pathlib import Path
 

@@ -56,7 +56,7 @@ ARM_KEYS = {  # keys of each command whose value may be just the name or file of
 }
 FIRST_KEY = {"inspect": "learner.model", "collect": "folder"}  # key of each command's positional argument
 FIRST_KEY_OF_SUFFIX = {  # the same where the argument is a file of another kind
-    "inspect": {".npz": "divergence", ".bvh": "clip", ".c3d": "clip", ".trc": "clip", ".csv": "clip"},
+    "inspect": {".bvh": "clip", ".c3d": "clip", ".trc": "clip", ".csv": "clip"},
 }
 _CONFIG_ERRORS = (
     FrozenInstanceError,

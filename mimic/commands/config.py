@@ -313,7 +313,6 @@ class InspectConfig:
       bound: whether to compute the kinematic bound of the distance, which takes a minute.
       out: new folder for a picture of both arms with their correspondence, a picture of expert poses with the
         learner's nearest poses (only with `bound`), and a JSON file of all results.
-      divergence: file that a training that diverged has written, to replay instead of an inspection.
       clip: motion capture file to inspect instead of an arm.
       capture: how it is read.
     """
@@ -323,7 +322,6 @@ class InspectConfig:
     limits: str = "none"
     bound: bool = True
     out: str = ""
-    divergence: str = ""
     clip: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
 

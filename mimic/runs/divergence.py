@@ -1,14 +1,12 @@
 """Divergence of a training: a number that is not finite."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 EXIT_CODE = 3
-FILE = "divergence.npz"  # in the run directory
 
 
 class Diverged(Exception):
@@ -16,13 +14,11 @@ class Diverged(Exception):
 
     Attributes:
       step: training steps after that epoch.
-      file: a file that repeats the first batch that is not finite, if there is one.
     """
 
     def __init__(self, step: int, what: str):
         super().__init__(f"training diverged: {what} is not finite after {step} steps")
         self.step = step
-        self.file: Path | None = None
 
 
 def check_finite(step: int, metrics: Mapping[str, float], params: Any) -> None:

@@ -284,8 +284,7 @@ def _stopped(console: Console, run_dir: Path, error: Interrupted | Diverged | OS
         console.print(f"stopped by {error}; continue with: {command}", soft_wrap=True)
         return error.exit_code
     if isinstance(error, Diverged):
-        replay = f"; replay it with: python -m mimic.inspect {error.file}" if error.file else ""
-        print(f"error: {error}; the checkpoints before it are kept in {run_dir}{replay}", file=sys.stderr)
+        print(f"error: {error}; the checkpoints before it are kept in {run_dir}", file=sys.stderr)
         return DIVERGED
     if isinstance(error, RunExists):
         print(f"error: {error}", file=sys.stderr)

@@ -33,12 +33,12 @@ class Case:
         self.statistics, *self.params = programs.initial_params(self.networks, OBSERVED, jax.random.PRNGKey(1))
         self.optimizer = optax.adam(optax.constant_schedule(0.01))
 
-    def on_device(self, staggered, unroll, unrolls, order, key, update=updates.updated):
+    def on_device(self, staggered, unroll, unrolls, order, key):
         """Policy, value and metrics by mimic."""
         policy, value = (updates.begin(params, self.optimizer) for params in self.params)
         of_run = self.networks, self.config, self.optimizer
         config = updates.UpdateConfig(*of_run, axis="devices", staggered=staggered, unroll=unroll)
-        return update((policy, value), self.statistics, unrolls, order, key, config)
+        return updates.updated((policy, value), self.statistics, unrolls, order, key, config)
 
     def expected(self):
         """The expected result: one update after the other, with means over the devices."""
@@ -97,25 +97,6 @@ def test_updates_equal_those_of_each_minibatch_in_turn(case, staggered, unroll):
             np.testing.assert_allclose(actual[0], reference, rtol=1e-5, atol=1e-7)
             assert not np.array_equal(reference, old)
         assert set(np.ravel(learner.optimizer[0].count)) == {UPDATES}
-
-
-def test_traced_updates_are_the_same(case):
-    def both(unrolls, order, key):
-        return [case.on_device(False, 1, unrolls, order, key, update) for update in (updates.updated, updates.traced)]
-
-    on_all = jax.jit(jax.vmap(both, axis_name="devices"))
-    (learners, means), (traced_learners, trace) = on_all(case.unrolls, case.order, case.keys)
-    jax.tree.map(lambda *x: np.testing.assert_allclose(*x, rtol=1e-9), learners, traced_learners)
-    *metrics, loss, norm = np.moveaxis(trace.metrics[0], -1, 0)
-    np.testing.assert_allclose(np.mean(metrics, axis=1), means.mean(axis=0), rtol=1e-9)
-    named = dict(zip(updates.METRICS, metrics, strict=True))
-    expected = named["policy_loss"] + named["value_loss"] - case.config.entropy_cost * named["entropy"]
-    np.testing.assert_allclose(loss, expected, rtol=1e-9)
-    assert (norm > LIMIT).all() and np.isfinite(norm).all() and trace.finite.all()
-    broken = case.unrolls._replace(reward=case.unrolls.reward.at[0, int(case.order[0, 2, 0]), 0].set(jnp.inf))
-    _, (_, trace) = on_all(broken, case.order, case.keys)
-    first = next(i for i in range(UPDATES) if int(case.order[0, 2, 0]) in case.order[0, i])
-    np.testing.assert_array_equal(trace.finite[1], np.arange(UPDATES) < first)
 
 
 def test_each_all_reduce_waits_for_the_one_before(case, monkeypatch):

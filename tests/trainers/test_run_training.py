@@ -262,7 +262,7 @@ def test_a_run_that_another_process_writes_is_not_resumed(finished):
 
 
 @pytest.mark.slow
-def test_a_training_that_diverges_stops_and_leaves_a_batch_to_replay(finished, tmp_path):
+def test_a_training_that_diverges_stops_and_keeps_its_checkpoints(finished, tmp_path):
     """It starts from a policy whose actions are beyond float32, although its parameters are not."""
     start, run_dir = tmp_path / "start", tmp_path / "run"
     start.mkdir()
@@ -271,16 +271,10 @@ def test_a_training_that_diverges_stops_and_leaves_a_batch_to_replay(finished, t
     save_checkpoint(start, step, (statistics, jax.tree.map(lambda x: 1e30 * x, policy), value))
     result = command("train", *TINY, f"init={start}", f"run_dir={run_dir}")
     assert result.returncode == 3, result.stderr[-2000:]
-    file = run_dir / "divergence.npz"
     (line,) = result.stderr.splitlines()
     assert re.match(r"error: training diverged: \w+ is not finite after \d+ steps; the checkpoints before it", line)
-    assert line.endswith(f"; replay it with: python -m mimic.inspect {file}")
+    assert line.endswith(f" are kept in {run_dir}")
     assert checkpoint_steps(run_dir) == [0] and not (run_dir / "report.json").exists()
-    assert "training diverged: looking for the first of 1 batches after 0 steps that is not finite" in result.stdout
-    replayed = command("inspect", str(file))
-    assert replayed.returncode == 0, replayed.stderr[-2000:]
-    assert replayed.stdout.startswith("first not finite: action in step 1 of 20, of 64 of 64 arms\n")
-    assert "replay on cpu: reproduces it, with the same metrics to the bit" in replayed.stdout
 
 
 @pytest.mark.slow

@@ -29,7 +29,6 @@ from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, PPOSettings, TrainConfig
 from mimic.trainers.ppo import training as ppo
-from mimic.trainers.ppo.programs import Replay
 from mimic.trainers.ppo.trainer import PolicyOfManyArms, with_crossovers, with_saved_demonstrations
 from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
 
@@ -180,10 +179,6 @@ class AnyArmPPOTrainer(Trainer):
     def follow(self, restored: Checkpoint | None) -> None:
         """See `ppo.train`."""
         ppo.follow(self._env, self.settings, seed=self._seed, restored=restored)  # type: ignore[arg-type]
-
-    def replay(self) -> Replay:
-        """Functions that repeat single batches of the training."""
-        return ppo.make_replay(self._env, self.settings)  # type: ignore[arg-type]
 
     def evaluate(self, params: Params) -> ArmsOutcome:
         """Runs the deterministic policy and the zero action once on each arm and demonstration."""

@@ -8,7 +8,7 @@ and with the evaluation's functions.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,6 @@ from mimic.trainers.schedules import schedules_from
 
 Params = tuple[Any, Any, Any]  # observation statistics, policy parameters, value parameters
 Metrics = dict[str, Array]
-T = TypeVar("T")
 
 _AXIS = "devices"
 _REPLICATED, _SHARDED = PartitionSpec(), PartitionSpec(_AXIS)
@@ -124,48 +123,6 @@ def compile_training(
         return compiled_start()(seed, params, done_updates, setup.expert_states)
 
     return TrainingFunctions(start_from, setup.restore, compiled_learn)
-
-
-class BatchRecord(NamedTuple):
-    """What happened in a batch.
-
-    Attributes:
-      unrolls: [rounds, time + 1, arms, ...].
-      qpos, qvel: [rounds, time, arms, joints] before each step.
-      trace: the updates.
-    """
-
-    unrolls: Unrolls
-    qpos: Array
-    qvel: Array
-    trace: updates.UpdateTrace
-
-
-class Replay(NamedTuple):
-    """The functions that repeat single batches of a training.
-
-    Attributes:
-      restore: see `TrainingFunctions`.
-      batch: state -> state after a batch, and a record of the batch; compiles in the background.
-    """
-
-    restore: Callable[..., TrainingState | None]
-    batch: Background[Callable[[TrainingState], tuple[TrainingState, BatchRecord]]]
-
-
-def compile_replay(
-    env: ImitationEnv,
-    config: PPOSettings,
-    networks: ppo_networks.PPONetworks,
-    learning_rate: optax.Schedule,
-    progress: optax.Schedule,
-) -> Replay:
-    """Compiles the functions that repeat single batches; for the arguments see `compile_training`."""
-    setup = _set_up(env, config, networks, learning_rate, progress, None)
-    of_arms = PartitionSpec(None, None, _AXIS)
-    outputs = _PARTITIONS, BatchRecord(of_arms, of_arms, of_arms, _REPLICATED)  # type: ignore[arg-type]
-    batch = _over_devices(setup.mesh, setup.training.recorded_batch, (_PARTITIONS,), outputs, donate_argnums=0)
-    return Replay(setup.restore, in_background(batch.lower(setup.shapes).compile))
 
 
 def saved_leaves(state: TrainingState) -> list[np.ndarray]:
@@ -278,11 +235,11 @@ class _Training(NamedTuple):
         env = fresh_episodes(self.env.with_expert_states(state.expert_states))
         make_policy = ppo_networks.make_inference_fn(self.networks)
 
-        def unroll(state: TrainingState, key: Array) -> tuple[TrainingState, tuple[Unrolls, tuple[()]]]:
-            return self._unroll(env, make_policy(state.params), state, key, lambda episodes: ())
+        def unroll(state: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
+            return self._unroll(env, make_policy(state.params), state, key)
 
         def batch(state: TrainingState, _: None) -> tuple[TrainingState, Array]:
-            return self._batch(unroll, updates.updated, state)[:2]
+            return self._batch(unroll, state)
 
         state, metrics = jax.lax.scan(batch, state, None, length=batches)
         means = dict(zip(updates.METRICS, jax.lax.pmean(metrics.mean(axis=0), _AXIS), strict=True))
@@ -290,29 +247,13 @@ class _Training(NamedTuple):
         loss = means["policy_loss"] + means["value_loss"] - entropy_cost * means["entropy"]
         return state, {"loss": loss, **means}
 
-    def recorded_batch(self, state: TrainingState) -> tuple[TrainingState, BatchRecord]:
-        """A batch of an epoch, with a record."""
-        env = fresh_episodes(self.env.with_expert_states(state.expert_states))
-        make_policy = ppo_networks.make_inference_fn(self.networks)
-
-        def joints(episodes: State) -> tuple[Array, Array]:
-            return arm_state(episodes).qpos, arm_state(episodes).qvel
-
-        def unroll(state: TrainingState, key: Array) -> tuple[TrainingState, tuple[Unrolls, tuple[Array, Array]]]:
-            return self._unroll(env, make_policy(state.params), state, key, joints)
-
-        state, trace, (unrolls, (qpos, qvel)) = self._batch(unroll, updates.traced, state)
-        return state, BatchRecord(unrolls, qpos, qvel, trace)
-
-    def _unroll(
-        self, env: Wrapper, policy: Any, state: TrainingState, key: Array, record: Callable[[State], T]
-    ) -> tuple[TrainingState, tuple[Unrolls, T]]:
-        """Steps of all arms, [time + 1, arms, ...], and a record of the episodes before each, [time, arms, ...]."""
+    def _unroll(self, env: Wrapper, policy: Any, state: TrainingState, key: Array) -> tuple[TrainingState, Unrolls]:
+        """The state after an unroll, and the steps of all arms, [time + 1, arms, ...]."""
 
         def elapsed(episodes: State) -> Array:
             return arm_state(episodes).step / self.env.config.horizon
 
-        def step(episodes: State, key: Array) -> tuple[State, tuple[Unrolls, T]]:
+        def step(episodes: State, key: Array) -> tuple[State, Unrolls]:
             action, extras = policy(episodes.obs, key)
             after = env.step(episodes, action)
             taken = Unrolls(
@@ -323,19 +264,17 @@ class _Training(NamedTuple):
                 1 - after.done,
                 elapsed(episodes),
             )
-            return after, (taken, record(episodes))
+            return after, taken
 
         keys = jax.random.split(key, self.config.unroll_length)
-        episodes, (steps, recorded) = jax.lax.scan(step, state.episodes, keys)
+        episodes, steps = jax.lax.scan(step, state.episodes, keys)
         last = jax.tree.map(lambda x: jnp.zeros_like(x[:1]), steps)
         last = last._replace(observation=episodes.obs[None], elapsed=elapsed(episodes)[None])
         steps = jax.tree.map(lambda *x: jnp.concatenate(x), steps, last)
-        return dataclasses.replace(state, episodes=episodes), (steps, recorded)
+        return dataclasses.replace(state, episodes=episodes), steps
 
-    def _batch(
-        self, unroll: Callable[..., Any], update: Callable[..., tuple[updates.TrainStates, T]], state: TrainingState
-    ) -> tuple[TrainingState, T, Any]:
-        """Collects unrolls, and learns from them; returns also what `update` and `unroll` return."""
+    def _batch(self, unroll: Callable[..., Any], state: TrainingState) -> tuple[TrainingState, Array]:
+        """Collects unrolls, and learns from them; returns the state and the means of the updates' metrics."""
         config = self.config
         rounds = config.batch_size * config.num_minibatches // config.num_envs
         minibatch = config.batch_size // self.devices
@@ -344,7 +283,7 @@ class _Training(NamedTuple):
             jax.random.fold_in(k, jax.lax.axis_index(_AXIS)) for k in (key_unroll, key_order, key_loss)
         )
         state, collected = jax.lax.scan(unroll, state, jax.random.split(key_unroll, rounds))
-        unrolls = jax.tree.map(lambda x: jnp.moveaxis(x, 2, 1).reshape(-1, x.shape[1], *x.shape[3:]), collected[0])
+        unrolls = jax.tree.map(lambda x: jnp.moveaxis(x, 2, 1).reshape(-1, x.shape[1], *x.shape[3:]), collected)
         statistics = running_statistics.update(state.statistics, unrolls.observation[:, :-1], pmap_axis_name=_AXIS)
         passes = jax.random.split(key_order, config.num_updates_per_batch)
         count = len(unrolls.observation)
@@ -360,9 +299,9 @@ class _Training(NamedTuple):
             unroll=2 if self.devices > 1 else 1,
         )
         states = state.policy, state.value
-        (policy, value), metrics = update(states, statistics, unrolls, order, key_loss, update_config)
+        (policy, value), metrics = updates.updated(states, statistics, unrolls, order, key_loss, update_config)
         state = dataclasses.replace(state, policy=policy, value=value, statistics=statistics, key=key)
-        return state, metrics, collected
+        return state, metrics
 
     def _settings_now(self, state: TrainingState) -> PPOSettings:
         """The settings at the present update."""

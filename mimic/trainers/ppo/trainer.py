@@ -24,7 +24,6 @@ from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, PPOSettings, TrainConfig
 from mimic.trainers.ppo import training as ppo
-from mimic.trainers.ppo.programs import Replay
 from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
 
 
@@ -165,10 +164,6 @@ class PPOTrainer(Trainer):
     def follow(self, restored: Checkpoint | None) -> None:
         """See `ppo.train`."""
         ppo.follow(self._env, self.settings, seed=self._seed, restored=restored)
-
-    def replay(self) -> Replay:
-        """Functions that repeat single batches of the training."""
-        return ppo.make_replay(self._env, self.settings)
 
     def evaluate(self, params: Params) -> Rollouts:
         """Runs the deterministic policy once on each demonstration."""

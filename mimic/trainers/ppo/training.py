@@ -22,18 +22,15 @@ from mimic.runs.checkpoints import (
     save_checkpoint,
     thin_checkpoints,
 )
-from mimic.runs.divergence import Diverged, check_finite
+from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOSettings
-from mimic.trainers.ppo.divergence import Epoch, record_divergence
 from mimic.trainers.ppo.networks import make_networks
 from mimic.trainers.ppo.programs import (
     Metrics,
     Params,
-    Replay,
     TrainingFunctions,
     TrainingState,
-    compile_replay,
     compile_training,
     initial_params,
     saved_leaves,
@@ -108,7 +105,7 @@ def train(
     best: _Best | None = None
     pending: list[Checkpoint] = []
     stop = False
-    for checkpoint in _checkpoints(env, config, seed, restored, on_compiling, run_dir):
+    for checkpoint in _checkpoints(env, config, seed, restored, on_compiling):
         if score and restored and checkpoint.step == restored.step:
             best = _best_saved(run_dir, restored, score)  # here: its function compiles as that of the training does
         if checkpoint.step not in checkpoint_steps(run_dir):
@@ -153,7 +150,7 @@ def _best_saved(run_dir: Path, restored: Checkpoint, score: Score) -> _Best | No
 
 def follow(env: ImitationEnv, config: PPOSettings, *, seed: int, restored: Checkpoint | None = None) -> None:
     """Runs the same training epochs as the first process, where `train` runs."""
-    for _ in _checkpoints(env, config, seed, restored, lambda: None, None):
+    for _ in _checkpoints(env, config, seed, restored, lambda: None):
         pass
 
 
@@ -163,12 +160,8 @@ def _checkpoints(
     seed: int,
     restored: Checkpoint | None,
     on_compiling: Callable[[], None],
-    run_dir: Path | None,
 ) -> Iterator[Checkpoint]:
-    """The checkpoint at the start of a training or the restored one, and that after each training epoch.
-
-    The first process, which has a run directory, writes the first batch that is not finite there.
-    """
+    """The checkpoint at the start of a training or the restored one, and that after each training epoch."""
     step, initial, leaves, metrics = restored or Checkpoint(0, None, None, {})
     del restored
     batches = _batches_per_epoch(config)
@@ -178,24 +171,16 @@ def _checkpoints(
     leaves = None  # frees their memory
     if state is None:
         state = _start_anew(functions, config, seed, step, initial)
-    leaves = saved_leaves(state)
-    yield Checkpoint(step, jax.device_get(state.params), leaves, metrics)
+    yield Checkpoint(step, jax.device_get(state.params), saved_leaves(state), metrics)
     walltime = metrics.get("walltime", 0.0)
     while step < config.num_timesteps:
         state, metrics, seconds = _timed(functions.epoch(), state)
         walltime += seconds
         step += batches * config.steps_per_batch
         params = jax.device_get(state.params)
-        try:
-            check_finite(step, metrics, params)
-        except Diverged as error:
-            del state  # it is as large as that of the replay
-            epoch = Epoch(step - batches * config.steps_per_batch, batches, leaves)
-            error.file = record_divergence(run_dir, lambda: make_replay(env, config), epoch)
-            raise
-        leaves = saved_leaves(state)
+        check_finite(step, metrics, params)
         speed = {"sps": batches * config.steps_per_batch / seconds, "walltime": walltime}
-        yield Checkpoint(step, params, leaves, {**speed, **metrics})
+        yield Checkpoint(step, params, saved_leaves(state), {**speed, **metrics})
 
 
 def _compile(
@@ -224,13 +209,6 @@ def _timed(
     state, means = run_epoch(state)
     metrics = {name: float(value) for name, value in jax.device_get(means).items()}
     return state, metrics, time.perf_counter() - began
-
-
-def make_replay(env: ImitationEnv, config: PPOSettings) -> Replay:
-    """Compiles the functions that repeat single batches of a training."""
-    progress = _progress(config)
-    networks = make_networks(config, env.observation_size, env.action_size)
-    return compile_replay(env, config, networks, _learning_rate(config, progress), progress)
 
 
 def _batches_per_epoch(config: PPOSettings) -> int:

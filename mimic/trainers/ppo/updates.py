@@ -9,7 +9,7 @@ import optax
 from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.ppo import networks as ppo_networks
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mimic.trainers.config import PPOSettings
 from mimic.trainers.ppo.losses import METRICS as POLICY_METRICS
@@ -17,7 +17,6 @@ from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
 from mimic.trainers.schedules import schedules_from
 
 METRICS = ("value_loss", *POLICY_METRICS)
-TRACED = (*METRICS, "loss", "gradient_norm")  # metrics of a single update, in the order of computation
 
 
 class TrainState(NamedTuple):
@@ -93,41 +92,6 @@ def updated(
     return (_staggered if config.staggered else _synchronous)(states, statistics, minibatch, order, keys, config)
 
 
-class UpdateTrace(NamedTuple):
-    """The updates of a batch, one by one.
-
-    Attributes:
-      metrics: of each update, see `TRACED`.
-      finite: whether all parameters are finite after the update.
-    """
-
-    metrics: Float[Array, "updates metrics"]
-    finite: Bool[Array, " updates"]
-
-
-def traced(
-    states: TrainStates,
-    statistics: RunningStatisticsState,
-    unrolls: Unrolls,
-    order: Int[Array, "updates minibatch"],
-    key: Array,
-    config: UpdateConfig,
-) -> tuple[TrainStates, UpdateTrace]:
-    """The same updates as `updated`, with the metrics of each. The means are over all devices."""
-    rows = unrolls.packed()
-
-    def update(states: TrainStates, inputs: tuple[Array, Array]) -> tuple[TrainStates, UpdateTrace]:
-        indices, key = inputs
-        states, metrics, norm = _update(states, statistics, unrolls.unpacked(rows[indices]), key, config)
-        means = jax.lax.pmean(metrics, config.axis)
-        named = dict(zip(METRICS, means, strict=True))
-        loss = named["policy_loss"] + named["value_loss"] - config.settings.entropy_cost * named["entropy"]
-        params = ravel_pytree([state.params for state in states])[0]
-        return states, UpdateTrace(jnp.stack([*means, loss, norm]), jnp.isfinite(params).all())
-
-    return jax.lax.scan(update, states, (order, jax.random.split(key, len(order))))
-
-
 def _synchronous(
     states: TrainStates,
     statistics: RunningStatisticsState,
@@ -138,8 +102,7 @@ def _synchronous(
 ) -> tuple[TrainStates, Array]:
     def update(states: TrainStates, inputs: tuple[Array, Array]) -> tuple[TrainStates, Array]:
         indices, key = inputs
-        states, metrics, _ = _update(states, statistics, minibatch(indices), key, config)
-        return states, metrics
+        return _update(states, statistics, minibatch(indices), key, config)
 
     states, metrics = jax.lax.scan(update, states, (order, keys), unroll=config.unroll)
     return states, metrics.mean(axis=0)
@@ -147,17 +110,16 @@ def _synchronous(
 
 def _update(
     states: TrainStates, statistics: RunningStatisticsState, batch: Unrolls, key: Array, config: UpdateConfig
-) -> tuple[TrainStates, Array, Array]:
-    """The states after an update with a minibatch, the metrics, and the norm of the gradient before it is clipped."""
+) -> tuple[TrainStates, Array]:
+    """The states after an update with a minibatch, and the metrics."""
     policy, value = states
     value_gradient, error, advantages = _value_gradient(value, statistics, batch, config)
     policy_gradient, metrics = _policy_gradient(policy, statistics, batch, advantages, key, config)
     mean = jax.lax.pmean(jnp.concatenate([policy_gradient, value_gradient]), config.axis)
     policy_mean, value_mean = mean[: len(policy_gradient)], mean[len(policy_gradient) :]
-    norm = _norm(mean)
-    policy = _step(policy, policy_mean, norm, config)
+    policy = _step(policy, policy_mean, _norm(mean), config)
     value = _step(value, value_mean, _norm(value_mean), config)
-    return (policy, value), jnp.append(error, metrics), norm
+    return (policy, value), jnp.append(error, metrics)
 
 
 def _staggered(

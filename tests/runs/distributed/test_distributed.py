@@ -21,7 +21,6 @@ from mimic.runs.distributed import process_group
 from mimic.runs.distributed.local_processes import LocalProcess, LocalProcesses, local_process
 from mimic.runs.distributed.process_group import DistributedConfig
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo.divergence import load_divergence
 from mimic.trainers.ppo.programs import initial_params
 from mimic.trainers.ppo.training import make_networks
 from mimic.trainers.run_config import run_schema
@@ -88,8 +87,7 @@ def test_the_variables_of_slurm_are_enough(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_first_process_records_a_divergence(tmp_path):
-    """All take part in the search for the first batch that is not finite."""
+def test_the_first_process_reports_a_divergence(tmp_path):
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
     networks = make_networks(PPOConfig(hidden_layers=[16]).resolve(), env.observation_size, env.action_size)
     statistics, policy, value = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
@@ -97,9 +95,7 @@ def test_the_first_process_records_a_divergence(tmp_path):
     save_checkpoint(tmp_path / "start", 0, (statistics, jax.tree.map(lambda x: 1e30 * x, policy), value))
     (first, shown), (second, silent) = finish(start(tmp_path, "init=start", "run_dir=run"))
     assert (first, second) == (3, 3), shown[-2000:] + silent[-2000:]
-    assert "replay it with: python -m mimic.inspect run/divergence.npz" in shown and "diverged" not in silent
-    recorded = load_divergence(tmp_path / "run" / "divergence.npz")
-    assert (str(recorded.finding), recorded.num_bad_arms) == ("action in step 1 of 20", 64) and recorded.devices == 2
+    assert "the checkpoints before it are kept in run\n" in shown and "diverged" not in silent
 
 
 def alone(tmp_path, *arguments):
