@@ -57,7 +57,7 @@ def untrained_bundle(folder: Path) -> Bundle:
     from mimic.trainers.run_models import save_models
 
     env = mimic.env_config("panda7dof", world="hardware", demonstrations={"count": 4, "held_out": 1})
-    config = TrainConfig(env, PPOConfig(preset="inner_loop"), compilation_cache="")
+    config = TrainConfig(env, PPOConfig(preset="inner_loop"), compilation_cache="").resolve()
     trainer = PPOTrainer(config, None)
     run = folder / "run"
     run.mkdir()

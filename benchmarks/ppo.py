@@ -27,7 +27,7 @@ from benchmarks.peers import stock
 from mimic.base import compat
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import wrap_for_training
-from mimic.trainers.config import PPOConfig, PPOSettings
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import training
 from mimic.trainers.ppo.programs import compile_training
 
@@ -39,7 +39,7 @@ SETTINGS = (  # that brax's PPO has under the same names
 )  # fmt: skip
 COLUMNS = "env case steps_per_s:,.0f spread:.1% compile_s:.1f"
 
-Case = Callable[[str, PPOSettings, int], dict[str, float]]  # environment, settings, batches of an epoch -> rates
+Case = Callable[[str, PPOConfig, int], dict[str, float]]  # environment, settings, batches of an epoch -> rates
 
 
 def rates(steps: int, times: Sequence[float]) -> dict[str, float]:
@@ -49,19 +49,19 @@ def rates(steps: int, times: Sequence[float]) -> dict[str, float]:
     return {"compile_s": compile_s, **summary_of_rates([steps / seconds for seconds in later])}
 
 
-def settings(config: PPOSettings) -> dict[str, Any]:
+def settings(config: PPOConfig) -> dict[str, Any]:
     """The settings of a resolved config that all implementations have."""
     return {name: getattr(config, name) for name in SETTINGS}
 
 
-def training_epoch(env: ImitationEnv, config: PPOSettings, batches: int) -> Any:
+def training_epoch(env: ImitationEnv, config: PPOConfig, batches: int) -> Any:
     """The compiled functions of `mimic.train`: one begins a training, one trains for a number of batches."""
     networks = training.make_networks(config, env.observation_size, env.action_size)
     schedule = optax.constant_schedule(config.learning_rate)
     return compile_training(env, config, networks, batches, schedule, None)
 
 
-def mimic_loop(physics: str, name: str, config: PPOSettings, batches: int) -> dict[str, float]:
+def mimic_loop(physics: str, name: str, config: PPOConfig, batches: int) -> dict[str, float]:
     times = [time.perf_counter()]
     start, _, epoch = training_epoch(mimic.make(name, physics=physics), config, batches)
     state = start(0)
@@ -72,7 +72,7 @@ def mimic_loop(physics: str, name: str, config: PPOSettings, batches: int) -> di
     return rates(batches * config.steps_per_batch, times)
 
 
-def brax_loop(physics: str, name: str, config: PPOSettings, batches: int) -> dict[str, float]:
+def brax_loop(physics: str, name: str, config: PPOConfig, batches: int) -> dict[str, float]:
     """Brax's own training loop, on the environment, or with "stock" on the stock one."""
     compat.mend_brax()
     imitation = mimic.make(name, physics="mjx" if physics == "stock" else physics)
@@ -95,7 +95,7 @@ def brax_loop(physics: str, name: str, config: PPOSettings, batches: int) -> dic
     return rates(batches * config.steps_per_batch, times)
 
 
-def stable_baselines(name: str, config: PPOSettings, batches: int) -> dict[str, float]:
+def stable_baselines(name: str, config: PPOConfig, batches: int) -> dict[str, float]:
     from benchmarks.peers import baselines  # of a package that may not be installed
 
     del batches  # the CPU is slow: one
@@ -111,7 +111,7 @@ CASES: dict[str, Case] = {
 }
 
 
-def run(name: str, config: PPOSettings, case: str, batches: int) -> Row:
+def run(name: str, config: PPOConfig, case: str, batches: int) -> Row:
     row: Row = {"env": name, "case": case}
     began = time.perf_counter()
     try:

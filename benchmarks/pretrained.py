@@ -87,7 +87,7 @@ def training_command(config: TrainConfig) -> str:
     """The shortest command that trains with this config, as far as it differs from the defaults."""
     trainer = CONFIGS[config.trainer.name](preset=config.trainer.preset)
     env = env_config(config.env.name)
-    default = TrainConfig(env, TrainConfig(env, trainer).resolved_trainer())
+    default = TrainConfig(env, trainer).resolve()
     values, defaults = flatten(to_dict(config)), flatten(to_dict(default))
     changed = {key: value for key, value in values.items() if value != defaults.get(key) and key not in _NOT_TRAINED}
     shown = {"env": config.env.name, "trainer": config.trainer.name, "trainer.preset": config.trainer.preset, **changed}

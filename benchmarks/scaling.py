@@ -22,7 +22,7 @@ from benchmarks.common.processes import read_metrics, train
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.common.timing import summary_of_rates
 from benchmarks.figures.canvas import plt, save
-from mimic.trainers.config import PRESETS
+from mimic.trainers.presets import PPO_PRESETS
 
 KINDS = ("weak", "strong")
 PROCESSES = ("one", "each")  # for all devices, or for each
@@ -100,7 +100,7 @@ def draw(rows: Sequence[Row], title: str, out: Path) -> None:
 def main() -> None:
     os.environ[_PREALLOCATE] = "false"  # this process only lists the devices; their memory is for the runs
     backend = "gpu" if jax.default_backend() == "gpu" else "cpu"
-    sizes = {"num_envs": PRESETS[backend]["num_envs"], "batch_size": PRESETS[backend]["batch_size"]}
+    sizes = {"num_envs": PPO_PRESETS[backend]["num_envs"], "batch_size": PPO_PRESETS[backend]["batch_size"]}
     lists = {"devices": [1, 2, 4, 8], "kinds": KINDS, "processes": PROCESSES, "seeds": [0]}
     parser = make_parser("scaling", __doc__, env="panda4dof", steps=STEPS[backend], **sizes, **lists)
     parser.add_argument("--arguments", nargs="*", default=[], metavar="KEY=VALUE", help="further ones of mimic.train")

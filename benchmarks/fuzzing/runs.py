@@ -60,7 +60,7 @@ def run_case(number: int) -> Case:
 def _good_run() -> Path:
     """A run directory with initial parameters, in a folder that ends with the process."""
     root = Path(tempfile.mkdtemp(prefix="mimic-fuzz-"))
-    config = TrainConfig(mimic.env_config("planar4dof"), _TRAINER, compilation_cache="")
+    config = TrainConfig(mimic.env_config("planar4dof"), _TRAINER, compilation_cache="").resolve()
     trainer = PoseMapperTrainer(config)
     run_dir = root / RUN
     run_dir.mkdir()

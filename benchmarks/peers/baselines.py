@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize  # pyri
 
 import mimic
 from benchmarks.peers.mujoco_task import MujocoTask
-from mimic.trainers.config import PPOSettings
+from mimic.trainers.config import PPOConfig
 
 STEPS = 256  # of each arm in a batch; the 4096 arms of a GPU would be 4096 processes
 
@@ -22,7 +22,7 @@ def make_arm(name: str, seed: int) -> MujocoTask:
     return task
 
 
-def learn(name: str, config: PPOSettings, epochs: int) -> tuple[int, list[float]]:
+def learn(name: str, config: PPOConfig, epochs: int) -> tuple[int, list[float]]:
     """Environment steps of an epoch, of one batch, and the times at which the training began and each epoch ended."""
     arms = os.cpu_count() or 1
     workers = SubprocVecEnv([functools.partial(make_arm, name, seed) for seed in range(arms)], start_method="spawn")

@@ -13,10 +13,11 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 
 from mimic.envs.config import DemonstrationConfig, EnvConfig
-from mimic.trainers.config import MAPPER_PRESETS, PRESETS, PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.presets import MAPPER_PRESETS, PPO_PRESETS
 
 _WIDTH, _COLUMN = 120, 38  # characters of a line, and in front of the explanation
-_PRESETS: dict[type, dict[str, dict[str, Any]]] = {PPOConfig: PRESETS, PoseMapperConfig: MAPPER_PRESETS}
+_PRESETS: dict[type, dict[str, dict[str, Any]]] = {PPOConfig: PPO_PRESETS, PoseMapperConfig: MAPPER_PRESETS}
 _REFERRED = {config.__name__: config for config in (TrainConfig, EnvConfig, DemonstrationConfig)}
 _ATTRIBUTE = re.compile(r"^  (\w+(?:, \w+)*): (.*(?:\n    .*)*)", re.MULTILINE)  # of a docstring's section
 

@@ -1,7 +1,7 @@
 """The config of a training run. `python -m mimic.train` composes it from mimic/conf and the command line."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Optional, Self, TypeVar
 
 from omegaconf import MISSING
 
@@ -10,68 +10,23 @@ from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, number, seed_number
 from mimic.envs.config import EnvConfig
 from mimic.runs.distributed.process_group import DistributedConfig
+from mimic.trainers.presets import INNER_LOOP, MAPPER_PRESETS, ONE_ARM, PPO_PRESETS, SAMPLED_ARMS
+
+if TYPE_CHECKING:
+    _Value = TypeVar("_Value")
+    FromPreset = Annotated[_Value, "a value once the config is resolved"]
+else:
+    FromPreset = Optional  # None: the preset's value
+
+
+def _unset() -> Any:
+    """A field without a value: the preset gives it."""
+    return dataclasses.field(default=None)
+
 
 NETWORKS = ("mlp", "joints")
 LOGGERS = ("local", "wandb", "mlflow")
 
-PRESETS: dict[str, dict[str, Any]] = {
-    # Two cores: few environments and many gradient steps on each sample, because the physics takes most of the time.
-    "cpu": {
-        "num_timesteps": 3_000_000,
-        "num_envs": 512,
-        "unroll_length": 10,
-        "batch_size": 128,
-        "num_minibatches": 32,
-        "num_updates_per_batch": 8,
-        "learning_rate": 1e-3,
-        "final_learning_rate": 0.05,
-        "discounting": 0.8,
-        "entropy_cost": 0.01,
-        "final_entropy_cost": 1.0,
-        "network": "mlp",
-        "hidden_layers": [128, 128],
-        "crossovers": 0,
-        "evaluations": 10,
-    },
-    # One GPU: enough environments to keep it busy. The high entropy cost makes the arm explore other pose branches.
-    "gpu": {
-        "num_timesteps": 150_000_000,
-        "num_envs": 4096,
-        "unroll_length": 10,
-        "batch_size": 512,
-        "num_minibatches": 32,
-        "num_updates_per_batch": 4,
-        "learning_rate": 1e-3,
-        "final_learning_rate": 0.01,
-        "discounting": 0.95,
-        "entropy_cost": 0.2,
-        "final_entropy_cost": 0.05,
-        "network": "mlp",
-        "hidden_layers": [512, 256],
-        "crossovers": 2000,
-        "evaluations": 8,
-    },
-}
-# Where the learner is drawn for each episode, an untrained policy is a good controller already: small steps, without a
-# reward for noise, and a long horizon, because it pays off late to move to another minimum of the metric.
-_OF_DRAWN_ARMS = {
-    "network": "joints",
-    "learning_rate": 3e-4,
-    "final_learning_rate": 0.1,
-    "discounting": 0.97,
-    "entropy_cost": 0.0,
-    "final_entropy_cost": 1.0,
-}
-# With an inner loop: a smaller learning rate ends with a smaller gap (measured), and delays need a longer horizon.
-_OF_INNER_LOOP = {"learning_rate": 3e-4, "discounting": 0.9, "entropy_cost": 0.02}
-# Presets in the order of the backends cpu and gpu.
-_ONE_ARM, _DRAWN_ARMS, _INNER_LOOP = ("cpu", "gpu"), ("any_arm_cpu", "any_arm"), ("inner_loop_cpu", "inner_loop")
-PRESETS |= {name: {**PRESETS[base], **_OF_DRAWN_ARMS} for name, base in zip(_DRAWN_ARMS, _ONE_ARM, strict=True)}
-PRESETS |= {name: {**PRESETS[base], **_OF_INNER_LOOP} for name, base in zip(_INNER_LOOP, _ONE_ARM, strict=True)}
-PRESETS["any_arm_cpu"] |= {"num_timesteps": 600_000, "evaluations": 5}  # eleven minutes on two cores
-PRESETS["any_arm"] |= {"num_timesteps": 30_000_000}  # 0.6 million arms; from 12 to 22 million steps on nothing changed
-# Layers twice as wide have about the same gap (docs/hardware_world.md), and a robot's computer takes longer for them.
-PRESETS["inner_loop"] |= {"num_timesteps": 120_000_000, "hidden_layers": [256, 128]}
 # Factor on the number of evaluations with a target gap, so that training ends soon after the gap is reached: an
 # evaluation takes less time than the steps between two evaluations.
 _TARGET_GAP_EVALUATIONS = 5
@@ -95,12 +50,22 @@ class TrainerConfig:
 
     @property
     def total_steps(self) -> int:
-        """Length of a training with resolved settings."""
+        """Length of a training with a resolved config."""
         raise NotImplementedError
 
-    def resolve(self) -> "TrainerConfig":
-        """The settings with every field filled in. Raises a `ValueError` where a value is out of range."""
-        raise NotImplementedError
+    def resolve(self, backend: str = "cpu", devices: int = 1, *, env: EnvConfig | None = None) -> Self:
+        """The config with a value in every field that applies; a resolved config stays as it is.
+
+        Args:
+          backend: JAX's backend, by which "auto" chooses the preset.
+          devices: number of devices that train.
+          env: the environment, by which "auto" chooses the preset too; one learner and the paper's world where None.
+
+        Raises:
+          ValueError: a value that does not fit the others, the devices or the environment.
+        """
+        del backend, devices, env
+        return self
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,85 +111,55 @@ class PPOConfig(TrainerConfig):
     name: str = "ppo"
     preset: str = "auto"
     # Sizes: `check_training_memory` rejects products that do not fit.
-    num_timesteps: int | None = number(None, at_least=1, at_most=10**12)  # a week on eight GPUs
-    num_envs: int | None = number(None, at_least=1, at_most=2**22)
-    unroll_length: int | None = number(None, at_least=1, at_most=10_000)
-    batch_size: int | None = number(None, at_least=1, at_most=2**22)
-    num_minibatches: int | None = number(None, at_least=1, at_most=100_000)
-    num_updates_per_batch: int | None = number(None, at_least=1, at_most=1000)
+    num_timesteps: FromPreset[int] = number(None, at_least=1, at_most=10**12)  # a week on eight GPUs
+    num_envs: FromPreset[int] = number(None, at_least=1, at_most=2**22)
+    unroll_length: FromPreset[int] = number(None, at_least=1, at_most=10_000)
+    batch_size: FromPreset[int] = number(None, at_least=1, at_most=2**22)
+    num_minibatches: FromPreset[int] = number(None, at_least=1, at_most=100_000)
+    num_updates_per_batch: FromPreset[int] = number(None, at_least=1, at_most=1000)
     # Adam's steps are about as large as its rate, and the initial weights are below 1.
-    learning_rate: float | None = number(None, above=0.0, at_most=1.0)
-    final_learning_rate: float | None = number(None, at_least=0.0, at_most=1.0)
-    discounting: float | None = number(None, at_least=0.0, at_most=1.0)
-    final_discounting: float | None = number(None, at_least=0.0, at_most=1.0)
+    learning_rate: FromPreset[float] = number(None, above=0.0, at_most=1.0)
+    final_learning_rate: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
+    discounting: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
+    final_discounting: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
     gae_lambda: float = number(0.9, at_least=0.0, at_most=1.0)
-    entropy_cost: float | None = number(None, at_least=0.0, at_most=1000.0)
-    final_entropy_cost: float | None = number(None, at_least=0.0, at_most=1.0)
+    entropy_cost: FromPreset[float] = number(None, at_least=0.0, at_most=1000.0)
+    final_entropy_cost: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
     clipping_epsilon: float = number(0.2, above=0.0, at_most=10.0)
     max_grad_norm: float = number(1.0, above=0.0, at_most=1e6)
     reward_scaling: float = number(10.0, above=0.0, at_most=1e6)  # its square is in the loss
-    network: str | None = None
-    hidden_layers: list[int] | None = number(None, at_least=1, at_most=2**16, entries=(1, 32))
-    crossovers: int | None = number(None, at_least=0, at_most=100_000)
+    network: FromPreset[str] = _unset()
+    hidden_layers: FromPreset[list[int]] = number(None, at_least=1, at_most=2**16, entries=(1, 32))
+    crossovers: FromPreset[int] = number(None, at_least=0, at_most=100_000)
     timed_critic: bool = True
     target_gap: float = number(0.0, at_least=0.0, at_most=100.0)
-    evaluations: int | None = number(None, at_least=1, at_most=1_000_000)
+    evaluations: FromPreset[int] = number(None, at_least=1, at_most=1_000_000)
 
     def __post_init__(self) -> None:
-        check_choice("trainer.preset", self.preset, ("auto", *PRESETS))
+        check_choice("trainer.preset", self.preset, ("auto", *PPO_PRESETS))
         check_choice("trainer.name", self.name, ("ppo",))
         if self.network is not None:
             check_choice("trainer.network", self.network, NETWORKS)
         check_ranges(self, "trainer.")
 
-    def resolve(self, backend: str = "cpu", devices: int = 1, *, env: EnvConfig | None = None) -> "PPOSettings":
-        """Returns the settings: every field has a value, and `preset` is never "auto".
-
-        Args:
-          backend: JAX's backend; it chooses the preset where that is "auto".
-          devices: number of devices that environments and batches are distributed over.
-          env: the environment, which chooses the preset too; one learner and the world of the paper where None.
-
-        Raises:
-          ValueError: numbers out of range, or batch sizes that PPO cannot divide.
-        """
-        presets = _ONE_ARM
-        if env is not None and (env.arms.are_drawn or env.has_inner_loop):
-            presets = _DRAWN_ARMS if env.arms.are_drawn else _INNER_LOOP
-        name = self.preset if self.preset != "auto" else presets[backend != "cpu"]
-        preset = PRESETS[name]
+    def resolve(self, backend: str = "cpu", devices: int = 1, *, env: EnvConfig | None = None) -> Self:
+        """See `TrainerConfig.resolve`."""
+        name = self.preset if self.preset != "auto" else _ppo_presets(env)[backend != "cpu"]
+        preset = PPO_PRESETS[name]
         if self.target_gap > 0:
             preset = {**preset, "evaluations": _TARGET_GAP_EVALUATIONS * preset["evaluations"]}
-        fields = _filled_in(self, preset)
-        if self.final_discounting is None:
-            fields["final_discounting"] = fields["discounting"]
-        settings = PPOSettings(**{**fields, "preset": name})
-        settings.check(devices)
-        return settings
+        config = _filled_in(self, preset, preset=name)
+        if config.final_discounting is None:
+            config = dataclasses.replace(config, final_discounting=config.discounting)
+        config._check(devices)
+        if env is not None and config.network != "mlp" and not env.arms.are_drawn:
+            raise ValueError(
+                f"trainer.network: expected mlp for one learner, got {config.network} (preset {name}), which is for a "
+                "learner that is drawn for each episode (env.arms)"
+            )
+        return config
 
-
-@dataclasses.dataclass(frozen=True)
-class PPOSettings(PPOConfig):
-    """A PPO config where every field has a value: used by the training and saved in the run directory."""
-
-    num_timesteps: int = MISSING
-    num_envs: int = MISSING
-    unroll_length: int = MISSING
-    batch_size: int = MISSING
-    num_minibatches: int = MISSING
-    num_updates_per_batch: int = MISSING
-    learning_rate: float = MISSING
-    final_learning_rate: float = MISSING
-    discounting: float = MISSING
-    final_discounting: float = MISSING
-    entropy_cost: float = MISSING
-    final_entropy_cost: float = MISSING
-    network: str = MISSING
-    hidden_layers: list[int] = MISSING
-    crossovers: int = MISSING
-    evaluations: int = MISSING
-
-    def check(self, devices: int) -> None:
+    def _check(self, devices: int) -> None:
         """Raises a ValueError for batch sizes that the environments or the devices cannot divide."""
         unrolls = self.batch_size * self.num_minibatches
         if unrolls % self.num_envs:
@@ -243,8 +178,8 @@ class PPOSettings(PPOConfig):
         """Environment steps of the training."""
         return self.num_timesteps
 
-    def at(self, progress: Any) -> "PPOSettings":
-        """Returns the settings at a fraction of the training, with the entropy cost and the discount factor there.
+    def at(self, progress: Any) -> Self:
+        """Returns the resolved config with entropy cost and discount factor at a fraction of the training.
 
         Args:
           progress: in [0, 1], a number or a scalar array.
@@ -263,84 +198,12 @@ class PPOSettings(PPOConfig):
         return self.batch_size * self.num_minibatches * self.unroll_length
 
 
-MAPPER_PRESETS: dict[str, dict[str, Any]] = {
-    # Network, training set and minibatches are the paper's. The paper does not state optimiser, rate, epochs, patience.
-    "paper": {
-        "inputs": "angles",
-        "outputs": "tanh",
-        "heads": 1,
-        "hidden_layers": [32, 32, 32],
-        "activation": "leaky_relu",
-        "samples": 1024,
-        "batch_size": 32,
-        "fresh": False,
-        "epochs": 2000,
-        "learning_rate": 1e-3,
-        "final_learning_rate": 1.0,
-        "weight_decay": 0.0,
-        "patience": 10,
-        "evaluations": 100,
-        "held_out_poses": 10_000,
-    },
-    # The best by measurement, both on a GPU and on two cores.
-    "large": {
-        "inputs": "link_states",
-        "outputs": "circle",
-        "heads": 4,
-        "hidden_layers": [128, 128, 128],
-        "activation": "gelu",
-        "samples": 65_536,
-        "batch_size": 512,
-        "fresh": True,
-        "epochs": 30,
-        "learning_rate": 2e-3,
-        "final_learning_rate": 1e-3,
-        "weight_decay": 0.0,
-        "patience": 0,
-        "evaluations": 10,
-        "held_out_poses": 10_000,
-    },
-    # A learner that is drawn for each training pose, on one GPU: 26 million arms and poses.
-    "any_arm": {
-        "width": 128,
-        "layers": 3,
-        "heads": 8,
-        "guesses": 8,
-        "refinements": 8,
-        "samples": 262_144,
-        "batch_size": 2048,
-        "fresh": True,
-        "epochs": 92,
-        "learning_rate": 1e-3,
-        "final_learning_rate": 1e-3,
-        "weight_decay": 1e-4,
-        "patience": 0,
-        "evaluations": 8,
-        "held_out_poses": 256,
-    },
-    # The same on two cores, in about 15 minutes: some 4000 arms and poses in a second.
-    "any_arm_cpu": {
-        "width": 64,
-        "layers": 2,
-        "heads": 8,
-        "guesses": 8,
-        "refinements": 8,
-        "samples": 65_536,
-        "batch_size": 512,
-        "fresh": True,
-        "epochs": 48,
-        "learning_rate": 2e-3,
-        "final_learning_rate": 1e-3,
-        "weight_decay": 1e-4,
-        "patience": 0,
-        "evaluations": 8,
-        "held_out_poses": 32,
-    },
+# Presets and fields that apply only to a mapper to one learner, and only to one to any arm.
+_MAPPER_PRESETS_OF = {"to one learner": ("paper", "large"), "to any arm (env.arms)": ("any_arm", "any_arm_cpu")}
+_MAPPER_FIELDS_OF = {
+    "to one learner": ("inputs", "outputs", "hidden_layers", "activation"),
+    "to any arm (env.arms)": ("width", "layers", "guesses", "refinements"),
 }
-_ONE_LEARNER_PRESETS, _ANY_ARM_PRESETS = ("paper", "large"), ("any_arm", "any_arm_cpu")
-# Fields that apply only to the network of one learner, and only to that of any arm.
-_OF_ONE_LEARNER = ("inputs", "outputs", "hidden_layers", "activation")
-_OF_ANY_ARM = ("width", "layers", "guesses", "refinements")
 ATTENTION_HEADS = 4  # of each layer of the network of any arm
 MAPPER_INPUTS, MAPPER_OUTPUTS, ACTIVATIONS = ("angles", "link_states"), ("tanh", "circle"), ("leaky_relu", "gelu")
 
@@ -393,148 +256,75 @@ class PoseMapperConfig(TrainerConfig):
 
     name: str = "pose_mapper"
     preset: str = "auto"
-    inputs: str | None = None
-    outputs: str | None = None
+    inputs: FromPreset[str] = _unset()
+    outputs: FromPreset[str] = _unset()
     # Sizes: `check_training_memory` rejects products that do not fit.
-    heads: int | None = number(None, at_least=1, at_most=1000)
-    hidden_layers: list[int] | None = number(None, at_least=1, at_most=2**16, entries=(1, 32))
-    activation: str | None = None
-    width: int | None = number(None, at_least=4, at_most=2**14)
-    layers: int | None = number(None, at_least=1, at_most=100)
-    guesses: int | None = number(None, at_least=0, at_most=1000)
-    refinements: int | None = number(None, at_least=0, at_most=1000)
-    samples: int | None = number(None, at_least=1, at_most=10**9)
-    batch_size: int | None = number(None, at_least=1, at_most=10**9)
-    fresh: bool | None = None
-    epochs: int | None = number(None, at_least=1, at_most=10_000_000)
+    heads: FromPreset[int] = number(None, at_least=1, at_most=1000)
+    hidden_layers: FromPreset[list[int]] = number(None, at_least=1, at_most=2**16, entries=(1, 32))
+    activation: FromPreset[str] = _unset()
+    width: FromPreset[int] = number(None, at_least=4, at_most=2**14)
+    layers: FromPreset[int] = number(None, at_least=1, at_most=100)
+    guesses: FromPreset[int] = number(None, at_least=0, at_most=1000)
+    refinements: FromPreset[int] = number(None, at_least=0, at_most=1000)
+    samples: FromPreset[int] = number(None, at_least=1, at_most=10**9)
+    batch_size: FromPreset[int] = number(None, at_least=1, at_most=10**9)
+    fresh: FromPreset[bool] = _unset()
+    epochs: FromPreset[int] = number(None, at_least=1, at_most=10_000_000)
     # Adam's steps are about as large as its rate, and the initial weights are below 1.
-    learning_rate: float | None = number(None, above=0.0, at_most=1.0)
-    final_learning_rate: float | None = number(None, at_least=0.0, at_most=1.0)
+    learning_rate: FromPreset[float] = number(None, above=0.0, at_most=1.0)
+    final_learning_rate: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
     dropout: float = number(0.0, at_least=0.0, below=1.0)
-    weight_decay: float | None = number(None, at_least=0.0, at_most=1000.0)  # times the rate in an update
-    patience: int | None = number(None, at_least=0, at_most=1_000_000)
+    weight_decay: FromPreset[float] = number(None, at_least=0.0, at_most=1000.0)  # times the rate in an update
+    patience: FromPreset[int] = number(None, at_least=0, at_most=1_000_000)
     target_quality: float = number(0.0, at_least=0.0, at_most=100.0)
-    evaluations: int | None = number(None, at_least=1, at_most=1_000_000)
+    evaluations: FromPreset[int] = number(None, at_least=1, at_most=1_000_000)
     validation_poses: int = number(1024, at_least=1, at_most=10_000_000)
-    held_out_poses: int | None = number(None, at_least=1, at_most=10_000_000)
+    held_out_poses: FromPreset[int] = number(None, at_least=1, at_most=10_000_000)
 
     def __post_init__(self) -> None:
         check_choice("trainer.preset", self.preset, ("auto", *MAPPER_PRESETS))
         check_choice("trainer.name", self.name, ("pose_mapper",))
         check_ranges(self, "trainer.")
 
-    def resolve(self) -> "PoseMapperSettings":
-        """Returns the settings of a mapper to one learner: every field has a value.
-
-        Raises:
-          ValueError: numbers out of range, a batch size that does not divide the samples, or a setting of a mapper to
-            any arm.
-        """
-        name = "large" if self.preset == "auto" else self.preset
-        self._check_applies(name, _ONE_LEARNER_PRESETS, _OF_ANY_ARM, "to one learner")
-        settings = PoseMapperSettings(**{**_filled_in(self, MAPPER_PRESETS[name]), "preset": name})
-        settings.check()
-        return settings
-
-    def resolve_any_arm(self, backend: str = "cpu") -> "AnyArmMapperSettings":
-        """Returns the settings of a mapper to any arm: every field that applies has a value.
-
-        Args:
-          backend: JAX's backend; it chooses the preset where that is "auto".
-
-        Raises:
-          ValueError: numbers out of range, a batch size that does not divide the samples, or a setting of a mapper to
-            one learner.
-        """
-        name = self.preset if self.preset != "auto" else "any_arm_cpu" if backend == "cpu" else "any_arm"
-        self._check_applies(name, _ANY_ARM_PRESETS, _OF_ONE_LEARNER, "to any arm (env.arms)")
-        if self.dropout:
-            raise ValueError(f"trainer.dropout: expected 0 for a mapper to any arm (env.arms), got {self.dropout}")
-        settings = AnyArmMapperSettings(**{**_filled_in(self, MAPPER_PRESETS[name]), "preset": name})
-        settings.check()
-        return settings
-
-    def _check_applies(self, preset: str, valid: tuple[str, ...], others: tuple[str, ...], kind: str) -> None:
-        """Raises a ValueError for a preset or a field of the other kind of mapper."""
-        if preset not in valid:
-            raise ValueError(f"trainer.preset: expected {' or '.join(valid)} for a mapper {kind}, got {preset}")
-        for field in others:
+    def resolve(self, backend: str = "cpu", devices: int = 1, *, env: EnvConfig | None = None) -> Self:
+        """See `TrainerConfig.resolve`; without an environment, the preset says whether the learner is any arm."""
+        del devices
+        one, many = _MAPPER_PRESETS_OF
+        is_of_many = self.preset in _MAPPER_PRESETS_OF[many] if env is None else env.arms.are_drawn
+        kind, other = (many, one) if is_of_many else (one, many)
+        auto = "large" if not is_of_many else "any_arm_cpu" if backend == "cpu" else "any_arm"
+        name = auto if self.preset == "auto" else self.preset
+        if name not in (valid := _MAPPER_PRESETS_OF[kind]):
+            raise ValueError(f"trainer.preset: expected {' or '.join(valid)} for a mapper {kind}, got {name}")
+        for field in _MAPPER_FIELDS_OF[other]:
             if getattr(self, field) is not None:
                 raise ValueError(f"trainer.{field}: expected none for a mapper {kind}, got {getattr(self, field)}")
+        if is_of_many and self.dropout:
+            raise ValueError(f"trainer.dropout: expected 0 for a mapper {kind}, got {self.dropout}")
+        config = _filled_in(self, MAPPER_PRESETS[name], preset=name)
+        config._check(is_of_many)
+        return config
 
-    def _check_batch_size(self) -> None:
-        if self.samples % self.batch_size:  # type: ignore[operator] - called by classes whose fields have values
+    def _check(self, is_of_many: bool) -> None:
+        """Raises a ValueError for an unknown choice, or a size that another one cannot divide."""
+        if not is_of_many:
+            check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
+            check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
+            check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
+        elif self.width % ATTENTION_HEADS:
+            raise ValueError(f"trainer.width: expected a multiple of {ATTENTION_HEADS}, got {self.width}")
+        if self.samples % self.batch_size:
             raise ValueError(
                 f"trainer.batch_size: expected a divisor of samples = {self.samples}, got {self.batch_size}"
             )
 
-
-@dataclasses.dataclass(frozen=True)
-class PoseMapperSettings(PoseMapperConfig):
-    """A pose mapper's config where every field has a value, but for those of a mapper to any arm."""
-
-    inputs: str = MISSING
-    outputs: str = MISSING
-    heads: int = MISSING
-    hidden_layers: list[int] = MISSING
-    activation: str = MISSING
-    samples: int = MISSING
-    batch_size: int = MISSING
-    fresh: bool = MISSING
-    epochs: int = MISSING
-    learning_rate: float = MISSING
-    final_learning_rate: float = MISSING
-    weight_decay: float = MISSING
-    patience: int = MISSING
-    evaluations: int = MISSING
-    held_out_poses: int = MISSING
-
-    def check(self) -> None:
-        """Raises a ValueError for an unknown choice, or a batch size that does not divide the samples."""
-        check_choice("trainer.inputs", str(self.inputs), MAPPER_INPUTS)
-        check_choice("trainer.outputs", str(self.outputs), MAPPER_OUTPUTS)
-        check_choice("trainer.activation", str(self.activation), ACTIVATIONS)
-        self._check_batch_size()
-
     @property
     def total_steps(self) -> int:
-        """Training poses, counted in every epoch."""
+        """Training poses, to any arm each with an arm, counted in every epoch."""
         return self.samples * self.epochs
 
 
-@dataclasses.dataclass(frozen=True)
-class AnyArmMapperSettings(PoseMapperConfig):
-    """The config of a mapper to any arm where every field has a value, but for those of a mapper to one learner."""
-
-    heads: int = MISSING
-    width: int = MISSING
-    layers: int = MISSING
-    guesses: int = MISSING
-    refinements: int = MISSING
-    samples: int = MISSING
-    batch_size: int = MISSING
-    fresh: bool = MISSING
-    epochs: int = MISSING
-    learning_rate: float = MISSING
-    final_learning_rate: float = MISSING
-    weight_decay: float = MISSING
-    patience: int = MISSING
-    evaluations: int = MISSING
-    held_out_poses: int = MISSING
-
-    def check(self) -> None:
-        """Raises a ValueError for a width that attention cannot divide, or a batch size that no epoch can."""
-        if self.width % ATTENTION_HEADS:
-            raise ValueError(f"trainer.width: expected a multiple of {ATTENTION_HEADS}, got {self.width}")
-        self._check_batch_size()
-
-    @property
-    def total_steps(self) -> int:
-        """Training poses, each with an arm, counted in every epoch."""
-        return self.samples * self.epochs
-
-
-MapperSettings = PoseMapperSettings | AnyArmMapperSettings
+_Config = TypeVar("_Config", bound=TrainerConfig)
 BUILT_IN_TRAINERS: dict[str, type[TrainerConfig]] = {"ppo": PPOConfig, "pose_mapper": PoseMapperConfig}
 registry.reserve("trainer", tuple(BUILT_IN_TRAINERS))
 
@@ -562,10 +352,17 @@ def trainer_config(name: str) -> type[TrainerConfig]:
     return config_class
 
 
-def _filled_in(config: TrainerConfig, preset: dict[str, Any]) -> dict[str, Any]:
-    """All fields; where one is None, the preset's value."""
-    fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    return {key: preset.get(key) if value is None else value for key, value in fields.items()}
+def _ppo_presets(env: EnvConfig | None) -> tuple[str, str]:
+    """The presets for an environment, on the backends cpu and gpu."""
+    if env is not None and env.arms.are_drawn:
+        return SAMPLED_ARMS
+    return INNER_LOOP if env is not None and env.has_inner_loop else ONE_ARM
+
+
+def _filled_in(config: _Config, values: dict[str, Any], **changes: Any) -> _Config:
+    """The config with these values of a preset where its fields are None, and some changes."""
+    unset = [field.name for field in dataclasses.fields(config) if getattr(config, field.name) is None]
+    return dataclasses.replace(config, **{name: values.get(name) for name in unset}, **changes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -613,19 +410,6 @@ class TrainConfig:
         """The names in `logger` as a list."""
         return [self.logger] if isinstance(self.logger, str) else list(map(str, self.logger or ()))
 
-    def resolved_trainer(self, backend: str = "cpu", devices: int = 1) -> TrainerConfig:
-        """The trainer's settings for this environment, with every field that applies filled in.
-
-        Args:
-          backend: JAX's backend; it chooses the preset where that is "auto".
-          devices: number of devices.
-
-        Raises:
-          ValueError: a value out of range, or one that does not apply to the environment.
-        """
-        drawn_arms = self.env.arms.are_drawn
-        if isinstance(self.trainer, PPOConfig):
-            return self.trainer.resolve(backend, devices, env=self.env)
-        if isinstance(self.trainer, PoseMapperConfig) and drawn_arms:
-            return self.trainer.resolve_any_arm(backend)
-        return self.trainer.resolve()
+    def resolve(self, backend: str = "cpu", devices: int = 1) -> Self:
+        """The config with a resolved trainer, see `TrainerConfig.resolve`."""
+        return dataclasses.replace(self, trainer=self.trainer.resolve(backend, devices, env=self.env))

@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jax
+
 from mimic.base import compat, registry
 from mimic.motions.demonstrations import Demonstrations
 from mimic.trainers.config import TrainConfig
@@ -28,6 +30,7 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
       ValueError: a config that cannot be trained, or not in the memory that there is.
     """
     name = config.trainer.name
+    config = config.resolve(jax.default_backend(), jax.device_count())
     check_training_memory(config)
     if name in _MAKERS:
         return _MAKERS[name](config, run_dir)

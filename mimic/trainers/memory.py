@@ -4,8 +4,6 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 
-import jax
-
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS
 from mimic.arms.embodiment import Embodiment
 from mimic.base.memory import check_memory, device_memory, host_memory
@@ -21,8 +19,11 @@ _NETWORKS = 2  # policy and value
 def check_training_memory(config: TrainConfig) -> None:
     """Raises a ValueError that names the settings of the largest part if a training cannot fit into the memory.
 
+    Args:
+      config: of the training, with a resolved trainer.
+
     Raises:
-      ValueError: also where the settings or the arms are invalid.
+      ValueError: also where the arms are invalid.
     """
     # Where the learner is drawn, the whole one counts.
     env = dataclasses.replace(config.env, arms=ArmsConfig())
@@ -48,10 +49,9 @@ def _demonstration_bytes(config: TrainConfig, expert: Embodiment) -> dict[str, f
     return {"env.demonstrations.count, env.horizon": numbers * _FLOAT64}
 
 
-def _ppo_bytes(config: TrainConfig, trainer: PPOConfig, expert: Embodiment, learner: Embodiment) -> dict[str, float]:
+def _ppo_bytes(config: TrainConfig, settings: PPOConfig, expert: Embodiment, learner: Embodiment) -> dict[str, float]:
     """Networks; observations of a batch and of the environments; hidden units of a minibatch."""
     drawn_arms = config.env.arms.are_drawn
-    settings = trainer.resolve(jax.default_backend(), jax.device_count(), env=config.env)
     observation = 12 * (learner.num_links + (config.env.preview + 1) * expert.num_links)
     if drawn_arms:
         observation = observation_size(expert.num_links)
@@ -68,9 +68,8 @@ def _ppo_bytes(config: TrainConfig, trainer: PPOConfig, expert: Embodiment, lear
     }
 
 
-def _mapper_bytes(trainer: PoseMapperConfig, expert: Embodiment, learner: Embodiment) -> dict[str, float]:
+def _mapper_bytes(settings: PoseMapperConfig, expert: Embodiment, learner: Embodiment) -> dict[str, float]:
     """Network; poses of all splits; hidden units of a minibatch."""
-    settings = trainer.resolve()
     poses = float(settings.samples + settings.validation_poses + settings.held_out_poses)
     widths = [expert.num_joints, *settings.hidden_layers, settings.heads * learner.num_joints]
     return {
@@ -80,9 +79,8 @@ def _mapper_bytes(trainer: PoseMapperConfig, expert: Embodiment, learner: Embodi
     }
 
 
-def _any_arm_mapper_bytes(trainer: PoseMapperConfig) -> dict[str, float]:
+def _any_arm_mapper_bytes(settings: PoseMapperConfig) -> dict[str, float]:
     """Network; hidden units of a minibatch, each token of a link has those of all layers; Jacobians of Newton steps."""
-    settings = trainer.resolve_any_arm(jax.default_backend())
     units = float(settings.width) * settings.layers
     poses = float(settings.held_out_poses) * (settings.heads + settings.guesses)
     return {

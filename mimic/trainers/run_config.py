@@ -89,7 +89,7 @@ def _read_config(run_dir: Path) -> TrainConfig:
         name = OmegaConf.select(content, "trainer.name")
         registry.check("trainer", str(name), "trainer.name")
         content = merged(run_schema(name), _with_old_defaults(content))
-        return typed(content)
+        return typed(content).resolve()
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
 

@@ -11,22 +11,12 @@ import pytest
 
 from mimic.base.ranges import Range, all_ranges, check_ranges, number, ranges
 from mimic.commands import config as commands
-from mimic.trainers.config import (
-    AnyArmMapperSettings,
-    PoseMapperConfig,
-    PoseMapperSettings,
-    PPOConfig,
-    PPOSettings,
-    TrainConfig,
-)
+from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 
 CONFIGS = (
     TrainConfig,
     PPOConfig,
-    PPOSettings,
     PoseMapperConfig,
-    PoseMapperSettings,
-    AnyArmMapperSettings,
     *(value for name, value in vars(commands).items() if name.endswith("Config") and dataclasses.is_dataclass(value)),
 )
 

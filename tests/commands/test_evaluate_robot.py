@@ -46,7 +46,7 @@ def untrained(folder, **settings):
     env = mimic.env_config(
         "panda7dof", limits="hardware", horizon=HORIZON, demonstrations={"count": 2, "held_out": HELD_OUT}, **settings
     )
-    config = TrainConfig(env, PPOConfig(hidden_layers=[8], preset="cpu"), compilation_cache="")
+    config = TrainConfig(env, PPOConfig(hidden_layers=[8], preset="cpu"), compilation_cache="").resolve()
     trainer = PPOTrainer(config, None)
     folder.mkdir()
     save_models(folder, config.env)

@@ -10,7 +10,8 @@ from mimic.__main__ import commands
 from mimic.base.config import schema
 from mimic.commands import cli
 from mimic.commands.key_help import explanations, key_lines
-from mimic.trainers.config import BUILT_IN_TRAINERS, MAPPER_PRESETS, PRESETS
+from mimic.trainers.config import BUILT_IN_TRAINERS
+from mimic.trainers.presets import MAPPER_PRESETS, PPO_PRESETS
 
 
 def shown(monkeypatch, capsys, name, *arguments):
@@ -41,11 +42,11 @@ def value(keys, key):
 
 def test_presets_are_shown_in_place_of_null(monkeypatch, capsys):
     keys = shown(monkeypatch, capsys, "train")
-    cpu, gpu = (PRESETS[name]["num_envs"] for name in ("cpu", "gpu"))
+    cpu, gpu = (PPO_PRESETS[name]["num_envs"] for name in ("cpu", "gpu"))
     assert value(keys, "num_envs") == f"{cpu} (cpu, any_arm_cpu, inner_loop_cpu), {gpu} (gpu, any_arm, inner_loop)"
     assert value(keys, "unroll_length") == "10" and value(keys, "final_discounting") == "null"
     keys = shown(monkeypatch, capsys, "train", "trainer.preset=gpu", "trainer.crossovers=7")
-    assert value(keys, "num_envs") == str(PRESETS["gpu"]["num_envs"]) and value(keys, "crossovers") == "7"
+    assert value(keys, "num_envs") == str(PPO_PRESETS["gpu"]["num_envs"]) and value(keys, "crossovers") == "7"
     keys = shown(monkeypatch, capsys, "train", "trainer=pose_mapper", "trainer.preset=paper")
     assert value(keys, "samples") == str(MAPPER_PRESETS["paper"]["samples"])
     keys = shown(monkeypatch, capsys, "train", "env=panda3dof")

@@ -29,7 +29,7 @@ def family(**changes: Any) -> EnvConfig:
 
 def untrained_family(folder: Path, **changes: Any) -> Path:
     """What a training run leaves, but with its initial parameters: no training is compiled."""
-    config = TrainConfig(family(**changes), PPOConfig(hidden_layers=[8]), compilation_cache="")
+    config = TrainConfig(family(**changes), PPOConfig(hidden_layers=[8]), compilation_cache="").resolve()
     trainer = make_any_arm_trainer(config, None)
     folder.mkdir()
     save_models(folder, config.env)

@@ -34,7 +34,7 @@ def environment(learner: Sequence[float] = (0.5, 0.5), model: str = "planar") ->
 def untrained_run(folder: Path, **settings: Any) -> Path:
     """What a training run leaves, but with its initial parameters: no training is compiled."""
     ppo = PPOConfig(hidden_layers=[8], preset="cpu")
-    config = TrainConfig(environment(**settings), ppo, compilation_cache="")
+    config = TrainConfig(environment(**settings), ppo, compilation_cache="").resolve()
     trainer = PPOTrainer(config, None)
     folder.mkdir()
     save_models(folder, config.env)

@@ -21,7 +21,7 @@ from mimic.envs.family import arm_sampler
 from mimic.metric.similarity import MEASURES
 from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers import run_training as session
-from mimic.trainers.config import AnyArmMapperSettings, PoseMapperConfig, TrainConfig
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.any_arm_evaluation import METHODS, Mapped, Reference, best_poses, table_of_pairs
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, load_mapper
 from mimic.trainers.pose_mapper.any_arm_model import expert_pose, make_any_arm_model
@@ -133,7 +133,7 @@ def test_evaluate_repeats_the_report(trained, tmp_path):
 @pytest.mark.slow
 def test_splits_without_arms_are_left_out(tmp_path):
     """All arms are seen in training; and if the config names none that are, the report draws some."""
-    trainer = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 1.0, "most_locked": 1, "unseen": []}))
+    trainer = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 1.0, "most_locked": 1, "unseen": []}).resolve())
     distances = np.linspace(0.1, 0.2, 16).reshape(8, 2)
     mapped = Mapped(distances, np.zeros((8, 2, MAX_JOINTS)), distances)
     reference = Reference(distances / 2, mapped.qpos, distances, mapped.qpos, distances, distances + 1)
@@ -141,7 +141,7 @@ def test_splits_without_arms_are_left_out(tmp_path):
     metrics = trainer.metrics({"arms": mapped})
     assert set(metrics["quality"]) == {"train"} and "unseen" not in trainer.status(metrics)
     assert trainer.rows(metrics)[0] == ("number of arms", "8", "0") and trainer.rows(metrics)[1][2] == ""
-    drawn = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 0.0, "unseen": [], "random": 1.0}))
+    drawn = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 0.0, "unseen": [], "random": 1.0}).resolve())
     assert len(drawn._arms["train"]) == 16 and len(drawn._arms["held_out"]) == 16
 
 
@@ -229,7 +229,8 @@ def test_training_reduces_the_loss():
 
     config = run_config("", samples=6400, epochs=1, learning_rate=1e-2).trainer
     assert isinstance(config, PoseMapperConfig)
-    settings, env = config.resolve_any_arm(), env_config("panda_family", arms=FEW_ARMS)
+    env = env_config("panda_family", arms=FEW_ARMS)
+    settings = config.resolve(env=env)
     model = make_any_arm_model(env, settings)
     objective = any_arm_objective(model, arm_sampler(env))
     optimiser = training._optimiser(settings)
@@ -290,16 +291,14 @@ def test_settings_of_any_arm_are_rejected_for_one_learner():
     with pytest.raises(ValueError, match="trainer.guesses: expected none for a mapper to one learner, got 0"):
         PoseMapperConfig(guesses=0).resolve()
     with pytest.raises(ValueError, match="trainer.preset: expected paper or large for a mapper to one learner"):
-        PoseMapperConfig(preset="any_arm").resolve()
+        PoseMapperConfig(preset="any_arm").resolve(env=env_config("panda4dof"))
 
 
 def test_the_backend_chooses_the_preset():
     for backend, preset in (("cpu", "any_arm_cpu"), ("gpu", "any_arm")):
-        settings = PoseMapperConfig().resolve_any_arm(backend)
+        settings = PoseMapperConfig().resolve(backend, env=env_config("panda_family"))
         assert settings.preset == preset
-        unset = [
-            field.name for field in dataclasses.fields(AnyArmMapperSettings) if getattr(settings, field.name) is None
-        ]
+        unset = [field.name for field in dataclasses.fields(PoseMapperConfig) if getattr(settings, field.name) is None]
         assert set(unset) == {"inputs", "outputs", "hidden_layers", "activation"}
     assert PoseMapperConfig().resolve().preset == "large"
 

@@ -38,7 +38,7 @@ ATOL = 1e-3  # rad: a Newton step magnifies rounding errors
 
 def untrained_run(run_dir, expert):
     env = env_config("panda_family", arms={**DRAWN, "expert": expert})
-    config = PoseMapperConfig(**TINY).resolve_any_arm()
+    config = PoseMapperConfig(**TINY).resolve(env=env)
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env, config))
     save_checkpoint(run_dir, 1, jax.jit(make_any_arm_model(env, config).init)(jax.random.key(0)))
@@ -201,8 +201,8 @@ def test_training_reduces_the_loss():
     """Two hundred updates of the smallest network lower the distance of its proposals by a quarter."""
     from mimic.trainers.pose_mapper import training
 
-    settings = PoseMapperConfig(**{**TINY, "samples": 6400, "learning_rate": 1e-2}).resolve_any_arm()
     env = env_config("panda_family", arms=DRAWN)
+    settings = PoseMapperConfig(**{**TINY, "samples": 6400, "learning_rate": 1e-2}).resolve(env=env)
     model = make_any_arm_model(env, settings)
     objective = any_arm_objective(model, arm_sampler(env))
     optimiser = training._optimiser(settings)

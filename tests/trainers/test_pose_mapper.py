@@ -141,7 +141,7 @@ def test_the_paper_overfits_and_early_stopping_goes_back_to_the_best(tmp_path):
 
 
 def test_evaluation_poses_are_not_training_poses(tmp_path):
-    jobs = [PoseMapperTrainer(run_config(tmp_path, seed=seed)) for seed in (0, 1)]
+    jobs = [PoseMapperTrainer(run_config(tmp_path, seed=seed).resolve()) for seed in (0, 1)]
     for job in jobs:
         training_poses = np.asarray(job._poses["train"])
         for split in ("validation", "held_out"):
@@ -200,7 +200,7 @@ def test_a_regularised_run_differs_in_training_and_repeats_its_report(tmp_path):
         for name, settings in (("plain", {}), ("regularised", {"dropout": 0.3, "weight_decay": 0.1}))
     )
     assert plain["quality"] != regularised["quality"]
-    job = PoseMapperTrainer(run_config(tmp_path, dropout=0.3, **SHORT))
+    job = PoseMapperTrainer(run_config(tmp_path, dropout=0.3, **SHORT).resolve())
     mapper = mimic.PoseMapper.load(tmp_path / "regularised")
     assert job.metrics(job.evaluate(mapper.params))["quality"] == pytest.approx(regularised["quality"], rel=1e-5)
 

@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from mimic.trainers.config import PPOConfig, PPOSettings
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import programs, training, updates
 from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
 
@@ -23,7 +23,7 @@ SIZES = OBSERVED, ACTIONS = 5, 2
 class Case:
     """Data and settings of updates; the first axis of each array is the device."""
 
-    config: PPOSettings
+    config: PPOConfig
     unrolls: Unrolls
     order: jax.Array
     keys: jax.Array

@@ -6,7 +6,7 @@ from omegaconf import OmegaConf
 from mimic.arms.arm import ArmConfig
 from mimic.metric.config import MetricConfig
 from mimic.runs.files import CONFIG
-from mimic.trainers.config import PPOSettings
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.run_config import load_config
 from tests.helpers import original_model
 from tests.helpers.run_directories import write_run
@@ -75,5 +75,5 @@ def test_an_old_run_keeps_its_critic_and_its_schedule(tmp_path):
     content.trainer.pop("final_entropy_cost", None)
     OmegaConf.save(content, run_dir / CONFIG)
     settings = load_config(run_dir).trainer.resolve()
-    assert isinstance(settings, PPOSettings)
+    assert isinstance(settings, PPOConfig)
     assert settings.timed_critic is False and settings.final_entropy_cost == 1

@@ -102,9 +102,6 @@ class OwnConfig(TrainerConfig):
     preset: str = "none"
     rate: float = 0.5
 
-    def resolve(self):
-        return self
-
 
 class OwnTrainer:
     config_class = OwnConfig

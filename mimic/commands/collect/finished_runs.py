@@ -146,7 +146,7 @@ def _read(path: Path, name: str) -> FinishedRun | LeftOut:
     version = _version(report or {})
     try:
         config = load_config(path, saved_models=False)  # runs of one arm are compared by its original path
-        total = config.resolved_trainer().total_steps
+        total = config.trainer.total_steps
     except ValueError as error:
         return LeftOut(name, f"{_other_version(version) if report else ''}{error}")
     try:

@@ -213,7 +213,7 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str
     else:
         layout = observation_layout(expert, learner, trained.env.preview)
     size = layout[-1]["stop"]
-    config = cast(PPOConfig, trained.trainer).resolve()  # saved with all values resolved
+    config = cast(PPOConfig, trained.trainer)
     params = load_checkpoint(run_dir, training.params_template(config, size, learner.num_joints), steps)[1]
     controller = training.make_controller(config, size, learner.num_joints)(jax.device_get(params))
     scale = jnp.asarray(torque_scale(arms.learner, trained.env.action_scale, trained.env.control_dt))

@@ -67,7 +67,7 @@ def _mapper(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction
 
 def _policy(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction:
     """A step of the controller of any arm with the policy, as in `AnyArmEnv`."""
-    env, config = trained.env, cast(PPOConfig, trained.trainer).resolve()  # saved with all values resolved
+    env, config = trained.env, cast(PPOConfig, trained.trainer)
     built = build_arm(env.expert, env.limits, env.metric.links)
     expert, weights, dt = built.embodiment, check_metric(env.metric), env.control_dt
     expert_arrays: ArmArrays = jax.tree.map(jnp.asarray, arm_arrays(built).astype(np.float32))

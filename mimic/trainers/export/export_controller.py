@@ -56,8 +56,7 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
     check_supported(trained.env.control, trained.env.control_dt)
     steps = check_checkpoint(run_dir, checkpoint)
     env = cast(HardwareEnv, run_environment(trained.env, run_dir)[0])
-    settings = config.resolve()  # saved with all values resolved
-    template = training.params_template(settings, env.observation_size, env.action_size)
+    template = training.params_template(config, env.observation_size, env.action_size)
     params = load_checkpoint(run_dir, template, steps)[1]
 
     def write(out: Path) -> None:
@@ -69,7 +68,7 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
                 policy=policy,
                 features=features,
                 clearance=clearance_constants(env.learner, env.capsules, env.config.world.floor_height),
-                controller=_description(env, steps) | {"features": settings.hidden_layers[0]},
+                controller=_description(env, steps) | {"features": config.hidden_layers[0]},
                 expert=expert_table(env),
                 start_poses=np.asarray(env.start_poses, float),
                 names=[f"demonstration {index}" for index in range(env.demonstrations.count)],

@@ -85,7 +85,7 @@ class AnyArmMapper:
         """
         assert isinstance(config.trainer, PoseMapperConfig)
         env = config.env
-        model = make_any_arm_model(env, config.trainer.resolve_any_arm())
+        model = make_any_arm_model(env, config.trainer)
         template = jax.eval_shape(model.init, jax.random.key(0))
         expert = DescribedArm.without_locks(build_arm(env.expert, env.limits, env.metric.links))
         return cls(model, read_params(template), expert, env, report or {})

@@ -24,7 +24,7 @@ from mimic.metric.array_kinematics import (
 from mimic.metric.distance import DistanceWeights
 from mimic.metric.kinematics import LinkStates
 from mimic.retargeting.array_nearest import angle_limits, nearest_pose
-from mimic.trainers.config import AnyArmMapperSettings
+from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.networks import Transformer
 
 Params = Any
@@ -183,7 +183,7 @@ class AnyArmMapperModel:
         return joints, links, of_expert, learner.is_free, has_link, has_expert_link
 
 
-def make_any_arm_model(env: EnvConfig, settings: AnyArmMapperSettings) -> AnyArmMapperModel:
+def make_any_arm_model(env: EnvConfig, settings: PoseMapperConfig) -> AnyArmMapperModel:
     """The untrained mapper of an environment's experts and metric.
 
     Raises:

@@ -17,7 +17,7 @@ from mimic.envs.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import write_atomically
 from mimic.runs.signals import Signals
-from mimic.trainers.config import AnyArmMapperSettings, PoseMapperConfig, TrainConfig
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.any_arm_evaluation import (
     METHODS,
@@ -66,7 +66,7 @@ class AnyArmMapperTrainer(Trainer):
     def __init__(self, config: TrainConfig, run_dir: Path | None = None):
         del run_dir
         assert isinstance(config.trainer, PoseMapperConfig)
-        self.settings: AnyArmMapperSettings = config.trainer.resolve_any_arm(jax.default_backend())
+        self.settings: PoseMapperConfig = config.trainer
         self._name, self._seed = config.env.name, config.seed % 2**31  # the range of a 32-bit integer
         self.total_steps = self.settings.total_steps
         self.env_config = config.env

@@ -24,7 +24,7 @@ from mimic.metric.distance import Metric
 from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import checked_poses, wrap_angles
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings
+from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.run_config import load_config
 
 Params = Any
@@ -64,7 +64,7 @@ class MapperModel:
     expert: Embodiment
     learner: Embodiment
     metric: MetricConfig
-    config: PoseMapperSettings
+    config: PoseMapperConfig
 
     @functools.cached_property
     def _network(self) -> _Network:
@@ -199,7 +199,7 @@ class PoseMapper:
                 f"{os.fspath(run_dir)!r}: expected a run with one learner, got env={config.env.name}; load it with "
                 "mimic.AnyArmMapper.load(RUN_DIR).to(LEARNER)"
             )
-        model = make_model(config.env, config.trainer.resolve())
+        model = make_model(config.env, config.trainer)
         template = jax.eval_shape(model.init, jax.random.key(0))
         return cls(model, load_checkpoint(Path(run_dir), template, checkpoint)[1])
 
@@ -240,7 +240,7 @@ class PoseMapper:
                 )
 
 
-def make_model(env: EnvConfig, config: PoseMapperSettings) -> MapperModel:
+def make_model(env: EnvConfig, config: PoseMapperConfig) -> MapperModel:
     """The untrained mapper of an environment's arms and metric.
 
     Raises:

@@ -17,7 +17,7 @@ from mimic.retargeting.pose import imitate_pose
 from mimic.retargeting.pose_baselines import copy_joints
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.signals import Signals
-from mimic.trainers.config import PoseMapperConfig, PoseMapperSettings, TrainConfig
+from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
@@ -72,7 +72,7 @@ class PoseMapperTrainer(Trainer):
     def __init__(self, config: TrainConfig, run_dir: Path | None = None):
         del run_dir
         assert isinstance(config.trainer, PoseMapperConfig)
-        self.settings: PoseMapperSettings = config.trainer.resolve()
+        self.settings: PoseMapperConfig = config.trainer
         self._name, self._seed = config.env.name, config.seed % 2**31  # the range of a 32-bit integer
         self.total_steps = self.settings.total_steps
         self.env_config = config.env

@@ -18,7 +18,7 @@ from mimic.base.compilation import Background, compiling
 from mimic.runs.checkpoints import STATE_UNUSED, Checkpoint, checkpoint_steps, save_checkpoint, thin_checkpoints
 from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
-from mimic.trainers.config import MapperSettings
+from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.pose_mapper.model import MapperModel, Params
 from mimic.trainers.schedules import schedules_from
 from mimic.trainers.trainer import OnEvaluation
@@ -75,7 +75,7 @@ class _Best(NamedTuple):
 # Above 40 lines because of its docstring.
 def train(
     objective: Objective,
-    config: MapperSettings,
+    config: PoseMapperConfig,
     samples: Callable[[], tuple[Samples, Samples]],
     run_dir: Path,
     *,
@@ -152,7 +152,7 @@ def _unflatten(template: Any, leaves: Sequence[np.ndarray] | None) -> Any:
 
 
 def _compile(
-    objective: Objective, config: MapperSettings, interval: int, seed: int, initial: Params | None
+    objective: Objective, config: PoseMapperConfig, interval: int, seed: int, initial: Params | None
 ) -> _Functions:
     optimiser = _optimiser(config)
 
@@ -174,7 +174,7 @@ def _compile(
     )
 
 
-def _optimiser(config: MapperSettings) -> optax.GradientTransformation:
+def _optimiser(config: PoseMapperConfig) -> optax.GradientTransformation:
     """AdamW with a constant rate, or with a warm-up and a cosine decay. Biases do not decay."""
     updates_per_epoch = config.samples // config.batch_size
     updates, rate = config.epochs * updates_per_epoch, config.learning_rate
@@ -192,7 +192,7 @@ def _is_kernel(params: Params) -> Any:
 
 
 def _training_epoch(
-    objective: Objective, config: MapperSettings, optimiser: optax.GradientTransformation, epochs: int
+    objective: Objective, config: PoseMapperConfig, optimiser: optax.GradientTransformation, epochs: int
 ) -> Callable[[Any, Any, Any, Samples], tuple[Any, Array]]:
     """A function that trains for some epochs.
 

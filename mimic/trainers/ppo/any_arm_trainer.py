@@ -27,7 +27,7 @@ from mimic.motions.demonstrations import Demonstrations, check_effort, concatena
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
-from mimic.trainers.config import PPOConfig, PPOSettings, TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.ppo import training as ppo
 from mimic.trainers.ppo.trainer import PolicyOfManyArms, with_crossovers, with_saved_demonstrations
 from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
@@ -59,7 +59,7 @@ class AnyArmPPOTrainer(Trainer):
     def __init__(self, config: TrainConfig, run_dir: Path | None, unseen: Demonstrations | None = None):
         assert isinstance(config.trainer, PPOConfig)
         self._name, self._seed = config.env.name, config.seed
-        self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count(), env=config.env)
+        self.settings: PPOConfig = config.trainer
         self.total_steps = self.settings.total_steps
         training, held_out = training_and_held_out(with_saved_demonstrations(config.env, run_dir))
         self._demonstrations = concatenate(training, held_out)

@@ -14,7 +14,7 @@ from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float
 
-from mimic.trainers.config import PPOSettings
+from mimic.trainers.config import PPOConfig
 
 METRICS = ("policy_loss", "entropy", "approx_kl", "clip_fraction", "action_std")  # of the policy
 _VALUE_WEIGHT = 0.25  # of the squared value error in the loss
@@ -56,7 +56,7 @@ def value_loss(
     statistics: RunningStatisticsState,
     unrolls: Unrolls,
     networks: ppo_networks.PPONetworks,
-    config: PPOSettings,
+    config: PPOConfig,
 ) -> tuple[Array, Float[Array, "unrolls time"]]:
     """The loss of the value network, and the normalised advantages for the policy's loss.
 
@@ -86,7 +86,7 @@ def policy_loss(
     advantages: Float[Array, "unrolls time"],
     key: Array,
     networks: ppo_networks.PPONetworks,
-    config: PPOSettings,
+    config: PPOConfig,
 ) -> tuple[Array, Float[Array, " metrics"]]:
     """The loss of the policy network, including the entropy, and the values of `METRICS`.
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS
 from mimic.envs.many_arms_observation import JOINT_FEATURES
-from mimic.trainers.config import PPOSettings
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.networks import Transformer
 
 # Standard deviation of an untrained policy, whose mean is the zero action: the controller is good from the start, and
@@ -25,7 +25,7 @@ _JOINT_STD = 0.05
 _MIN_DEVIATION, _MAX_NORMALIZED = 0.1, 10.0  # of an observation of any arm, whose entries are of the order of 1
 
 
-def make_networks(config: PPOSettings, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
+def make_networks(config: PPOConfig, observation_size: int, action_size: int) -> ppo_networks.PPONetworks:
     """The policy and value network of the trainer's settings."""
     hidden = tuple(config.hidden_layers or ())
     layers = {"policy_hidden_layer_sizes": hidden, "value_hidden_layer_sizes": hidden}

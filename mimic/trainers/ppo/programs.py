@@ -26,7 +26,7 @@ from mimic.base.compilation import Background, a_process_for_each_gpu, compiler_
 from mimic.envs.imitation import ImitationEnv, arm_state
 from mimic.envs.wrappers import fresh_episodes
 from mimic.metric.kinematics import LinkStates
-from mimic.trainers.config import PPOSettings
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import updates
 from mimic.trainers.ppo.losses import Unrolls
 from mimic.trainers.schedules import schedules_from
@@ -90,7 +90,7 @@ class TrainingFunctions(NamedTuple):
 # Above 40 lines because of its docstring.
 def compile_training(
     env: ImitationEnv,
-    config: PPOSettings,
+    config: PPOConfig,
     networks: ppo_networks.PPONetworks,
     batches: int,
     learning_rate: optax.Schedule,
@@ -108,7 +108,7 @@ def compile_training(
       batches: number of batches in a training epoch.
       learning_rate: Adam's learning rate at each update from 0 on.
       initial: parameters to start from, or their shapes; random ones where None.
-      progress: fraction of the training that is done at each update, see `PPOSettings.at`.
+      progress: fraction of the training that is done at each update, see `PPOConfig.at`.
       restored: whether a saved state is to be restored, so that `start` is not needed.
     """
     setup = _set_up(env, config, networks, learning_rate, progress, initial)
@@ -174,7 +174,7 @@ class _Setup(NamedTuple):
 
 def _set_up(
     env: ImitationEnv,
-    config: PPOSettings,
+    config: PPOConfig,
     networks: ppo_networks.PPONetworks,
     learning_rate: optax.Schedule,
     progress: optax.Schedule,
@@ -212,7 +212,7 @@ class _Training(NamedTuple):
     """A training as pure functions on one device; `devices` is the number of devices."""
 
     env: ImitationEnv
-    config: PPOSettings
+    config: PPOConfig
     networks: ppo_networks.PPONetworks
     optimizer: optax.GradientTransformation
     progress: optax.Schedule
@@ -303,6 +303,6 @@ class _Training(NamedTuple):
         state = dataclasses.replace(state, policy=policy, value=value, statistics=statistics, key=key)
         return state, metrics
 
-    def _settings_now(self, state: TrainingState) -> PPOSettings:
+    def _settings_now(self, state: TrainingState) -> PPOConfig:
         """The settings at the present update."""
         return self.config.at(self.progress(state.policy.optimizer[1].count))

@@ -22,7 +22,7 @@ from mimic.motions.demonstrations import Demonstrations, check_effort, concatena
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
-from mimic.trainers.config import PPOConfig, PPOSettings, TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.ppo import training as ppo
 from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
 
@@ -66,12 +66,7 @@ class PPOTrainer(Trainer):
     ):
         assert isinstance(config.trainer, PPOConfig)
         self._name, self._seed, self._shared = config.env.name, config.seed, shared
-        self.settings: PPOSettings = config.trainer.resolve(jax.default_backend(), jax.device_count(), env=config.env)
-        if self.settings.network != "mlp" and shared is None:
-            raise ValueError(
-                f"trainer.network: expected mlp for one learner, got {self.settings.network} (preset "
-                f"{self.settings.preset}), which is for a learner that is drawn for each episode (env.arms)"
-            )
+        self.settings: PPOConfig = config.trainer
         self.total_steps = self.settings.total_steps
         env, held_out = run_environment(config.env, run_dir)
         if unseen is not None:

@@ -24,7 +24,7 @@ from mimic.runs.checkpoints import (
 )
 from mimic.runs.divergence import check_finite
 from mimic.runs.signals import Signals
-from mimic.trainers.config import PPOSettings
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo.networks import make_networks
 from mimic.trainers.ppo.programs import (
     Metrics,
@@ -48,13 +48,13 @@ class _Best(NamedTuple):
     params: Params
 
 
-def params_template(config: PPOSettings, observation_size: int, action_size: int) -> Params:
+def params_template(config: PPOConfig, observation_size: int, action_size: int) -> Params:
     """The shapes of the parameters, with the structure of a checkpoint."""
     networks = make_networks(config, observation_size, action_size)
     return jax.eval_shape(lambda: initial_params(networks, observation_size, jax.random.PRNGKey(0)))
 
 
-def make_controller(config: PPOSettings, observation_size: int, action_size: int) -> Callable[[Params], Controller]:
+def make_controller(config: PPOConfig, observation_size: int, action_size: int) -> Callable[[Params], Controller]:
     """The deterministic policy as a function of its parameters."""
     make_policy = ppo_networks.make_inference_fn(make_networks(config, observation_size, action_size))
 
@@ -68,7 +68,7 @@ def make_controller(config: PPOSettings, observation_size: int, action_size: int
 # Above 40 lines because of its docstring.
 def train(
     env: ImitationEnv,
-    config: PPOSettings,
+    config: PPOConfig,
     run_dir: Path,
     *,
     seed: int,
@@ -148,7 +148,7 @@ def _best_saved(run_dir: Path, restored: Checkpoint, score: Score) -> _Best | No
     return best
 
 
-def follow(env: ImitationEnv, config: PPOSettings, *, seed: int, restored: Checkpoint | None = None) -> None:
+def follow(env: ImitationEnv, config: PPOConfig, *, seed: int, restored: Checkpoint | None = None) -> None:
     """Runs the same training epochs as the first process, where `train` runs."""
     for _ in _checkpoints(env, config, seed, restored, lambda: None):
         pass
@@ -156,7 +156,7 @@ def follow(env: ImitationEnv, config: PPOSettings, *, seed: int, restored: Check
 
 def _checkpoints(
     env: ImitationEnv,
-    config: PPOSettings,
+    config: PPOConfig,
     seed: int,
     restored: Checkpoint | None,
     on_compiling: Callable[[], None],
@@ -184,7 +184,7 @@ def _checkpoints(
 
 
 def _compile(
-    env: ImitationEnv, config: PPOSettings, batches: int, initial: Params | None, *, restored: bool
+    env: ImitationEnv, config: PPOConfig, batches: int, initial: Params | None, *, restored: bool
 ) -> TrainingFunctions:
     networks = make_networks(config, env.observation_size, env.action_size)
     progress = _progress(config)
@@ -193,7 +193,7 @@ def _compile(
 
 
 def _start_anew(
-    functions: TrainingFunctions, config: PPOSettings, seed: int, step: int, initial: Params | None
+    functions: TrainingFunctions, config: PPOConfig, seed: int, step: int, initial: Params | None
 ) -> TrainingState:
     """The state at a step where none is saved, or none that fits the settings."""
     if step and jax.process_index() == 0:
@@ -211,21 +211,21 @@ def _timed(
     return state, metrics, time.perf_counter() - began
 
 
-def _batches_per_epoch(config: PPOSettings) -> int:
+def _batches_per_epoch(config: PPOConfig) -> int:
     """Batches between two evaluations. A resumed training has the same, and so the same compiled function."""
     batches = -(-config.num_timesteps // config.steps_per_batch)
     return max(round(batches / config.evaluations), 1)
 
 
-def _updates(config: PPOSettings, step: int) -> int:
+def _updates(config: PPOConfig, step: int) -> int:
     """Updates of a network in a number of environment steps."""
     return step // config.steps_per_batch * config.num_minibatches * config.num_updates_per_batch
 
 
-def _progress(config: PPOSettings) -> optax.Schedule:
+def _progress(config: PPOConfig) -> optax.Schedule:
     """Fraction of the training that is done after a number of updates."""
     return optax.linear_schedule(0.0, 1.0, _updates(config, config.num_timesteps))
 
 
-def _learning_rate(config: PPOSettings, progress: optax.Schedule) -> optax.Schedule:
+def _learning_rate(config: PPOConfig, progress: optax.Schedule) -> optax.Schedule:
     return lambda count: config.learning_rate * (1 + progress(count) * (config.final_learning_rate - 1))

@@ -11,7 +11,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from mimic.trainers.config import PPOSettings
+from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo.losses import METRICS as POLICY_METRICS
 from mimic.trainers.ppo.losses import Unrolls, policy_loss, value_loss
 from mimic.trainers.schedules import schedules_from
@@ -55,7 +55,7 @@ class UpdateConfig(NamedTuple):
     """
 
     networks: ppo_networks.PPONetworks
-    settings: PPOSettings
+    settings: PPOConfig
     optimizer: optax.GradientTransformation
     axis: str
     staggered: bool

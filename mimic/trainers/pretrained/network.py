@@ -163,7 +163,7 @@ def policy_template(config: TrainConfig) -> tuple[Any, Any]:
     from mimic.trainers.ppo import training
 
     observation_size, joints = _policy_sizes(config)
-    return training.params_template(cast(PPOConfig, config.trainer).resolve(), observation_size, joints)[:2]
+    return training.params_template(cast(PPOConfig, config.trainer), observation_size, joints)[:2]
 
 
 def _policy_sizes(config: TrainConfig) -> tuple[int, int]:
@@ -181,7 +181,7 @@ def _policy(folder: Path, config: TrainConfig) -> Function:
     params = read_params(folder, policy_template(config))
     size, joints = _policy_sizes(config)
     no_value_network = (*params, None)
-    controller = training.make_controller(cast(PPOConfig, config.trainer).resolve(), size, joints)(no_value_network)
+    controller = training.make_controller(cast(PPOConfig, config.trainer), size, joints)(no_value_network)
 
     def policy(observation: ArrayLike) -> Array:
         values = jnp.asarray(observation)
@@ -195,6 +195,6 @@ def _policy(folder: Path, config: TrainConfig) -> Function:
 def _mapper(folder: Path, config: TrainConfig) -> Function:
     from mimic.trainers.pose_mapper.model import PoseMapper, make_model  # imports flax networks
 
-    model = make_model(config.env, cast(PoseMapperConfig, config.trainer).resolve())
+    model = make_model(config.env, cast(PoseMapperConfig, config.trainer))
     template = jax.eval_shape(model.init, jax.random.key(0))
     return PoseMapper(model, read_params(folder, template))

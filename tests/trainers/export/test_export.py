@@ -132,7 +132,7 @@ def test_a_mapper_of_an_environment_with_an_inner_loop_is_a_function(tmp_path):
 def any_arm_run(run_dir, expert="fixed"):
     """A run whose mapper to any arm has random weights."""
     env = mimic.env_config("any_arm", arms={"expert": expert})
-    config = PoseMapperConfig(width=16, layers=1, heads=2, guesses=1, refinements=2).resolve_any_arm()
+    config = PoseMapperConfig(preset="any_arm", width=16, layers=1, heads=2, guesses=1, refinements=2).resolve()
     params = make_any_arm_model(env, config).init(jax.random.key(3))
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env, config))

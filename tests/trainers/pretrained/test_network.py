@@ -93,7 +93,9 @@ def test_the_mapper_to_any_arm_says_where_it_comes_from(any_arm):
 def test_the_mapper_to_any_arm_reaches_its_recorded_distance_on_unseen_locks(any_arm):
     arms = {name: arm for name, arm in report_arms(any_arm.env)[UNSEEN].items() if name.startswith("locked")}
     poses = (
-        AnyArmMapperTrainer(TrainConfig(any_arm.env, PoseMapperConfig(preset="any_arm")))._pairs["arms"].expert_qpos[0]
+        AnyArmMapperTrainer(TrainConfig(any_arm.env, PoseMapperConfig(preset="any_arm")).resolve())
+        ._pairs["arms"]
+        .expert_qpos[0]
     )
     model = any_arm.model
     distances = jax.jit(
