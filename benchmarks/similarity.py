@@ -32,7 +32,6 @@ TRANSLATIONS = 0.0, 0.25, 0.5, 1.0, 2.0, 4.0  # weights; that of rotation is 1
 SOME_TRANSLATIONS = 0.0, 0.5, 2.0
 KEPT = {("kept", name): TRANSLATIONS for name in ("arc_length", "overlap")}  # candidates
 MERGED = {("merged", name): SOME_TRANSLATIONS for name in ("overlap", "arc_length")} | {
-    ("merged", "chord_overlap"): (0.0,)
 }
 STATE_DEPENDENT = {("kept", name): SOME_TRANSLATIONS for name in ("hard", "soft")}
 SUBSET = ("panda -3,6,7", "panda -5")  # of state-dependent correspondence, which is slow

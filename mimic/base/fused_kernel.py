@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 from jaxtyping import Array
@@ -163,32 +162,28 @@ class Columns:
         return self.ref.shape[1 - self.sample_axis]
 
     def _at(self, column: Array) -> Any:
-        # The integer type of a slice's start, which interpret mode requires.
-        column = jnp.maximum(column, 0).astype(int)
+        column = column.astype(int)  # the type of a slice's start, which interpret mode requires
         return self.ref.at[column, :] if self.sample_axis else self.ref.at[:, column]
 
     def read(self, column: Array) -> Array:
-        """Reads a column, [block]; 0 for a negative index."""
-        mask = self.mask & (column >= 0)
-        return triton.load(self._at(column), mask=mask, other=0.0)
+        """Reads a column, [block]."""
+        return triton.load(self._at(column), mask=self.mask, other=0.0)
 
     def write(self, column: Array, values: Scalar) -> None:
-        """Writes a column; nothing for a negative index."""
-        mask = self.mask & (column >= 0)
+        """Writes a column."""
         values = jnp.broadcast_to(jnp.asarray(values, self.ref.dtype), self.mask.shape)
-        triton.store(self._at(column), values, mask=mask)
+        triton.store(self._at(column), values, mask=self.mask)
 
 
 # Above 40 lines because of its docstring.
 def by_columns(
-    body: Callable[..., None], widths: Sequence[int], *tables: np.ndarray, launch: LaunchConfig = DEFAULT
+    body: Callable[..., None], widths: Sequence[int], *, launch: LaunchConfig = DEFAULT
 ) -> Callable[..., tuple[Array, ...]]:
     """A function of arrays [samples, width] as one Pallas kernel: a thread computes a sample.
 
     Args:
-      body: takes `Columns` of the inputs, `Columns` of the outputs, and references to the tables.
+      body: takes `Columns` of the inputs and `Columns` of the outputs.
       widths: of the output arrays.
-      *tables: constant arrays, common to all samples.
       launch: launch configuration of the kernel.
     """
     block, sample_axis = launch.block, launch.sample_axis
@@ -203,21 +198,18 @@ def by_columns(
 
         def kernel(*refs: Any) -> None:
             mask = pl.program_id(0) * block + jnp.arange(block) < count
-            inputs, constants = refs[: len(rows)], refs[len(rows) : len(rows) + len(tables)]
-            outputs = refs[len(rows) + len(tables) :]
-            body(*([Columns(ref, mask, sample_axis) for ref in group] for group in (inputs, outputs)), *constants)
+            groups = refs[: len(rows)], refs[len(rows) :]
+            body(*([Columns(ref, mask, sample_axis) for ref in group] for group in groups))
 
-        numbers = [jnp.asarray(x, dtype if np.issubdtype(x.dtype, np.floating) else x.dtype) for x in tables]
-        whole = [pl.BlockSpec(x.shape, lambda i, rank=x.ndim: (0,) * rank) for x in tables]
         shapes = [(width, count) if sample_axis else (count, width) for width in widths]
         outputs = pl.pallas_call(
             kernel,
             out_shape=[jax.ShapeDtypeStruct(shape, dtype) for shape in shapes],
             grid=(pl.cdiv(count, block),),
-            in_specs=[*(window(x.shape[1]) for x in rows), *whole],
+            in_specs=[window(x.shape[1]) for x in rows],
             out_specs=[window(width) for width in widths],
             compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
-        )(*(x.T if sample_axis else x for x in rows), *numbers)
+        )(*(x.T if sample_axis else x for x in rows))
         return tuple(x.T if sample_axis else x for x in outputs)
 
     return batched

@@ -36,7 +36,7 @@ from mimic.metric.distance import (
     adaptive_weights,
 )
 
-CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft", "chord_overlap")
+CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft")
 registry.reserve("correspondence", CORRESPONDENCES)
 
 
@@ -55,9 +55,8 @@ class MetricConfig:
       adaptive: replace the weights of translation and rotation by the paper's distance-dependent ones.
       rotation_measure: "cosine" or "angle".
       links: "kept" (a locked joint removes no link) or "merged" (its two links become one chord; paper).
-      correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance); "chord_overlap" is the overlap
-        of old runs, which merged links; or a registered name, or a .csv or .npz file with a matrix, see
-        `load_correspondence`.
+      correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance), a registered name, or a
+        .csv or .npz file with a matrix, see `load_correspondence`.
       link_distance: a registered function of two links, in place of the weighted parts; none where empty.
       xi: sharpness of the soft correspondence, below 0.
       reduction: "mean" or "frobenius".
@@ -109,7 +108,6 @@ class MetricConfig:
         constructors: dict[str, Callable[[], Correspondence]] = {
             "arc_length": lambda: arc_length_correspondence(expert, learner, chains=chains),
             "overlap": lambda: overlap_correspondence(expert, learner, chains=chains),
-            "chord_overlap": lambda: overlap_correspondence(expert, learner, lengths="chord", chains=chains),
             "hard": lambda: hard_correspondence,
             "soft": lambda: partial(soft_correspondence, xi=self.xi),
         }

@@ -1,7 +1,7 @@
 """Correspondence matrices W [n, n_hat]: how strongly each pair of links of two embodiments corresponds."""
 
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +12,6 @@ from jaxtyping import Array, Float
 
 from mimic.arms.chain_match import ChainMatch, matched_chains
 from mimic.arms.embodiment import Embodiment
-
-LinkLengths = Literal["path", "chord"]
 
 
 def hard_correspondence(distances: Float[Array, "expert learner"]) -> Float[Array, "expert learner"]:
@@ -49,7 +47,7 @@ def soft_correspondence(distances: Float[Array, "expert learner"], *, xi: ArrayL
 
 
 def overlap_correspondence(
-    expert: Embodiment, learner: Embodiment, *, lengths: LinkLengths = "path", chains: ChainMatch = "name"
+    expert: Embodiment, learner: Embodiment, *, chains: ChainMatch = "name"
 ) -> Float[Array, "expert learner"]:
     """Static correspondence by the overlap of links along their chains, with the same weight for each link (paper).
 
@@ -60,14 +58,12 @@ def overlap_correspondence(
     Args:
       expert: n links.
       learner: n_hat links.
-      lengths: lengths of the links: "path" along the centre line, or "chord" from start to end. They differ only for
-        merged links.
       chains: see `matched_chains`.
 
     Raises:
       ValueError: trees whose chains do not match.
     """
-    overlap, (length_a, length_b), numpy = _overlaps(expert, learner, lengths, chains)
+    overlap, (length_a, length_b), numpy = _overlaps(expert, learner, chains)
     return jnp.asarray(overlap / length_a[:, None] + overlap / length_b[None, :])
 
 
@@ -88,13 +84,11 @@ def arc_length_correspondence(
     Raises:
       ValueError: trees whose chains do not match.
     """
-    overlap, _, numpy = _overlaps(expert, learner, "path", chains)
+    overlap, _, numpy = _overlaps(expert, learner, chains)
     return jnp.asarray(expert.num_links * learner.num_links * overlap / numpy.sum(overlap))
 
 
-def _overlaps(
-    expert: Embodiment, learner: Embodiment, lengths: LinkLengths, chains: ChainMatch
-) -> tuple[Any, Any, ModuleType]:
+def _overlaps(expert: Embodiment, learner: Embodiment, chains: ChainMatch) -> tuple[Any, Any, ModuleType]:
     """Overlap of each pair of links on [0, 1], [n, n_hat]; the links' lengths there; and the array library.
 
     In trees, overlaps are summed over pairs of chains, and so are the lengths.
@@ -102,7 +96,7 @@ def _overlaps(
     arms = expert, learner
     is_constant = all(isinstance(leaf, np.ndarray) for arm in arms for leaf in (arm.link_lengths, arm.segment_start))
     numpy = np if is_constant else jnp
-    link_lengths = [arm.link_lengths if lengths == "chord" else _path_lengths(arm, numpy) for arm in arms]
+    link_lengths = [_path_lengths(arm, numpy) for arm in arms]
     pairs = matched_chains(expert.chain_names, learner.chain_names, chains)
     if len(expert.chains) == len(learner.chains) == 1:
         return *overlaps_of_chains(link_lengths[0], link_lengths[1], numpy), numpy

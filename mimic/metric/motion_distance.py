@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import Embodiment, in_chain_lengths
 from mimic.base import fused_kernel
-from mimic.metric import analytic_gradient, long_chain_kernel
+from mimic.metric import analytic_gradient
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
     PARTS,
@@ -23,7 +23,6 @@ from mimic.metric.distance import (
     Reduction,
     RotationMeasure,
     Weights,
-    pair_distances,
 )
 from mimic.metric.kinematics import LONG, joint_values, link_states
 
@@ -51,9 +50,8 @@ def motion_distance(
     mode, and only with respect to the differentiated arguments. `jax.vmap` of the function, or of its gradient, is one
     kernel on NVIDIA GPUs.
 
-    For an arm of more than 16 joints this implementation is a loop over the joints, which compiles in seconds. It is
-    one GPU kernel too if the corresponding links lie in order along both arms; otherwise, and on CPUs, it is several
-    slower kernels with automatic differentiation. Any other metric composes `link_states` and `embodiment_distance`.
+    Any other metric, and any metric where an arm has more than 16 joints, composes `link_states` and
+    `embodiment_distance`, with automatic differentiation: the unrolled code of long arms takes minutes to compile.
 
     Args:
       expert: embodiment of the expert.
@@ -77,10 +75,10 @@ def motion_distance(
 
     # Validates the arguments for all implementations below.
     jax.eval_shape(composed, *(jax.ShapeDtypeStruct((arm.num_joints,), jnp.float32) for arm in arms for _ in range(2)))
-    if metric.is_static and _is_constant((arms, correspondence, weights)):
+    is_short = max(expert.num_joints, learner.num_joints) <= LONG
+    if is_short and metric.is_static and _is_constant((arms, correspondence, weights)):
         factors = _factors(np.asarray(correspondence, float), cast(DistanceWeights, weights))
-        is_long = max(expert.num_joints, learner.num_joints) > LONG
-        distance = (_long if is_long else _short)([in_chain_lengths(_as_numpy(arm)) for arm in arms], factors)
+        distance = _unrolled([in_chain_lengths(_as_numpy(arm)) for arm in arms], factors)
     else:
         distance = composed
 
@@ -107,50 +105,13 @@ def _factors(matrix: Float[np.ndarray, "expert learner"], weights: DistanceWeigh
     return np.stack(weights_of_parts) * matrix / matrix.size
 
 
-def _by_pairs(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
-    """The distance of corresponding pairs of links only."""
-    pairs = np.nonzero(factors.any(axis=0))
-    weighted = [part for part, factor in zip(PARTS, factors, strict=True) if factor.any()] or PARTS[:1]
-    factors = np.stack([factors[PARTS.index(part), *pairs] for part in weighted])
-
-    def distance(*motion: Array) -> Array:
-        states = link_states(arms[0], *motion[:2]), link_states(arms[1], *motion[2:])
-        pair_states = [
-            jax.tree.map(lambda x, rows=rows: x[rows], arm_states)
-            for arm_states, rows in zip(states, pairs, strict=True)
-        ]
-        parts = jax.vmap(functools.partial(pair_distances, measure="cosine"))(*pair_states)
-        distances = jnp.stack([getattr(parts, part) for part in weighted])
-        return jnp.sum(factors.astype(distances.dtype) * distances)
-
-    return distance
-
-
-def _short(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
+def _unrolled(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
     """The distance with all links unrolled."""
     joints = [arm.num_joints for arm in arms for _ in range(2)]
 
     def values(arguments: tuple[int, ...]) -> Values:
         function = functools.partial(analytic_gradient.distance_and_gradient, *arms, factors, arguments)
         return fused_kernel.fused(function, [1, *(joints[k] for k in arguments)])
-
-    return _with_gradient(values)
-
-
-def _long(arms: list[Embodiment], factors: np.ndarray) -> Callable[..., Array]:
-    """The distance as a loop; with its own GPU kernel if the corresponding links lie in order."""
-    by_pairs, schedule = _by_pairs(arms, factors), long_chain_kernel.plan(arms, factors)
-    if schedule is None:
-        return by_pairs
-
-    def values(arguments: tuple[int, ...]) -> Values:
-        def differentiated(*motion: Array) -> tuple[Array, ...]:
-            value, gradients = (
-                jax.value_and_grad(by_pairs, arguments)(*motion) if arguments else (by_pairs(*motion), ())
-            )
-            return value[None], *gradients
-
-        return fused_kernel.batched_by(long_chain_kernel.gpu_kernel(schedule, arguments), differentiated)
 
     return _with_gradient(values)
 

@@ -97,7 +97,7 @@ def _read_config(run_dir: Path) -> TrainConfig:
 def _with_old_defaults(content: DictConfig) -> DictConfig:
     """Completes the config of an older run with the defaults of its time."""
     content = merged({"env": {"physics": "mjx"}}, content)
-    content = _without_base_segments(_with_old_default_metric(content))
+    content = _without_base_segments(content)
     trainer = OmegaConf.select(content, "trainer")
     defaults: dict[str, Any] = {"keep": 1_000_000}
     if trainer.name == "ppo":
@@ -115,16 +115,6 @@ def _without_base_segments(content: DictConfig) -> DictConfig:
     models = {role: OmegaConf.select(content, f"env.{role}.model") for role in ("expert", "learner")}
     old = {role: {"base_segment": False} for role, model in models.items() if model not in (None, *BUILT_IN)}
     return merged({"env": old}, content) if old else content
-
-
-def _with_old_default_metric(content: DictConfig) -> DictConfig:
-    """Completes the config of a run older than the field `metric.links` with the default metric of that time."""
-    if OmegaConf.select(content, "env.metric.links") is not None:
-        return content
-    old = {"translation": 0.0, "correspondence": "overlap", **(OmegaConf.select(content, "env.metric") or {})}
-    correspondence = "chord_overlap" if old["correspondence"] == "overlap" else old["correspondence"]
-    metric = {**old, "correspondence": correspondence, "links": "merged"}
-    return merged(content, {"env": {"metric": metric}})
 
 
 def policy_config(run: str) -> tuple[Path, TrainConfig]:

@@ -57,7 +57,7 @@ def test_a_name_is_registered_once_unless_replaced():
     with pytest.raises(ValueError, match=r"registered already, by .*test_registry; replace=True"):
         mimic.register("correspondence", "double", double)
     mimic.register("correspondence", "double", len, replace=True)
-    with pytest.raises(ValueError, match=r"arc_length, overlap, hard, soft, chord_overlap, double, got 'triple'"):
+    with pytest.raises(ValueError, match=r"arc_length, overlap, hard, soft, double, got 'triple'"):
         MetricConfig(correspondence="triple")
 
 

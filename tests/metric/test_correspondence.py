@@ -154,15 +154,13 @@ def test_overlap_under_jit_with_the_arms_as_arguments():
     assert np.array_equal(np.asarray(traced) > 0, np.asarray(constant) > 0)
 
 
-def test_merged_links_overlap_by_their_path_or_their_chord():
+def test_merged_links_overlap_by_their_path():
     """A chord across a right angle, 2 along the path and sqrt(2) straight, next to a link of 1."""
     bent = merged_by_a_right_angle()
     assert bent.link_lengths == pytest.approx([np.sqrt(2), 1.0])
     twin = planar_arm([2.0, 1.0])
     np.testing.assert_allclose(overlap_correspondence(bent, twin), 2 * np.eye(2), atol=1e-9)
-    chord_twin = planar_arm([np.sqrt(2), 1.0])
-    np.testing.assert_allclose(overlap_correspondence(bent, chord_twin, lengths="chord"), 2 * np.eye(2), atol=1e-9)
-    assert np.count_nonzero(overlap_correspondence(bent, chord_twin)) == 3
+    assert np.count_nonzero(overlap_correspondence(bent, planar_arm([np.sqrt(2), 1.0]))) == 3
     traced = jax.jit(overlap_correspondence)(bent, twin)
     np.testing.assert_allclose(traced, 2 * np.eye(2), atol=1e-6)  # float32
 
