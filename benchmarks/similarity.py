@@ -31,8 +31,7 @@ from mimic.retargeting.pose_baselines import BASELINES
 TRANSLATIONS = 0.0, 0.25, 0.5, 1.0, 2.0, 4.0  # weights; that of rotation is 1
 SOME_TRANSLATIONS = 0.0, 0.5, 2.0
 KEPT = {("kept", name): TRANSLATIONS for name in ("arc_length", "overlap")}  # candidates
-MERGED = {("merged", name): SOME_TRANSLATIONS for name in ("overlap", "arc_length")} | {
-}
+MERGED = {("merged", name): SOME_TRANSLATIONS for name in ("overlap", "arc_length")}
 STATE_DEPENDENT = {("kept", name): SOME_TRANSLATIONS for name in ("hard", "soft")}
 SUBSET = ("panda -3,6,7", "panda -5")  # of state-dependent correspondence, which is slow
 EVERY = 10  # samples of a demonstration of which one is taken
