@@ -32,9 +32,6 @@ LAYERS = (
 DATA = ("conf",)  # packages for Hydra's sake, without code
 # Imports that break the rule: {(module, module that it imports): reason}.
 EXCEPTIONS: dict[tuple[str, str], str] = {
-    ("mimic.arms.arrays", "mimic.physics.chain_dynamics"): "pseudo_inertia is to move down",
-    ("mimic.physics.mujoco_world", "mimic.retargeting.costs"): "pose_limits is to move down",
-    ("mimic.physics.mujoco_world", "mimic.retargeting.pose"): "changing_pairs is to move down",
     ("mimic.physics.plant", "mimic.envs.config"): "WorldConfig is to move down",
     ("mimic.physics.step", "mimic.envs.config"): "AUTO is to move down",
     ("mimic.runs.distributed.process_group", "mimic.trainers.distributed.heartbeats"): "is to leave",

@@ -25,6 +25,7 @@ from mimic.base.config import check_choice
 
 Limits = Literal["none", "hardware"]
 LIMITS = ("none", "hardware")
+LONG = 16  # joints; `link_states` of more is a loop, because unrolled code takes long to compile
 
 
 @struct.dataclass

@@ -1,5 +1,7 @@
 """Distances of the capsules around an arm's links, from each other and over poses."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +47,13 @@ def changing_pairs(arm: Embodiment, capsules: Capsules) -> Bool[np.ndarray, " pa
     with jax.ensure_compile_time_eval():
         of_pose = jax.jit(jax.vmap(lambda q: pair_distances(capsules, *capsule_axes(arm, capsules, q))))
         return np.ptp(np.asarray(of_pose(jnp.asarray(qpos, jnp.float32))), axis=0) > _CHANGE
+
+
+def with_changing_pairs(arm: Embodiment, capsules: Capsules) -> Capsules:
+    """The capsules with those of their pairs alone whose distance the joints change."""
+    changes = changing_pairs(arm, capsules)
+    pairs = tuple(pair for pair, is_changing in zip(capsules.pairs, changes, strict=True) if is_changing)
+    return dataclasses.replace(capsules, pairs=pairs)
 
 
 def segment_distance(

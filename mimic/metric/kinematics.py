@@ -12,7 +12,7 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from mimic.arms.embodiment import Embodiment
+from mimic.arms.embodiment import LONG, Embodiment
 from mimic.base import spatial
 from mimic.base.spatial import Rotation, Vector
 
@@ -66,7 +66,6 @@ class LinkVectors(NamedTuple):
 
 
 BASE = JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)
-LONG = 16  # joints; `link_states` of more is a loop, because unrolled code takes long to compile
 
 
 def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Frames:

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from mimic.arms.embodiment import Embodiment, in_chain_lengths
+from mimic.arms.embodiment import LONG, Embodiment, in_chain_lengths
 from mimic.base import fused_kernel
 from mimic.metric import analytic_gradient
 from mimic.metric.distance import (
@@ -24,7 +24,7 @@ from mimic.metric.distance import (
     RotationMeasure,
     Weights,
 )
-from mimic.metric.kinematics import LONG, joint_values, link_states
+from mimic.metric.kinematics import joint_values, link_states
 
 Values = Callable[..., tuple[Array, ...]]  # motions -> distance, gradients
 MotionDistance = Callable[..., Float[Array, ""]]  # expert_qpos, expert_qvel, learner_qpos, learner_qvel

@@ -15,7 +15,6 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.pose_limits import pose_limits
 from mimic.arms.simulation_model import simulation_spec
 from mimic.control.joint_control import PERIOD
-from mimic.metric.capsule_distances import changing_pairs
 from mimic.physics.plant import GRAVITY, end_of_last_link
 from mimic.physics.world import WorldConfig
 
@@ -149,7 +148,7 @@ def _add_payload(spec: mujoco.MjSpec, arm: Arm, places: list[_Place]) -> np.ndar
 
 
 def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, places: list[_Place], floor_height: float) -> None:
-    """Adds the capsules as geoms, pairs whose distance joints change, and a floor for all but those near the base.
+    """Adds the capsules as geoms, their pairs, and a floor for all but those near the base.
 
     These are the pairs of the safety layer's clearance. The floor is a plane of the base frame, as there.
     """
@@ -163,9 +162,8 @@ def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, places: lis
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[_FLOOR_SIZE, _FLOOR_SIZE, 0.1],
         pos=arm.T_world_base[:3, :3] @ [0, 0, floor_height] + arm.T_world_base[:3, 3], quat=quaternion, **_NO_CONTACT,
     )  # fmt: skip
-    for (i, j), changes in zip(capsules.pairs, changing_pairs(arm.embodiment, capsules), strict=True):
-        if changes:
-            spec.add_pair(geomname1=f"capsule{i}", geomname2=f"capsule{j}")
+    for i, j in capsules.pairs:
+        spec.add_pair(geomname1=f"capsule{i}", geomname2=f"capsule{j}")
     for index, is_near_base in enumerate(capsules.near_base):
         if not is_near_base:
             spec.add_pair(geomname1=FLOOR, geomname2=f"capsule{index}")

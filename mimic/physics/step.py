@@ -9,9 +9,9 @@ import mujoco
 from jaxtyping import Array, Float
 from mujoco import mjx
 
+from mimic.arms.embodiment import LONG
 from mimic.base import fused_kernel
 from mimic.envs.config import AUTO
-from mimic.metric.kinematics import LONG
 from mimic.physics import chain_dynamics as dynamics
 
 _LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest by measurement

@@ -7,11 +7,11 @@ import pytest
 from jax.typing import DTypeLike
 
 from mimic import motion_distance
-from mimic.arms.embodiment import panda, planar_arm
+from mimic.arms.embodiment import LONG, panda, planar_arm
 from mimic.base import fused_kernel
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence
 from mimic.metric.distance import PAPER_WEIGHTS, DistanceWeights, embodiment_distance
-from mimic.metric.kinematics import LONG, link_states
+from mimic.metric.kinematics import link_states
 from tests.helpers.lowering import gpu_program
 from tests.helpers.metric_cases import ALL_WEIGHTS, CORRESPONDENCES, EXPERT, LEARNER, WEIGHTS
 

@@ -6,7 +6,7 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
-from mimic.metric.capsule_distances import changing_pairs
+from mimic.metric.capsule_distances import with_changing_pairs
 from mimic.physics.mujoco_world import FLOOR, mujoco_world
 from mimic.physics.world import WorldConfig
 from mimic.retargeting.self_collision import smallest_clearances, touching_line
@@ -19,14 +19,13 @@ def test_clearances_are_the_distances_of_mujocos_contacts(locked):
     """Of the same capsules, whose contacts MuJoCo finds on its own; among the poses are many that touch."""
     config = ArmConfig(locked=list(locked))
     arm, capsules = build_arm(config, "hardware"), fit_capsules(config, "hardware")
-    model = mujoco_world(arm, WorldConfig(gravity=True, contacts=True), capsules).model
+    changing = with_changing_pairs(arm.embodiment, capsules)
+    model = mujoco_world(arm, WorldConfig(gravity=True, contacts=True), changing).model
     model.pair_margin[:] = 10.0  # reports distances, too
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     lower, upper = np.asarray(arm.embodiment.joint_range).T
     poses, expected = rng.uniform(lower, upper, (POSES, len(lower))), []
-    counted = {
-        pair for pair, changes in zip(capsules.pairs, changing_pairs(arm.embodiment, capsules), strict=True) if changes
-    }
+    counted = set(changing.pairs)
     for qpos in poses:
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
