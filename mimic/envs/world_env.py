@@ -15,7 +15,7 @@ from mimic.envs.arm_state import ArmState
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.world_state import HardwareState
-from mimic.metric.capsule_distances import with_changing_pairs
+from mimic.metric.capsule_distances import colliding_pairs
 from mimic.metric.kinematics import LinkStates, link_states
 from mimic.motions.demonstrations import Demonstrations
 from mimic.physics.inner_loop import LoopState, make_inner_loop
@@ -72,8 +72,9 @@ class HardwareEnv(ImitationEnv):
 
     def _make_mjx_loop(self, periods: int) -> MjxLoop:
         world = self.config.world
-        capsules = with_changing_pairs(self.learner, self.capsules) if world.contacts else None
-        model = mujoco_world(self.arm, world, capsules)
+        capsules = self.capsules if world.contacts else None
+        pairs = colliding_pairs(self.learner, capsules) if capsules else ()
+        model = mujoco_world(self.arm, world, capsules, pairs)
         return make_mjx_loop(self.config.control, self.plant, model, periods)
 
     def _make_fused_loop(self, periods: int) -> MjxLoop:

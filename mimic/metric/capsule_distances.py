@@ -1,7 +1,5 @@
 """Distances of the capsules around an arm's links, from each other and over poses."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,11 +47,10 @@ def changing_pairs(arm: Embodiment, capsules: Capsules) -> Bool[np.ndarray, " pa
         return np.ptp(np.asarray(of_pose(jnp.asarray(qpos, jnp.float32))), axis=0) > _CHANGE
 
 
-def with_changing_pairs(arm: Embodiment, capsules: Capsules) -> Capsules:
-    """The capsules with those of their pairs alone whose distance the joints change."""
+def colliding_pairs(arm: Embodiment, capsules: Capsules) -> list[tuple[int, int]]:
+    """The capsules' pairs whose distance the joints change."""
     changes = changing_pairs(arm, capsules)
-    pairs = tuple(pair for pair, is_changing in zip(capsules.pairs, changes, strict=True) if is_changing)
-    return dataclasses.replace(capsules, pairs=pairs)
+    return [pair for pair, is_changing in zip(capsules.pairs, changes, strict=True) if is_changing]
 
 
 def segment_distance(

@@ -4,6 +4,7 @@ MJX simulates it for checks of the environment, and C MuJoCo as a virtual robot.
 `joint_control.friction_torque`, among the applied torques.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -53,13 +54,16 @@ class LoadedFields(NamedTuple):
     body_ipos: Float[Any, "bodies 3"]
 
 
-def mujoco_world(arm: Arm, world: WorldConfig, capsules: Capsules | None = None) -> MujocoWorld:
+def mujoco_world(
+    arm: Arm, world: WorldConfig, capsules: Capsules | None = None, pairs: Sequence[tuple[int, int]] = ()
+) -> MujocoWorld:
     """Makes the model.
 
     Args:
       arm: the learner.
       world: its gravity, stops and contacts; what is drawn for each episode is not set.
       capsules: shapes of the links, for contacts; needed where `world.contacts`.
+      pairs: indices of the capsules that can collide with each other, see `colliding_pairs`.
     """
     assert capsules is not None or not world.contacts
     spec = simulation_spec(arm.model, arm.embodiment.joint_names)
@@ -71,7 +75,7 @@ def mujoco_world(arm: Arm, world: WorldConfig, capsules: Capsules | None = None)
     places = _places(arm)
     along = _add_payload(spec, arm, places)
     if capsules is not None:
-        _add_contacts(spec, arm, capsules, places, world.floor_height)
+        _add_contacts(spec, arm, capsules, pairs, places, world.floor_height)
     model = spec.compile()
     body_joint = np.full(model.nbody, -1)
     body_joint[model.jnt_bodyid] = np.arange(model.njnt)
@@ -147,7 +151,14 @@ def _add_payload(spec: mujoco.MjSpec, arm: Arm, places: list[_Place]) -> np.ndar
     return place[0].T @ arm.T_world_base[:3, :3] @ along
 
 
-def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, places: list[_Place], floor_height: float) -> None:
+def _add_contacts(
+    spec: mujoco.MjSpec,
+    arm: Arm,
+    capsules: Capsules,
+    pairs: Sequence[tuple[int, int]],
+    places: list[_Place],
+    floor_height: float,
+) -> None:
     """Adds the capsules as geoms, their pairs, and a floor for all but those near the base.
 
     These are the pairs of the safety layer's clearance. The floor is a plane of the base frame, as there.
@@ -162,7 +173,7 @@ def _add_contacts(spec: mujoco.MjSpec, arm: Arm, capsules: Capsules, places: lis
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[_FLOOR_SIZE, _FLOOR_SIZE, 0.1],
         pos=arm.T_world_base[:3, :3] @ [0, 0, floor_height] + arm.T_world_base[:3, 3], quat=quaternion, **_NO_CONTACT,
     )  # fmt: skip
-    for i, j in capsules.pairs:
+    for i, j in pairs:
         spec.add_pair(geomname1=f"capsule{i}", geomname2=f"capsule{j}")
     for index, is_near_base in enumerate(capsules.near_base):
         if not is_near_base:

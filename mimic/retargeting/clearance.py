@@ -15,7 +15,7 @@ from mimic.arms.capsules import Capsules
 from mimic.arms.embodiment import Embodiment
 from mimic.control import clearance as control_clearance
 from mimic.control.clearance import ClearanceConstants
-from mimic.metric.capsule_distances import with_changing_pairs
+from mimic.metric.capsule_distances import colliding_pairs
 from mimic.metric.matrix_kinematics import frame_constants, point_columns
 
 _TINY = 1e-12  # m^2, replaces the squared length of a capsule that is a sphere
@@ -47,7 +47,7 @@ def clearance_constants(arm: Embodiment, capsules: Capsules, floor_height: float
       capsules: from `fit_capsules`, of the same arm.
       floor_height: height of the floor in the base frame [m].
     """
-    pairs = np.array(with_changing_pairs(arm, capsules).pairs, int).reshape(-1, 2)
+    pairs = np.array(colliding_pairs(arm, capsules), int).reshape(-1, 2)
     moving = np.flatnonzero(~np.array(capsules.near_base))
     moved, fixed = _columns(arm, capsules, pairs, moving)
     squared = np.sum((np.asarray(capsules.end) - np.asarray(capsules.start)) ** 2, axis=1)

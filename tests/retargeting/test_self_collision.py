@@ -6,7 +6,7 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
-from mimic.metric.capsule_distances import with_changing_pairs
+from mimic.metric.capsule_distances import colliding_pairs
 from mimic.physics.mujoco_world import FLOOR, mujoco_world
 from mimic.physics.world import WorldConfig
 from mimic.retargeting.self_collision import smallest_clearances, touching_line
@@ -19,17 +19,16 @@ def test_clearances_are_the_distances_of_mujocos_contacts(locked):
     """Of the same capsules, whose contacts MuJoCo finds on its own; among the poses are many that touch."""
     config = ArmConfig(locked=list(locked))
     arm, capsules = build_arm(config, "hardware"), fit_capsules(config, "hardware")
-    changing = with_changing_pairs(arm.embodiment, capsules)
-    model = mujoco_world(arm, WorldConfig(gravity=True, contacts=True), changing).model
+    pairs = colliding_pairs(arm.embodiment, capsules)
+    model = mujoco_world(arm, WorldConfig(gravity=True, contacts=True), capsules, pairs).model
     model.pair_margin[:] = 10.0  # reports distances, too
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     lower, upper = np.asarray(arm.embodiment.joint_range).T
     poses, expected = rng.uniform(lower, upper, (POSES, len(lower))), []
-    counted = set(changing.pairs)
     for qpos in poses:
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
-        expected.append(min(contact.dist for contact in data.contact if _counts(model, contact, counted)))
+        expected.append(min(contact.dist for contact in data.contact if _counts(model, contact, set(pairs))))
     actual = smallest_clearances(arm.embodiment, capsules, poses[:, None])
     expected = np.array(expected)
     assert 20 < (expected < 0).sum() < POSES - 20

@@ -8,7 +8,7 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.capsules import fit_capsules
 from mimic.arms.drives import JointFriction, drives_of
 from mimic.control.limits import JointLimits
-from mimic.metric.capsule_distances import with_changing_pairs
+from mimic.metric.capsule_distances import colliding_pairs
 from mimic.physics.mujoco_world import MujocoWorld, mujoco_world
 from mimic.physics.world import WorldConfig
 
@@ -53,8 +53,11 @@ def robot_model(config: ArmConfig, floor_height: float = 0.0) -> RobotModel:
     """
     arm = build_arm(config, "hardware")
     features = WorldConfig(gravity=True, stops=True, contacts=True, floor_height=floor_height)
-    capsules = with_changing_pairs(arm.embodiment, fit_capsules(config, "hardware"))
-    simulated, drives = mujoco_world(arm, features, capsules), drives_of(config, arm)
+    capsules = fit_capsules(config, "hardware")
+    simulated, drives = (
+        mujoco_world(arm, features, capsules, colliding_pairs(arm.embodiment, capsules)),
+        drives_of(config, arm),
+    )
     collision_torque = _COLLISION_FRACTION * drives.limits.torque
     if config.model == "panda":
         collision_torque = np.array([_COLLISION_TORQUE[name] for name in arm.embodiment.joint_names])
