@@ -39,7 +39,6 @@ _COMMANDS = {
     "demonstrations": commands.RecordingConfig,
     "inspect": commands.InspectConfig,
     "retarget": commands.RetargetConfig,
-    "figures": commands.FiguresConfig,
     "view": commands.ViewConfig,
     "collect": commands.CollectConfig,
 }

@@ -31,7 +31,6 @@ from mimic.commands.config import (
     CollectConfig,
     DatasetConfig,
     EvaluateConfig,
-    FiguresConfig,
     InspectConfig,
     RecordingConfig,
     RenderConfig,
@@ -225,7 +224,6 @@ def _register_schemas() -> None:
     store.store(name="dataset_schema", node=schema(DatasetConfig))
     store.store(name="evaluate_schema", node=schema(EvaluateConfig))
     store.store(name="export_schema", node=schema(ExportConfig))
-    store.store(name="figures_schema", node=schema(FiguresConfig))
     store.store(name="render_schema", node=schema(RenderConfig))
     store.store(name="demonstrations_schema", node=schema(RecordingConfig))
     store.store(name="inspect_schema", node=schema(InspectConfig))

@@ -107,29 +107,6 @@ class EvaluateConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class FiguresConfig:
-    """Config of the figures of the metric and of pose retargeting.
-
-    Attributes:
-      out: folder for the figures.
-      only: names of the figures to draw. Default []: all.
-      runs: folder with one run directory of a pose mapper for each environment. Default "": the folder `runs` in
-        `out`.
-      seed: seed of the pose mappers that have to be trained.
-      compilation_cache: see `TrainConfig`.
-    """
-
-    out: str = ""
-    only: list[str] = dataclasses.field(default_factory=list)
-    runs: str = ""
-    seed: int = seed_number()
-    compilation_cache: str = "~/.cache/mimic/jax"
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
-
-@dataclasses.dataclass(frozen=True)
 class RenderConfig:
     """Config of a video of a trained policy, of a pose mapper, or of retargeted motions.
 
