@@ -6,11 +6,10 @@ import re
 import sys
 from pathlib import Path
 
-from mimic import __version__
 from mimic.base.config import BAD_INPUT, suggestion
+from mimic.base.distribution import VERSION
 
 _ENTRY_POINT = re.compile(r"`python -m mimic\.(\w+)[^`]*`: (.*)\.")  # the docstring of an entry point
-_COMPLETION = "completion", "prints the completion of a shell: bash, zsh or fish"
 _HELP = ("-h", "--help")
 
 
@@ -32,12 +31,8 @@ def main(arguments: list[str] | None = None) -> int:
     """
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in _HELP or name == "--version":
-        print(_overview() if name in _HELP else f"mimic {__version__}")
+        print(_overview() if name in _HELP else f"mimic {VERSION}")
         return 0
-    if name == _COMPLETION[0]:
-        from mimic.shell_completion import complete  # imports Hydra
-
-        return complete(rest, [*commands(), name])
     if name not in commands():
         print(f"error: {_unknown(name)}", file=sys.stderr)
         return BAD_INPUT
@@ -51,14 +46,14 @@ def main(arguments: list[str] | None = None) -> int:
 def _unknown(name: str) -> str:
     if "=" in name:
         return f"expected a command before {name!r:.80}, as in mimic train env=panda4dof"
-    valid = [*commands(), _COMPLETION[0]]
+    valid = commands()
     return f"unknown command {name!r:.80}; valid are {', '.join(valid)}{suggestion(name, valid)}"
 
 
 def _overview() -> str:
     summaries = commands()
-    width = max(map(len, [*summaries, _COMPLETION[0]]))
-    rows = [f"  {name:{width}}  {summary}" for name, summary in [*summaries.items(), _COMPLETION]]
+    width = max(map(len, summaries))
+    rows = [f"  {name:{width}}  {summary}" for name, summary in summaries.items()]
     head = "usage: mimic COMMAND [KEY=VALUE ...], or python -m mimic.COMMAND [KEY=VALUE ...]"
     return "\n".join([head, "", *rows, "", "mimic COMMAND --help shows the keys of each, mimic --version the version."])
 

@@ -9,7 +9,7 @@ import io
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -243,27 +243,3 @@ def mend_brax() -> None:
 
     if not hasattr(jax, "device_put_replicated"):
         jax.device_put_replicated = device_put_replicated  # type: ignore[attr-defined]
-
-
-@contextlib.contextmanager
-def coordination_address(replace: Callable[[str], str]) -> Iterator[None]:
-    """Context in which `jax.distributed.initialize` connects its client to another address.
-
-    Args:
-      replace: the address to connect to, for that of the coordinator, which JAX may have detected.
-    """
-    from jax._src.lib import _jax  # type: ignore[attr-defined]
-
-    make_client = _jax.get_distributed_runtime_client
-    _jax.get_distributed_runtime_client = lambda address, *args, **more: make_client(replace(address), *args, **more)
-    try:
-        yield
-    finally:
-        _jax.get_distributed_runtime_client = make_client
-
-
-def process_count() -> int:
-    """The number of processes in `jax.distributed`; unlike `jax.process_count`, it does not start the backend."""
-    from jax._src import distributed
-
-    return distributed.global_state.num_processes or 1

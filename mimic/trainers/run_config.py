@@ -4,11 +4,9 @@ import dataclasses
 import os
 import time
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mimic.arms.arm import BUILT_IN
 from mimic.base import registry
 from mimic.base.config import check_new, check_writable, explain, merged, schema, to_dict, typed
 from mimic.base.config_files import check_references, read_config
@@ -88,33 +86,9 @@ def _read_config(run_dir: Path) -> TrainConfig:
                 raise ValueError(f"{group}: expected keys and values, got {content[group]}")
         name = OmegaConf.select(content, "trainer.name")
         registry.check("trainer", str(name), "trainer.name")
-        content = merged(run_schema(name), _with_old_defaults(content))
-        return typed(content).resolve()
+        return typed(merged(run_schema(name), content)).resolve()
     except Exception as error:  # OmegaConf, YAML and our own checks each have their own types of error
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
-
-
-def _with_old_defaults(content: DictConfig) -> DictConfig:
-    """Completes the config of an older run with the defaults of its time."""
-    content = merged({"env": {"physics": "mjx"}}, content)
-    content = _without_base_segments(content)
-    trainer = OmegaConf.select(content, "trainer")
-    defaults: dict[str, Any] = {"keep": 1_000_000}
-    if trainer.name == "ppo":
-        defaults |= {"timed_critic": False, "final_entropy_cost": 1.0}
-    elif trainer.get("refinements") is not None:  # a mapper to any arm
-        defaults |= {"guesses": 0}
-    return merged(content, {"trainer": {**defaults, **trainer}})
-
-
-def _without_base_segments(content: DictConfig) -> DictConfig:
-    """Completes the config of a run older than the field `base_segment`: an arm from a file began at its first joint.
-
-    The number of links, and so the size of observations, is part of what was trained.
-    """
-    models = {role: OmegaConf.select(content, f"env.{role}.model") for role in ("expert", "learner")}
-    old = {role: {"base_segment": False} for role, model in models.items() if model not in (None, *BUILT_IN)}
-    return merged({"env": old}, content) if old else content
 
 
 def policy_config(run: str) -> tuple[Path, TrainConfig]:

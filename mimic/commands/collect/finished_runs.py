@@ -10,7 +10,7 @@ from typing import Any
 
 from mimic.base import registry
 from mimic.base.config import flatten, to_dict
-from mimic.base.distribution import VERSION, recorded_version
+from mimic.base.distribution import NAME, VERSION
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import CONFIG, METRICS, REPORT, read_json
 from mimic.runs.sweeps.sweeper import LOGS, SWEEP
@@ -205,7 +205,7 @@ def _progress(path: Path, total: int, history: Mapping[str, Mapping[int, float]]
 
 def _version(report: Mapping[str, Any]) -> str:
     versions = report.get("versions")
-    return recorded_version(versions) if isinstance(versions, Mapping) else "unknown"
+    return str(versions.get(NAME, "unknown")) if isinstance(versions, Mapping) else "unknown"
 
 
 def _history(path: Path) -> dict[str, dict[int, float]]:

@@ -1,37 +1,33 @@
-"""Training in several processes: they connect, train in step, and end together.
+"""Training in several processes: they connect by `jax.distributed`, train in step, and end together.
 
 Only the first process writes, evaluates and may stop early, while the others wait for it in their next training epoch.
 So the first process announces the end of a training through JAX's coordination service. A failure, or a signal that
 only one process received, is announced in the same way. A process that is killed or stopped announces nothing: the
-others miss its heartbeats, and end with one line that names it.
+others end by the errors of their connections to it, or by JAX when its heartbeats stay out.
 """
 
 import atexit
 import contextlib
 import dataclasses
-import functools
 import os
 import re
 import sys
 import threading
-import time
 from collections.abc import Callable
+from typing import NoReturn
 
 import jax
 
 from mimic.base import compat
 from mimic.base.ranges import check_ranges, number
 from mimic.runs.distributed.local_processes import LocalProcesses, gpu_count, local_process
-from mimic.runs.signals import EXIT_HOOKS, STOPPED_BY_SIGNAL, Signals, with_patience
-from mimic.trainers.distributed.heartbeats import Heartbeats
-from mimic.trainers.distributed.relay import Relay
+from mimic.runs.signals import EXIT_HOOKS, STOPPED_BY_SIGNAL, Signals
 
 AUTO, LOCAL = "auto", "local"
-_ENDED, _SIGNAL, _ALIVE = "mimic/ended", "mimic/signal", "mimic/alive/"  # keys of the coordination service
+_ENDED, _SIGNAL = "mimic/ended", "mimic/signal"  # keys of the coordination service
 _POLL_S = 0.5
-_BEAT_S = 2
 _CONNECTION_ERROR = re.compile("gloo|nccl|connection|socket|timed? ?out|deadline", re.IGNORECASE)
-_VERDICT_S = 45  # until a process that was lost counts as lost
+_HEARTBEAT_S = 30  # JAX ends all processes if one is silent for that long; Python may hold it up while it traces
 _SHUTDOWN_S = 60  # timeout for the last process to disconnect
 _GRACE_S = 3  # the same error may occur in two processes with this delay
 _FAILED = 1
@@ -80,24 +76,20 @@ class ProcessGroup:
       signals: signals that this process received; in the first process, those of all processes.
     """
 
-    def __init__(self, index: int, others: LocalProcesses | None = None, relay: Relay | None = None):
-        """Starts to watch the other processes.
+    def __init__(self, index: int, others: LocalProcesses | None = None):
+        """Starts to watch for announcements.
 
         Args:
           index: number of this process.
           others: the processes that this process started.
-          relay: the connection to the first process; None in the first process.
         """
         self.index = index
-        self._others, self._relay = others, relay
-        self._heartbeats = Heartbeats(compat.process_count())
+        self._others = others
         self.signals = Signals()
         self._client = compat.coordination_client()
         self._left = threading.Event()
-        self._ending = threading.Lock()  # never released by the thread that ends this process
         self._watcher = threading.Thread(target=self._watch, name="group", daemon=True)
         self._watcher.start()
-        threading.Thread(target=self._guard, name="heartbeats", daemon=True).start()
         EXIT_HOOKS.append(self._announce)
         atexit.register(self.end, _FAILED)
 
@@ -121,54 +113,26 @@ class ProcessGroup:
         self._watcher.join()
 
     def run(self, work: Callable[[], int | None]) -> int | None:
-        """Does the work of this process; if that fails because another process was lost, ends with its name."""
+        """Does the work of this process; ends it with one line if that fails because another process was lost."""
         try:
             return work()
         except jax.errors.JaxRuntimeError as error:
-            if _CONNECTION_ERROR.search(str(error)):
-                self._left.wait(_VERDICT_S)  # `_guard` or `_watch` ends this process, if another one was lost
-            raise
-
-    def _announce(self, exit_code: int, process: int | None = None, reason: str = "") -> None:
-        """Announces that this or another process has ended, and so all end."""
-        ended = self.index if process is None else process
-        with contextlib.suppress(jax.errors.JaxRuntimeError):  # another process has announced the end
-            self._client.key_value_set(_ENDED, f"{ended} {exit_code} {reason}")
-
-    def _guard(self) -> None:
-        """Ends all if a process is lost. In a thread of its own: a stopped first process does not answer `_watch`."""
-        while not self._left.wait(_POLL_S):
-            if lost := self._heartbeats.lost():
-                process, silent_s = lost
-                reason = f"is lost or stopped: no heartbeat for {silent_s:.0f} s"
-            elif self._relay and self._relay.lost.is_set():
-                process, reason = 0, "is lost: its connection has closed"
-                if self._left.wait(_GRACE_S):
-                    return
-            else:
-                continue
-            self._ending.acquire()
-            _report(process, self._others, reason)
-            with_patience(functools.partial(self._announce, _FAILED, process, reason))
-            if self._others:
-                self._others.end(patience_s=0)
-            elif self.first:
-                time.sleep(2 * _POLL_S)  # so that the others can read the announcement
+            if not _CONNECTION_ERROR.search(str(error)):
+                raise
+            self._left.wait(_GRACE_S)  # `_watch` ends this process, if it knows which one was lost
+            reason = " ".join(str(error).split())[:200]
+            print(f"error: another process of the training is lost: {reason}", file=sys.stderr)
+            self._announce(_FAILED)
             _exit(_FAILED)
 
-    def _beat(self) -> None:
-        """Sends a heartbeat, and reads those of the others."""
-        with contextlib.suppress(jax.errors.JaxRuntimeError):
-            self._client.key_value_set(f"{_ALIVE}{self.index}", f"{time.time()}", allow_overwrite=True)
-            for key, sign in self._client.key_value_dir_get(_ALIVE):
-                self._heartbeats.hear(int(key.rpartition("/")[2]), sign)
+    def _announce(self, exit_code: int) -> None:
+        """Announces that this process has ended, and so all end."""
+        with contextlib.suppress(jax.errors.JaxRuntimeError):  # another process has announced the end
+            self._client.key_value_set(_ENDED, f"{self.index} {exit_code}")
 
     def _watch(self) -> None:
-        signal_shared, beat = False, 0.0
+        signal_shared = False
         while not self._left.wait(_POLL_S):
-            if time.monotonic() - beat > _BEAT_S:
-                beat = time.monotonic()
-                self._beat()
             if self.first and not signal_shared and (number := self._read(_SIGNAL)):
                 self.signals.caught.append(int(number))
                 signal_shared = True
@@ -178,15 +142,12 @@ class ProcessGroup:
                 signal_shared = True
             # This thread ends the process, because the main thread may wait in an all-reduce that never ends.
             if ended := self._read(_ENDED):
-                process, code, reason = ended.split(" ", 2)
-                exit_code = int(code)
+                process, exit_code = map(int, ended.split())
                 if 0 < exit_code < STOPPED_BY_SIGNAL:
                     if self._others and self._left.wait(_GRACE_S):
                         return  # the same error occurred here and has been reported
-                    self._ending.acquire()
-                    _report(int(process), self._others, reason)
-                if not reason:  # else one process is lost: it cannot disconnect, and JAX would wait for it
-                    _disconnect()
+                    _report(process, self._others)
+                _disconnect()
                 if self._others:
                     self._others.end()
                 _exit(exit_code)
@@ -229,23 +190,19 @@ def join(config: DistributedConfig) -> ProcessGroup | None:
                 others.end(patience_s=0)
                 _exit(_FAILED)
         options = {"local_device_ids": [index], "coordinator_bind_address": address}
-    relays: list[Relay] = []
-
-    def relayed(coordinator: str) -> str:
-        if compat.process_number() == 0:
-            return coordinator
-        relays.append(Relay(coordinator))
-        return relays[0].address
-
     try:
-        with compat.coordination_address(relayed):
-            jax.distributed.initialize(
-                None if address == AUTO else address, count, index, shutdown_timeout_seconds=_SHUTDOWN_S, **options
-            )
+        jax.distributed.initialize(
+            None if address == AUTO else address,
+            count,
+            index,
+            heartbeat_timeout_seconds=_HEARTBEAT_S,
+            shutdown_timeout_seconds=_SHUTDOWN_S,
+            **options,
+        )
     except (RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"distributed.coordinator={config.coordinator}: no processes found: {reason}") from error
-    return ProcessGroup(compat.process_number(), others, relays[0] if relays else None)
+    return ProcessGroup(compat.process_number(), others)
 
 
 def processes_here(requested: int | None) -> int:
@@ -265,14 +222,14 @@ def processes_here(requested: int | None) -> int:
     return requested or available
 
 
-def _report(failed: int, others: LocalProcesses | None, reason: str = "") -> None:
+def _report(failed: int, others: LocalProcesses | None) -> None:
     """Prints which process failed, and its error output."""
-    print(f"error: process {failed} of the training {reason or 'failed'}", file=sys.stderr)
+    print(f"error: process {failed} of the training failed", file=sys.stderr)
     if others and failed and (output := others.error_output(failed)):
         print(output, file=sys.stderr)
 
 
-def _exit(exit_code: int) -> None:
+def _exit(exit_code: int) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         stream.flush()
     os._exit(exit_code)

@@ -1,12 +1,9 @@
 """Registration of our sweeper, launchers and reader of config files with Hydra, in this process only.
 
-Hydra loads plugins only from the package `hydra_plugins`, whose modules every Hydra application in an environment
-imports. Ours is not on disk there, so that other applications do not import mimic and JAX.
+Every Hydra application of an environment imports the modules of the package `hydra_plugins`. Ours are not in it, so
+that other applications do not import mimic and JAX.
 """
 
-import importlib
-import sys
-import types
 from pathlib import Path
 
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
@@ -18,33 +15,16 @@ from hydra.plugins.plugin import Plugin
 
 from mimic.base.config_files import read_config
 
-_PACKAGE, _MODULE = "hydra_plugins", "mimic"
-
 
 def target(name: str) -> str:
-    """The `_target_` of one of our plugins in Hydra's configs."""
-    return f"{_PACKAGE}.{_MODULE}.{name}"
+    """The `_target_` of one of our plugins in Hydra's configs, which accept classes of one package alone."""
+    return f"hydra_plugins.mimic.{name}"
 
 
 def register(plugin: type[Plugin], config: type, group: str, choice: str) -> None:
     """Registers a plugin with Hydra, and its config as a choice of a config group."""
-    package = _plugins()
-    module = getattr(package, _MODULE, types.ModuleType(f"{_PACKAGE}.{_MODULE}"))
-    setattr(package, _MODULE, module)
-    setattr(module, plugin.__name__, plugin)
-    plugin.__module__ = sys.modules.setdefault(module.__name__, module).__name__
-    Plugins.instance().register(plugin)
+    Plugins.instance().class_name_to_class[target(plugin.__name__)] = plugin  # Hydra looks it up here; no import
     ConfigStore.instance().store(group=group, name=choice, node=config, provider="mimic")
-
-
-def _plugins() -> types.ModuleType:
-    """Hydra's package of plugins; it is created if none are installed."""
-    try:
-        return importlib.import_module(_PACKAGE)
-    except ImportError:
-        package = types.ModuleType(_PACKAGE)
-        package.__path__ = []
-        return sys.modules.setdefault(_PACKAGE, package)
 
 
 class BoundedFileSource(FileConfigSource):

@@ -151,15 +151,6 @@ def test_runs_of_several_versions_are_said_to_be(tmp_path, capsys):
     assert "several versions of mimic: 0.1.0 (1), 0.2.0 (1)" in capsys.readouterr().err
 
 
-def test_runs_under_the_former_name_keep_their_version(tmp_path, capsys):
-    for seed, version in enumerate(("0.1.0", "0.2.0")):
-        path = write_run(tmp_path / version, [0.5], seed=seed) / REPORT
-        report = json.loads(path.read_text())
-        path.write_text(json.dumps({**report, "versions": {"mimic-mjx": version}}))
-    assert collect(tmp_path) == 0
-    assert "several versions of mimic: 0.1.0 (1), 0.2.0 (1)" in capsys.readouterr().err
-
-
 def test_pose_mappers_are_collected_by_their_quality(tmp_path, capsys):
     for seed in range(2):
         write_run(tmp_path / f"mapper-{seed}", [0.5, 0.01], seed=seed, trainer="pose_mapper")
