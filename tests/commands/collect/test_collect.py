@@ -10,7 +10,6 @@ import pytest
 from mimic.commands.collect.collect import prepare_collection
 from mimic.commands.collect.seed_groups import mean_interval
 from mimic.commands.config import CollectConfig
-from mimic.runs.files import REPORT
 from mimic.runs.sweeps.sweeper import SWEEP
 from tests.helpers.run_directories import write_run
 
