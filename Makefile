@@ -38,11 +38,16 @@ install: $(STAMP) ## install alone
 train: $(STAMP) ## install if needed, then train: make train ARGS="env=panda4dof"
 	@$(BIN)/python -m mimic.train $(ARGS)
 
-test: static ## install if needed, then ruff, pyright, the quick tests and quick examples
-	$(PYTEST) $(PYTEST_ARGS)
+# ruff and pyright run beside pytest, whose workers wait now and then; what they say comes after its report.
+BESIDE_STATIC = mkdir -p build; $(MAKE) --no-print-directory static >build/static.log 2>&1 & static=$$!; \
+  trap 'kill $$static' INT TERM; $(1); tests=$$?; wait $$static; lint=$$?; cat build/static.log; \
+  test $$lint -eq 0 && exit $$tests; echo 'error: ruff or pyright failed, see above' >&2; exit 1
 
-test-all: static ## the same with the slow tests
-	$(PYTEST) -m 'not gpu' --timeout 1800 $(PYTEST_ARGS)
+test: $(STAMP_TEST) ## install if needed, then ruff, pyright, the quick tests and quick examples
+	@$(call BESIDE_STATIC,$(PYTEST) $(PYTEST_ARGS))
+
+test-all: $(STAMP_TEST) ## the same with the slow tests
+	@$(call BESIDE_STATIC,$(PYTEST) -m 'not gpu' --timeout 1800 $(PYTEST_ARGS))
 
 lint: static ## ruff and pyright alone
 

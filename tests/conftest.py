@@ -12,7 +12,7 @@ import pytest
 from jaxtyping import config as jaxtyping_config
 from jaxtyping import install_import_hook
 
-from tests.helpers.repository import REPOSITORY, SLOW_PARAMETERS
+from tests.helpers.repository import CACHE, SLOW_PARAMETERS, share_compilations
 
 # Not mimic.base.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
 CORE = (
@@ -38,8 +38,9 @@ def pytest_configure(config: pytest.Config) -> None:
     marks = config.getoption("markexpr") or ""
     if "gpu" not in marks or "not gpu" in marks:
         jax.config.update("jax_platforms", "cpu")
-    jax.config.update("jax_compilation_cache_dir", str(REPOSITORY / ".jax_cache"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    share_compilations()  # in the environment, for processes that tests start; here JAX is imported already
+    jax.config.update("jax_compilation_cache_dir", str(CACHE))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if importlib.util.find_spec("beartype") is not None:
         from tests.helpers import typechecking  # here already: the hook itself imports no more than `tests`
 

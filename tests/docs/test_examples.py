@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 import mimic
-from tests.helpers.repository import CACHE, CACHED, REPOSITORY
+from tests.helpers.repository import CACHED, REPOSITORY
 
 EXAMPLES = REPOSITORY / "examples"
 NAMES = sorted(path.stem for path in EXAMPLES.glob("[0-9]*.py"))
@@ -23,7 +23,6 @@ patience = pytest.mark.timeout(900)
 def said(request, tmp_path):
     """The output of the test's example, which writes into the test's folder."""
     name = request.param
-    CACHE.mkdir(exist_ok=True)
     result = subprocess.run(
         [sys.executable, str(EXAMPLES / f"{name}.py"), str(tmp_path)],
         capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, **CACHED},

@@ -7,7 +7,7 @@ import os
 import pytest
 
 import mimic
-from tests.helpers.repository import CACHE, CACHED, REPOSITORY
+from tests.helpers.repository import CACHED, REPOSITORY
 
 NOTEBOOKS = sorted((REPOSITORY / "examples" / "notebooks").glob("*.ipynb"))
 SLOW = ("2_train_and_evaluate",)
@@ -54,7 +54,6 @@ def test_notebooks_run(path, tmp_path, monkeypatch):
     nbclient = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     nbformat = pytest.importorskip("nbformat")
-    CACHE.mkdir(exist_ok=True)
     for name, value in {**CACHED, "PYTHONPATH": str(REPOSITORY)}.items():
         monkeypatch.setenv(name, value)
     notebook = nbformat.read(path, as_version=4)

@@ -29,7 +29,7 @@ import pytest
 
 from mimic.commands import cli
 from mimic.runs.sweeps.sweeper import Sweeper
-from tests.helpers.repository import REPOSITORY
+from tests.helpers.repository import CACHED, REPOSITORY
 
 PAGES = [
     *(REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md")),
@@ -212,15 +212,7 @@ def _run(words: list[str], folder: pathlib.Path) -> None:
         flags = [word for word in arguments if word.startswith("-")]  # Hydra takes them before all others
         others = [word for word in arguments if word not in flags]
         arguments = [*flags, *SMALL.get(name, []), *others, *SHORT.get(name, [])]
-    home = REPOSITORY / ".jax_cache" / "home"  # the default place of the compilation cache
-    home.mkdir(parents=True, exist_ok=True)
-    quickly_compiled = "--xla_backend_optimization_level=0"  # most of a small run is compilation
-    settings = {
-        "HOME": str(home),
-        "PYTHONPATH": str(REPOSITORY),
-        "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {quickly_compiled}".strip(),
-    }
+    settings = {**CACHED, "PYTHONPATH": str(REPOSITORY)}
     ended = subprocess.run(
         [sys.executable, "-m", program, *arguments],
         cwd=folder,
