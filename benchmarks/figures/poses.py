@@ -18,10 +18,10 @@ from matplotlib.lines import Line2D  # noqa: E402
 from benchmarks.figures import candidate_points, similarity
 from benchmarks.figures import metric as metric_figures  # noqa: E402
 from benchmarks.figures.planar_arms import add_match_legend, draw_match, fit, joint_points  # noqa: E402
-from benchmarks.figures.pose_picture import PANDA_POSES, show_images  # noqa: E402
 from mimic.arms.embodiment import planar_arm  # noqa: E402
 from mimic.arms.link_match import LinkMatch  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
+from mimic.commands.pose_picture import PANDA_POSES, show_images  # noqa: E402
 from mimic.envs import env_config  # noqa: E402
 from mimic.metric.config import MetricConfig  # noqa: E402
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402

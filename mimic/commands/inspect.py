@@ -17,7 +17,6 @@ from rich.console import Console  # noqa: E402
 from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
 
-from benchmarks.figures.pose_picture import nearest_poses, readable_poses, save_poses  # noqa: E402
 from mimic.arms.arm import Arm, ArmConfig, finite_velocity_limit, torque_scale
 from mimic.arms.named_arms import is_arm_name, named_arms  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
@@ -25,6 +24,7 @@ from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.base.config import new_folder  # noqa: E402
 from mimic.commands import arm_checks  # noqa: E402
 from mimic.commands.config import InspectConfig  # noqa: E402
+from mimic.commands.pose_picture import nearest_poses, readable_poses, save_poses  # noqa: E402
 from mimic.envs.config import EnvConfig  # noqa: E402
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
 from mimic.motions.demonstrations import Demonstrations  # noqa: E402

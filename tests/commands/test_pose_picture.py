@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.figures.pose_picture import PANDA_POSES, nearest_poses, readable_poses, save_poses
 from mimic.arms.arm import ArmConfig, build_arm
+from mimic.commands.pose_picture import PANDA_POSES, nearest_poses, readable_poses, save_poses
 from mimic.envs.config import EnvConfig
 from mimic.metric.similarity import MEASURES
 

@@ -13,7 +13,6 @@ import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 
-from benchmarks.figures.planar_arms import EXPERT_COLOUR, LEARNER_COLOUR  # noqa: E402
 from mimic.arms.arm import Arm, ArmConfig  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.envs.config import EnvConfig
@@ -32,6 +31,7 @@ PANDA_POSES = np.array(
     ],
     np.float32,
 )
+_EXPERT_COLOUR, _LEARNER_COLOUR = "tab:blue", "tab:orange"
 _PIXELS = 260  # of one image; rendering meshes is slow without a GPU
 
 
@@ -106,7 +106,7 @@ def save_poses(path: Path, expert: Arm, learner: Arm, env: EnvConfig, pairs: Pos
             show_images(row, images, f"{role}: {arm.embodiment.name}")
             lines.append((role, scene.flattened(_with_ends(centre_line_table(arm.embodiment, poses)))))
     for column, axes in enumerate(rows[2]):
-        for (role, points), colour, width in zip(lines, (EXPERT_COLOUR, LEARNER_COLOUR), (6, 2.5), strict=True):
+        for (role, points), colour, width in zip(lines, (_EXPERT_COLOUR, _LEARNER_COLOUR), (6, 2.5), strict=True):
             alpha = 0.45 if role == "expert" else 1.0
             axes.plot(*points[column].T, color=colour, lw=width, alpha=alpha, label=role, solid_capstyle="round")
         axes.set(aspect="equal", xlim=(-0.6, 0.6), ylim=(-0.06, 0.9), xticks=[], yticks=[])
