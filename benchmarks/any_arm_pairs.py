@@ -20,8 +20,9 @@ from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from mimic.arms.arm import ArmConfig
 from mimic.arms.arrays import ArmArrays, stack_arms
+from mimic.base.files import read_json
 from mimic.envs.family import UNSEEN, report_arms
-from mimic.runs.files import REPORT, read_json
+from mimic.runs.files import REPORT
 from mimic.trainers.pose_mapper.any_arm_evaluation import METHODS, Pairs, make_reference, run_mapper, table_of_pairs
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
 from mimic.trainers.pose_mapper.any_arm_training import random_pose

@@ -23,12 +23,13 @@ import numpy as np
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import print_table
 from mimic.base.config import flatten, to_dict
+from mimic.base.files import read_json
 from mimic.envs import env_config
 from mimic.metric.kinematics import link_state_table
 from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import copy_joints
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.runs.files import REPORT, read_json
+from mimic.runs.files import REPORT
 from mimic.trainers.config import BUILT_IN_TRAINERS as CONFIGS
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.make import make_trainer

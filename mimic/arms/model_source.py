@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.parsers import expat
 
+from mimic.base.files import file_digest, read_bytes
+
 MAX_FILE_SIZE = 32 * 2**20  # bytes of XML; the largest robot models known to us have 1 MiB
 MAX_ASSET_SIZE = 512 * 2**20  # bytes of all meshes, textures and height fields
 MAX_DEPTH = 300  # levels of XML
@@ -119,12 +121,6 @@ def _source(reader: "_Reader") -> ModelSource:
     return ModelSource(digest.hexdigest(), root, reader.attached, files, tuple(reader.missing))
 
 
-def file_digest(file: Path) -> str:
-    """The SHA-256 checksum of a file."""
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
 def write_xml(root: Element) -> str:
     """An element as XML, each element in its line as far as possible: MuJoCo's messages give the line."""
     parts: list[str] = []
@@ -200,13 +196,10 @@ class _Reader:
             raise ValueError(f"{str(file)!r} {error}") from None
 
     def _text(self, file: Path) -> str:
-        with file.open("rb") as stream:
-            content = stream.read(MAX_FILE_SIZE + 1)
-        if len(content) > MAX_FILE_SIZE:
-            raise ValueError(
-                f"{str(file)!r} has {max(file.stat().st_size, len(content)) / 2**20:.0f} MiB; "
-                f"expected a model of at most {MAX_FILE_SIZE // 2**20} MiB of XML"
-            )
+        try:
+            content = read_bytes(file, MAX_FILE_SIZE)
+        except ValueError as error:
+            raise ValueError(f"{str(file)!r} cannot be read: {error}") from error
         try:
             return content.decode("utf-8-sig")
         except UnicodeDecodeError:

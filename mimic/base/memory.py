@@ -2,7 +2,8 @@
 
 import contextlib
 import os
-from pathlib import Path
+
+from mimic.base.files import read_text
 
 _CGROUP_LIMITS = "/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"  # version 2, version 1
 _GIB = 2**30
@@ -31,7 +32,7 @@ def host_memory() -> int | None:
         limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     for path in _CGROUP_LIMITS:
         with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
-            limits.append(int(Path(path).read_text()))
+            limits.append(int(read_text(path)))
     return min(limits, default=None)
 
 

@@ -26,6 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from mimic.base import compat, registry
 from mimic.base.config import BAD_INPUT, explain, schema, suggestion, typed
 from mimic.base.distribution import VERSION
+from mimic.base.files import read_text
 from mimic.commands.arguments import check_arguments, load_plugins
 from mimic.commands.config import (
     CollectConfig,
@@ -190,7 +191,7 @@ def process_started() -> float:
     """`time.perf_counter()` at the start of this process; its present value if the system does not report it."""
     now = time.perf_counter()
     with contextlib.suppress(OSError, AttributeError, ValueError):
-        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])  # since boot: see proc(5)
+        ticks = int(read_text("/proc/self/stat").rpartition(")")[2].split()[19])  # since boot: see proc(5)
         return now - (time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK"))
     return now
 

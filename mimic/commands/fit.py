@@ -14,6 +14,7 @@ from rich.console import Console
 
 from mimic.base.compilation import compilation_cache, use_compilation_cache
 from mimic.base.config import explain, merged, schema, typed
+from mimic.base.files import open_file, read_json
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_report
 from mimic.envs import EnvConfig, env_config
@@ -21,7 +22,7 @@ from mimic.envs.imitation import ImitationEnv
 from mimic.envs.make import make_env, make_family_env
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.runs.files import DEMONSTRATIONS, REPORT, read_json
+from mimic.runs.files import DEMONSTRATIONS, REPORT
 from mimic.runs.signals import Signals
 from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig, TrainerConfig, trainer_config, trainers
@@ -81,7 +82,7 @@ class Run:
         """The plots of the run by name, such as `quality`; a notebook shows them."""
         from PIL import Image
 
-        return {path.stem: Image.open(path) for path in sorted(self.run_dir.glob("*.png"))}
+        return {path.stem: Image.open(open_file(path)) for path in sorted(self.run_dir.glob("*.png"))}
 
     def make_env(self) -> ImitationEnv | AnyArmEnv:
         """The environment of the run, with its training demonstrations; an `AnyArmEnv` for a run of many arms."""

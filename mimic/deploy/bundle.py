@@ -1,7 +1,6 @@
 """Controller bundles: the folders that hold a policy, its safety layer's clearance, its parameters and motions."""
 
 import dataclasses
-import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mimic.base.files import file_digest, read_json
 from mimic.base.npz import read_arrays
 from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import MODES, PERIOD, JointParameters, action_size
@@ -131,7 +131,7 @@ def write_bundle(
         **controller,
         "period": PERIOD,
         "start_pose": np.asarray(start_poses, float)[0].tolist(),
-        "hashes": {name: _sha256(folder / name) for name in _MODELS},
+        "hashes": {name: file_digest(folder / name) for name in _MODELS},
     }
     np.savez(
         folder / MOTIONS,
@@ -155,7 +155,7 @@ def load_bundle(folder: str | Path) -> Bundle:
         raise ValueError(f"bundle: {str(folder)!r}: expected a folder of mimic.export with format=controller; it lacks "
                          f"{', '.join(missing)}")  # fmt: skip
     for name in _MODELS:
-        if content["hashes"].get(name) != _sha256(folder / name):
+        if content["hashes"].get(name) != file_digest(folder / name):
             raise ValueError(f"bundle: {name}: expected the file that {CONTROLLER} was written for, got another one")
     motions = _arrays(folder / MOTIONS, ("expert", "start_poses", "names"))
     clearance = _arrays(folder / CLEARANCE, ClearanceConstants._fields)
@@ -167,10 +167,9 @@ def load_bundle(folder: str | Path) -> Bundle:
 
 def _controller(folder: Path) -> dict[str, Any]:
     try:
-        content = json.loads((folder / CONTROLLER).read_text())
-    except (ValueError, UnicodeDecodeError) as error:
+        keys = read_json(folder / CONTROLLER)
+    except ValueError as error:
         raise ValueError(f"bundle: {CONTROLLER}: expected JSON: {error}") from error
-    keys = content if isinstance(content, dict) else {}
     if keys.get("format", FORMAT) != FORMAT:
         raise ValueError(
             f"bundle: {CONTROLLER}: format: expected {FORMAT}, got {keys['format']!r:.40}; export the run again, with "
@@ -271,7 +270,3 @@ def _check_clearance(constants: ClearanceConstants, joints: int) -> None:
             )
     if any(not -1 <= parent < joint for joint, parent in enumerate(constants.parent)) or not columns:
         raise ValueError(f"bundle: {CLEARANCE}: expected parents before their children, and something to check")
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

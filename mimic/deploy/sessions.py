@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mimic.base.files import read_bytes
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import FEATURES, POLICY, Bundle
 
@@ -33,7 +34,7 @@ def open_session(path: Path | bytes, inputs: dict[str, int], outputs: dict[str, 
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     name = "policy" if isinstance(path, bytes) else path.name
     try:
-        content = path if isinstance(path, bytes) else str(path)
+        content = path if isinstance(path, bytes) else read_bytes(path)
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no common class
         line = " ".join(str(error).split())[:200]

@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 import matplotlib.ticker  # noqa: E402
 import numpy as np  # noqa: E402
 
+from mimic.base.files import read_text  # noqa: E402
 from mimic.evaluation.labels import SIMILARITY_HEADERS, SIMILARITY_NAMES, SPLIT_NAMES  # noqa: E402
 from mimic.evaluation.rollout_metrics import WORST  # noqa: E402
 from mimic.runs.files import METRICS  # noqa: E402
@@ -28,8 +29,7 @@ def plot_training(folder: Path, metric: str, label: str, *, labels: Mapping[str,
     log = folder / METRICS
     if not log.is_file():
         return
-    with log.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader(read_text(log).splitlines()))
     steps = [int(row["step"]) for row in rows]
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
     for split, colour in _COLOURS.items():

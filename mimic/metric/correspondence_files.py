@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment
+from mimic.base.files import read_text
 from mimic.base.npz import read_arrays
 
 SUFFIXES = (".csv", ".npz")
@@ -33,8 +34,6 @@ def load_correspondence(
     label = repr(os.fspath(path))
     if not file.is_file():
         raise ValueError(f"correspondence: no file at {label}")
-    if file.stat().st_size > MAX_BYTES:
-        raise ValueError(f"correspondence: {label}: expected at most {MAX_BYTES:,} bytes, got {file.stat().st_size:,}")
     try:
         matrix = _read_npz(file) if file.suffix == ".npz" else _read_csv(file)
     except ValueError as error:
@@ -71,10 +70,7 @@ def _read_npz(file: Path) -> np.ndarray:
 
 
 def _read_csv(file: Path) -> np.ndarray:
-    try:
-        lines = [line for line in file.read_text().splitlines() if line.strip()]
-    except UnicodeDecodeError as error:
-        raise ValueError("expected text") from error
+    lines = [line for line in read_text(file, MAX_BYTES).splitlines() if line.strip()]
     rows = [[_number(cell) for cell in line.split(",")] for line in lines]
     if not rows or len({len(row) for row in rows}) != 1:
         raise ValueError("expected rows of equal length, numbers separated by commas")

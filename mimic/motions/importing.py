@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mimic.arms.embodiment import Embodiment
+from mimic.base.files import read_text
 from mimic.base.npz import read_arrays
 from mimic.motions.demonstrations import MAX_VALUE, Demonstrations, check_effort
 from mimic.motions.formats.episodes import Motion
@@ -130,12 +131,11 @@ def _resampled(motion: Motion, dt: float, horizon: int) -> tuple[np.ndarray, np.
 
 
 def _read_csv(path: Path, names: Sequence[str]) -> list[Motion]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        try:
-            header, *rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
-            table = np.array(rows, float).reshape(len(rows), len(header))
-        except (ValueError, UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"source: {str(path)!r} is no table of numbers below a header: {error}") from error
+    try:
+        header, *rows = [[cell.strip() for cell in row] for row in csv.reader(read_text(path).splitlines()) if row]
+        table = np.array(rows, float).reshape(len(rows), len(header))
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"source: {str(path)!r} is no table of numbers below a header: {error}") from error
     times = [header.index(name) for name in _TIME if name in header]
     angles = _columns(header, names, _ANGLE_PREFIXES)
     lacking = [name for name, column in zip(names, angles, strict=True) if column is None]

@@ -15,7 +15,8 @@ from pathlib import Path
 import jax
 
 from mimic.base.compilation import compilation_cache
-from mimic.runs.files import read_json, write_atomically
+from mimic.base.files import read_bytes, read_json
+from mimic.runs.files import write_atomically
 
 FILE = "autotuning.json"
 _FOLDER = "xla_gpu_per_fusion_autotune_cache_dir"  # JAX's name for it in the compilation cache
@@ -54,7 +55,7 @@ def use_kept_choices(run_dir: Path) -> None:
 
 
 def _choices_in(folder: Path) -> Choices:
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {path.relative_to(folder).as_posix(): read_bytes(path) for path in folder.rglob("*") if path.is_file()}
 
 
 def _kept_choices(run_dir: Path) -> Choices:

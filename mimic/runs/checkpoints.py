@@ -6,7 +6,6 @@ its name when it is complete, and is never written again.
 """
 
 import contextlib
-import hashlib
 import json
 import logging
 import os
@@ -22,6 +21,7 @@ import jaxlib
 import numpy as np
 import orbax.checkpoint as ocp
 
+from mimic.base.files import file_digest, read_json, read_text
 from mimic.base.npz import read_arrays
 from mimic.runs.autotuning import keep_choices
 from mimic.runs.files import write_atomically
@@ -151,7 +151,7 @@ def check_checkpoint(run_dir: Path, step: int | None = None) -> int:
 def run_id(run_dir: Path) -> str:
     """The random name of a run in its checkpoints; empty for a run without any."""
     try:
-        return (run_dir / FOLDER / _RUN).read_text()
+        return read_text(run_dir / FOLDER / _RUN)
     except FileNotFoundError:
         return ""
 
@@ -224,19 +224,18 @@ def _verify(path: Path) -> None:
         if (name in actual or name != _STATE) and actual.get(name) != expected:
             raise DamagedCheckpoint(f"checkpoint {str(path)!r} is damaged: {name} is missing or was changed")
     run = path.parent / _RUN
-    if checksums and run.is_file() and content.get("run") != run.read_text():
+    if checksums and run.is_file() and content.get("run") != read_text(run):
         raise DamagedCheckpoint(f"checkpoint {str(path)!r} is that of another run")
 
 
 def _content(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads((path / _CONTENT).read_text())
+        content = read_json(path / _CONTENT)
     except FileNotFoundError:
         return {}
     except ValueError as error:
         raise DamagedCheckpoint(f"checkpoint {str(path)!r} is damaged: {_CONTENT} cannot be read") from error
-    tables = "metrics", "made_with", "sha256"
-    if not isinstance(content, dict) or not all(isinstance(content.get(name, {}), dict) for name in tables):
+    if not all(isinstance(content.get(name, {}), dict) for name in ("metrics", "made_with", "sha256")):
         raise DamagedCheckpoint(f"checkpoint {str(path)!r} is damaged: {_CONTENT} has other content")
     return content
 
@@ -253,7 +252,7 @@ def _software_and_devices() -> dict[str, str]:
 
 def _checksums(path: Path) -> dict[str, str]:
     files = sorted(file for file in path.rglob("*") if file.is_file() and file.name != _CONTENT)
-    return {file.relative_to(path).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    return {file.relative_to(path).as_posix(): file_digest(file) for file in files}
 
 
 def _read_params(path: Path, template: Any) -> Any:

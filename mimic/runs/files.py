@@ -9,8 +9,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from mimic.base.files import read_json
+
 CONFIG, REPORT, METRICS, DEMONSTRATIONS = "config.yaml", "report.json", "metrics.csv", "demonstrations.npz"
-_MAX_JSON_BYTES = 10_000_000  # a report has some 20 kB, the plan of a large sweep 1 MB
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -35,24 +36,6 @@ def written_atomically(folder: Path) -> Iterator[Path]:
 def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:
     """Writes report.json; numbers that are not finite, as after a divergence, are null."""
     write_atomically(run_dir / REPORT, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON file that holds an object.
-
-    Raises:
-      FileNotFoundError: there is no file.
-      ValueError: the file is too large, or not such a file.
-    """
-    if path.stat().st_size > _MAX_JSON_BYTES:
-        raise ValueError(f"expected at most {_MAX_JSON_BYTES:,} bytes, got {path.stat().st_size:,}")
-    try:
-        content = json.loads(path.read_text())
-    except RecursionError as error:
-        raise ValueError("expected values that are not nested as deeply") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"expected an object, got {content!r:.80}")
-    return content
 
 
 def reported_steps(run_dir: Path, unit: str) -> int:

@@ -7,6 +7,8 @@ import socket
 import time
 from pathlib import Path
 
+from mimic.base.files import read_json
+
 try:
     import fcntl
 except ImportError:  # Windows, where runs are not locked
@@ -51,6 +53,6 @@ class RunLock:
 
 def _owner(run_dir: Path) -> str:
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        owner = json.loads((run_dir / LOCK).read_text())
+        owner = read_json(run_dir / LOCK)
         return f"process {owner['process']} on {owner['host']} since {owner['since']}"
     return "another process"

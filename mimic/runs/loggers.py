@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mimic.base.distribution import install_command
+from mimic.base.files import read_text
 
 
 class Logger(Protocol):
@@ -50,7 +51,7 @@ class _MlflowLogger:
         if experiment := _unless_set("MLFLOW_EXPERIMENT_NAME", experiment_name="mimic"):
             self._mlflow.set_experiment(**experiment)
         run_id = run_dir / "mlflow_run_id"
-        self._mlflow.start_run(run_id=run_id.read_text() if run_id.exists() else None, run_name=run_dir.name)
+        self._mlflow.start_run(run_id=read_text(run_id) if run_id.exists() else None, run_name=run_dir.name)
         if not run_id.exists():
             run_id.write_text(self._mlflow.active_run().info.run_id)
             self._mlflow.log_dict(dict(config), "config.json")

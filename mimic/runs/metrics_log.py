@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mimic.base import compat
+from mimic.base.files import read_text
 from mimic.runs.files import METRICS, write_atomically
 
 
@@ -65,8 +66,7 @@ def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:
     """Columns and rows of a metrics file, without rows that were not written to their end."""
     if not path.exists():
         return [], []
-    with path.open(newline="", errors="replace") as file:
-        lines = [line for line in file if line.endswith("\n")]
+    lines = read_text(path, errors="replace").split("\n")[:-1]
     header, *rows = csv.reader(lines) if lines else [[]]
     complete = [row for row in rows if len(row) == len(header)]
     return header, [dict(zip(header, row, strict=True)) for row in complete]

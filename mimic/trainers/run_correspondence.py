@@ -2,9 +2,9 @@
 
 import dataclasses
 import os
-import shutil
 from pathlib import Path
 
+from mimic.base.files import read_bytes
 from mimic.envs.config import EnvConfig
 from mimic.metric.correspondence_files import SUFFIXES, is_correspondence_file
 
@@ -20,7 +20,7 @@ def save_correspondence(run_dir: Path, env: EnvConfig) -> None:
     if os.path.abspath(copy) == os.path.abspath(original):
         return
     partial = copy.with_name(f"{copy.name}.partial")
-    shutil.copyfile(original, partial)
+    partial.write_bytes(read_bytes(original))
     os.replace(partial, copy)
 
 

@@ -10,14 +10,14 @@ from typing import Any
 
 from mimic.arms.arm import ArmConfig
 from mimic.arms.model_copy import copied_files
-from mimic.arms.model_source import file_digest, read_source
+from mimic.arms.model_source import read_source
+from mimic.base.files import file_digest, read_bytes, read_json
 from mimic.envs.config import EnvConfig
 from mimic.envs.family import arm_name
 from mimic.runs.files import write_atomically
 
 MODELS, RECORD = "models", "models.json"
 _ROLES, _LISTS = ("expert", "learner"), ("models", "evaluated")  # fields of EnvConfig, and lists of ArmsConfig
-_MAX_RECORD = 2**20  # bytes
 
 
 def save_models(run_dir: Path, env: EnvConfig) -> None:
@@ -44,7 +44,7 @@ def save_models(run_dir: Path, env: EnvConfig) -> None:
             if isinstance(content, bytes):
                 place.write_bytes(content)
             else:
-                shutil.copyfile(content, place)
+                place.write_bytes(read_bytes(content))
     record = {
         "arms": {role: {"file": f"{role}/{Path(arm.model).name}", "original": arm.model} for role, arm in arms.items()},
         "sha256": {str(path.relative_to(partial)): file_digest(path) for path in _files(partial)},
@@ -126,10 +126,7 @@ def _files(folder: Path) -> list[Path]:
 def _read_record(folder: Path) -> Mapping[str, Any]:
     path = folder / RECORD
     try:
-        if not path.is_file():
-            raise ValueError("there is no such file")
-        with path.open("rb") as file:
-            record = json.loads(file.read(_MAX_RECORD))
+        record = read_json(path)
         for role, arm in record["arms"].items():
             if not (isinstance(arm["file"], str) and isinstance(arm["original"], str)):
                 raise ValueError(f"unexpected entry {role!r}")

@@ -188,7 +188,10 @@ FILES = {
         "<mujoco><worldbody><body><joint/></body></worldbody></mujoco>",
         "'.*arm.xml' has a moving body without inertia; expected an <inertial>",
     ),
-    "huge": (" " * (MAX_FILE_SIZE + 1), "'.*arm.xml' has 32 MiB; expected a model of at most 32 MiB of XML$"),
+    "huge": (
+        " " * (MAX_FILE_SIZE + 1),
+        "'.*arm.xml' cannot be read: expected at most 33,554,432 bytes, got 33,554,433$",
+    ),
     "a broken URDF": ('<robot name="a"><link name="b"></robot>', "'.*arm.xml' is not an MJCF or URDF model"),
 }
 

@@ -1,7 +1,5 @@
 """Config files of others: bounded in size, aliases and references; no resolver is called."""
 
-import os
-
 import pytest
 from omegaconf import OmegaConf
 
@@ -10,18 +8,14 @@ from mimic.base.config_files import check_references, read_config
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config
 
-BOMB = "a: &a [1,1,1]\n" + "".join(
-    f"{new}: &{new} [*{old},*{old},*{old},*{old}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
-)
-WIDE = f"a: &a [{'1,' * 2000}1]\nb: &b [*a,*a,*a,*a]\n"  # 4 aliases, 10,000 values
+BOMB = "a: &a [1, 1]\nb: [*a, *a]\n"
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (BOMB, "expected at most 8 aliases"),
-        (WIDE, "expected at most 5,000 values"),
-        ("a: &a [*a]", "not nested as deeply"),
+        (BOMB, r"expected no aliases, got \*a"),
+        ("a: &a [*a]", r"expected no aliases, got \*a"),
         ("[" * 5000, "not nested as deeply"),
         ("a: " + "x" * 60_000, "expected at most 50,000 bytes, got 60,003"),
         ("a: 1\na: 2", "found duplicate key a"),
@@ -30,24 +24,13 @@ WIDE = f"a: &a [{'1,' * 2000}1]\nb: &b [*a,*a,*a,*a]\n"  # 4 aliases, 10,000 val
         ("", "expected keys and values, got None"),
         ("? {a: 1}\n: 2", "unhashable key"),
     ],
-    ids=["bomb", "wide", "itself", "deep", "large", "duplicate", "object", "list", "empty", "mapping as key"],
+    ids=["bomb", "itself", "deep", "large", "duplicate", "object", "list", "empty", "mapping as key"],
 )
 def test_hostile_yaml_is_rejected_in_one_line(tmp_path, text, message):
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(ValueError, match=message) as error:
         read_config(tmp_path / "config.yaml")
     assert "\n" not in str(error.value)
-
-
-def test_a_few_aliases_are_read(tmp_path):
-    (tmp_path / "config.yaml").write_text("a: &a [1, 2]\nb: *a\n")
-    assert read_config(tmp_path / "config.yaml").b == [1, 2]
-
-
-def test_only_regular_files_are_read(tmp_path):
-    os.mkfifo(tmp_path / "config.yaml")
-    with pytest.raises(ValueError, match="expected a regular file"):
-        read_config(tmp_path / "config.yaml")
 
 
 REJECTED = "${oc.env:SECRET_TOKEN}", "${a.${seed}}", r"\${oc.env:SECRET_TOKEN}", "${oc.decode:1}", "${now:%Y}"

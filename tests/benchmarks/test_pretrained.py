@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks import pretrained
+from mimic.base.files import read_json
 from mimic.envs import env_config
-from mimic.runs.files import REPORT, read_json
+from mimic.runs.files import REPORT
 from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.pretrained.network import NETWORKS, read_any_arm_mapper, read_network

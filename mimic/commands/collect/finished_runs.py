@@ -11,8 +11,9 @@ from typing import Any
 from mimic.base import registry
 from mimic.base.config import flatten, to_dict
 from mimic.base.distribution import NAME, VERSION
+from mimic.base.files import read_json, read_text
 from mimic.evaluation.labels import SPLITS
-from mimic.runs.files import CONFIG, METRICS, REPORT, read_json
+from mimic.runs.files import CONFIG, METRICS, REPORT
 from mimic.runs.sweeps.sweeper import LOGS, SWEEP
 from mimic.trainers.run_config import load_config
 
@@ -132,7 +133,7 @@ def _reason(folder: Path, entry: Mapping[str, Any]) -> str:
     log = folder / LOGS / f"{Path(entry['run_dir']).name}.log"
     if "exit_code" in entry or not log.is_file():
         return ""
-    last = [line.strip() for line in log.read_text(errors="replace").splitlines() if line.strip()][-1:]
+    last = [line.strip() for line in read_text(log, errors="replace").splitlines() if line.strip()][-1:]
     return f"not finished; its log ends with: {last[0]}" if last else ""
 
 
@@ -231,8 +232,7 @@ def _history(path: Path) -> dict[str, dict[int, float]]:
 
 
 def _complete_lines(path: Path) -> list[str]:
-    with path.open(newline="") as file:
-        return [line for line in file if line.endswith("\n")]
+    return read_text(path).split("\n")[:-1]
 
 
 def _numbers(report: Mapping[str, Any]) -> dict[str, float]:

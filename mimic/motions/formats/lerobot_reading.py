@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from mimic.base.files import check_file, read_json
 from mimic.motions.formats.episodes import ANGLE, EXPERT, MAX_NUMBERS, VELOCITY, Motion, choose_entry, package_error
 from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, FINAL, INFO
-from mimic.runs.files import read_json
 
 _TIME_TOLERANCE = 1e-4  # s: LeRobot's own, between a timestamp and that of its frame
 _FLOATS = ("float32", "float64")
@@ -110,7 +110,7 @@ def _read_frames(path: Path, feature: str) -> tuple[np.ndarray, ...]:
     if not files:
         raise ValueError(f"source: {str(path)!r} has no data, expected {DATA_FOLDER}/chunk-000/file-000.parquet")
     try:
-        count = sum(_count_numbers(pq.read_metadata(file), names) for file in files)
+        count = sum(_count_numbers(pq.read_metadata(check_file(file)), names) for file in files)
         if not 0 < count <= MAX_NUMBERS:
             raise ValueError(f"expected 1 to {MAX_NUMBERS:,} numbers, got {count:,}")
         tables = [pq.ParquetFile(file).read(columns=names) for file in files]
@@ -139,7 +139,7 @@ def _final_values(path: Path, feature: str) -> dict[int, np.ndarray]:
     final: dict[int, np.ndarray] = {}
     try:
         for file in sorted((path / EPISODES_FOLDER).glob("*/*.parquet")):
-            if FINAL + feature in pq.read_schema(file).names:
+            if FINAL + feature in pq.read_schema(check_file(file)).names:
                 table = pq.ParquetFile(file).read(columns=["episode_index", FINAL + feature])
                 values = _numbers(table[FINAL + feature]).reshape(table.num_rows, -1)
                 final |= dict(zip(table["episode_index"].to_pylist(), values, strict=True))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mimic.base.files import check_file, check_folder
 from mimic.motions.formats.episodes import (
     ANGLE,
     MAX_NUMBERS,
@@ -165,7 +166,7 @@ def _joint_messages(bag: Path, limit: int) -> dict[str, list[tuple[int, Any]]]:
     from rosbags.rosbag2 import Reader
 
     store, messages, read = _type_store(), {}, 0
-    with Reader(bag) as reader:
+    with Reader(check_folder(bag) if bag.is_dir() else check_file(bag, None)) as reader:
         connections = [connection for connection in reader.connections if connection.msgtype == _TYPE]
         for connection, recorded, content in reader.messages(connections) if connections else ():
             message = store.deserialize_cdr(content, _TYPE)

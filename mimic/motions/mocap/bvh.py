@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mimic.base.files import read_text
+
 END = "_end"  # appended to the name of a joint for its end site
 _AXES = {"x": 0, "y": 1, "z": 2}
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
@@ -49,9 +51,7 @@ def read_bvh(path: Path) -> Bvh:
     Raises:
       ValueError: what is missing or wrong, with its line where it has one.
     """
-    if path.stat().st_size > _MAX_BYTES:
-        raise ValueError(f"expected at most {_MAX_BYTES / 2**30:.0f} GiB, got {path.stat().st_size / 2**30:.1f}")
-    text = path.read_text(encoding="utf-8", errors="replace").lstrip("\ufeff")
+    text = read_text(path, errors="replace")
     head, *motion = re.split(r"^\s*MOTION\b", text, maxsplit=1, flags=re.MULTILINE | re.IGNORECASE)
     if not motion:
         raise ValueError("it has no MOTION section")

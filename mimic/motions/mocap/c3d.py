@@ -27,11 +27,12 @@ def read_c3d(path: Path) -> "Table":
     Raises:
       ValueError: ezc3d is not installed, or it cannot read the file.
     """
+    from mimic.base.files import check_file
     from mimic.motions.mocap.tables import read_npz
 
     with tempfile.TemporaryDirectory(prefix="mimic-c3d-") as folder:
         out = Path(folder) / "points.npz"
-        request = json.dumps({"file": str(path.absolute()), "out": str(out), "path": sys.path})
+        request = json.dumps({"file": str(check_file(path).absolute()), "out": str(out), "path": sys.path})
         try:
             done = subprocess.run(
                 [sys.executable, "-I", __file__], input=request, capture_output=True, text=True, timeout=_WALL_SECONDS

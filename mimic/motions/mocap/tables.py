@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mimic.base.files import read_text
 from mimic.base.npz import read_arrays
 
-_MAX_BYTES = 2**30
 _MAX_POINTS = 2000
 _MAX_VALUE = 1e9
 _COLUMN = re.compile(r"(.+?)[ ._:]?([xyz])", re.IGNORECASE)
@@ -42,7 +42,7 @@ def read_trc(path: Path) -> Table:
     Raises:
       ValueError: what is missing or wrong.
     """
-    lines = _text(path).splitlines()
+    lines = read_text(path, errors="replace").splitlines()
     if len(lines) < 6 or not lines[0].lower().startswith("pathfiletype"):
         raise ValueError("expected a TRC file, which begins with PathFileType")
     header = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
@@ -60,7 +60,7 @@ def read_csv(path: Path) -> Table:
     Raises:
       ValueError: what is missing or wrong.
     """
-    reader = csv.reader(_text(path).splitlines())
+    reader = csv.reader(read_text(path, errors="replace").splitlines())
     try:
         header = [name.strip() for name in next(reader, [])]
         rows = [row for row in reader if row]
@@ -138,12 +138,6 @@ def _checked(table: Table) -> Table:
         if np.any(np.abs(table.positions) > _MAX_VALUE):
             raise ValueError(f"positions: expected numbers of at most {_MAX_VALUE:g}")
     return table._replace(positions=np.where(np.isfinite(table.positions), table.positions, np.nan))
-
-
-def _text(path: Path) -> str:
-    if path.stat().st_size > _MAX_BYTES:
-        raise ValueError(f"expected at most {_MAX_BYTES / 2**30:.0f} GiB, got {path.stat().st_size / 2**30:.1f}")
-    return path.read_text(encoding="utf-8-sig", errors="replace")
 
 
 def _numbers(rows: list[list[str]], what: str, columns: list[int] | None = None) -> np.ndarray:

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from mimic.base.files import read_text
 from mimic.runs.signals import NOTED, STOPPED_BY_SIGNAL
 from mimic.runs.sweeps.sweeper import FAILED, Outcome, path_override
 
@@ -87,7 +88,7 @@ class RunCommand:
                 exit_code, f"stopped by {name}; continue with: python -m {self.module} resume={self.run_dir}"
             )
         if exit_code:
-            lines = (Path(self.folder) / self.log).read_text(errors="replace").split("\n")
+            lines = read_text(Path(self.folder) / self.log, errors="replace").split("\n")
             last = next((line.strip() for line in reversed(lines) if line.strip()), f"exit code {exit_code}")
             return Outcome(exit_code, f"{last.removeprefix('error: ')}; log: {self.log}")
         return Outcome()

@@ -25,7 +25,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from mimic.base.config import check_writable
 from mimic.base.config_files import check_references
-from mimic.runs.files import CONFIG, REPORT, read_json
+from mimic.base.files import read_json
+from mimic.runs.files import CONFIG, REPORT
 from mimic.runs.signals import exit_hook
 from mimic.runs.sweeps.hydra_plugins import register, target
 

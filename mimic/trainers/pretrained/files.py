@@ -9,8 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from mimic.base.files import read_json
 from mimic.base.npz import read_arrays
-from mimic.runs.files import REPORT, read_json, write_report
+from mimic.runs.files import REPORT, write_report
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, save_config
 
