@@ -14,7 +14,6 @@ from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, checkpoint_number, number, seed_number
 from mimic.envs import env_config, environments
 from mimic.envs.config import PHYSICS, ArmsConfig, EnvConfig
-from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
@@ -22,7 +21,7 @@ from mimic.trainers.export.config import check_locked
 
 ROBOT_WORLDS = ("paper", "nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
-CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "tracking", "searched")
+CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "tracking")
 ROBOT_CONTROLLERS = ("policy", "tracking")
 ARM_SIDES = ("left", "right")
 DATASET_FORMATS = ("lerobot", "rosbag2")
@@ -40,8 +39,7 @@ class EvaluateConfig:
     Attributes:
       run: run directory.
       checkpoint: environment steps of the checkpoint. Default None: the last checkpoint.
-      controller: "policy"; a baseline controller (see `run_controller`); or "searched" (see `search_torques`).
-      search: number of updates and of initial guesses for "searched".
+      controller: "policy", or a baseline controller (see `run_controller`).
       learner: of a run of many arms: name or file of the one arm to evaluate on. Default "": all arms of the report.
       locked: numbers or names of the joints of `learner` that are locked.
       demonstrations: file of demonstrations that replace the held-out ones.
@@ -61,7 +59,6 @@ class EvaluateConfig:
     run: str = ""
     checkpoint: int | None = checkpoint_number()
     controller: str = "policy"
-    search: SearchConfig = dataclasses.field(default_factory=SearchConfig)
     learner: str = ""
     locked: list[Any] = dataclasses.field(default_factory=list)
     demonstrations: str = ""

@@ -20,13 +20,12 @@ from mimic.runs.stopwatch import Stopwatch
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.make import make_any_arm_trainer, make_ppo_trainer, make_trainer
-from mimic.trainers.progress import SearchProgress
 from mimic.trainers.report import make_report, show_report
 from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.trainer import Trainer
 
 CONTROLLERS_OF_MANY = ("policy", "nearest_pose")
-TORQUE_CONTROLLERS = ("pd", "computed_torque", "nearest_pose", "searched")  # for actions that are torques
+TORQUE_CONTROLLERS = ("pd", "computed_torque", "nearest_pose")  # for actions that are torques
 TARGET_CONTROLLERS = ("tracking",)  # for actions that are other targets of an inner loop
 
 
@@ -86,8 +85,7 @@ def prepare_report(config: EvaluateConfig, started: float, console: Console) -> 
 
     def run() -> dict[str, Any]:
         with stopwatch.stage("evaluate"):
-            with SearchProgress(console, config.search.iterations) as progress:
-                outcome, controller = trainer.run_controller(config.controller, params, config.search, progress.update)
+            outcome, controller = trainer.run_controller(config.controller, params)
             metrics = {**trainer.metrics(outcome), **trainer.details(outcome, config.controller)}
             if config.controller == "policy" and not config.physics:
                 metrics |= trainer.cross_check(params)
@@ -119,11 +117,6 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
                 f"trainer=ppo, got one of {trained.trainer.name}"
             )
         return trained, make_trainer(trained, run_dir)
-    if config.controller == "searched" and trained.env.metric.link_distance:
-        raise ValueError(
-            "controller=searched: expected a metric of weighted parts, got a run with "
-            f"metric.link_distance={trained.env.metric.link_distance}"
-        )
     _check_arms(trained.env, config)
     _check_commands(trained.env, config.controller)
     base = with_one_learner(trained.env, config.learner, config.locked) if config.learner else trained.env

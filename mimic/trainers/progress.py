@@ -1,4 +1,4 @@
-"""Progress bars of a training and a search, and the tables of a report."""
+"""The progress bar of a training, and the tables of a report."""
 
 import os
 import time
@@ -41,27 +41,6 @@ class TrainingProgress:
             left = max(display.total - step, 0) / steps_per_second
         display.update(step, status, left)
         display.print_line(f"step {step:>11,}")
-
-
-class SearchProgress:
-    """A bar over the updates of a search, shown from the first one on; without a terminal, ten lines."""
-
-    def __init__(self, console: Console, total: int):
-        self._display = _Display(console, "searching", total)
-
-    def __enter__(self) -> "SearchProgress":
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self._display.stop()
-
-    def update(self, done: int, status: str) -> None:
-        """Shows the state after `done` updates."""
-        display = self._display
-        display.start()
-        display.update(done, status, display.elapsed / done * (display.total - done) if done else None)
-        if done % max(display.total // 10, 1) == 0 or done == display.total:
-            display.print_line(f"searching {done:>4} of {display.total}")
 
 
 def is_animated(console: Console) -> bool:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from mimic.envs.config import EnvConfig
-from mimic.evaluation.config import SearchConfig
 from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import TrainerConfig
@@ -14,7 +13,6 @@ from mimic.trainers.config import TrainerConfig
 Params = Any  # pytree
 Metrics = dict[str, Any]  # quality metrics of a report, some by split
 OnEvaluation = Callable[[int, Params, Mapping[str, float]], bool]  # (steps, parameters, training metrics) -> stop?
-OnUpdate = Callable[[int, str], None]  # (updates, state of the search)
 Row = tuple[str, str, str]  # of the final table: label, value on training data, value on held-out data
 
 
@@ -87,21 +85,16 @@ class Trainer(abc.ABC):
     def evaluate(self, params: Params) -> Any:
         """Evaluates parameters; the result is the argument of `metrics`, `details` and `save_outcome`."""
 
-    def run_controller(
-        self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate
-    ) -> tuple[Any, dict[str, Any]]:
+    def run_controller(self, name: str, params: Params) -> tuple[Any, dict[str, Any]]:
         """Evaluates a controller, which may be another one than the trained policy.
 
         Args:
           name: the controller; "policy" is the trained one.
           params: parameters of the trained policy.
-          search: settings of the controller "searched".
-          on_update: called with the number of updates of a search, from 0 on, and the state of the search as text.
 
         Returns:
           The result of `evaluate`, and the controller's entries of the report.
         """
-        del search, on_update
         assert name == "policy", name
         return self.evaluate(params), {}
 

@@ -14,8 +14,8 @@ from mimic.motions.recording import record_demonstrations
 from mimic.viewer.hand import hand_position
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.meshes import ArmShape
-from mimic.viewer.messages import HAND
 
+HAND = "/expert/base/hand"  # name of the handle that drags the expert's hand
 _DEMONSTRATIONS = 8  # number to choose from; recorded when the first one is played
 _ANGLE_STEP = 0.01  # rad
 _DRAG_PAUSE = 0.3  # s after the last message of a drag, for which the handle stays where the user holds it

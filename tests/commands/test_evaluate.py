@@ -113,8 +113,7 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
     [
         (
             ["controller=mpc"],
-            "controller: expected one of policy, hold, pd, computed_torque, nearest_pose, tracking, searched, got "
-            "'mpc'",
+            "controller: expected one of policy, hold, pd, computed_torque, nearest_pose, tracking, got 'mpc'",
         ),
         (["physics=bullet"], "physics: expected one of mjx, fused, got 'bullet'"),
         (["checkpoint=7"], "has no checkpoint 7; it has 0"),

@@ -11,7 +11,6 @@ from mimic.envs.start_poses import CLEARANCE, nearest_poses
 from mimic.envs.wrappers import fresh_episodes
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_frames import RolloutFrames
-from mimic.evaluation.searched_torques import _task
 from mimic.metric.capsule_distances import capsule_axes, pair_distances
 from mimic.motions.demonstrations import Demonstrations
 
@@ -73,7 +72,6 @@ def test_holding_the_start_pose_and_videos_begin_there(evaluator):
     rollouts = jax.jit(lambda: evaluator.rollout(lambda state: jnp.zeros(4)))()
     frames = RolloutFrames(evaluator, rollouts, 1, 30)
     np.testing.assert_allclose(frames.learner[0], env.start_poses[1], atol=1e-6)
-    np.testing.assert_array_equal(_task(env, np.array([2, 0])).start, env.start_poses[[2, 0]])
 
 
 def test_episodes_that_restart_do_so_where_their_demonstration_starts(evaluator):

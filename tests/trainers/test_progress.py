@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from mimic.trainers import progress
-from mimic.trainers.progress import SearchProgress, TrainingProgress
+from mimic.trainers.progress import TrainingProgress
 
 STATUS = "distance 0.1139  gap 234.6%, held out 255.2%"
 
@@ -107,21 +107,3 @@ def test_without_a_terminal_there_is_line_for_each_evaluation(monkeypatch, clock
         f"step         500  {STATUS}  10 steps/s  elapsed 2:00  left 0:50",
         f"step       1,000  {STATUS}  10 steps/s  elapsed 3:00  left 0:00",
     ]
-
-
-def test_a_search_writes_ten_lines_into_a_pipe(monkeypatch, clock):
-    console = as_pipe(monkeypatch)
-    with SearchProgress(console, 200) as shown:
-        for done in range(201):
-            clock[0] += 1
-            shown.update(done, "objective 0.5")
-    lines = written(console).splitlines()
-    assert len(lines) == 11
-    assert lines[5] == "searching  100 of 200  objective 0.5  elapsed 1:41  left 1:41"
-
-
-def test_a_search_without_updates_shows_nothing(clock):
-    console = terminal(80)
-    with SearchProgress(console, 200):
-        pass
-    assert written(console) == ""

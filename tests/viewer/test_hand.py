@@ -5,7 +5,6 @@ import pytest
 
 import mimic
 from mimic.viewer.hand import hand_position, pose_of_hand
-from mimic.viewer.messages import HAND, fault
 
 
 @pytest.mark.parametrize("limits", ["none", "hardware"])
@@ -22,15 +21,3 @@ def test_the_hand_comes_near_a_position_out_of_reach():
     arm = mimic.planar_arm([0.5, 0.5])
     hand = hand_position(arm, pose_of_hand(arm, np.array([0.3, 0.4]), np.array([0.0, 3.0, 0.0])))
     np.testing.assert_allclose(hand, [0, 1, 0], atol=0.02)
-
-
-DRAG = {"type": "TransformControlsUpdateMessage", "name": HAND, "wxyz": [1.0, 0, 0, 0], "position": [0.1, 0, 1]}
-
-
-def test_only_drags_of_the_hand_are_accepted():
-    def check_of(_):
-        return None
-
-    assert fault({**DRAG, "owner": None}, check_of) is None
-    for change in ({"name": "/learner"}, {"position": [0.1, 0]}, {"position": [0.1, float("nan"), 0]}, {"extra": 1}):
-        assert fault({**DRAG, **change}, check_of) == "bad drag"

@@ -19,7 +19,6 @@ from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.envs.make import make_family_env
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS, ArmRollouts, ArmsEvaluator, ArmsOutcome
-from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory, nearest_pose_controller
 from mimic.evaluation.rollout_metrics import MIN_SPAN
@@ -30,7 +29,7 @@ from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.ppo import training as ppo
 from mimic.trainers.ppo.trainer import PolicyOfManyArms, with_crossovers, with_saved_demonstrations
-from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
+from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
 
 _VALIDATION = 64  # training demonstrations by which a fine-tuning chooses its result: one arm, so they cost little
 
@@ -184,9 +183,7 @@ class AnyArmPPOTrainer(Trainer):
         """Runs the deterministic policy and the zero action once on each arm and demonstration."""
         return ArmsOutcome(self._run(params, is_policy=True)[1], self._controller_rollouts())
 
-    def run_controller(
-        self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate
-    ) -> tuple[ArmsOutcome, dict[str, Any]]:
+    def run_controller(self, name: str, params: Params) -> tuple[ArmsOutcome, dict[str, Any]]:
         """The policy, or "nearest_pose": the controller without learning; the others need an environment of one arm."""
         if name == "policy":
             return self.evaluate(params), {}

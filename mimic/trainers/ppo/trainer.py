@@ -13,7 +13,6 @@ from mimic.base.compilation import Background, compiling, on_host
 from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.envs.make import make_env
-from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
@@ -24,7 +23,7 @@ from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.ppo import training as ppo
-from mimic.trainers.trainer import Metrics, OnEvaluation, OnUpdate, Params, Row, Trainer
+from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
 
 
 class PolicyOfManyArms(NamedTuple):
@@ -178,17 +177,10 @@ class PPOTrainer(Trainer):
             summary = evaluator.summary(rollouts(jax.device_get(params)))
         return {"mjx": {key: summary[key] for key in ("optimality_gap", "mean_distance")}}
 
-    def run_controller(
-        self, name: str, params: Params, search: SearchConfig, on_update: OnUpdate
-    ) -> tuple[Rollouts, dict[str, Any]]:
-        """See `mimic.evaluation.tracking_controllers.run_controller` and `search_torques`."""
+    def run_controller(self, name: str, params: Params) -> tuple[Rollouts, dict[str, Any]]:
+        """See `mimic.evaluation.tracking_controllers.run_controller`."""
         if name == "policy":
             return self.evaluate(params), {}
-        if name == "searched":
-            from mimic.evaluation.searched_torques import search_torques
-
-            outcome, starts = search_torques(self.evaluator, self.controller(params), search, on_update)
-            return outcome, {"trainer": name, "search": dataclasses.asdict(search), "starts": starts}
         from mimic.evaluation.tracking_controllers import run_controller
 
         outcome, setting = run_controller(self.evaluator, name)

@@ -1,6 +1,7 @@
 """The search for torques: never worse than its start, and exact where learner and expert are equal."""
 
 import json
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -8,14 +9,11 @@ import numpy as np
 import pytest
 
 import mimic
-from mimic.commands.config import EvaluateConfig
-from mimic.commands.evaluate import prepare_evaluation
+from benchmarks.common.trajectory_descent import Task, TrajectoryDescent, _bounded_law
+from benchmarks.searched_torques import main, search_torques
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
-from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.labels import SPLITS
-from mimic.evaluation.searched_torques import search_torques
-from mimic.evaluation.trajectory_descent import Task, TrajectoryDescent, _bounded_law
 from mimic.physics.step import Load
 from tests.helpers.untrained_run import untrained_run
 
@@ -64,7 +62,7 @@ def test_an_arm_that_imitates_itself_finds_the_torques():
     """From zero torques. Both arms hold a torque for 0.1 s: 1e-3 of the hold distance is rounding and kinks."""
     evaluator = evaluator_of(LINKS, action_scale=2.0)
     still = lambda state: jnp.zeros(evaluator.env.action_size)  # noqa: E731
-    best, _ = search_torques(evaluator, still, SearchConfig(iterations=30, starts=1), lambda *_: None)
+    best, _ = search_torques(evaluator, still, iterations=30, starts=1)
     np.testing.assert_array_less(np.mean(best.distance, axis=1), 1e-3 * evaluator.hold_distance.mean(axis=1))
 
 
@@ -81,15 +79,16 @@ def test_no_update_makes_a_sequence_worse(evaluator):
 
 
 @pytest.mark.slow
-def test_the_objective_equals_the_distance_in_the_environment(evaluator):
+def test_the_objective_equals_the_distance_in_the_environment(evaluator, capsys):
     """With the loads that the environment draws. 2e-5: float32, and the five digits of the text."""
     loaded = evaluator_of([0.5, 0.5], randomization={"mass": [0.5, 2.0], "damping": [0.5, 2.0]})
     objectives = []
     for each in (evaluator, loaded):
-        controller, texts = controller_of(random_actions(each)), {}
-        search_torques(each, controller, SearchConfig(iterations=1, starts=1), texts.__setitem__)
+        controller = controller_of(random_actions(each))
+        search_torques(each, controller, iterations=1, starts=1)
+        first = capsys.readouterr().out.splitlines()[0]
         rolled_out = jax.jit(lambda each=each, controller=controller: each.rollout(controller))()
-        objectives.append(float(texts[0].removeprefix("objective ")))
+        objectives.append(float(first.rpartition("objective ")[2]))
         assert objectives[-1] == pytest.approx(float(np.mean(np.asarray(rolled_out.distance))), abs=2e-5)
     assert abs(objectives[0] - objectives[1]) > 1e-3
 
@@ -168,31 +167,16 @@ def test_runaways_give_no_nan(evaluator):
 
 
 @pytest.mark.slow
-def test_the_report_of_a_search(tmp_path):
+def test_the_best_of_all_starts_is_returned(tmp_path, monkeypatch, capsys):
     """Of an untrained policy. 1e-5: float32, means in another order."""
-    run = untrained_run(tmp_path / "run")
-    config = EvaluateConfig(
-        str(run), out=str(tmp_path / "out"), controller="searched", search=SearchConfig(5, 5), compilation_cache=""
-    )
-    prepare_evaluation(config, 0.0)()
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["trainer"] == "searched" and report["search"] == {"iterations": 5, "starts": 5}
-    names = ["policy", "computed_torque", "pd", "hold", "noisy_policy_1"]
-    assert list(report["starts"]) == names
+    run, out = untrained_run(tmp_path / "run"), tmp_path / "out.json"
+    arguments = ["--run", str(run), "--iterations", "5", "--starts", "5", "--out", str(out), "--commit", "none"]
+    monkeypatch.setattr(sys, "argv", ["searched_torques", *arguments])
+    main()
+    result = json.loads(out.read_text())
+    assert list(result["starts"]) == ["policy", "computed_torque", "pd", "hold", "noisy_policy_1"]
     for split in SPLITS:
-        every = [gaps[kind][split] for gaps in report["starts"].values() for kind in ("start", "found")]
-        assert report["optimality_gap"][split] <= min(every) + 1e-5
-        for gaps in report["starts"].values():
+        every = [gaps[kind][split] for gaps in result["starts"].values() for kind in ("start", "found")]
+        assert result["optimality_gap"][split] <= min(every) + 1e-5
+        for gaps in result["starts"].values():
             assert gaps["found"][split] < gaps["start"][split]
-
-
-@pytest.mark.parametrize(
-    ("argument", "message"),
-    [
-        ("search.iterations=0", "search.iterations: expected a whole number from 1 to 100,000, got 0"),
-        ("search.starts=-1", "search.starts: expected a whole number from 1 to 1,000, got -1"),
-        ("search.starts=many", "search.starts"),
-    ],
-)
-def test_bad_search_settings(rejected, argument, message):
-    assert message in rejected("evaluate", "run=anything", "controller=searched", argument)

@@ -1,6 +1,12 @@
-"""Estimates the best achievable rollouts: optimises the torques of each demonstration, knowing the whole motion."""
+"""The best achievable rollouts of a run's learner: searches torques of each demonstration, knowing the whole motion.
 
-from collections.abc import Callable, Mapping
+    python -m benchmarks.searched_torques --run DIR [--iterations 40] [--starts 8] [--out FILE]
+
+Compares the optimality gap with that of the run's policy. Takes minutes.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,14 +15,18 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
+from benchmarks.common.parser import make_parser
+from benchmarks.common.record import write_results
+from benchmarks.common.trajectory_descent import Task, TrajectoryDescent
 from mimic.envs.imitation import ImitationEnv, arm_state
-from mimic.evaluation.config import SearchConfig
 from mimic.evaluation.evaluator import Controller, Evaluator, Rollouts
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
 from mimic.evaluation.rollout_metrics import gaps
 from mimic.evaluation.tracking_controllers import run_controller
-from mimic.evaluation.trajectory_descent import Task, TrajectoryDescent
 from mimic.physics.step import Load
+from mimic.runs.checkpoints import load_checkpoint
+from mimic.trainers.make import make_ppo_trainer
+from mimic.trainers.run_config import policy_run
 
 _NOISE = 0.3  # standard deviation of the noise on the policy's actions in additional starts
 _NOISE_STEPS = 5  # duration of a constant noise, long enough to move the arm off its path
@@ -29,8 +39,8 @@ NOISY_POLICY = "noisy_policy"
 def search_torques(
     evaluator: Evaluator,
     policy: Controller | ControllerWithMemory,
-    config: SearchConfig,
-    on_update: Callable[[int, str], None],
+    iterations: int = 40,
+    starts: int = 8,
 ) -> tuple[Rollouts, dict[str, dict[str, dict[str, float]]]]:
     """Optimises torques for each demonstration, by descent from several starts.
 
@@ -44,35 +54,34 @@ def search_torques(
     Args:
       evaluator: evaluator of the environment and its demonstrations.
       policy: controller of the first start.
-      config: see `SearchConfig`.
-      on_update: called with the number of updates, from 0 on, and the objective as text.
+      iterations: number of updates of each torque sequence.
+      starts: number of initial sequences for each demonstration: those of the policy, computed_torque, pd and hold in
+        this order, then of the policy with noise.
 
     Returns:
       Rollouts of the best torques; and by name of the start and by split, the optimality gap of the start ("start")
       and of its solution ("found").
     """
     env = evaluator.env
-    starts = _starts(evaluator, policy, config)
+    rollouts_by_start = _starts(evaluator, policy, starts)
     scale = np.asarray(env.torque_scale)
-    actions = np.concatenate([np.asarray(start.torque) / scale for start in starts.values()])
-    optimised = _descend(evaluator, actions, config.iterations, on_update)
-    optimised = optimised.reshape(len(starts), env.demonstrations.count, *optimised.shape[1:])
+    actions = np.concatenate([np.asarray(start.torque) / scale for start in rollouts_by_start.values()])
+    optimised = _descend(evaluator, actions, iterations)
+    optimised = optimised.reshape(starts, env.demonstrations.count, *optimised.shape[1:])
     replay = jax.jit(lambda action: evaluator.rollout(_replay(action)))
-    solutions = dict(zip(starts, map(replay, optimised), strict=True))
-    candidates = *solutions.values(), *starts.values()
+    solutions = dict(zip(rollouts_by_start, map(replay, optimised), strict=True))
+    candidates = *solutions.values(), *rollouts_by_start.values()
     best = np.stack([_objective(env, rollouts) for rollouts in candidates]).argmin(axis=0)
     best_rollouts = jax.tree.map(
         lambda *each: np.stack([np.asarray(x) for x in each])[best, np.arange(len(best))], *candidates
     )
-    return best_rollouts, _gaps_by_start(evaluator, starts, solutions)
+    return best_rollouts, _gaps_by_start(evaluator, rollouts_by_start, solutions)
 
 
-def _starts(
-    evaluator: Evaluator, policy: Controller | ControllerWithMemory, config: SearchConfig
-) -> dict[str, Rollouts]:
-    """Rollouts of `config.starts` starts, by name."""
+def _starts(evaluator: Evaluator, policy: Controller | ControllerWithMemory, count: int) -> dict[str, Rollouts]:
+    """Rollouts of a number of starts, by name."""
     names = ["policy", "computed_torque", "pd", "hold"]
-    names += [f"{NOISY_POLICY}_{i}" for i in range(1, config.starts - len(names) + 1)]
+    names += [f"{NOISY_POLICY}_{i}" for i in range(1, count - len(names) + 1)]
     noisy = jax.jit(lambda key: evaluator.rollout(_with_noise(evaluator.env, policy, key)))
 
     def make(name: str) -> Rollouts:
@@ -82,7 +91,7 @@ def _starts(
             return noisy(jax.random.fold_in(jax.random.PRNGKey(0), names.index(name)))
         return run_controller(evaluator, name)[0]
 
-    return {name: make(name) for name in names[: config.starts]}
+    return {name: make(name) for name in names[:count]}
 
 
 def _with_noise(
@@ -116,9 +125,7 @@ def _replay(action: Float[Array, "demonstrations time joints"]) -> Controller:
     return controller
 
 
-def _descend(
-    evaluator: Evaluator, action: np.ndarray, iterations: int, on_update: Callable[[int, str], None]
-) -> Float[np.ndarray, "sequences time joints"]:
+def _descend(evaluator: Evaluator, action: np.ndarray, iterations: int) -> Float[np.ndarray, "sequences time joints"]:
     """Updates torque sequences, which are ordered by start and then by demonstration."""
     descent = TrajectoryDescent(evaluator.env, _CHUNK["cpu" if jax.default_backend() == "cpu" else "gpu"])
     count = evaluator.env.demonstrations.count
@@ -126,7 +133,7 @@ def _descend(
     episodes = descent.start(task, jnp.asarray(action, jnp.float32))
     for done in range(iterations + 1):
         best = np.asarray(episodes.objective).reshape(-1, count).min(axis=0)
-        on_update(done, f"objective {np.mean(best):.5f}")
+        print(f"{done:>4} of {iterations}  objective {np.mean(best):.5f}", flush=True)
         if done < iterations:
             episodes = descent.improve(task, episodes)
     return np.asarray(episodes.action)
@@ -165,3 +172,23 @@ def _gaps_by_start(
         }
 
     return {name: {"start": gap(starts[name]), "found": gap(solutions[name])} for name in starts}
+
+
+def main() -> None:
+    """Runs the command."""
+    parser = make_parser("searched_torques", __doc__, iterations=40, starts=8)
+    parser.add_argument("--run", required=True, metavar="DIR", help="run of trainer=ppo with one learner")
+    options = parser.parse_args()
+    run_dir, trained = policy_run(options.run, None)
+    if trained.env.arms.are_drawn or trained.env.has_inner_loop or trained.env.metric.link_distance:
+        parser.error("--run: expected one learner, torques as actions and a metric of weighted parts")
+    trainer = make_ppo_trainer(trained, Path(run_dir))
+    _, params = load_checkpoint(run_dir, trainer.params_template(), None)
+    best, starts = search_torques(trainer.evaluator, trainer.controller(params), options.iterations, options.starts)
+    gap = trainer.metrics(best)["optimality_gap"]
+    write_results(options, iterations=options.iterations, optimality_gap=gap, starts=starts)
+    print("gap: " + ", ".join(f"{split} {value:.2%}" for split, value in gap.items()))
+
+
+if __name__ == "__main__":
+    main()
