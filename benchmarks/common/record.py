@@ -12,7 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from mimic.runs.files import finite, write_atomically
+from mimic.base.files import write_atomically
+from mimic.runs.files import finite
 from mimic.runs.provenance import hardware, versions
 
 WIDTH = 140  # characters of a table, also without a terminal

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
-from mimic.runs.files import write_atomically
+from mimic.base.files import write_atomically
 
 # Shapes of the fields of `ArmArrays` that a pose depends on, in the order of the vector; and of the other fields.
 _KINEMATICS: dict[str, tuple[int, ...]] = {

@@ -109,6 +109,13 @@ def read_json(path: PathLike) -> dict[str, Any]:
     return content
 
 
+def write_atomically(path: Path, text: str) -> None:
+    """Writes a file; an existing one is replaced only when the new one is complete."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text, newline="")
+    os.replace(partial, path)
+
+
 def file_digest(path: PathLike) -> str:
     """The SHA-256 checksum of a regular file of any size. See `open_file`."""
     with open_file(path, None) as file:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, stack_arms
 from mimic.base.compilation import Background, compiled_quickly, on_host
+from mimic.base.files import write_atomically
 from mimic.envs.family import SEEN, UNSEEN
 from mimic.envs.many_arms import AnyArmEnv, any_arm_state
 from mimic.evaluation.evaluator import Controller
@@ -25,7 +26,6 @@ from mimic.metric.array_kinematics import link_states
 from mimic.metric.array_similarity import motion_similarity
 from mimic.metric.kinematics import LinkStates
 from mimic.retargeting.array_bound import closest_motion
-from mimic.runs.files import write_atomically
 
 EVALUATED_DEMONSTRATIONS = 8  # of the held-out ones: with 29 arms, 232 rollouts and bounds
 _ROUNDING = 1e-5  # relative float32 error of a velocity at its limit

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.pose_limits import pose_limits
 from mimic.base.compilation import Background, on_host
+from mimic.base.files import write_atomically
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
@@ -28,7 +29,6 @@ from mimic.motions.demonstrations import Demonstrations, concatenate
 from mimic.retargeting.kinematic_bound import closest_motion
 from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import baseline_poses
-from mimic.runs.files import write_atomically
 
 Controller = Callable[[State], Array]  # (state of the environment) -> action
 Motions = Float[np.ndarray, "demonstrations time joints"]

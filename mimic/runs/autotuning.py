@@ -15,8 +15,7 @@ from pathlib import Path
 import jax
 
 from mimic.base.compilation import compilation_cache
-from mimic.base.files import read_bytes, read_json
-from mimic.runs.files import write_atomically
+from mimic.base.files import read_bytes, read_json, write_atomically
 
 FILE = "autotuning.json"
 _FOLDER = "xla_gpu_per_fusion_autotune_cache_dir"  # JAX's name for it in the compilation cache

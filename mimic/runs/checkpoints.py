@@ -21,10 +21,9 @@ import jaxlib
 import numpy as np
 import orbax.checkpoint as ocp
 
-from mimic.base.files import file_digest, read_json, read_text
+from mimic.base.files import file_digest, read_json, read_text, write_atomically
 from mimic.base.npz import read_arrays
 from mimic.runs.autotuning import keep_choices
-from mimic.runs.files import write_atomically
 
 FOLDER = "checkpoints"
 WITH_STATE = 2  # newest checkpoints of a run that have the state of the training

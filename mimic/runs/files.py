@@ -9,16 +9,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mimic.base.files import read_json
+from mimic.base.files import read_json, write_atomically
 
 CONFIG, REPORT, METRICS, DEMONSTRATIONS = "config.yaml", "report.json", "metrics.csv", "demonstrations.npz"
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Writes a file; an existing one is replaced only when the new one is complete."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, newline="")
-    os.replace(partial, path)
 
 
 @contextlib.contextmanager

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mimic.base import compat
-from mimic.base.files import read_text
-from mimic.runs.files import METRICS, write_atomically
+from mimic.base.files import read_text, write_atomically
+from mimic.runs.files import METRICS
 
 
 class MetricsLog:

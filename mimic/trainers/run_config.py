@@ -10,8 +10,9 @@ from omegaconf import DictConfig, OmegaConf
 from mimic.base import registry
 from mimic.base.config import check_new, check_writable, explain, merged, schema, to_dict, typed
 from mimic.base.config_files import check_references, read_config
+from mimic.base.files import write_atomically
 from mimic.runs.checkpoints import check_checkpoint
-from mimic.runs.files import CONFIG, DEMONSTRATIONS, write_atomically
+from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
 from mimic.trainers.config import TrainConfig, trainer_config
 from mimic.trainers.run_correspondence import COPIES, with_saved_correspondence

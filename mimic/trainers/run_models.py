@@ -11,10 +11,9 @@ from typing import Any
 from mimic.arms.arm import ArmConfig
 from mimic.arms.model_copy import copied_files
 from mimic.arms.model_source import read_source
-from mimic.base.files import file_digest, read_bytes, read_json
+from mimic.base.files import file_digest, read_bytes, read_json, write_atomically
 from mimic.envs.config import EnvConfig
 from mimic.envs.family import arm_name
-from mimic.runs.files import write_atomically
 
 MODELS, RECORD = "models", "models.json"
 _ROLES, _LISTS = ("expert", "learner"), ("models", "evaluated")  # fields of EnvConfig, and lists of ArmsConfig

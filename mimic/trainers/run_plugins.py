@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mimic.base import registry
-from mimic.base.files import read_json
-from mimic.runs.files import write_atomically
+from mimic.base.files import read_json, write_atomically
 from mimic.trainers.config import BUILT_IN_TRAINERS, TrainConfig
 
 PLUGINS = "plugins.json"

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mimic.base.config import check_writable
+from mimic.base.files import write_atomically
 from mimic.commands.collect.finished_runs import FinishedRun, LeftOut, QualityMetric, find_runs, quality_metric
 from mimic.commands.collect.seed_groups import (
     CONFIDENCE,
@@ -26,7 +27,7 @@ from mimic.commands.collect.seed_groups import (
 )
 from mimic.commands.config import CollectConfig
 from mimic.evaluation.labels import SPLITS
-from mimic.runs.files import REPORT, write_atomically
+from mimic.runs.files import REPORT
 
 NAME = "collected"
 SOME_LEFT_OUT = 1

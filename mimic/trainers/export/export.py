@@ -15,10 +15,10 @@ from rich.console import Console
 from mimic.arms.embodiment import Embodiment
 from mimic.base.config import check_choice, new_file, new_folder
 from mimic.base.distribution import VERSION, install_command
+from mimic.base.files import write_atomically
 from mimic.envs import env_config
 from mimic.envs.imitation import layout_of, observation_layout, torque_scale
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
-from mimic.runs.files import write_atomically
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.export.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
 from mimic.trainers.export.export_any_arm import any_arm_function, description_writer

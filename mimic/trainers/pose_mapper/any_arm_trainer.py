@@ -13,9 +13,9 @@ from jaxtyping import Array
 
 from mimic.arms.arrays import ArmArrays, stack_arms
 from mimic.base.compilation import Background, compiling
+from mimic.base.files import write_atomically
 from mimic.envs.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.runs.checkpoints import Checkpoint
-from mimic.runs.files import write_atomically
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training
