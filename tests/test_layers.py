@@ -25,8 +25,8 @@ LAYERS = (
     ("retargeting",),
     ("envs",),
     ("evaluation",),
-    ("trainers",),
     ("viewer",),
+    ("trainers",),
     ("commands",),
 )  # and above these the modules directly in the package: the entry points, cli, gymnasium, __init__
 DATA = ("conf",)  # packages for Hydra's sake, without code

@@ -30,9 +30,9 @@ from mimic.trainers.run_config import load_config, policy_config, policy_run
 from mimic.viewer.live_session import LiveSession
 
 if TYPE_CHECKING:
+    from mimic.commands.newest_checkpoint import NewestCheckpoint
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
     from mimic.viewer.follower import Mapper, Preset
-    from mimic.viewer.newest_checkpoint import NewestCheckpoint
     from mimic.viewer.page import Page
     from mimic.viewer.playback import Playback
     from mimic.viewer.player import Player
@@ -197,8 +197,8 @@ def _prepare_training_view(config: ViewConfig) -> Callable[[], int]:
     """Prepares the playback of the newest checkpoint of a run that another process trains."""
     jax.config.update("jax_platforms", "cpu")  # the training may take the whole memory of the GPU
     compat.import_mjx()
+    from mimic.commands.newest_checkpoint import NewestCheckpoint
     from mimic.trainers.make import make_ppo_trainer
-    from mimic.viewer.newest_checkpoint import NewestCheckpoint
     from mimic.viewer.playback import Playback
 
     run_dir, trained = policy_config(config.run)

@@ -80,9 +80,12 @@ def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
 
 
 def test_only_the_page_of_the_view_imports_viser():
-    names = ["html", "live_session", "playback", "meshes", "follower", "history", "newest_checkpoint", "captured"]
-    names.append("any_learner")
-    code = f"import sys; sys.modules['viser'] = None; import {', '.join(f'mimic.viewer.{name}' for name in names)}"
+    viewer = ["html", "live_session", "playback", "meshes", "follower", "history", "captured"]
+    names = [f"mimic.viewer.{name}" for name in viewer] + [
+        "mimic.commands.newest_checkpoint",
+        "mimic.commands.view_any_arm",
+    ]
+    code = f"import sys; sys.modules['viser'] = None; import {', '.join(names)}"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 

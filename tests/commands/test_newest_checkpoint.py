@@ -11,10 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mimic.commands.newest_checkpoint import NewestCheckpoint
 from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint, save_checkpoint
 from mimic.runs.files import write_report
 from mimic.runs.metrics_log import METRICS
-from mimic.viewer.newest_checkpoint import NewestCheckpoint
 from tests.helpers.tiny import TINY
 from tests.helpers.untrained_run import untrained_run
 
@@ -37,7 +37,7 @@ def trainer():
 
 @pytest.fixture
 def newest(trainer, tmp_path, monkeypatch):
-    monkeypatch.setattr("mimic.viewer.newest_checkpoint._PERIOD", 0.0)
+    monkeypatch.setattr("mimic.commands.newest_checkpoint._PERIOD", 0.0)
     newest = NewestCheckpoint(trainer, tmp_path)
     yield newest
     newest.finish()
