@@ -152,8 +152,8 @@ def main() -> None:
     if kind == "controller":
         draw_controller({key: value for content in results for key, value in content.items()}, Path(out))
     elif kind == "policy":
-        rows = ([row for row in content["arms"] if row["controller_gap"] is not None] for content in results)
-        draw_policy(*rows, Path(out))
+        policy, outside = ([row for row in content["arms"] if row["controller_gap"] is not None] for content in results)
+        draw_policy(policy, outside, Path(out))
     elif kind == "mapper":
         draw_mapper(results[0]["rows"], Path(out))
     else:

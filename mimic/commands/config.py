@@ -353,7 +353,6 @@ class ViewConfig:
       arm: "left" or "right" arm of the person in `source`. Default "": right.
       capture: how `source` is read.
       checkpoint: steps of the checkpoint of the policy or the mapper. Default None: the last checkpoint.
-      follow: whether to play each new checkpoint of `run`, which another process trains.
       split: "held_out" or "train": demonstrations of the run to show first.
       host: address of the server; 0.0.0.0 is every address of this machine.
       port: port of the server.
@@ -370,7 +369,6 @@ class ViewConfig:
     arm: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
     checkpoint: int | None = checkpoint_number()
-    follow: bool = False
     split: str = "held_out"
     host: str = "127.0.0.1"
     port: int = number(8080, at_least=1, at_most=65_535)
@@ -381,11 +379,6 @@ class ViewConfig:
         check_choice("split", self.split, SPLITS)
         if self.run and self.mapper:
             raise ValueError(f"run, mapper: expected one of them, got {self.run!r} and {self.mapper!r}")
-        if self.follow and (not self.run or self.checkpoint is not None):
-            raise ValueError(
-                f"follow: expected with run= and without checkpoint=, as in run=runs/NAME follow=true, "
-                f"got run={self.run!r} and checkpoint={self.checkpoint}"
-            )
         if (self.run or self.mapper) and (self.expert or self.learner):
             raise ValueError(
                 "expert, learner: expected neither with run= or mapper=, whose arms are used; "

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,16 +25,14 @@ from mimic.commands.view_capture import (
 from mimic.commands.view_server import check_port, is_installed, serve
 from mimic.envs.config import ArmsConfig, EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
-from mimic.trainers.run_config import load_config, policy_config, policy_run
+from mimic.trainers.run_config import load_config, policy_run
 from mimic.viewer.live_session import LiveSession
 
 if TYPE_CHECKING:
-    from mimic.commands.newest_checkpoint import NewestCheckpoint
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-    from mimic.viewer.follower import Mapper, Preset
     from mimic.viewer.page import Page
     from mimic.viewer.playback import Playback
-    from mimic.viewer.player import Player
+    from mimic.viewer.tracking import Mapper, Preset
 
 CAPTURE_RATE = 100.0  # frames per second of a captured person, at most
 _NUMBERS_RATE = 15.0  # per second, of the numbers, chart and maps, which cost a browser more than the arms
@@ -56,8 +53,6 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     from mimic.base.compilation import use_compilation_cache
 
     use_compilation_cache(config.compilation_cache)
-    if config.follow:
-        return _prepare_training_view(config)
     if config.run:
         return _prepare_playback(config)
     # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
@@ -79,7 +74,7 @@ def _prepare_live(
 ) -> Callable[[], int]:
     """Prepares a view whose expert the user moves; `learners` as of `serve`, `presets` as of `LearnerControls`."""
 
-    def follow(page: "Page", times: Iterator[float]) -> None:
+    def show_session(page: "Page", times: Iterator[float]) -> None:
         from mimic.viewer.learner_controls import LearnerControls
         from mimic.viewer.live_page import show_live
         from mimic.viewer.manual_controls import ManualControls
@@ -87,7 +82,7 @@ def _prepare_live(
         expert = ManualControls(session, env, page.expert)
         show_live(page, times, session, env, expert, LearnerControls(session, page.starts, presets))
 
-    return lambda: serve(config, env, _title(config, env), follow, None, session.finish, learners=learners)
+    return lambda: serve(config, env, _title(config, env), show_session, None, session.finish, learners=learners)
 
 
 def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
@@ -98,7 +93,7 @@ def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
     """
     from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
     from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
-    from mimic.viewer.follower import shown_preset
+    from mimic.viewer.tracking import shown_preset
 
     mapper, env = _load_mapper(config)
     if not isinstance(mapper, AnyArmMapper):
@@ -141,14 +136,14 @@ def _prepare_captured(config: ViewConfig, env: EnvConfig) -> Callable[[], int]:
     def show(expert: CapturedExpert) -> int:
         live = LiveSession(expert.env)
 
-        def follow(page: "Page", times: Iterator[float]) -> None:
+        def show_session(page: "Page", times: Iterator[float]) -> None:
             from mimic.viewer.learner_controls import LearnerControls
             from mimic.viewer.live_page import show_live
 
             learner = LearnerControls(live, page.starts)
             show_live(page, times, live, expert.env, expert.controls(live), learner, _NUMBERS_RATE)
 
-        return serve(config, expert.env, _title(config, expert.env), follow, None, live.finish, rate=CAPTURE_RATE)
+        return serve(config, expert.env, _title(config, expert.env), show_session, None, live.finish, rate=CAPTURE_RATE)
 
     if is_address(config.source):
         listener = listen(config)
@@ -193,68 +188,17 @@ def _prepare_playback(config: ViewConfig) -> Callable[[], int]:
     return lambda: serve(config, trained.env, _title(config, trained.env), play, before=evaluate)
 
 
-def _prepare_training_view(config: ViewConfig) -> Callable[[], int]:
-    """Prepares the playback of the newest checkpoint of a run that another process trains."""
-    jax.config.update("jax_platforms", "cpu")  # the training may take the whole memory of the GPU
-    compat.import_mjx()
-    from mimic.commands.newest_checkpoint import NewestCheckpoint
-    from mimic.trainers.make import make_ppo_trainer
-    from mimic.viewer.playback import Playback
-
-    run_dir, trained = policy_config(config.run)
-    trainer = make_ppo_trainer(trained, run_dir)
-    newest, playback = NewestCheckpoint(trainer, run_dir), Playback(trained.env, trainer.evaluator)
-
-    def show(page: "Page", times: Iterator[float]) -> None:
-        newest.start()
-        if not newest.exists:
-            print(f"view: {run_dir} has no checkpoint yet; waiting for the first one", flush=True)
-        _play_newest(page, times, playback, newest, config.split)
-
-    return lambda: serve(config, trained.env, _title(config, trained.env), show, after=newest.finish)
-
-
 def _play(page: "Page", times: Iterator[float], playback: "Playback", split: str) -> None:
     from mimic.viewer.player import Player
 
     player = Player(page.server, playback, split)
     for dt in times:
         if player.advance(dt):
-            _show_playback(page, playback, player)
-
-
-def _show_playback(page: "Page", playback: "Playback", player: "Player", text: str = "") -> None:
-    """Shows the current frame of a playback, below a text."""
-    episode = player.split, player.demonstration
-    frame, note = playback.frame(*episode, player.time), playback.note(*episode)
-    page.show(frame, playback.chart(*episode, player.time), f"{text}\n{note}" if text else note)
-
-
-def _play_newest(
-    page: "Page", times: Iterator[float], playback: "Playback", newest: "NewestCheckpoint", split: str
-) -> None:
-    """Plays each new checkpoint from when it is evaluated; the time in the episode goes on."""
-    from mimic.viewer.player import Player
-
-    page.show_note("waiting for the first checkpoint" if not newest.exists else "evaluating the newest checkpoint …")
-    player, text = None, ""
-    for dt in times:
-        try:
-            evaluation = newest.advance()
-        except ValueError as error:
-            evaluation = None
-            print(f"view: {error}; waiting for the next one", file=sys.stderr, flush=True)
-        if evaluation is not None:
-            playback.replace(evaluation.rollouts)
-            text = evaluation.text
-            print(f"view: {text}", flush=True)
-            player = player or Player(page.server, playback, split)
-            player.refresh()
-        if player is not None and player.advance(dt):
-            _show_playback(page, playback, player, text)
+            episode = player.split, player.demonstration
+            frame, chart = playback.frame(*episode, player.time), playback.chart(*episode, player.time)
+            page.show(frame, chart, playback.note(*episode))
 
 
 def _title(config: ViewConfig, env: EnvConfig) -> str:
-    policy = f"{'newest policy' if config.follow else 'policy'} of {Path(config.run).name}"
-    controller = policy if config.run else "pose mapper" if config.mapper else "optimiser"
+    controller = f"policy of {Path(config.run).name}" if config.run else "pose mapper" if config.mapper else "optimiser"
     return f"{env.name or 'mimic'}: the {controller} moves the learner"

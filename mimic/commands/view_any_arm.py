@@ -22,7 +22,7 @@ from mimic.retargeting.array_nearest import nearest_pose
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
 from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, expert_pose
 from mimic.trainers.pose_mapper.any_arm_training import random_pose
-from mimic.viewer.follower import CompiledFunctions, PoseComparison, Preset, Settings, compiled
+from mimic.viewer.tracking import CompiledFunctions, PoseComparison, Preset, Settings, compiled
 
 # The kinematic bound: Newton steps from random poses, home and the mapper's pose. On Pandas with locked joints and on
 # four real arms it is at most 0.01 above that of 200 poses and 24 steps, in the mean at most 3e-4.
@@ -87,12 +87,12 @@ class _Compiled(NamedTuple):
     """Compiled functions of padded poses [rad], the weights (translation, rotation) and a learner.
 
     Attributes:
-      follow: (expert_qpos, weights, learner) -> the mapper's pose [rad].
+      track: (expert_qpos, weights, learner) -> the mapper's pose [rad].
       compare: (expert_qpos, learner_qpos, weights, learner) -> `PoseComparison`, with empty slots of links.
       best: (expert_qpos, guess, weights, learner) -> the best pose [rad], and its distance.
     """
 
-    follow: Callable[..., Array]
+    track: Callable[..., Array]
     compare: Callable[..., PoseComparison]
     best: Callable[..., tuple[Array, Array]]
 
@@ -125,8 +125,8 @@ class AnyLearnerFunctions:
         arrays, joints = learner.with_locks(settings.locked), learner.arm.embodiment.num_joints
         links = self._expert.num_links, learner.arm.embodiment.num_links
 
-        def follow(qpos: Array, current: Array, weights: Array) -> np.ndarray:
-            return np.asarray(functions.follow(_padded(qpos), weights, arrays))[:joints]
+        def track(qpos: Array, current: Array, weights: Array) -> np.ndarray:
+            return np.asarray(functions.track(_padded(qpos), weights, arrays))[:joints]
 
         def compare(qpos: Array, learner_qpos: Array, weights: Array) -> PoseComparison:
             comparison = functions.compare(_padded(qpos), _padded(learner_qpos), weights, arrays)
@@ -134,11 +134,11 @@ class AnyLearnerFunctions:
 
         def best(qpos: Array, weights: Array) -> tuple[np.ndarray, Array]:
             expert_qpos = _padded(qpos)
-            guess = functions.follow(expert_qpos, weights, arrays)
+            guess = functions.track(expert_qpos, weights, arrays)
             nearest, distance = functions.best(expert_qpos, guess, weights, arrays)
             return np.asarray(nearest)[:joints], distance
 
-        return CompiledFunctions(learner.arm, follow, compare, best)
+        return CompiledFunctions(learner.arm, track, compare, best)
 
     def finish(self) -> None:
         """Waits for the compilation: a process must not end during it."""
@@ -149,7 +149,7 @@ def _compile(mapper: AnyArmMapper) -> _Compiled:
     def model_of(weights: Array) -> AnyArmMapperModel:
         return dataclasses.replace(mapper.model, weights=DistanceWeights(weights[0], weights[1]))
 
-    def follow(qpos: Array, weights: Array, learner: ArmArrays) -> Array:
+    def track(qpos: Array, weights: Array, learner: ArmArrays) -> Array:
         return model_of(weights)(mapper.params, expert_pose(mapper.model.expert, qpos), learner)
 
     def compare(qpos: Array, learner_qpos: Array, weights: Array, learner: ArmArrays) -> PoseComparison:
@@ -175,7 +175,7 @@ def _compile(mapper: AnyArmMapper) -> _Compiled:
     learner = mapper.model.expert  # any other arm has the same shapes
     pose, weights = np.zeros(MAX_JOINTS, np.float32), np.ones(2, np.float32)
     return _Compiled(
-        compiled(follow, pose, weights, learner),
+        compiled(track, pose, weights, learner),
         compiled(compare, pose, pose, weights, learner),
         compiled(best, pose, pose, weights, learner),
     )

@@ -23,7 +23,7 @@ from mimic.motions.mocap.link_motion import LinkMotion
 from mimic.motions.mocap.live_points import LiveArm, Sample, find_live_arms
 from mimic.motions.mocap.point_socket import PointListener
 from mimic.runs.signals import Signals, noted_signals
-from mimic.viewer.captured import Clip, ClipPlayer, PointFollower, make_clip
+from mimic.viewer.captured import Clip, ClipPlayer, PointTracker, make_clip
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.origins import is_local
 
@@ -115,10 +115,10 @@ def live_expert(env: EnvConfig, arm: LiveArm, links: LinkMotion, listener: Point
     from mimic.viewer.capture_controls import PointControls
 
     assert arm.zero is not None
-    follower = PointFollower(listener, arm)
+    tracker = PointTracker(listener, arm)
     with _with_model(env, links, arm.zero) as with_expert:
-        yield CapturedExpert(with_expert, lambda session: PointControls(session, follower))
-    print(f"view: {follower.summary}", flush=True)
+        yield CapturedExpert(with_expert, lambda session: PointControls(session, tracker))
+    print(f"view: {tracker.summary}", flush=True)
 
 
 def wait_for_arm(listener: PointListener, config: ViewConfig, env: EnvConfig) -> tuple[LiveArm, LinkMotion] | None:

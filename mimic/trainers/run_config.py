@@ -92,11 +92,11 @@ def _read_config(run_dir: Path) -> TrainConfig:
         raise ValueError(f"{str(run_dir / CONFIG)!r} cannot be read: {explain(error)}") from error
 
 
-def policy_config(run: str) -> tuple[Path, TrainConfig]:
-    """The directory and the config of a run that trains a policy; it may have no checkpoint yet.
+def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
+    """The directory and the config of a run, for a command that shows its policy.
 
     Raises:
-      ValueError: no run directory, or a run of another trainer than PPO.
+      ValueError: no run directory, a run of another trainer than PPO, or no such checkpoint.
     """
     if not run:
         raise ValueError("run: expected the run directory to show, as in run=runs/NAME")
@@ -104,15 +104,5 @@ def policy_config(run: str) -> tuple[Path, TrainConfig]:
     trained = load_config(run_dir)
     if trained.trainer.name != "ppo":
         raise ValueError(f"run: expected a run of trainer=ppo, got one of {trained.trainer.name}")
-    return run_dir, trained
-
-
-def policy_run(run: str, checkpoint: int | None) -> tuple[Path, TrainConfig]:
-    """The directory and the config of a run, for a command that shows its policy.
-
-    Raises:
-      ValueError: see `policy_config`; or no such checkpoint.
-    """
-    run_dir, trained = policy_config(run)
     check_checkpoint(run_dir, checkpoint)
     return run_dir, trained

@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from mimic.viewer.captured import ClipPlayer, PointFollower
+from mimic.viewer.captured import ClipPlayer, PointTracker
 from mimic.viewer.live_session import LiveSession
 
 _SCRUB_STEP = 0.01  # s
@@ -63,9 +63,9 @@ class ClipControls:
 class PointControls:
     """Moves the expert of a session by points, and says whether they arrive."""
 
-    def __init__(self, session: LiveSession, follower: PointFollower):
-        self._session, self._follower = session, follower
-        self._state = follower.state
+    def __init__(self, session: LiveSession, tracker: PointTracker):
+        self._session, self._tracker = session, tracker
+        self._state = tracker.state
         self._since_update = 0.0
 
     def add_widgets(self, server: viser.ViserServer) -> None:
@@ -76,13 +76,13 @@ class PointControls:
 
     def advance(self, dt: float) -> None:
         """Moves the expert, and prints a line where the sender has stopped or started."""
-        pose, paused = self._follower.advance(dt)
+        pose, paused = self._tracker.advance(dt)
         if pose is not None:
             if paused:
                 self._session.seek()
             self._session.show_pose(pose)
-        if self._follower.state != self._state:
-            self._state = self._follower.state
+        if self._tracker.state != self._state:
+            self._state = self._tracker.state
             print(f"view: {self._state}", file=sys.stderr, flush=True)
         self._since_update += dt
 
@@ -93,4 +93,4 @@ class PointControls:
             self._text.content = self._content()
 
     def _content(self) -> str:
-        return f"{self._follower.state}: {self._follower.summary}"
+        return f"{self._tracker.state}: {self._tracker.summary}"

@@ -105,7 +105,7 @@ class ClipPlayer:
             self._jumped = self._changed = True
 
 
-class PointFollower:
+class PointTracker:
     """Poses of an arm from the newest points of a listener.
 
     Attributes:

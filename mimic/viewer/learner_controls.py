@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import viser
 
-from mimic.viewer.follower import Preset, shown_preset
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.manual_controls import by_user
+from mimic.viewer.tracking import Preset, shown_preset
 
 
 class LearnerControls:

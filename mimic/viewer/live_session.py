@@ -12,7 +12,8 @@ from jaxtyping import Float
 from mimic.arms.arm import build_arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
-from mimic.viewer.follower import (
+from mimic.viewer.hand import pose_of_hand
+from mimic.viewer.tracking import (
     CompiledFunctions,
     FunctionCache,
     Mapper,
@@ -23,7 +24,6 @@ from mimic.viewer.follower import (
     lock_angles,
     step_towards,
 )
-from mimic.viewer.hand import pose_of_hand
 
 _GLIDE = 1.0  # s, duration of the expert's motion to the pose of a button
 _REST_TIME = 0.25  # s that the expert rests before the learner may leave a local minimum
@@ -79,7 +79,7 @@ class FunctionSource(Protocol):
 
 
 class LiveSession:
-    """An expert that the user moves, and a learner that follows it. The methods are thread-safe.
+    """An expert that the user moves, and a learner that tracks it. The methods are thread-safe.
 
     Args:
       env: environment that defines the arms and the metric.
@@ -110,7 +110,7 @@ class LiveSession:
         self._motion: tuple[np.ndarray, np.ndarray] | None = None  # times [s] and poses [rad] of the expert
         self._time = 0.0  # s, since the start of the motion
         self._rest_time = 0.0  # s, since the expert moved
-        self._goal: np.ndarray | None = None  # pose of the learner to move to instead of following the optimiser
+        self._goal: np.ndarray | None = None  # pose of the learner to move to instead of the optimiser's
         self._seeks = False  # whether the learner is on its way to the best pose while the expert moves
         self._solved: tuple[Any, np.ndarray, float] | None = None  # request, best pose and bound
         self._active = self.settings  # the last settings with compiled functions
@@ -137,14 +137,14 @@ class LiveSession:
             self._pose, self._rest_time, self._goal = pose, 0.0, None
 
     def show_pose(self, pose: Float[np.ndarray, " joints"]) -> None:
-        """Sets the expert's pose [rad], one of a motion: the learner follows from where it is."""
+        """Sets the expert's pose [rad], one of a motion: the learner tracks it from where it is."""
         if not np.all(np.isfinite(pose)):
             return
         with self._lock:
             self._motion, self._pose, self._rest_time = None, np.asarray(pose, np.float32), 0.0
 
     def seek(self) -> None:
-        """Moves the learner to the best pose of many initial guesses before it follows; for motions that jump."""
+        """Moves the learner to the best pose of many initial guesses before it tracks again; for motions that jump."""
         with self._lock:
             self._seeks = self._escape
 
@@ -315,7 +315,7 @@ class LiveSession:
             self._goal = best
         goal = self._goal
         if goal is None or goal.shape != current.shape:
-            goal = np.asarray(functions.follow(self._pose, current, weights))
+            goal = np.asarray(functions.track(self._pose, current, weights))
             self._goal = None
         pose, is_there = step_towards(arm, current, goal, jump)
         if self._goal is not None:

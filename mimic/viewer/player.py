@@ -45,10 +45,6 @@ class Player:
         changed, self._changed = self._changed, False
         return changed
 
-    def refresh(self) -> None:
-        """Makes the next `advance` return True: the playback has other rollouts."""
-        self._changed = True
-
     def _set_playing(self, playing: bool) -> None:
         self._playing = playing
         self._button.label = "pause" if playing else "play"

@@ -11,8 +11,8 @@ from mimic.commands.config import ViewConfig
 from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
 from mimic.envs.config import ArmsConfig
 from mimic.metric.similarity import centre_line, similarity
-from mimic.viewer.follower import shown_preset
 from mimic.viewer.live_session import LiveSession
+from mimic.viewer.tracking import shown_preset
 from tests.helpers.compilations import count_compilations
 from tests.helpers.original_model import ur_like
 

@@ -1,4 +1,4 @@
-"""Captured motions that move a live view: the player of a clip, and the follower of points."""
+"""Captured motions that move a live view: the player of a clip, and the tracker of points."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from mimic.motions.mocap.ball_chain import zero_frames
 from mimic.motions.mocap.link_motion import arm_motion
 from mimic.motions.mocap.live_points import LiveArm, Sample, find_live_arms
 from mimic.motions.mocap.point_socket import Counts
-from mimic.viewer.captured import Clip, ClipPlayer, PointFollower, make_clip
+from mimic.viewer.captured import Clip, ClipPlayer, PointTracker, make_clip
 from tests.helpers.bodies import RATE, person
 
 
@@ -77,7 +77,7 @@ class Listener:
         return self._samples.pop(0) if self._samples else None
 
 
-def test_a_follower_holds_its_pose_where_points_are_missing():
+def test_a_tracker_holds_its_pose_where_points_are_missing():
     body = person(10)
     samples = [Sample(i / RATE, dict(zip(body.names, row, strict=True))) for i, row in enumerate(body.positions)]
     arm = LiveArm(find_live_arms(samples[0], ""), "right", 1.0, "z", 0.0, (0.0, 0.0, 0.0))
@@ -85,20 +85,20 @@ def test_a_follower_holds_its_pose_where_points_are_missing():
     unseen = Sample(1.0, {**samples[2].points, "RightHand": np.full(3, np.nan)})
     together = Sample(1.0, {**samples[2].points, "RightHand": samples[2].points["RightForeArm"]})
     listener = Listener([samples[0], unseen, together, samples[1]])
-    follower = PointFollower(listener, arm)  # type: ignore[arg-type]
-    first, second, third, fourth, fifth = (follower.advance(0.02) for _ in range(5))
+    tracker = PointTracker(listener, arm)  # type: ignore[arg-type]
+    first, second, third, fourth, fifth = (tracker.advance(0.02) for _ in range(5))
     assert first[0] is not None and first[1]  # the first pose may be anywhere
     assert second == third == fifth == (None, False)
     assert fourth[0] is not None
     np.testing.assert_allclose(fourth[0], arm.pose(samples[1]))
-    assert not fourth[1] and follower.incomplete == 2
-    assert follower.summary == "7 samples, 2 bad lines, 2 without all points of the arm, 1 rejected connections"
+    assert not fourth[1] and tracker.incomplete == 2
+    assert tracker.summary == "7 samples, 2 bad lines, 2 without all points of the arm, 1 rejected connections"
 
 
 def test_a_sender_that_stops_is_said():
-    follower = PointFollower(listener := Listener([]), None)  # type: ignore[arg-type]
-    assert follower.state == "points arrive"
+    tracker = PointTracker(listener := Listener([]), None)  # type: ignore[arg-type]
+    assert tracker.state == "points arrive"
     listener.silence = 2.0
-    assert follower.state == "the sender is silent, the arms hold their pose"
+    assert tracker.state == "the sender is silent, the arms hold their pose"
     listener.is_connected = False
-    assert follower.state == "no sender is connected, the arms hold their pose"
+    assert tracker.state == "no sender is connected, the arms hold their pose"

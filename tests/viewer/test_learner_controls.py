@@ -13,9 +13,9 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands import view_server
 from mimic.commands.config import ViewConfig
 from mimic.envs import env_config
-from mimic.viewer.follower import Preset
 from mimic.viewer.learner_controls import LearnerControls
 from mimic.viewer.live_session import Frame, LiveSession
+from mimic.viewer.tracking import Preset
 
 ARMS = {"panda": ArmConfig(), "planar": ArmConfig(model="planar", link_lengths=[0.3, 0.3, 0.3])}
 PRESETS = Preset("panda", 0, {}), Preset("bent", 0, {"joint2": 0.5}), Preset("planar", 1, {})

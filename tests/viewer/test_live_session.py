@@ -12,9 +12,9 @@ from mimic.envs import env_config
 from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.viewer import html
-from mimic.viewer.follower import Settings, initial_settings, learner_arm, step_towards
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.meshes import ArmShape
+from mimic.viewer.tracking import Settings, initial_settings, learner_arm, step_towards
 
 TICK = 1 / 30
 ENOUGH = 20  # updates a second that feel live

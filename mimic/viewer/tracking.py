@@ -109,14 +109,14 @@ class CompiledFunctions:
 
     Attributes:
       learner: learner with its locked joints.
-      follow: (expert_qpos, learner_qpos, weights) -> pose of the local minimum reached from the learner's pose [rad].
+      track: (expert_qpos, learner_qpos, weights) -> pose of the local minimum reached from the learner's pose [rad].
       compare: (expert_qpos, learner_qpos, weights) -> `PoseComparison`.
       best: (expert_qpos, weights) -> best pose from many initial guesses [rad], and its distance: the kinematic bound.
         None until it is compiled; its compilation takes longest.
     """
 
     learner: Arm
-    follow: Callable[..., Any]
+    track: Callable[..., Any]
     compare: Callable[..., PoseComparison]
     best: Callable[..., Any] | None
 
@@ -157,7 +157,7 @@ def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None 
     learner = arm.embodiment
     metric = _metric_of_weights(env, settings, expert, learner)
 
-    def follow(qpos: Array, current: Array, weights: Array) -> Array:
+    def track(qpos: Array, current: Array, weights: Array) -> Array:
         if mapper is not None:
             return mapper(qpos)
         options = {"warm_start": current, "iterations": _TRACKING_ITERATIONS, **metric(weights).arguments}
@@ -176,7 +176,7 @@ def compile_functions(env: EnvConfig, settings: Settings, mapper: Mapper | None 
 
     q, q_hat = (jax.ShapeDtypeStruct((n.num_joints,), np.float32) for n in (expert, learner))
     w = jax.ShapeDtypeStruct((2,), np.float32)
-    functions = CompiledFunctions(arm, compiled(follow, q, q_hat, w), compiled(compare, q, q_hat, w), None)
+    functions = CompiledFunctions(arm, compiled(track, q, q_hat, w), compiled(compare, q, q_hat, w), None)
     yield functions
     yield dataclasses.replace(functions, best=compiled(best, q, w))
 
