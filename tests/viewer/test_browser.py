@@ -115,7 +115,7 @@ def updates_per_second(page, seconds):
     return page.evaluate(count, seconds) / seconds
 
 
-def test_a_slider_moves_and_the_learner_follows(page, serve, tmp_path):
+def test_a_slider_moves_and_the_learner_tracks_it(page, serve, tmp_path):
     page, complaints = page
     page.goto(serve("env=panda4dof"))
     wait_for_bound(page)
