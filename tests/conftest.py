@@ -12,7 +12,8 @@ import pytest
 from jaxtyping import config as jaxtyping_config
 from jaxtyping import install_import_hook
 
-from tests.helpers.repository import CACHE, SLOW_PARAMETERS, share_compilations
+from tests.helpers.compilations import check_budget
+from tests.helpers.repository import CACHE, share_compilations
 
 # Not mimic.base.spatial: its scalars have no shape to check, and it is called thousands of times for each arm.
 CORE = (
@@ -56,11 +57,16 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before pytest selects by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks single parameters of tests as slow, where quicker ones of the same test run in `make test`."""
-    slow = set(SLOW_PARAMETERS.read_text().splitlines())
+    """Marks the parameters that `slow_for` names as slow; quicker ones of the same test run in `make test`."""
     for item in items:
-        if item.nodeid in slow:
+        if any(item.callspec.id in mark.args for mark in item.iter_markers("slow_for")):  # type: ignore[attr-defined]
             item.add_marker(pytest.mark.slow)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item):
+    with check_budget(is_slow=any(item.iter_markers("slow"))):
+        return (yield)
 
 
 @pytest.fixture
@@ -121,13 +127,22 @@ def own_registry(monkeypatch: pytest.MonkeyPatch):
         sys.modules.pop(plugin, None)
 
 
+@pytest.fixture(scope="session")
+def schemas():
+    """`mimic.base.config.schema`, once for each class: a third of the time of a command that is rejected."""
+    from mimic.base.config import schema
+
+    return functools.cache(schema)
+
+
 @pytest.fixture
-def rejected(monkeypatch, capsys, tmp_path):
+def rejected(monkeypatch, capsys, tmp_path, schemas):
     """A function that runs a command in an empty folder and returns the line that it is rejected with."""
 
     def run(name, *arguments):
         from mimic.commands import cli
 
+        monkeypatch.setattr(cli, "schema", schemas)
         folder = tmp_path / "empty"
         folder.mkdir()
         monkeypatch.chdir(folder)

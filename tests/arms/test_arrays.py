@@ -56,6 +56,7 @@ HARD_AXES = {
 FORMS = [jax.jit(form) for form in (unrolled, looped)]  # of all cases, so that each is compiled once
 
 
+@pytest.mark.slow_for("almost parallel, 1e-5 rad")
 @pytest.mark.parametrize("name", HARD_AXES)
 def test_hard_axes_move_as_in_mujoco(x64, name):
     """To 1e-11: rounding of 1e-16 a step, and axes at less than 1e-12 rad count as parallel."""

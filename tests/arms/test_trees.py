@@ -40,6 +40,7 @@ def poses(arm, count=2, seed=0):
     return rng.uniform(-1, 1, (count, arm.num_joints)), rng.normal(size=(count, arm.num_joints))
 
 
+@pytest.mark.slow_for("locked hand")
 @pytest.mark.parametrize("name", [*GENERATED, *OTHERS])
 def test_link_states_are_those_of_mujoco(x64, name):
     if name in OTHERS:

@@ -19,6 +19,7 @@ COUNTS = {
 }  # each damage some times
 
 
+@pytest.mark.slow_for("models", "npz")
 @pytest.mark.parametrize("kind", COUNTS)
 def test_fuzzed_inputs_are_accepted_or_rejected_in_one_line(kind):
     rows = run_here(kind, range(COUNTS[kind]))

@@ -14,6 +14,7 @@ COMMAND_LINES = 45
 RUNS = 300  # of which every sixth and fifth is a checkpoint
 
 
+@pytest.mark.slow_for("command_lines")
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("kind", ["command_lines", pytest.param("runs", marks=pytest.mark.slow)])
 def test_odd_inputs_end_in_one_line(kind):

@@ -93,6 +93,7 @@ def test_the_objective_equals_the_distance_in_the_environment(evaluator, capsys)
     assert abs(objectives[0] - objectives[1]) > 1e-3
 
 
+@pytest.mark.slow_for("arc_length-False")
 @pytest.mark.parametrize(("correspondence", "adaptive"), [("arc_length", False), ("soft", True)])
 def test_the_gradient_is_that_of_the_objective(correspondence, adaptive):
     """By single actions, over a whole rollout, against central differences.

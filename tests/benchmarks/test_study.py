@@ -25,6 +25,7 @@ def compose():
         yield hydra.compose
 
 
+@pytest.mark.slow_for("paper")
 @pytest.mark.parametrize("preset", study.STUDY["presets"])
 def test_every_run_and_evaluation_has_arguments_that_the_commands_take(preset, compose, tmp_path):
     cases = study.cases(preset)

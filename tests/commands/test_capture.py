@@ -115,6 +115,12 @@ def test_inspect_shows_what_a_clip_has(clip, tmp_path):
     assert (tmp_path / "pictures" / "skeleton.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow_for(
+    "arguments0-arm: expected left, right or both",
+    "arguments1-unit",
+    "arguments2-count: expected none with source=FILE",
+    "arguments3-expected a motion without gaps of",
+)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -135,6 +135,7 @@ def test_bad_run_directories(rejected, tmp_path):
     assert "exists" in rejected("train", f"run_dir={run_dir}")
 
 
+@pytest.mark.slow_for("None-not a run directory-train-resume")
 @pytest.mark.parametrize(("command", "key"), [("train", "resume"), ("evaluate", "run"), ("render", "run")])
 @pytest.mark.parametrize(
     ("config", "message"),

@@ -126,6 +126,7 @@ def test_rollouts_as_bags_are_the_same(run_dir, tmp_path, monkeypatch, capsys):
         np.testing.assert_allclose(torque, columns["action"][episode], rtol=0, atol=1e-6)  # compiled twice
 
 
+@pytest.mark.slow_for("lerobot")
 @pytest.mark.parametrize("format", FORMATS)
 def test_demonstrations_come_back_from_a_dataset(recorded, tmp_path, monkeypatch, capsys, format):
     dataset = write(tmp_path / "set", demonstrations=str(recorded), format=format)
@@ -196,6 +197,7 @@ def test_rollouts_that_a_runaway_cuts_short_are_counted(run_dir, tmp_path, monke
     assert [row["length"] for row in rows] == [HORIZON, 3, *[HORIZON] * 3]
 
 
+@pytest.mark.slow_for("joint_position-quantity1")
 @pytest.mark.parametrize(("control", "quantity"), [("joint_velocity", VELOCITY), ("joint_position", ANGLE)])
 def test_rollouts_with_an_inner_loop_have_its_targets(control, quantity):
     """A target angle is where the reference goes, and a target velocity the one that it takes on."""

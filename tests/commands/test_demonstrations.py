@@ -16,6 +16,7 @@ def panda():
     return mimic.build_arm(mimic.ArmConfig())
 
 
+@pytest.mark.slow_for("pd")
 @pytest.mark.parametrize("kind", ["pd", pytest.param("reach", marks=pytest.mark.slow)])
 def test_the_command_records_what_the_library_does(kind, tmp_path):
     out = tmp_path / "demonstrations.npz"

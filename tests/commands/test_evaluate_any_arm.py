@@ -17,6 +17,10 @@ def run_dir(tmp_path_factory):
     return untrained_family(tmp_path_factory.mktemp("runs") / "run")
 
 
+@pytest.mark.slow_for(
+    "settings0-controller: expected policy or nearest_pose for all arms of a run of many, got pd; choose",
+    "settings5-panda_pair: expected a serial arm, got a tree of 2 chains",
+)
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -58,6 +58,15 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows(with_ma
     assert np.all(np.abs(motions.qvel) <= largest / dt)
 
 
+@pytest.mark.slow_for(
+    "arguments0-demonstrations: expected a file",
+    "arguments1-out: expected a file",
+    "arguments2-no file",
+    "arguments3-unknown environment 'panda5dof'",
+    "arguments4-recorded with the joints",
+    "arguments5-exists; name a new file",
+    "arguments6-there is no folder",
+)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

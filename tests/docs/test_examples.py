@@ -89,6 +89,7 @@ def test_metric(said, tmp_path):
     assert is_picture(tmp_path / "links.png")
 
 
+@pytest.mark.slow_for("02_batches_and_gradients")
 @example("02_batches_and_gradients")
 def test_batches_and_gradients(said):
     rows = re.findall(r"(?:gradient \[1/rad\]|central differences): +\[(.*)\]", said)
@@ -177,6 +178,7 @@ def test_other_tools(said, tmp_path):
     assert (tmp_path / "policy.onnx").stat().st_size > 1000
 
 
+@pytest.mark.slow_for("09_swarm")
 @example("09_swarm")
 def test_swarm(said, tmp_path):
     assert number(r"order of its numbers: (\S+)", said) > number(r"shortest flights: +(\S+)", said)

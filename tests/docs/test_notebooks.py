@@ -46,6 +46,7 @@ def test_notebooks_use_what_is_public(path):
     assert not imported and used <= set(mimic.__all__) and ("import mimic" in source or '"-m", "mimic"' in source)
 
 
+@pytest.mark.slow_for("1_metric_and_retargeting", "3_own_arm")
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     "path", [pytest.param(path, marks=pytest.mark.slow if path.stem in SLOW else ()) for path in NOTEBOOKS], ids=named

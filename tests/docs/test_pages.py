@@ -52,6 +52,19 @@ def test_the_examples_on_poses_run(monkeypatch, tmp_path):
     assert scope["followed"].qpos.shape == (50, 4)
 
 
+@pytest.mark.slow_for(
+    "any_arm.md",
+    "datasets.md",
+    "dynamic_imitation.md",
+    "motion_capture.md",
+    "other_tools.md",
+    "own_arm.md",
+    "own_demonstrations.md",
+    "scaling.md",
+    "static_pose_imitation.md",
+    "training.md1",
+    "view.md",
+)
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_commands_and_code_are_valid(page, monkeypatch, tmp_path, own_registry):
     monkeypatch.chdir(tmp_path)

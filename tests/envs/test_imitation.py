@@ -22,6 +22,7 @@ OF_ONE_LEARNER = [name for name in mimic.environments() if name not in OF_MANY_A
 QUICK = ("planar4dof", "panda3dof")  # the others have all their shapes checked
 
 
+@pytest.mark.slow_for("any_arm", "panda_family")
 @pytest.mark.parametrize("name", mimic.environments())
 def test_every_environment_has_its_shapes(name):
     env = mimic.make(name, demonstrations=FEW)
@@ -31,6 +32,7 @@ def test_every_environment_has_its_shapes(name):
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
 
 
+@pytest.mark.slow_for("planar4dof-none")
 @pytest.mark.parametrize("limits", ["none", "hardware"])
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in OF_ONE_LEARNER]

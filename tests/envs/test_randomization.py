@@ -88,6 +88,7 @@ def test_equal_bounds_are_a_fixed_load(plain, varied):
     assert not np.allclose(stepped(fixed), stepped(plain), rtol=0.01)
 
 
+@pytest.mark.slow_for("mjx")
 @pytest.mark.parametrize("physics", ["mjx", "fused"])
 def test_a_heavier_arm_moves_as_in_mujoco(plain, physics):
     """1e-5 rad and rad/s: float32 over 0.1 s."""

@@ -31,23 +31,23 @@ def evaluator():
     return Evaluator(ImitationEnv(config, moved(training, 0)), moved(held_out, 1))
 
 
-def distance_of(env, demonstration, qpos):
-    zero = jnp.zeros((), jnp.int32)
-    return float(env.distance(jnp.asarray(qpos), jnp.zeros(len(qpos)), jnp.asarray(demonstration), zero))
-
-
 def test_each_episode_starts_at_rest_in_the_nearest_pose_of_its_demonstration(evaluator):
     env = evaluator.env
+    start_of, distance, observe = map(jax.jit, (env.start, env.distance, env.observe))
+
+    def distance_of(demonstration, qpos):
+        return float(distance(qpos, np.zeros(len(qpos), np.float32), demonstration, 0))
+
     for demonstration in range(env.demonstrations.count):
-        start = env.start(jax.random.PRNGKey(0), demonstration)
+        start = start_of(jax.random.PRNGKey(0), demonstration)
         np.testing.assert_array_equal(start.qpos, env.start_poses[demonstration])
         assert not np.any(start.qvel)
         # Of the static distance: the expert's velocity at its first step is zero here.
         poses = np.random.default_rng(0).normal(start.qpos, 0.3, (20, env.action_size)).astype(np.float32)
-        nearest = distance_of(env, demonstration, start.qpos)
-        assert nearest < min(distance_of(env, demonstration, pose) for pose in poses)
-        assert nearest < distance_of(env, demonstration, env.learner.home) - 0.05
-        np.testing.assert_allclose(env.begin(start).obs, env.observe(start), atol=1e-6)
+        nearest = distance_of(demonstration, start.qpos)
+        assert nearest < min(distance_of(demonstration, pose) for pose in poses)
+        assert nearest < distance_of(demonstration, np.asarray(env.learner.home, np.float32)) - 0.05
+        np.testing.assert_allclose(jax.jit(env.begin)(start).obs, observe(start), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -77,12 +77,12 @@ def test_holding_the_start_pose_and_videos_begin_there(evaluator):
 def test_episodes_that_restart_do_so_where_their_demonstration_starts(evaluator):
     env = evaluator.env
     episodes = fresh_episodes(env)
-    state = episodes.reset(jax.random.split(jax.random.PRNGKey(0), 8))
-    again = env.restart_done(state.replace(done=jnp.ones(8)))
+    state = jax.jit(episodes.reset)(jax.random.split(jax.random.PRNGKey(0), 8))
+    again = jax.jit(env.restart_done)(state.replace(done=jnp.ones(8)))
     for states in (state, again):
         arm = states.pipeline_state
         np.testing.assert_array_equal(arm.qpos, env.start_poses[np.asarray(arm.demonstration)])
-        np.testing.assert_allclose(states.obs, jax.vmap(env.observe)(arm), atol=1e-6)
+        np.testing.assert_allclose(states.obs, jax.jit(jax.vmap(env.observe))(arm), atol=1e-6)
 
 
 def test_home_is_the_default_and_other_names_are_rejected():

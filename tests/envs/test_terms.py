@@ -44,6 +44,7 @@ def terms(own_registry):
     return {"reward": {"terms": {"height": 0.5}}, "observation": {"terms": ["angles", "demonstration"]}}
 
 
+@pytest.mark.slow_for("mjx")
 @pytest.mark.parametrize("physics", ["mjx", "fused"])
 def test_terms_are_added_in_both_physics(terms, physics):
     plain = mimic.make("planar4dof", physics=physics, **SMALL)

@@ -63,6 +63,7 @@ def test_without_a_world_it_is_the_environment_of_the_paper():
     assert mimic.env_config("panda4dof", world="hardware").has_inner_loop
 
 
+@pytest.mark.slow_for("1")
 @pytest.mark.parametrize("delay", [1, 3])
 def test_a_delayed_action_acts_that_many_ticks_later(nominal, actions, undelayed, delay):
     """The first ticks have the action 0, which holds the start pose: the same motion, later."""
@@ -115,7 +116,7 @@ def test_a_lost_action_is_replaced_by_the_one_before(nominal, actions):
 def test_what_is_drawn_lies_in_its_ranges_and_changes_the_motion(nominal, actions, undelayed):
     config = mimic.env_config("panda4dof", demonstrations=FEW, world="hardware")
     env = make(world="hardware")
-    starts = jax.vmap(env.start)(jax.random.split(jax.random.PRNGKey(0), 500))
+    starts = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), 500))
     draw, world = starts.draw, config.world
     for name, values in {
         "payload": draw.payload, "payload_lever": draw.payload_lever, "gravity_error": draw.gravity_error,
@@ -132,6 +133,7 @@ def test_what_is_drawn_lies_in_its_ranges_and_changes_the_motion(nominal, action
     assert 1e-4 < difference < 0.1  # the inner loop holds the arm near its reference
 
 
+@pytest.mark.slow_for("joint_impedance", "joint_position", "torque")
 @pytest.mark.parametrize("control", ["torque", "joint_position", "joint_velocity", "joint_impedance"])
 def test_each_mode_moves_the_arm_within_its_limits(control):
     env = make(control=control)
@@ -202,7 +204,7 @@ def test_joints_without_limits_have_no_stops(name, fields):
 
 def test_an_episode_starts_where_the_robot_measures_itself():
     env = make(world="hardware")
-    states = jax.vmap(env.start)(jax.random.split(jax.random.PRNGKey(0), 50))
+    states = jax.jit(jax.vmap(env.start))(jax.random.split(jax.random.PRNGKey(0), 50))
     error = states.reference.qpos - states.qpos
     np.testing.assert_allclose(error, states.draw.bias, atol=1e-6)
     assert np.abs(error).max() > 1e-3

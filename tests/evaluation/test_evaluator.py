@@ -227,6 +227,7 @@ def test_holding_the_start_pose_is_the_reference_of_the_gap(evaluator):
     assert setting == {"frequency_rad_s": 0} and not np.asarray(ran.torque).any()
 
 
+@pytest.mark.slow
 def test_exact_dynamics_track_better_than_none(evaluator):
     feedback, exact = (run_controller(evaluator, name)[0] for name in ("pd", "computed_torque"))
     actual = [evaluator.summary(ran)["optimality_gap"] for ran in (exact, feedback)]

@@ -17,6 +17,7 @@ def make_evaluator(**fields) -> Evaluator:
     return Evaluator(make_env(config, training), held_out)
 
 
+@pytest.mark.slow_for("joint_velocity")
 @pytest.mark.parametrize(
     "control",
     [

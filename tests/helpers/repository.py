@@ -5,7 +5,6 @@ import os
 import pathlib
 
 REPOSITORY = pathlib.Path(__file__).resolve().parents[2]
-SLOW_PARAMETERS = REPOSITORY / "tests" / "slow_parameters.txt"  # one test with its parameter on each line
 # Outside of the checkout, so that a fresh clone finds what an older one compiled.
 CACHE = pathlib.Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or "~/.cache/mimic/tests").expanduser()
 CACHED = {  # environment variables of processes with the user's home: mimic's own cache is kept out of it

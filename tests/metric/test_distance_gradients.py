@@ -62,6 +62,7 @@ FINITE_DIFFERENCES = [
 ]
 
 
+@pytest.mark.slow_for("overlap-constant-cosine-mean")
 @pytest.mark.parametrize("combination", FINITE_DIFFERENCES, ids="-".join)
 def test_gradients_equal_finite_differences(x64, combination):
     correspondence, weights, *options = combination
@@ -76,6 +77,7 @@ def test_gradients_equal_finite_differences(x64, combination):
     assert abs(gradient[0, a.size :]).max() > 1e-3  # and it is not 0
 
 
+@pytest.mark.slow_for("overlap-constant-vmap")
 # jit compiles each of the twelve for seconds; the derivatives are the same operations, fused
 @pytest.mark.parametrize("transform", [lambda f: f, pytest.param(jax.jit, marks=pytest.mark.slow)], ids=["vmap", "jit"])
 @pytest.mark.parametrize("weights", WEIGHTS)

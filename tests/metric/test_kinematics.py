@@ -203,6 +203,7 @@ def test_a_batch_is_a_vmap_is_a_loop():
         jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k], b), batch, one)
 
 
+@pytest.mark.slow_for("18-body_twists", "18-forward_kinematics")
 @pytest.mark.parametrize("function", [forward_kinematics, link_states, body_twists])
 @pytest.mark.parametrize("joints", [3, LONG + 2])
 def test_jit_takes_the_arm_as_an_argument(function, joints):

@@ -49,6 +49,7 @@ def largest_difference(actual, expected):
     return max(float(np.abs(np.asarray(a, float) - np.asarray(b, float)).max()) for a, b in pairs)
 
 
+@pytest.mark.slow_for("long-paper", "panda 7->4-paper")
 @pytest.mark.parametrize(
     ("pair", "weights"),
     [
@@ -124,6 +125,7 @@ def test_one_expert_pose_serves_a_batch_of_learners():
     np.testing.assert_allclose(every[0], expected, rtol=1e-6)
 
 
+@pytest.mark.slow_for("panda")
 @pytest.mark.parametrize(
     "arm",
     [
@@ -149,6 +151,7 @@ def test_zero_with_finite_gradients_at_a_match(arm):
                 assert np.all(np.isfinite(gradients)) and np.abs(gradients).max() < 100  # weights, angular velocities
 
 
+@pytest.mark.slow_for("long")
 @pytest.mark.parametrize("pair", ["planar", "long"])
 def test_dtypes_are_kept(x64, pair):
     arms = PAIRS[pair]
@@ -216,6 +219,7 @@ def test_the_kernel_equals_the_plain_function(count):
         np.testing.assert_allclose(values, reference, rtol=1e-6)  # float32, fused and not
 
 
+@pytest.mark.slow_for("long")
 def test_value_and_gradient_are_one_kernel_on_a_gpu():
     arms = PAIRS["planar"]
     distance = motion_distance(*arms, overlap_correspondence(*arms))

@@ -56,6 +56,7 @@ def run(monkeypatch, capsys, *arguments):
     return capsys.readouterr().out
 
 
+@pytest.mark.slow_for("joint{}", "q_joint{}")
 @pytest.mark.parametrize("spelling", ["joint{}", "q_{}", "q_joint{}"])
 def test_a_table_becomes_demonstrations_that_training_takes(tmp_path, monkeypatch, capsys, spelling):
     numbers = range(1, 8)

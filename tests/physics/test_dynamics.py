@@ -45,6 +45,7 @@ def test_random_arms_accelerate_as_in_mujoco(x64):
         assert empty.any() and not actual[empty].any()
 
 
+@pytest.mark.slow
 def test_gravity_is_that_of_mujoco(x64, batch):
     """As an acceleration of the base, in the frame of the first joint."""
     gravity, expected = np.array([1.0, -2.0, -9.0]), []

@@ -164,6 +164,7 @@ def test_in_double_precision_only_rounding_is_left(name, x64):
     np.testing.assert_allclose(state.qpos, expected[-1], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow_for("panda7dof-joint_velocity-0")
 @pytest.mark.parametrize(
     ("mode", "sample_axis"), [pytest.param("torque", 1, marks=pytest.mark.slow), ("joint_velocity", 0)]
 )

@@ -70,6 +70,7 @@ def case():
     return arm, plant, world, draw, jax.jit(make_mjx_loop("torque", plant, world, PERIODS))
 
 
+@pytest.mark.slow_for("torque0-False", "torque1-True")
 @pytest.mark.parametrize(
     ("torque", "touches"),
     [

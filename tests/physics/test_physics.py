@@ -43,6 +43,7 @@ def copies(arm, count=COUNT):
     return stack_arms([arm] * count)
 
 
+@pytest.mark.slow_for("panda-fused", "planar-mjx")
 @pytest.mark.parametrize(
     ("name", "kind"), [("panda", "fused"), ("panda5", "fused"), ("planar", "fused"), ("planar", "mjx")]
 )
@@ -131,6 +132,7 @@ def test_gradients_are_finite_and_those_of_finite_differences(x64, mixed):
     np.testing.assert_allclose(actual, expected, rtol=1e-6)  # 1e-16 / 1e-6, times a hundred, and the step squared
 
 
+@pytest.mark.slow
 def test_the_kernel_steps_as_the_plain_function_does(mixed, gpu_kernels):
     """The GPU kernel, interpreted on the CPU, for a batch that is no multiple of its block."""
     advance = make_advance(TIMESTEP, 1)

@@ -31,8 +31,8 @@ def test_the_gradient_is_that_of_the_metric(x64, panda, locked):
     learner, matrix = lock_joints(panda, locked), correspondence(panda, panda)
     expert, qpos = link_states(panda, *motion(0)), motion(1)[0] * learner.is_free
     metric = make_metric(WEIGHTS, matrix)
-    expected = jax.grad(lambda q: metric(expert, link_states(learner, q)))(qpos) * learner.is_free
-    near = pose_quadratic(learner, WEIGHTS, matrix, expert, qpos)
+    expected = jax.jit(jax.grad(lambda q: metric(expert, link_states(learner, q))))(qpos) * learner.is_free
+    near = jax.jit(lambda q: pose_quadratic(learner, WEIGHTS, matrix, expert, q))(qpos)
     np.testing.assert_allclose(near.gradient, expected, rtol=0, atol=1e-13)  # rounding of a few hundred operations
     np.testing.assert_allclose(near.hessian, near.hessian.T, rtol=0, atol=1e-15)
     assert np.linalg.eigvalsh(near.hessian).min() > 0
@@ -49,6 +49,7 @@ def test_steps_lead_to_an_equal_arm_and_its_velocity(x64, panda):
     np.testing.assert_allclose(found[6], qpos[6], rtol=0, atol=0.1)  # it moves only the last link, by a few cm
 
 
+@pytest.mark.slow
 def test_steps_reduce_the_distance_and_leave_locked_joints(x64, panda):
     learner, matrix = lock_joints(panda, LOCKED), correspondence(panda, panda)
     metric, expert = make_metric(WEIGHTS, matrix), link_states(panda, *motion(4))

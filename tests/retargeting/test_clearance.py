@@ -23,6 +23,7 @@ def poses(arm, count=500, seed=0):
     return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
 
 
+@pytest.mark.slow_for("panda", "two arms")
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 def test_it_is_the_distance_of_the_costs(config):
     arm, capsules = build_arm(config, "hardware").embodiment, fit_capsules(config, "hardware")

@@ -36,6 +36,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.slow_for("imitate_trajectory", "kinematic_bound")
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_second_call_compiles_nothing(name):
     call, metric = FUNCTIONS[name], MetricConfig()

@@ -180,6 +180,7 @@ def test_each_cost_of_a_pose_falls_where_it_has_a_weight():
         assert np.all(total <= np.asarray(plain.distance) + before + 1e-3), name  # the smoothing of positions
 
 
+@pytest.mark.slow
 def test_arms_do_not_intersect_themselves_or_the_floor():
     """A planar arm that folds back on itself; the floor is a plane that the default pose crosses."""
     expert = learner = planar_arm([0.4, 0.3, 0.4])

@@ -63,6 +63,7 @@ def solved(name):
     return motion, correspondence, closest_motion(expert, learner, *motion, correspondence, PAPER_WEIGHTS)
 
 
+@pytest.mark.slow_for("panda 7->4")
 @pytest.mark.parametrize("name", ARMS)
 def test_no_sampled_motion_is_below_the_bound(name):
     expert, learner = ARMS[name]
@@ -188,6 +189,7 @@ def test_velocities_of_any_size_are_found():
     np.testing.assert_allclose(bound / speed, 0, atol=5e-3)
 
 
+@pytest.mark.slow_for("hard")
 @pytest.mark.parametrize(
     "correspondence, weights, options",
     [
@@ -210,6 +212,7 @@ def test_correspondence_and_weights_may_depend_on_the_distances(correspondence, 
         assert jnp.all(closest.distance <= tried.min(axis=1) + 1e-6)
 
 
+@pytest.mark.slow
 def test_angles_stay_within_the_joint_range():
     expert, learner = panda(), panda(locked=(3, 6, 7), limits="hardware")
     motion = demonstration(7)  # joint 4 turns the way that the real arm cannot

@@ -35,6 +35,7 @@ def poses(arm, count, seed=0):
     return np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, arm.num_joints)).astype(np.float32)
 
 
+@pytest.mark.slow_for("planar 4->7")
 @pytest.mark.parametrize("name", ["planar 7->4", "planar 4->7"])
 def test_planar_arms_reach_the_closed_form(name):
     expert, learner = PAIRS[name]
@@ -44,6 +45,7 @@ def test_planar_arms_reach_the_closed_form(name):
     assert np.all(solution.converged) and np.all(np.abs(solution.qpos) <= np.pi + 1e-6)
 
 
+@pytest.mark.slow_for("default-1e-06")
 @pytest.mark.parametrize(("metric", "tolerance"), [("directions", 1e-9), ("default", 1e-6)])
 def test_an_equal_arm_finds_the_pose_itself(metric, tolerance):
     """Distances of directions are quadratic in the error, of positions linear: float32 rounds it to 1e-7."""
@@ -136,6 +138,7 @@ def test_distances_belong_to_the_poses_and_no_nearby_pose_is_better():
             assert np.all(batched(qpos, near) > solution.distance - tolerance)
 
 
+@pytest.mark.slow
 def test_newton_beats_gradient_descent():
     expert, learner = PAIRS["panda 7->4"]
     qpos, correspondence = poses(expert, 32), overlap_correspondence(expert, learner)
@@ -147,6 +150,7 @@ def test_newton_beats_gradient_descent():
     assert np.mean(plain.distance - newton.distance) < 1e-2  # the paper's way gets near
 
 
+@pytest.mark.slow
 def test_dropped_initial_guesses_are_not_missed():
     expert, learner = PAIRS["planar 7->4"]
     arguments = expert, learner, poses(expert, 64), overlap_correspondence(expert, learner), DIRECTIONS
@@ -171,6 +175,7 @@ def test_shapes_and_warm_starts():
     np.testing.assert_allclose(mapped.distance, warm.distance, atol=1e-6)
 
 
+@pytest.mark.slow_for("directions-none")
 @pytest.mark.parametrize("limits", ["none", pytest.param("hardware", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "metric",

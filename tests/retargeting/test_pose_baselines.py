@@ -154,6 +154,7 @@ def test_solutions_within_the_joint_range_come_first():
     assert np.mean(angles[:2].max(axis=0) < ROUNDING) > 0.99
 
 
+@pytest.mark.slow_for("True")
 @pytest.mark.parametrize("reachable", [True, False])
 def test_subproblem_2_minimises_the_angle(reachable):
     """Against a grid over both angles."""

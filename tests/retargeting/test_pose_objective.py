@@ -67,6 +67,7 @@ def check_derivatives(learner, matrix, weights, seed=0, rotation: Any = "cosine"
     np.testing.assert_allclose(values[0] - values[1], distance(one) - distance(other), atol=1e-12)
 
 
+@pytest.mark.slow_for("both")
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
     ("weights", "rotation"),
@@ -85,6 +86,7 @@ def test_closed_derivatives_are_those_of_the_smoothed_distance(weights, rotation
         check_derivatives(learner, jnp.asarray(matrix * (rng.uniform(size=shape) < 0.5)), weights, rotation=rotation)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_arrays_of_weights_and_a_correspondence_known_only_at_run_time():
     expert, learner = panda(), panda(locked=(3, 6, 7))
@@ -115,6 +117,7 @@ def test_a_match_has_zero_gradient_and_finite_curvature(dtype, rotation):
         assert all(np.all(np.isfinite(jnp.stack(row))) for row in here.hessian)
 
 
+@pytest.mark.slow_for("float32")
 def test_smoothing_changes_the_distance_by_less_than_its_own_size(dtype):
     """Arc length W has entries that sum to n n_hat: the mean length is off by s at most; 1e-5 for float32."""
     expert, learner = panda(), panda(locked=(3, 6, 7))

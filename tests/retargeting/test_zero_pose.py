@@ -28,6 +28,7 @@ def test_there_are_127_locked_pandas():
     assert len(LOCKS) == 127
 
 
+@pytest.mark.slow_for("directions")
 @pytest.mark.parametrize("metric", [METRIC, DIRECTIONS], ids=["default", "directions"])
 def test_the_distance_is_zero_at_the_zero_pose(metric):
     """1e-6: float32 rounds positions to 1e-7 chain lengths."""

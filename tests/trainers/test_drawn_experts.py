@@ -76,6 +76,7 @@ def test_an_expert_is_the_same_in_all_its_forms(mapper):
     np.testing.assert_allclose(batch[:, 0], learner_qpos, atol=ATOL)
 
 
+@pytest.mark.slow
 def test_the_expert_is_that_of_the_environment_by_default(mapper):
     qpos = poses(3, 7)
     np.testing.assert_allclose(mapper(qpos, FOUR), mapper(qpos, FOUR, "panda"), atol=ATOL)

@@ -82,6 +82,7 @@ def case(x64):
     return Case(config, unrolls, order, jax.random.split(jax.random.PRNGKey(2), DEVICES))
 
 
+@pytest.mark.slow_for("False-1")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("staggered", "unroll"), [(False, 1), pytest.param(True, 1, marks=pytest.mark.slow), (True, 2)]

@@ -289,6 +289,7 @@ def test_training_ends_at_the_target_gap(tmp_path):
 SLOW_SIGNALS = signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2
 
 
+@pytest.mark.slow_for("15")
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in SLOW_SIGNALS)]
 )

@@ -52,6 +52,7 @@ def settle(session, seconds=6.0):
     raise AssertionError("the learner does not come to rest")
 
 
+@pytest.mark.slow_for("nan")
 @pytest.mark.parametrize("angle", [float("nan"), float("inf"), -float("inf")])
 def test_an_angle_that_is_no_number_is_dropped(live, angle):
     before = live.pose

@@ -64,6 +64,7 @@ def slurm(tmp_path):
     return {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}", "SLURM_STAND_IN": str(tmp_path)}
 
 
+@pytest.mark.slow_for("basic", "submitit_slurm")
 # Any command can be swept, and this one is quick: collecting a folder with a run, and one that is not there.
 @pytest.mark.parametrize(
     "launcher", ["basic", pytest.param("submitit_local", marks=pytest.mark.slow), "submitit_slurm", "ray"]
@@ -89,6 +90,7 @@ def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
             assert f"#SBATCH {option}" in submitted
 
 
+@pytest.mark.slow_for("arguments3-expected only with a sweep; add -m")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -67,6 +67,7 @@ def random_poses(arm, count, seed=0):
     return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
 
 
+@pytest.mark.slow_for("1")
 @pytest.mark.parametrize("batch", [1, 33])
 def test_an_onnx_policy_equals_the_policy(tmp_path, batch):
     env, controller = policy_run(tmp_path / "run")
@@ -100,6 +101,9 @@ def test_the_metadata_describes_inputs_and_outputs(tmp_path):
     assert max(part["stop"] for part in layout.values()) == env.observation_size
 
 
+@pytest.mark.slow_for(
+    "panda3dof-large-metric4", "panda4dof-large-None", "panda4dof-paper-None", "planar7dof-large-metric3"
+)
 @pytest.mark.parametrize(
     ("name", "preset", "metric"),
     [
