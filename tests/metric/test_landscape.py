@@ -45,3 +45,10 @@ def test_bad_input_is_rejected():
         distance_landscape(ARM, planar_arm([1, 1, 1]), EXPERT_POSE, hard_correspondence, adaptive_weights)
     with pytest.raises(ValueError, match="resolution: expected at least 3"):
         distance_landscape(ARM, ARM, EXPERT_POSE, hard_correspondence, adaptive_weights, resolution=2)
+
+
+def test_a_plateau_has_no_minimum():
+    distance = np.ones((4, 4))
+    assert len(local_minima(distance)) == 0
+    distance[1, 0] = 0.0
+    assert local_minima(distance).tolist() == [[1, 0]]
