@@ -27,8 +27,10 @@ from mimic.arms.arrays import MAX_JOINTS
 from mimic.arms.sampler import random_arm
 from mimic.control.joint_control import JointParameters, Reference, Target, action_target
 from mimic.envs import env_config
+from mimic.envs.world_env import plant_of
 from mimic.physics import composite_kernel, dynamics, inner_loop, physics
-from mimic.physics.plant import draw_episode, make_plant
+from mimic.physics.plant import draw_episode
+from mimic.physics.world import WorldConfig
 
 TIMESTEP = 0.01  # s, of the physics
 DRAWN = 512
@@ -74,10 +76,13 @@ def of_inner_loop(name: str, periods: int) -> Case:
     """Random episodes of an environment near its start pose, with random targets."""
     config, rng = env_config(name, world="hardware"), np.random.default_rng(0)
     arm = build_arm(config.learner, config.limits)
-    plant, home = make_plant(config, arm), np.asarray(arm.embodiment.home)
+    plant, home = (
+        plant_of(config, arm),
+        np.asarray(arm.embodiment.home),
+    )
 
     def draw(key: jax.Array) -> inner_loop.Episode:
-        return plant.episode(draw_episode(config, len(home), key))
+        return plant.episode(draw_episode(config.world or WorldConfig(), config.randomization, len(home), key))
 
     episodes = jax.jit(jax.vmap(draw))(jax.random.split(jax.random.PRNGKey(0), DRAWN))
     qpos, qvel, qacc, torque, action = rng.uniform(-1, 1, (5, DRAWN, len(home)))

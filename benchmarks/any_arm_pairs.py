@@ -21,7 +21,7 @@ from benchmarks.common.record import Row, print_table, write_results
 from mimic.arms.arm import ArmConfig
 from mimic.arms.arrays import ArmArrays, stack_arms
 from mimic.base.files import read_json
-from mimic.envs.family import UNSEEN, report_arms
+from mimic.envs.family import UNSEEN, arms_config, report_arms
 from mimic.runs.files import REPORT
 from mimic.trainers.pose_mapper.any_arm_evaluation import METHODS, Pairs, make_reference, run_mapper, table_of_pairs
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
@@ -68,7 +68,7 @@ def summary(group: str, rows: list[Row]) -> Row:
 def main() -> None:
     options = make_parser("any_arm_pairs", __doc__, run=Path, models=Path, poses=128).parse_args()
     mapper = AnyArmMapper.load(options.run)
-    own = mapper.env.arms
+    own = arms_config(mapper.env)
     configs = {
         file.stem: ArmConfig(model=str(file), armature=own.armature, damping=own.damping)
         for file in sorted(options.models.glob("*.xml"))

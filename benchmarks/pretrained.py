@@ -52,7 +52,7 @@ def make_network(run_dir: Path, out: Path, commit: str, half: bool) -> dict[str,
     """Writes the folder of a run's network, and returns its row of the table."""
     config = load_config(run_dir)
     kind = next(kind for kind, trainer in TRAINERS.items() if trainer == config.trainer.name)
-    if config.env.arms.are_drawn and kind == "policy":
+    if config.env.kind == "sampled_arms" and kind == "policy":
         raise ValueError(f"{str(run_dir)!r}: expected a pose mapper or a policy of one learner, got one of many arms")
     trainer = make_trainer(config, run_dir)
     _, params = load_checkpoint(run_dir, trainer.params_template())
@@ -63,7 +63,7 @@ def make_network(run_dir: Path, out: Path, commit: str, half: bool) -> dict[str,
         **read_json(run_dir / REPORT),
         **trainer.metrics(outcome),
         **trainer.details(outcome),
-        "copying_distance": None if config.env.arms.are_drawn else copying_distance(trainer),
+        "copying_distance": None if config.env.kind == "sampled_arms" else copying_distance(trainer),
         SOURCE: {"command": training_command(stored_config), "commit": commit, "matrices": MATRICES[half]},
     }
     folder = out / f"{config.env.name}-{kind}"
@@ -74,7 +74,7 @@ def make_network(run_dir: Path, out: Path, commit: str, half: bool) -> dict[str,
 
 def without_evaluated(config: TrainConfig) -> TrainConfig:
     """The config without the files of arms that only the report of a run needs."""
-    arms = dataclasses.replace(config.env.arms, evaluated=[])
+    arms = dataclasses.replace(config.env.arms, evaluated=[]) if config.env.arms else None
     return dataclasses.replace(config, env=dataclasses.replace(config.env, arms=arms))
 
 

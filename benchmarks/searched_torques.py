@@ -180,7 +180,7 @@ def main() -> None:
     parser.add_argument("--run", required=True, metavar="DIR", help="run of trainer=ppo with one learner")
     options = parser.parse_args()
     run_dir, trained = policy_run(options.run, None)
-    if trained.env.arms.are_drawn or trained.env.has_inner_loop or trained.env.metric.link_distance:
+    if trained.env.kind != "one_arm" or trained.env.metric.link_distance:
         parser.error("--run: expected one learner, torques as actions and a metric of weighted parts")
     trainer = make_ppo_trainer(trained, Path(run_dir))
     _, params = load_checkpoint(run_dir, trainer.params_template(), None)

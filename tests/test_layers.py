@@ -32,8 +32,6 @@ LAYERS = (
 DATA = ("conf",)  # packages for Hydra's sake, without code
 # Imports that break the rule: {(module, module that it imports): reason}.
 EXCEPTIONS: dict[tuple[str, str], str] = {
-    ("mimic.physics.plant", "mimic.envs.config"): "WorldConfig is to move down",
-    ("mimic.physics.step", "mimic.envs.config"): "AUTO is to move down",
     ("mimic.runs.distributed.process_group", "mimic.trainers.distributed.heartbeats"): "is to leave",
     ("mimic.runs.distributed.process_group", "mimic.trainers.distributed.relay"): "is to leave",
 }

@@ -27,9 +27,9 @@ def schema(config_class: type) -> DictConfig:
 def _unfreeze(node: DictConfig) -> None:
     """Makes a node writable: OmegaConf makes those of frozen dataclasses read-only, but presets set their fields."""
     OmegaConf.set_readonly(node, None)
-    for key in node:
+    for key in () if node._is_none() else node:
         child = node._get_node(key)
-        if isinstance(child, DictConfig) and not child._is_none():
+        if isinstance(child, DictConfig):
             _unfreeze(child)
             if OmegaConf.get_type(child) is dict:  # its keys are the user's; Hydra forbids new keys elsewhere
                 OmegaConf.set_struct(child, False)
@@ -53,12 +53,14 @@ def _check_ranges(node: DictConfig, prefix: str = "") -> None:
         if OmegaConf.is_missing(node, key):
             continue
         value, name = node[key], f"{prefix}{key}"
+        if value is None and node._get_node(key)._metadata.optional:  # type: ignore[union-attr]
+            continue
         expected = node._get_node(key)._metadata.ref_type  # type: ignore[union-attr]
         if dataclasses.is_dataclass(expected) and expected not in (OmegaConf.get_type(value) or object).__mro__:
             raise ValueError(f"{name}: expected keys and values of its own, got {value!s:.80}")  # by a reference
         if isinstance(value, DictConfig):
             _check_ranges(value, f"{name}.")
-        elif key in limits and value is not None:
+        elif key in limits:
             limits[key].check(name, value)
 
 

@@ -145,7 +145,7 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
 
 def train_options(env: EnvConfig) -> str:
     """What a training on a person's motion needs else. A robot starts in its ready pose, and must not touch itself."""
-    if not env.has_inner_loop:
+    if env.kind != "inner_loop":
         return "env.start=nearest 'env.observation.terms=[distance_gradient]'"
     world = next((name for name in ROBOT_WORLDS if env_config(env.name, world=name).world == env.world), "hardware")
     return f"world={world} 'env.reward.terms={{self_collision: 2}}'"

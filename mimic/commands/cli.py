@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import FrozenInstanceError
 from pathlib import Path
 from string import Template
@@ -58,6 +58,10 @@ FIRST_KEY = {"inspect": "learner.model", "collect": "folder"}  # key of each com
 FIRST_KEY_OF_SUFFIX = {  # the same where the argument is a file of another kind
     "inspect": {".bvh": "clip", ".c3d": "clip", ".trc": "clip", ".csv": "clip"},
 }
+_OPTIONAL_PARTS = {  # of the config of an environment, and what has them
+    "env.world": "an inner loop, as in world=ideal, nominal or hardware",
+    "env.arms": "sampled arms, as in env=any_arm or panda_family",
+}
 _CONFIG_ERRORS = (
     FrozenInstanceError,
     HydraException,
@@ -106,6 +110,10 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         if is_composed:
             raise
         _exit_with_error(error)
+    except (AssertionError, AttributeError):  # of OmegaConf: a key of a config that is null
+        if is_composed or not (message := _key_of_nothing(sys.argv[1:])):
+            raise
+        _exit_with_error(ValueError(message))
 
 
 def _print_help(config_name: str) -> bool:
@@ -174,6 +182,15 @@ def expand_shorthand(argument: str, command: str) -> str:
         return f"{of_suffix.get(Path(argument).suffix.lower(), FIRST_KEY[command])}={argument}"
     is_arm = key in ARM_KEYS.get(command, ()) and not value.startswith("{")
     return f"{key}.model={value}" if equals and is_arm else argument
+
+
+def _key_of_nothing(arguments: Sequence[str]) -> str:
+    """The error message for a key of a part that the environment does not have."""
+    for argument in arguments:
+        for part, advice in _OPTIONAL_PARTS.items():
+            if argument.lstrip("+~").startswith((f"{part}.", f"{part}={{")):
+                return f"{argument.partition('=')[0]}: expected with {advice}; {part} is null"
+    return ""
 
 
 def _failed_run(error: BaseException, exit_code: int) -> Outcome:

@@ -13,8 +13,9 @@ from mimic.arms.named_arms import is_arm_name
 from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, checkpoint_number, number, seed_number
 from mimic.envs import env_config, environments
-from mimic.envs.config import PHYSICS, ArmsConfig, EnvConfig
+from mimic.envs.config import EnvConfig
 from mimic.evaluation.labels import SPLITS
+from mimic.physics.world import PHYSICS
 from mimic.retargeting.costs import Costs
 from mimic.trainers.config import trainers
 from mimic.trainers.export.config import check_locked
@@ -403,7 +404,7 @@ class ViewConfig:
         if "learner" not in arms:
             self.env.check_one_learner()
         env = dataclasses.replace(self.env, **arms)
-        return dataclasses.replace(env, arms=ArmsConfig()) if "learner" in arms else env
+        return dataclasses.replace(env, arms=None) if "learner" in arms else env
 
     def resolve_learners(self, own: ArmConfig) -> dict[str, ArmConfig]:
         """The arms to choose from, by the name that the page shows.

@@ -96,7 +96,8 @@ def _print_clearance(console: Console, env: EnvConfig, arm: Arm, demonstrations:
         capsules = fit_capsules(env.expert, env.limits)
     except ValueError:  # no geoms
         return
-    clearances = smallest_clearances(arm.embodiment, capsules, demonstrations.qpos, env.world.floor_height)
+    floor_height = env.world.floor_height if env.world else 0.0
+    clearances = smallest_clearances(arm.embodiment, capsules, demonstrations.qpos, floor_height)
     console.print(touching_line(clearances), soft_wrap=True, highlight=False)
 
 

@@ -127,7 +127,7 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
     )
     evaluated = dataclasses.replace(trained, env=env)
     unseen = load_demonstrations(Path(config.demonstrations).expanduser()) if config.demonstrations else None
-    if env.arms.are_drawn:
+    if env.kind == "sampled_arms":
         trainer = make_any_arm_trainer(evaluated, run_dir, unseen)
     else:
         shared = make_any_arm_trainer(trained, run_dir).shared_policy() if config.learner else None
@@ -137,20 +137,20 @@ def _trainer_to_evaluate(trained: TrainConfig, run_dir: Path, config: EvaluateCo
 
 def _check_commands(env: EnvConfig, controller: str) -> None:
     """Rejects controllers whose commands are not those of the run."""
-    has_targets = env.has_inner_loop and env.control != "torque"
-    unfit = [*(TORQUE_CONTROLLERS if env.has_inner_loop else ()), *(() if has_targets else TARGET_CONTROLLERS)]
+    has_loop, has_targets = env.kind == "inner_loop", env.control != "torque"
+    unfit = [*(TORQUE_CONTROLLERS if has_loop else ()), *(() if has_targets else TARGET_CONTROLLERS)]
     if controller in unfit:
         valid = [name for name in CONTROLLERS if name not in unfit]
-        loop = f"an inner loop and control={env.control}" if env.has_inner_loop else "no inner loop"
+        loop = f"an inner loop and control={env.control}" if has_loop else "no inner loop"
         raise ValueError(f"controller: expected {', '.join(valid[:-1])} or {valid[-1]} for a run with {loop}, got "
                          f"{controller}")  # fmt: skip
 
 
 def _check_arms(env: EnvConfig, config: EvaluateConfig) -> None:
     """Rejects what a run of one learner, or the report of many arms, does not have."""
-    if config.learner and not env.arms.are_drawn:
+    if config.learner and env.kind != "sampled_arms":
         raise ValueError(f"learner: expected a run of many arms, got one of env={env.name}, whose learner is evaluated")
-    if env.arms.are_drawn and not config.learner and config.controller not in CONTROLLERS_OF_MANY:
+    if env.kind == "sampled_arms" and not config.learner and config.controller not in CONTROLLERS_OF_MANY:
         raise ValueError(
             f"controller: expected {' or '.join(CONTROLLERS_OF_MANY)} for all arms of a run of many, got "
             f"{config.controller}; choose one arm with learner=NAME"

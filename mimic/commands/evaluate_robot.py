@@ -52,8 +52,9 @@ def prepare_robot_evaluation(
     assert isinstance(trainer, PPOTrainer)
     out = new_folder("out", config.out) if config.out else None
     steps = check_checkpoint(run_dir, config.checkpoint)
-    world = env_config("panda7dof", world=config.robot_world).world if config.robot_world else trained.env.world
-    floor_height = trained.env.world.floor_height  # where the robot stands, whatever its world is
+    own = trained.env.world or WorldConfig()
+    world = env_config("panda7dof", world=config.robot_world).world or WorldConfig() if config.robot_world else own
+    floor_height = own.floor_height  # where the robot stands, whatever its world is
     world, robot = dataclasses.replace(world, floor_height=floor_height), robot_model(trained.env.learner, floor_height)
 
     def run() -> None:
@@ -90,13 +91,13 @@ def prepare_robot_evaluation(
 
 def _check(config: EvaluateConfig, trained: TrainConfig) -> None:
     """Raises a `ValueError` for what virtual robots or the safety layer do not have."""
-    if trained.trainer.name != "ppo" or trained.env.arms.are_drawn:
+    if trained.trainer.name != "ppo" or trained.env.kind == "sampled_arms":
         raise ValueError(f"robot: expected a run of trainer=ppo with one learner, got env={trained.env.name} and "
                          f"trainer={trained.trainer.name}")  # fmt: skip
     if config.robot == "virtual_panda" and trained.env.learner.model != "panda":
         raise ValueError("robot: expected virtual_robot for another learner than a Panda, got virtual_panda")
     env = trained.env
-    if env.has_inner_loop:
+    if env.kind == "inner_loop":
         check_supported(env.control, env.control_dt)
     elif env.observation.terms or env.environment:
         raise ValueError("robot: expected a run without observation.terms and environment, or with an inner loop")
@@ -134,7 +135,7 @@ def _run(tasks: list[Task], console: Console) -> list[Episodes]:
 def _policy(trained: TrainConfig, evaluator: Evaluator, run_dir: Path, steps: int, folder: Path) -> Path | TorquePolicy:
     """The policy as a bundle, or as torques where the run has no inner loop."""
     expert = _expert_table(evaluator)
-    if not trained.env.has_inner_loop:
+    if trained.env.kind != "inner_loop":
         model = _torque_model(evaluator, run_dir, steps)
         return TorquePolicy(model, expert, trained.env.preview, trained.env.control_dt)
     from mimic.trainers.export.export_controller import export_controller

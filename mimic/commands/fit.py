@@ -89,7 +89,7 @@ class Run:
         env, path = self.config.env, self.run_dir / DEMONSTRATIONS
         if path.is_file():
             env = dataclasses.replace(env, demonstrations=dataclasses.replace(env.demonstrations, path=str(path)))
-        return make_family_env(env) if env.arms.are_drawn else make_env(env)
+        return make_family_env(env) if env.kind == "sampled_arms" else make_env(env)
 
     def evaluate(self, *, quiet: bool = False, **options: Any) -> dict[str, Any]:
         """Evaluates the run, as `python -m mimic.evaluate` does.

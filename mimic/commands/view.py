@@ -23,7 +23,7 @@ from mimic.commands.view_capture import (
     wait_for_arm,
 )
 from mimic.commands.view_server import check_port, is_installed, serve
-from mimic.envs.config import ArmsConfig, EnvConfig
+from mimic.envs.config import EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.run_config import load_config, policy_run
 from mimic.viewer.live_session import LiveSession
@@ -102,7 +102,7 @@ def _prepare_mapper(config: ViewConfig) -> Callable[[], int]:
         return _prepare_live(config, env, LiveSession(env, mapper))
     named = config.resolve_learners(env.learner)
     learners, presets = read_learners(named, env.limits, env.metric.links)
-    env = dataclasses.replace(env, arms=ArmsConfig(), learner=next(iter(named.values())))
+    env = dataclasses.replace(env, arms=None, learner=next(iter(named.values())))
     names = [shown_preset(presets, index, {}).name for index in range(len(learners))]
     session = LiveSession(env, any_arm=AnyLearnerFunctions(mapper, learners))
     drawn = dict(zip(names, (learner.config for learner in learners), strict=True))
@@ -126,7 +126,7 @@ def _load_mapper(config: ViewConfig) -> "tuple[Mapper | AnyArmMapper, EnvConfig]
         network = load(config.mapper, "pose_mapper")
         return (network.function, network.config.env) if isinstance(network, Pretrained) else (network, network.env)
     env = load_config(run_dir).env
-    load_run = AnyArmMapper.load if env.arms.are_drawn else PoseMapper.load
+    load_run = AnyArmMapper.load if env.kind == "sampled_arms" else PoseMapper.load
     return load_run(run_dir, config.checkpoint), env
 
 

@@ -1,6 +1,7 @@
 """The config of an environment. The presets in mimic/conf/env, `make` and the command line set its fields."""
 
 import dataclasses
+from typing import Literal
 
 from mimic.arms.arm import ArmConfig, ArmPair, build_arm
 from mimic.arms.embodiment import LIMITS
@@ -11,10 +12,9 @@ from mimic.control.joint_control import MODES
 from mimic.envs.start_poses import START_POSES
 from mimic.metric.config import MetricConfig
 from mimic.motions.recording import KINDS
-from mimic.physics.world import WorldConfig
+from mimic.physics.world import AUTO, PHYSICS, RandomizationConfig, WorldConfig
 
-PHYSICS = ("mjx", "fused")
-AUTO = "auto"
+Kind = Literal["one_arm", "inner_loop", "sampled_arms"]
 REWARD_TERMS, OBSERVATION_TERMS = ("self_collision",), ("distance_gradient",)  # built in, see mimic/envs/terms.py
 registry.reserve("reward_term", REWARD_TERMS)
 registry.reserve("observation_term", OBSERVATION_TERMS)
@@ -46,29 +46,6 @@ class DemonstrationConfig:
     def __post_init__(self) -> None:
         check_choice("demonstrations.kind", self.kind, KINDS)
         check_ranges(self, "demonstrations.")
-
-
-@dataclasses.dataclass(frozen=True)
-class RandomizationConfig:
-    """Randomization of the learner's dynamics, drawn at the start of each episode; a range of zero width is constant.
-
-    Attributes:
-      mass: minimum and maximum factor on the masses and inertias of the learner's bodies.
-      damping: minimum and maximum factor on the damping of its joints.
-      torque_noise: standard deviation of the noise on each torque, as a fraction of the maximum torque.
-    """
-
-    # Beyond these factors the arm is another one, and float32 no longer simulates it.
-    mass: list[float] = number(lambda: [1.0, 1.0], at_least=1e-3, at_most=1e3, entries=(2, 2))
-    damping: list[float] = number(lambda: [1.0, 1.0], at_least=1e-3, at_most=1e3, entries=(2, 2))
-    torque_noise: float = number(0.0, at_least=0.0, at_most=10.0)
-
-    def __post_init__(self) -> None:
-        check_ranges(self, "randomization.")
-        for name in ("mass", "damping"):
-            minimum, maximum = getattr(self, name)
-            if minimum > maximum:
-                raise ValueError(f"randomization.{name}: expected [minimum, maximum], got [{minimum}, {maximum}]")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,17 +83,17 @@ class ObservationConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ArmsConfig:
-    """What the learner of each episode is drawn from. If all weights are 0, it is always the environment's learner.
+    """What the learner of each episode is drawn from: three kinds of arms, each with its fraction of their sum.
 
     Attributes:
       expert: "fixed": the environment's expert; or "drawn": another arm for each training pose, from the same
         distribution as the learner. Only for `trainer=pose_mapper`.
-      locked: weight of the environment's learner with joints locked at home, none of them included.
-      most_locked: largest number of joints that are locked.
+      locked_fraction: of the environment's learner with joints locked at home, none of them included.
+      most_locked: maximum number of joints that are locked.
       unseen: sets of locked joints that training leaves out, as in "2" or "1+4"; the report shows them apart.
-      perturbed: weight of `models`, each drawn with another size, other masses, rotors, damping and velocity limits.
+      perturbed_fraction: of `models`, each drawn with another size, other masses, rotors, damping and velocity limits.
       models: arms to draw perturbed ones from: names or files, see `ArmConfig.model`.
-      random: weight of random arms, see `random_arm` in mimic/arms/sampler.py.
+      random_fraction: of random arms, see `random_arm` in mimic/arms/sampler.py.
       reward: "relative": how much nearer the arm is than with the controller that the zero action is; or "distance",
         without it. See `AnyArmEnv`.
       distinct: number of distinct arms in a training; 0 draws a new arm for each episode.
@@ -125,12 +102,12 @@ class ArmsConfig:
     """
 
     expert: str = "fixed"
-    locked: float = number(0.0, at_least=0.0, at_most=1e6)
+    locked_fraction: float = number(0.0, at_least=0.0, at_most=1e6)
     most_locked: int = number(2, at_least=0, at_most=7)
     unseen: list[str] = dataclasses.field(default_factory=list)
-    perturbed: float = number(0.0, at_least=0.0, at_most=1e6)
+    perturbed_fraction: float = number(0.0, at_least=0.0, at_most=1e6)
     models: list[str] = dataclasses.field(default_factory=list)
-    random: float = number(0.0, at_least=0.0, at_most=1e6)
+    random_fraction: float = number(0.0, at_least=0.0, at_most=1e6)
     reward: str = "relative"
     distinct: int = number(0, at_least=0, at_most=2**31 - 1)
     evaluated: list[str] = dataclasses.field(default_factory=list)
@@ -141,20 +118,18 @@ class ArmsConfig:
         check_ranges(self, "arms.")
         check_choice("arms.reward", self.reward, ("relative", "distance"))
         check_choice("arms.expert", self.expert, ("fixed", "drawn"))
-        if self.expert == "drawn" and not self.are_drawn:
+        if not self.locked_fraction + self.perturbed_fraction + self.random_fraction > 0:
             raise ValueError(
-                "arms.expert: expected fixed where the learner is not drawn (all weights of arms are 0), got drawn"
+                "arms: expected locked_fraction, perturbed_fraction or random_fraction above 0, as in env=any_arm, got "
+                "none"
             )
         for text in self.unseen:
             if not all(number.isdecimal() and int(number) > 0 for number in text.split("+")):
                 raise ValueError(f"arms.unseen: expected numbers of joints from 1, as in 2 or 1+4, got {text!r:.80}")
-        if bool(self.models) != (self.perturbed > 0):
-            raise ValueError("arms: expected models and a weight perturbed above 0, or neither of them")
-
-    @property
-    def are_drawn(self) -> bool:
-        """Whether the learner is another arm in each episode."""
-        return self.locked + self.perturbed + self.random > 0
+        if bool(self.models) != (self.perturbed_fraction > 0):
+            raise ValueError("arms: expected models and a perturbed_fraction above 0, or neither of them")
+        if not self.locked_fraction and self.unseen:
+            raise ValueError("arms.unseen: expected with a locked_fraction above 0, got none")
 
     @property
     def unseen_sets(self) -> list[tuple[int, ...]]:
@@ -164,12 +139,12 @@ class ArmsConfig:
 
 @dataclasses.dataclass(frozen=True)
 class EnvConfig:
-    """An imitation environment.
+    """An imitation environment of one of three kinds: see `kind`.
 
     Attributes:
       name: name of the preset.
       expert, learner: the arms.
-      arms: what the learner of each episode is drawn from, where it is not always the same.
+      arms: what the learner of each episode is drawn from, as of env=any_arm; null where it is always the same.
       limits: "none" (start in the zero pose, paper) or "hardware" (start in the ready pose, the manufacturer's joint
         ranges).
       metric: embodiment distance of the reward.
@@ -182,8 +157,8 @@ class EnvConfig:
       physics: "mjx"; "fused": the same equations in one fused kernel, many times faster; or "auto": "fused" where it
         covers the learner exactly, otherwise "mjx", see `choose_physics` in mimic/physics/step.py.
       control: what an action is: "torque", which is constant in a control step (paper); or the target of an inner loop
-        at 1 kHz: "joint_position", "joint_velocity" or "joint_impedance", see `mimic.control`.
-      world: gravity, friction, load, sensors and delays.
+        at 1 kHz: "joint_position", "joint_velocity" or "joint_impedance", see `mimic.control`; only in a `world`.
+      world: gravity, friction, load, sensors and delays, and an inner loop at 1 kHz; null in the paper's world.
       randomization: how the learner's dynamics differ from its model.
       preview: how many control steps ahead the learner also observes the expert; 0 is the paper.
       limit_weight: weight in the reward of joints near or beyond their range and velocity limit; only where `limits`
@@ -198,7 +173,7 @@ class EnvConfig:
     name: str = ""
     expert: ArmConfig = dataclasses.field(default_factory=ArmConfig)
     learner: ArmConfig = dataclasses.field(default_factory=ArmConfig)
-    arms: ArmsConfig = dataclasses.field(default_factory=ArmsConfig)
+    arms: ArmsConfig | None = None
     limits: str = "none"
     metric: MetricConfig = dataclasses.field(default_factory=MetricConfig)
     demonstrations: DemonstrationConfig = dataclasses.field(default_factory=DemonstrationConfig)
@@ -208,7 +183,7 @@ class EnvConfig:
     substeps: int = number(10, at_least=1, at_most=1000)  # 0.1 ms for the default control step
     physics: str = AUTO
     control: str = "torque"
-    world: WorldConfig = dataclasses.field(default_factory=WorldConfig)
+    world: WorldConfig | None = None
     randomization: RandomizationConfig = dataclasses.field(default_factory=RandomizationConfig)
     preview: int = number(1, at_least=0, at_most=100)  # each step adds an expert to the observation
     limit_weight: float = number(1.0, at_least=0.0, at_most=1e6)
@@ -225,6 +200,7 @@ class EnvConfig:
         check_choice("physics", self.physics, (AUTO, *PHYSICS))
         check_choice("control", self.control, MODES)
         check_ranges(self)
+        self._check_applies()
         for name in self.reward.terms:
             registry.check("reward_term", name, "reward.terms")
         for name in self.observation.terms:
@@ -240,15 +216,31 @@ class EnvConfig:
                 f"physics steps to record, got {steps:,}"
             )
 
+    def _check_applies(self) -> None:
+        """Raises a ValueError for a value that has no effect in an environment of this kind."""
+        if self.arms is not None and self.world is not None:
+            raise ValueError("arms, world: expected one of them, got both")
+        if self.world is None and self.control != "torque":
+            raise ValueError(
+                f"control: expected torque without an inner loop, got {self.control}; world=ideal, nominal or hardware "
+                "has one"
+            )
+        if self.limits == "none" and self.limit_weight != EnvConfig.limit_weight:
+            raise ValueError(f"limit_weight: expected with limits=hardware, got {self.limit_weight}")
+        if self.world is not None and self.substeps != EnvConfig.substeps:
+            raise ValueError(f"substeps: expected none with an inner loop, whose steps take 1 ms, got {self.substeps}")
+
     @property
-    def has_inner_loop(self) -> bool:
-        """Whether a controller runs at 1 kHz between actions and torques, or the world is not the paper's."""
-        return self.control != "torque" or self.world != WorldConfig()
+    def kind(self) -> Kind:
+        """The kind of environment: one arm in the paper's world, one with an inner loop in a world, or sampled arms."""
+        if self.arms is not None:
+            return "sampled_arms"
+        return "one_arm" if self.world is None else "inner_loop"
 
     @property
     def recording_substeps(self) -> int:
         """Physics steps in a control step of the demonstrations that are recorded."""
-        return max(1, round(self.control_dt / _RECORDING_TIMESTEP)) if self.has_inner_loop else self.substeps
+        return max(1, round(self.control_dt / _RECORDING_TIMESTEP)) if self.kind == "inner_loop" else self.substeps
 
     def build_arms(self) -> ArmPair:
         """Both arms, with the links that the metric compares.
@@ -261,7 +253,7 @@ class EnvConfig:
 
     def check_one_learner(self) -> None:
         """Raises a ValueError where the learner is another arm in each episode."""
-        if self.arms.are_drawn:
+        if self.kind == "sampled_arms":
             raise ValueError(
                 f"env: expected an environment of one learner, got {self.name!r}, which draws another learner for each "
                 "episode; python -m mimic.evaluate run=DIR learner=NAME evaluates a policy of it on one learner"

@@ -17,12 +17,25 @@ from mimic.arms.sampler import (
     perturbed_sampler,
     random_arm,
 )
-from mimic.envs.config import EnvConfig, ObservationConfig, RandomizationConfig, RewardConfig
-from mimic.physics.world import WorldConfig
+from mimic.envs.config import ArmsConfig, EnvConfig, ObservationConfig, RewardConfig
+from mimic.physics.world import RandomizationConfig
 
 SEEN, UNSEEN = "seen", "unseen"
 _RANDOM_ARMS = 16  # in a report
 _RANDOM_SEED = 2**20  # of the random arms of a report; training draws from other keys
+
+
+def arms_config(config: EnvConfig) -> ArmsConfig:
+    """What the learners of an environment are drawn from.
+
+    Raises:
+      ValueError: an environment of one learner.
+    """
+    if config.arms is None:
+        raise ValueError(
+            f"env: expected one that draws its learners, as any_arm or panda_family, got {config.name!r} of one learner"
+        )
+    return config.arms
 
 
 def arm_sampler(config: EnvConfig) -> Sampler:
@@ -31,19 +44,17 @@ def arm_sampler(config: EnvConfig) -> Sampler:
     Raises:
       ValueError: an arm that cannot be loaded or has too many joints, or a set of joints that the learner lacks.
     """
-    arms = config.arms
+    arms = arms_config(config)
     parts: list[tuple[float, Sampler]] = []
-    if arms.locked:
+    if arms.locked_fraction:
         base = _arrays(config, config.learner)
-        parts.append((arms.locked, lock_sampler(base, _masks(config, base))))
-    if arms.perturbed:
+        parts.append((arms.locked_fraction, lock_sampler(base, _masks(config, base))))
+    if arms.perturbed_fraction:
         parts.append(
-            (arms.perturbed, perturbed_sampler([_arrays(config, _model(config, name)) for name in arms.models]))
+            (arms.perturbed_fraction, perturbed_sampler([_arrays(config, _model(arms, name)) for name in arms.models]))
         )
-    if arms.random:
-        parts.append((arms.random, random_arm))
-    if not parts:
-        raise ValueError("arms: expected a weight above 0 of locked, perturbed or random arms, got none")
+    if arms.random_fraction:
+        parts.append((arms.random_fraction, random_arm))
     total = sum(weight for weight, _ in parts)
     samplers = [sampler for _, sampler in parts]
     sampler = samplers[0] if len(parts) == 1 else mixed_sampler(samplers, [weight / total for weight, _ in parts])
@@ -52,17 +63,16 @@ def arm_sampler(config: EnvConfig) -> Sampler:
 
 def check_family(config: EnvConfig) -> None:
     """Raises a ValueError for settings that an environment of many arms does not have."""
-    if config.arms.expert != "fixed":
+    expert = arms_config(config).expert
+    if expert != "fixed":
         raise ValueError(
-            f"arms.expert: expected fixed, because demonstrations are of one expert, got {config.arms.expert}; "
+            f"arms.expert: expected fixed, because demonstrations are of one expert, got {expert}; "
             "trainer=pose_mapper draws experts"
         )
     supported = {
         "physics": ("auto", "fused"),
         "start": ("home",),
         "preview": (1,),
-        "control": ("torque",),
-        "world": (WorldConfig(),),
         "randomization": (RandomizationConfig(),),
         "reward": (RewardConfig(),),
         "observation": (ObservationConfig(),),
@@ -87,9 +97,9 @@ def report_arms(config: EnvConfig) -> dict[str, dict[str, ArmArrays]]:
     Raises:
       ValueError: see `arm_sampler`, or two arms of one name.
     """
-    arms = config.arms
+    arms = arms_config(config)
     result: dict[str, dict[str, ArmArrays]] = {SEEN: {}, UNSEEN: {}}
-    if arms.locked:
+    if arms.locked_fraction:
         base = _arrays(config, config.learner)
         for mask in _masks(config, base):
             result[SEEN][_name_of_locks(mask)] = lock_joints(base, mask)
@@ -98,12 +108,12 @@ def report_arms(config: EnvConfig) -> dict[str, dict[str, ArmArrays]]:
             result[UNSEEN][_name_of_locks(mask)] = lock_joints(base, mask)
     for split, names in ((SEEN, arms.models), (UNSEEN, arms.evaluated)):
         for name in names:
-            model = _model(config, name)
+            model = _model(arms, name)
             short = arm_name(model)
             if short in result[SEEN] or short in result[UNSEEN]:
                 raise ValueError(f"arms: expected models and evaluated of different names, got {short!r} twice")
             result[split][short] = _arrays(config, model)
-    if arms.random:
+    if arms.random_fraction:
         drawn = jax.device_get(
             jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(_RANDOM_SEED), _RANDOM_ARMS))
         )
@@ -130,8 +140,8 @@ def _changes(value: Any) -> str:
     )
 
 
-def _model(config: EnvConfig, name: str) -> ArmConfig:
-    return ArmConfig(model=name, armature=config.arms.armature, damping=config.arms.damping)
+def _model(arms: ArmsConfig, name: str) -> ArmConfig:
+    return ArmConfig(model=name, armature=arms.armature, damping=arms.damping)
 
 
 def _arrays(config: EnvConfig, arm: ArmConfig) -> ArmArrays:
@@ -140,20 +150,18 @@ def _arrays(config: EnvConfig, arm: ArmConfig) -> ArmArrays:
 
 def _masks(config: EnvConfig, base: ArmArrays) -> np.ndarray:
     """The sets of locked joints that training draws from: none, and up to `most_locked`, without the unseen ones."""
-    joints = int(np.sum(base.is_free))
-    if config.arms.most_locked >= joints:
-        raise ValueError(
-            f"arms.most_locked: expected less than the learner's {joints} joints, got {config.arms.most_locked}"
-        )
-    for locked in config.arms.unseen_sets:
+    arms, joints = arms_config(config), int(np.sum(base.is_free))
+    if arms.most_locked >= joints:
+        raise ValueError(f"arms.most_locked: expected less than the learner's {joints} joints, got {arms.most_locked}")
+    for locked in arms.unseen_sets:
         if locked[-1] > joints:
             raise ValueError(f"arms.unseen: the learner has {joints} joints, got joint {locked[-1]}")
         if len(set(locked)) >= joints:
             raise ValueError(f"arms.unseen: expected at least one of the learner's {joints} joints to move, got none")
     none = np.zeros((1, MAX_JOINTS))
-    if not config.arms.most_locked:
+    if not arms.most_locked:
         return none
-    return np.concatenate([none, lock_masks(joints, config.arms.most_locked, config.arms.unseen_sets)])
+    return np.concatenate([none, lock_masks(joints, arms.most_locked, arms.unseen_sets)])
 
 
 def _name_of_locks(mask: np.ndarray) -> str:

@@ -34,7 +34,7 @@ def make(name: str, **overrides: Any) -> "ImitationEnv | AnyArmEnv":
     """
     config = env_config(name, **overrides)
     compat.import_mjx()  # takes seconds, as the imports below
-    if config.arms.are_drawn:
+    if config.kind == "sampled_arms":
         return make_family_env(config)
     return make_env(config)
 
@@ -42,7 +42,7 @@ def make(name: str, **overrides: Any) -> "ImitationEnv | AnyArmEnv":
 def make_env(config: EnvConfig, demonstrations: Demonstrations | None = None) -> "ImitationEnv":
     """Makes the environment of a config with one learner: an `ImitationEnv`, or an object of a subclass of it.
 
-    The subclass is `HardwareEnv` where `config.has_inner_loop`, or the registered class that the config names.
+    The subclass is `HardwareEnv` for the kind "inner_loop", or the registered class that the config names.
 
     Args:
       config: the config.
@@ -54,7 +54,7 @@ def make_env(config: EnvConfig, demonstrations: Demonstrations | None = None) ->
     from mimic.envs.imitation import ImitationEnv, env_class
 
     config.check_one_learner()
-    if not config.has_inner_loop:
+    if config.kind == "one_arm":
         return env_class(config)(config, demonstrations)
     from mimic.envs.world_env import HardwareEnv
 

@@ -23,6 +23,7 @@ from mimic.arms.sampler import Sampler
 from mimic.base import compat
 from mimic.envs.arm_state import ArmState, arm_state
 from mimic.envs.config import EnvConfig
+from mimic.envs.family import arms_config
 from mimic.envs.many_arms_control import Plan, make_plan, max_speed, planned_torque, torque_scale
 from mimic.envs.many_arms_observation import observation_size, observe
 from mimic.metric.array_kinematics import (
@@ -145,7 +146,7 @@ class AnyArmEnv(Env):
             goals=first_goals(arm.home),
             plan=Plan(zeros, jnp.zeros((MAX_JOINTS, MAX_JOINTS)), zeros),
         )
-        if self.config.arms.reward == "relative":
+        if arms_config(self.config).reward == "relative":
             state = dataclasses.replace(state, baseline=state)
         return self.with_plan(state)
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from mimic.arms.arm import Arm
 from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
 from mimic.envs.arm_state import ArmState
@@ -21,9 +22,9 @@ from mimic.motions.demonstrations import Demonstrations
 from mimic.physics.inner_loop import LoopState, make_inner_loop
 from mimic.physics.mjx_loop import MjxLoop, make_mjx_loop
 from mimic.physics.mujoco_world import mujoco_world
-from mimic.physics.plant import Draw, draw_episode, make_plant
+from mimic.physics.plant import Draw, Plant, draw_episode, make_plant
 from mimic.physics.step import PhysicsChoice
-from mimic.physics.world import MAX_DELAY
+from mimic.physics.world import MAX_DELAY, WorldConfig
 
 SENT_ACTIONS = 3  # that the policy observes: from them it tells how long its actions take
 _DRAW, _START, _MEASURE, _LOSS = 5, 6, 7, 8  # folded into an episode's key, see mimic/envs/imitation.py
@@ -36,7 +37,7 @@ class HardwareEnv(ImitationEnv):
     place of the true ones, and then the angles and velocities of the reference and the last actions that were sent.
 
     Args:
-      config: see `EnvConfig`; `has_inner_loop`.
+      config: see `EnvConfig`; of the kind "inner_loop".
       demonstrations: see `ImitationEnv`.
 
     Attributes:
@@ -53,12 +54,18 @@ class HardwareEnv(ImitationEnv):
         _check(config)
         super().__init__(config, demonstrations)
 
+    @property
+    def world(self) -> WorldConfig:
+        """The world of the config."""
+        assert self.config.world is not None, "checked by `_check`"
+        return self.config.world
+
     def _set_physics(self, physics: PhysicsChoice) -> None:
         config, arm = self.config, self.arm
         self.physics, self.config = physics, dataclasses.replace(config, physics=physics.name)
-        self.plant = make_plant(config, arm)
+        self.plant = plant_of(config, arm)
         make = self._make_fused_loop if physics.name == "fused" else self._make_mjx_loop
-        waiting = round(config.world.action_latency / PERIOD)
+        waiting = round(self.world.action_latency / PERIOD)
         self._waiting_loop = make(waiting) if waiting else None
         self._acting_loop = make(round(config.control_dt / PERIOD) - waiting)
         parameters = self.plant.constants.parameters
@@ -71,7 +78,7 @@ class HardwareEnv(ImitationEnv):
         return np.clip(super()._start_poses_of(demonstrations), lower, upper)
 
     def _make_mjx_loop(self, periods: int) -> MjxLoop:
-        world = self.config.world
+        world = self.world
         capsules = self.capsules if world.contacts else None
         pairs = colliding_pairs(self.learner, capsules) if capsules else ()
         model = mujoco_world(self.arm, world, capsules, pairs)
@@ -88,7 +95,7 @@ class HardwareEnv(ImitationEnv):
     def on_mjx(self) -> "HardwareEnv":
         """See `ImitationEnv`; without contacts, which take ten times as long and which the fused loop lacks too."""
         env = copy.copy(self)
-        env.config = dataclasses.replace(self.config, world=dataclasses.replace(self.config.world, contacts=False))
+        env.config = dataclasses.replace(self.config, world=dataclasses.replace(self.world, contacts=False))
         return cast(HardwareEnv, env.with_physics("mjx"))
 
     @property
@@ -99,10 +106,10 @@ class HardwareEnv(ImitationEnv):
     def start(self, key: Array, demonstration: Int[Array, ""] | int | None = None) -> HardwareState:
         """The first state of an episode: at rest near the start pose, which is also the reference."""
         state, joints = super().start(key, demonstration), self.learner.num_joints
-        deviation = self.config.world.start_noise
+        deviation = self.world.start_noise
         noise = jax.random.uniform(jax.random.fold_in(key, _START), (joints,), minval=-deviation, maxval=deviation)
         qpos = jnp.clip(state.qpos + noise, self.parameters.lower, self.parameters.upper) if deviation else state.qpos
-        draw = draw_episode(self.config, joints, jax.random.fold_in(key, _DRAW))
+        draw = draw_episode(self.world, self.config.randomization, joints, jax.random.fold_in(key, _DRAW))
         zero = jnp.zeros_like(qpos)
         actions = jnp.zeros((MAX_DELAY + 1, self.action_size))
         reference = Reference(qpos + draw.bias, zero, zero)  # where the arm seems to be
@@ -121,9 +128,9 @@ class HardwareEnv(ImitationEnv):
         state = cast(HardwareState, before)
         step = state.step + 1
         arrived = command
-        if self.config.world.packet_loss:
+        if self.world.packet_loss:
             key_loss = jax.random.fold_in(jax.random.fold_in(state.key, _LOSS), step)
-            is_lost = jax.random.uniform(key_loss) < self.config.world.packet_loss
+            is_lost = jax.random.uniform(key_loss) < self.world.packet_loss
             arrived = jnp.where(is_lost, state.arrived[0], command)
         history = _pushed(state.arrived, arrived)
         acting = history[state.draw.action_delay]
@@ -148,7 +155,7 @@ class HardwareEnv(ImitationEnv):
 
     def _measure(self, state: LoopState, draw: Draw, key: Array, step: Array) -> Float[Array, " numbers"]:
         """Measured angles and velocities, and those of the reference."""
-        world, reference = self.config.world, state.reference
+        world, reference = self.world, state.reference
         key = jax.random.fold_in(jax.random.fold_in(key, _MEASURE), step)
         noise = jax.random.normal(key, (2, len(state.qpos)))
         qpos = state.qpos + draw.bias + world.position_noise * noise[0]
@@ -180,8 +187,16 @@ class HardwareEnv(ImitationEnv):
         return self.observe(state)
 
 
+def plant_of(config: EnvConfig, arm: Arm) -> Plant:
+    """The plant of an environment with an inner loop, see `make_plant`."""
+    assert config.world is not None, "checked by `_check`"
+    return make_plant(config.learner, arm, config.world, action_scale=config.action_scale, control_dt=config.control_dt)
+
+
 def _check(config: EnvConfig) -> None:
     """Raises a ValueError for settings that such an environment does not have."""
+    if config.world is None:
+        raise ValueError("world: expected one, as world=nominal, got none")
     periods = config.control_dt / PERIOD
     if abs(periods - round(periods)) > 1e-6:
         raise ValueError(f"control_dt: expected a multiple of {PERIOD} s with an inner loop, got {config.control_dt}")

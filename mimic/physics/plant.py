@@ -8,17 +8,16 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from mimic.arms.arm import Arm, torque_scale
+from mimic.arms.arm import Arm, ArmConfig, torque_scale
 from mimic.arms.arrays import ArmArrays, arm_arrays, body_moments, moments_of_joints
 from mimic.arms.drives import drives_of
 from mimic.arms.simulation_model import joint_inertia
 from mimic.control.joint_control import PERIOD
 from mimic.control.limits import joint_parameters
-from mimic.envs.config import EnvConfig
 from mimic.physics.dynamics import NUMBERS, joint_numbers
 from mimic.physics.inner_loop import Episode, JointConstants
 from mimic.physics.step import Load
-from mimic.physics.world import WorldConfig
+from mimic.physics.world import RandomizationConfig, WorldConfig
 
 GRAVITY = 9.81  # m/s^2
 # Mechanical stops as critically damped springs: stiff, and slow enough for steps of 1 ms.
@@ -55,9 +54,8 @@ class Draw:
     load: Load
 
 
-def draw_episode(config: EnvConfig, joints: int, key: Array) -> Draw:
-    """Draws an episode from the ranges of the config."""
-    world, randomization = config.world, config.randomization
+def draw_episode(world: WorldConfig, randomization: RandomizationConfig, joints: int, key: Array) -> Draw:
+    """Draws an episode from the ranges of a world and a randomization."""
     keys = iter(jax.random.split(key, 11))
 
     def uniform(bounds: list[float], *shape: int) -> Array:
@@ -119,25 +117,32 @@ class Plant:
         )
 
 
-def make_plant(config: EnvConfig, arm: Arm) -> Plant:
+def make_plant(learner: ArmConfig, arm: Arm, world: WorldConfig, *, action_scale: float, control_dt: float) -> Plant:
     """The plant of an environment's learner.
+
+    Args:
+      learner: config of the arm.
+      arm: the learner.
+      world: the world.
+      action_scale: factor on the torque range, see `EnvConfig`.
+      control_dt: duration of a control step [s].
 
     Raises:
       ValueError: an arm that is no chain, or has too many joints or links.
     """
     arrays = arm_arrays(arm)
-    drives = drives_of(config.learner, arm)
+    drives = drives_of(learner, arm)
     inertia = joint_inertia(arm.model, np.asarray(arm.embodiment.home))
-    scale = torque_scale(arm, config.action_scale, config.control_dt)
-    minimum, maximum = drives.limits.position.T if config.world.stops else np.array([[-np.inf], [np.inf]])
+    scale = torque_scale(arm, action_scale, control_dt)
+    minimum, maximum = drives.limits.position.T if world.stops else np.array([[-np.inf], [np.inf]])
     ones = np.ones(len(inertia))
     constants = JointConstants(
         parameters=joint_parameters(
             drives.limits,
-            (inertia, _largest_inertia(arm, config.world)),
+            (inertia, _largest_inertia(arm, world)),
             np.asarray(arm.model.dof_damping),
             scale,
-            config.control_dt,
+            control_dt,
         ),
         friction_rate=drives.friction.rate,
         minimum=minimum * ones,

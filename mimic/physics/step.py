@@ -11,8 +11,8 @@ from mujoco import mjx
 
 from mimic.arms.embodiment import LONG
 from mimic.base import fused_kernel
-from mimic.envs.config import AUTO
 from mimic.physics import chain_dynamics as dynamics
+from mimic.physics.world import AUTO
 
 _LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest by measurement
 

@@ -10,7 +10,7 @@ from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, number, seed_number
 from mimic.envs.config import EnvConfig
 from mimic.runs.distributed.process_group import DistributedConfig
-from mimic.trainers.presets import INNER_LOOP, MAPPER_PRESETS, ONE_ARM, PPO_PRESETS, SAMPLED_ARMS
+from mimic.trainers.presets import MAPPER_PRESETS, PPO_PRESETS, PPO_PRESETS_OF
 
 if TYPE_CHECKING:
     _Value = TypeVar("_Value")
@@ -144,7 +144,8 @@ class PPOConfig(TrainerConfig):
 
     def resolve(self, backend: str = "cpu", devices: int = 1, *, env: EnvConfig | None = None) -> Self:
         """See `TrainerConfig.resolve`."""
-        name = self.preset if self.preset != "auto" else _ppo_presets(env)[backend != "cpu"]
+        of_backends = PPO_PRESETS_OF["one_arm" if env is None else env.kind]
+        name = self.preset if self.preset != "auto" else of_backends[backend != "cpu"]
         preset = PPO_PRESETS[name]
         if self.target_gap > 0:
             preset = {**preset, "evaluations": _TARGET_GAP_EVALUATIONS * preset["evaluations"]}
@@ -152,7 +153,7 @@ class PPOConfig(TrainerConfig):
         if config.final_discounting is None:
             config = dataclasses.replace(config, final_discounting=config.discounting)
         config._check(devices)
-        if env is not None and config.network != "mlp" and not env.arms.are_drawn:
+        if env is not None and config.network != "mlp" and env.kind != "sampled_arms":
             raise ValueError(
                 f"trainer.network: expected mlp for one learner, got {config.network} (preset {name}), which is for a "
                 "learner that is drawn for each episode (env.arms)"
@@ -290,7 +291,7 @@ class PoseMapperConfig(TrainerConfig):
         """See `TrainerConfig.resolve`; without an environment, the preset says whether the learner is any arm."""
         del devices
         one, many = _MAPPER_PRESETS_OF
-        is_of_many = self.preset in _MAPPER_PRESETS_OF[many] if env is None else env.arms.are_drawn
+        is_of_many = self.preset in _MAPPER_PRESETS_OF[many] if env is None else env.kind == "sampled_arms"
         kind, other = (many, one) if is_of_many else (one, many)
         auto = "large" if not is_of_many else "any_arm_cpu" if backend == "cpu" else "any_arm"
         name = auto if self.preset == "auto" else self.preset
@@ -350,13 +351,6 @@ def trainer_config(name: str) -> type[TrainerConfig]:
             f"with the default name = {name!r}, got {config_class!r:.80}"
         )
     return config_class
-
-
-def _ppo_presets(env: EnvConfig | None) -> tuple[str, str]:
-    """The presets for an environment, on the backends cpu and gpu."""
-    if env is not None and env.arms.are_drawn:
-        return SAMPLED_ARMS
-    return INNER_LOOP if env is not None and env.has_inner_loop else ONE_ARM
 
 
 def _filled_in(config: _Config, values: dict[str, Any], **changes: Any) -> _Config:

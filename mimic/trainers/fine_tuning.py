@@ -11,7 +11,7 @@ from mimic.arms.arm import ArmConfig
 from mimic.arms.arrays import masked_arrays
 from mimic.base.config import to_dict, typed
 from mimic.envs.config import ArmsConfig, EnvConfig
-from mimic.envs.family import arm_name
+from mimic.envs.family import arm_name, arms_config
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, run_schema
 
@@ -30,7 +30,7 @@ def fine_tuned(requested: TrainConfig, overrides: Sequence[str]) -> TrainConfig:
       ValueError: no run of many arms, or overrides of what the policy was trained with.
     """
     run = load_config(Path(requested.init).expanduser())
-    if not run.env.arms.are_drawn:
+    if run.env.kind != "sampled_arms":
         raise ValueError(f"learner: expected init=DIR of a run of many arms, got one of env={run.env.name}")
     if run.trainer.name != "ppo":
         raise ValueError(f"learner: expected init=DIR of a run of trainer=ppo, got one of {run.trainer.name}")
@@ -55,8 +55,8 @@ def with_only_arm(env: EnvConfig, model: str) -> EnvConfig:
       env: the environment of a run of many arms.
       model: the arm, see `ArmConfig.model`.
     """
-    kept = {key: getattr(env.arms, key) for key in ("reward", "armature", "damping")}
-    arms = ArmsConfig(locked=1.0, most_locked=0, **kept)
+    kept = {key: getattr(arms_config(env), key) for key in ("reward", "armature", "damping")}
+    arms = ArmsConfig(locked_fraction=1.0, most_locked=0, **kept)
     learner = arm_of(env, model)
     return dataclasses.replace(env, name=f"{env.name}-{arm_name(learner)}", arms=arms, learner=learner)
 
@@ -74,7 +74,7 @@ def with_one_learner(env: EnvConfig, model: str, locked: Sequence[int | str]) ->
     """
     learner = dataclasses.replace(arm_of(env, model), locked=list(locked) or None)
     label = "-".join([env.name, arm_name(learner), *(["locked", *map(str, locked)] if locked else [])])
-    config = dataclasses.replace(env, name=label, arms=ArmsConfig(), learner=learner, physics="auto")
+    config = dataclasses.replace(env, name=label, arms=None, learner=learner, physics="auto")
     masked_arrays(learner, config.limits, config.metric.links)
     return config
 
@@ -85,4 +85,5 @@ def arm_of(env: EnvConfig, model: str) -> ArmConfig:
     Raises:
       ValueError: there is no such arm.
     """
-    return ArmConfig(model=model, armature=env.arms.armature, damping=env.arms.damping)
+    arms = arms_config(env)
+    return ArmConfig(model=model, armature=arms.armature, damping=arms.damping)

@@ -76,7 +76,7 @@ def make_policy_trainer(
     Raises:
       ValueError: a learner for a run of one, none for a run of many, or one that its policy cannot move.
     """
-    if not config.env.arms.are_drawn:
+    if config.env.kind != "sampled_arms":
         if learner:
             raise ValueError(f"learner: expected none for a run of one learner, got {learner!r}")
         return config, make_ppo_trainer(config, run_dir)
@@ -90,12 +90,12 @@ def make_policy_trainer(
 
 
 def _make_ppo_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
-    make = make_any_arm_trainer if config.env.arms.are_drawn else make_ppo_trainer
+    make = make_any_arm_trainer if config.env.kind == "sampled_arms" else make_ppo_trainer
     return make(config, run_dir)
 
 
 def _make_pose_mapper_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
-    if config.env.arms.are_drawn:
+    if config.env.kind == "sampled_arms":
         from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
 
         return AnyArmMapperTrainer(config, run_dir)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS
 from mimic.arms.embodiment import Embodiment
 from mimic.base.memory import check_memory, device_memory, host_memory
-from mimic.envs.config import ArmsConfig
 from mimic.envs.many_arms_observation import observation_size
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 
@@ -26,12 +25,12 @@ def check_training_memory(config: TrainConfig) -> None:
       ValueError: also where the arms are invalid.
     """
     # Where the learner is drawn, the whole one counts.
-    env = dataclasses.replace(config.env, arms=ArmsConfig())
+    env = dataclasses.replace(config.env, arms=None)
     expert, learner = env.build_arms().embodiments
     if isinstance(config.trainer, PPOConfig):
         _check("host", _demonstration_bytes(config, expert), host_memory())
         _check("device", _ppo_bytes(config, config.trainer, expert, learner), device_memory())
-    elif isinstance(config.trainer, PoseMapperConfig) and config.env.arms.are_drawn:
+    elif isinstance(config.trainer, PoseMapperConfig) and config.env.kind == "sampled_arms":
         _check("device", _any_arm_mapper_bytes(config.trainer), device_memory())
     elif isinstance(config.trainer, PoseMapperConfig):
         _check("device", _mapper_bytes(config.trainer, expert, learner), device_memory())
@@ -51,9 +50,8 @@ def _demonstration_bytes(config: TrainConfig, expert: Embodiment) -> dict[str, f
 
 def _ppo_bytes(config: TrainConfig, settings: PPOConfig, expert: Embodiment, learner: Embodiment) -> dict[str, float]:
     """Networks; observations of a batch and of the environments; hidden units of a minibatch."""
-    drawn_arms = config.env.arms.are_drawn
     observation = 12 * (learner.num_links + (config.env.preview + 1) * expert.num_links)
-    if drawn_arms:
+    if config.env.kind == "sampled_arms":
         observation = observation_size(expert.num_links)
     networks = 1 if settings.network == "joints" else _NETWORKS  # with hidden layers; the other one is small
     widths = [observation, *settings.hidden_layers, 1]

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from mimic.envs.config import Kind
+
 PPO_PRESETS: dict[str, dict[str, Any]] = {
     # Two cores: few environments and many gradient steps on each sample, because the physics takes most of the time.
     "cpu": {
@@ -52,10 +54,15 @@ _OF_SAMPLED_ARMS = {
 }
 # With an inner loop: a smaller learning rate ends with a smaller gap (measured), and delays need a longer horizon.
 _OF_INNER_LOOP = {"learning_rate": 3e-4, "discounting": 0.9, "entropy_cost": 0.02}
-# Presets in the order of the backends cpu and gpu.
-ONE_ARM, SAMPLED_ARMS, INNER_LOOP = ("cpu", "gpu"), ("any_arm_cpu", "any_arm"), ("inner_loop_cpu", "inner_loop")
-for _names, _changes in ((SAMPLED_ARMS, _OF_SAMPLED_ARMS), (INNER_LOOP, _OF_INNER_LOOP)):
-    for _name, _base in zip(_names, ONE_ARM, strict=True):
+# The presets of each kind of environment, on the backends cpu and gpu.
+PPO_PRESETS_OF: dict[Kind, tuple[str, str]] = {
+    "one_arm": ("cpu", "gpu"),
+    "sampled_arms": ("any_arm_cpu", "any_arm"),
+    "inner_loop": ("inner_loop_cpu", "inner_loop"),
+}
+_CHANGES_OF: dict[Kind, dict[str, Any]] = {"sampled_arms": _OF_SAMPLED_ARMS, "inner_loop": _OF_INNER_LOOP}
+for _kind, _changes in _CHANGES_OF.items():
+    for _name, _base in zip(PPO_PRESETS_OF[_kind], PPO_PRESETS_OF["one_arm"], strict=True):
         PPO_PRESETS[_name] = {**PPO_PRESETS[_base], **_changes}
 PPO_PRESETS["any_arm_cpu"] |= {"num_timesteps": 600_000, "evaluations": 5}  # eleven minutes on two cores
 # 0.6 million arms; from 12 to 22 million steps on nothing changed.

@@ -83,8 +83,10 @@ def _with_models(env: EnvConfig, models: Mapping[str, str]) -> EnvConfig:
     changes: dict[str, Any] = {
         role: dataclasses.replace(getattr(env, role), model=models[role]) for role in _ROLES if role in models
     }
-    lists = {key: [models.get(_role(name), name) for name in getattr(env.arms, key)] for key in _LISTS}
-    return dataclasses.replace(env, arms=dataclasses.replace(env.arms, **lists), **changes)
+    if env.arms is not None:
+        lists = {key: [models.get(_role(name), name) for name in getattr(env.arms, key)] for key in _LISTS}
+        changes["arms"] = dataclasses.replace(env.arms, **lists)
+    return dataclasses.replace(env, **changes)
 
 
 def _original(arm: ArmConfig, role: str) -> ArmConfig:
@@ -104,7 +106,7 @@ def own_arms(env: EnvConfig) -> dict[str, ArmConfig]:
       ValueError: several files of one name among the many, or one that is named like a role.
     """
     arms = {role: arm for role in _ROLES if (arm := getattr(env, role)).is_file}
-    for name in (name for key in _LISTS for name in getattr(env.arms, key)):
+    for name in (name for key in _LISTS for name in getattr(env.arms, key, ())):
         arm, role = ArmConfig(model=name), _role(name)
         if arm.is_file and role in _ROLES:
             raise ValueError(f"arms: expected a file of another name than expert and learner, got {arm.model!r}")

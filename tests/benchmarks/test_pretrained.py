@@ -73,7 +73,7 @@ def test_a_mapper_to_any_arm_is_stored_without_the_files_of_its_report(tmp_path)
         "epochs": 1,
     }
     trainer = PoseMapperConfig(**settings, evaluations=1, validation_poses=8, held_out_poses=2)
-    arms = {"locked": 1.0, "most_locked": 1, "unseen": ["2"], "evaluated": ["panda"]}
+    arms = {"locked_fraction": 1.0, "most_locked": 1, "unseen": ["2"], "evaluated": ["panda"]}
     config = TrainConfig(env_config("panda_family", arms=arms), trainer, run_dir=str(tmp_path / "run"))
     assert train.prepare_training(dataclasses.replace(config, compilation_cache=""), 0.0)() == 0
     row = pretrained.make_network(tmp_path / "run", tmp_path / "out", "c0ffee", True)

@@ -23,6 +23,8 @@ from tests.helpers.repository import REPOSITORY
             "unknown env 'panda5dof'; valid are any_arm, bimanual, pair, panda3dof, panda4dof, panda7dof",
         ),
         (["trainer=sac"], "unknown trainer 'sac'; valid are "),
+        (["env.world.payload=[0,1]"], "env.world.payload: expected with an inner loop, as in world=ideal"),
+        (["env.arms.distinct=3"], "env.arms.distinct: expected with sampled arms, as in env=any_arm"),
         (["env.previw=1"], "unknown key 'env.previw'; valid are"),
         (["seed=one"], "could not be converted to Integer"),
         (["env.learner.locked=[joint9]"], "unknown joint 'joint9'"),

@@ -9,7 +9,6 @@ import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.config import ViewConfig
 from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
-from mimic.envs.config import ArmsConfig
 from mimic.metric.similarity import centre_line, similarity
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.tracking import shown_preset
@@ -46,7 +45,7 @@ def functions(mapper, choices):
 @pytest.fixture
 def live(mapper, functions):
     learner = ViewConfig(learner="panda4dof").resolve_env().learner
-    return LiveSession(dataclasses.replace(mapper.env, arms=ArmsConfig(), learner=learner), any_arm=functions)
+    return LiveSession(dataclasses.replace(mapper.env, arms=None, learner=learner), any_arm=functions)
 
 
 def choose(live, choices, name):

@@ -26,7 +26,7 @@ def test_make_returns_the_environment_of_any_arm(name):
 
 
 def test_registered_environments_of_many_arms_are_made_too(own_registry):
-    mimic.register("environment", "few", {"expert": "panda", "arms": {"locked": 1.0, "most_locked": 0}})
+    mimic.register("environment", "few", {"expert": "panda", "arms": {"locked_fraction": 1.0, "most_locked": 0}})
     assert isinstance(mimic.make("few", **SMALL), AnyArmEnv)
 
 
@@ -40,7 +40,7 @@ def test_brax_wraps_it_for_training():
 
 
 def test_the_report_has_each_arm_once():
-    arms = report_arms(family(arms={"random": 1.0}))
+    arms = report_arms(family(arms={"random_fraction": 1.0}))
     assert list(arms[SEEN]) == ["whole", "locked 1", "locked 7"]
     assert list(arms[UNSEEN])[:5] == [f"locked {i}" for i in (2, 3, 4, 5, 6)]
     assert [int(arm.is_free.sum()) for arm in arms[SEEN].values()] == [7, 6, 6]

@@ -30,7 +30,7 @@ def config():
         physics="fused",
         horizon=HORIZON,
         demonstrations={"count": COUNT, "held_out": HELD_OUT},
-        arms={"reward": "distance"},
+        arms={"random_fraction": 1.0, "reward": "distance"},
     )
 
 
@@ -73,7 +73,7 @@ def zero_actions(env, four_joints):
 
 @pytest.fixture(scope="module")
 def evaluator(config, motions):
-    return Evaluator(mimic.ImitationEnv(config, motions[0]), motions[1])
+    return Evaluator(mimic.ImitationEnv(dataclasses.replace(config, arms=None), motions[0]), motions[1])
 
 
 @pytest.fixture(scope="module")

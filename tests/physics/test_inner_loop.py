@@ -14,8 +14,9 @@ from mimic.base.fused_kernel import LaunchConfig
 from mimic.control import joint_control
 from mimic.control.joint_control import MODES, PERIOD, JointParameters, Reference, Target
 from mimic.envs import env_config
+from mimic.envs.world_env import plant_of
 from mimic.physics.inner_loop import LoopState, flattened, gpu_kernel, make_inner_loop
-from mimic.physics.plant import GRAVITY, Draw, end_of_last_link, make_plant
+from mimic.physics.plant import GRAVITY, Draw, end_of_last_link
 from mimic.physics.step import Load
 from tests.helpers.lowering import gpu_program
 
@@ -29,7 +30,7 @@ NAMES = ["panda7dof", "panda4dof"]
 def make_arm_and_plant(name: str):
     config = env_config(name, **FIELDS)
     arm = build_arm(config.learner, config.limits)
-    return arm, make_plant(config, arm)
+    return arm, plant_of(config, arm)
 
 
 @pytest.fixture(scope="module", params=NAMES)

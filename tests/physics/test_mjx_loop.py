@@ -13,11 +13,11 @@ from mimic.arms.capsules import fit_capsules
 from mimic.control import joint_control
 from mimic.control.joint_control import Reference, Target
 from mimic.envs import env_config
+from mimic.envs.world_env import plant_of
 from mimic.metric.capsule_distances import colliding_pairs
 from mimic.physics.inner_loop import LoopState
 from mimic.physics.mjx_loop import make_mjx_loop
 from mimic.physics.mujoco_world import mujoco_world
-from mimic.physics.plant import make_plant
 from tests.physics.test_inner_loop import draw_for
 
 PERIODS, TICKS = 50, 12
@@ -52,7 +52,8 @@ def in_mujoco(model, plant, draw, home, target):
 def case():
     config = env_config("panda4dof", world="nominal")
     arm = build_arm(config.learner, config.limits)
-    plant, capsules = make_plant(config, arm), fit_capsules(config.learner, config.limits)
+    plant, capsules = plant_of(config, arm), fit_capsules(config.learner, config.limits)
+    assert config.world is not None
     world = mujoco_world(arm, config.world, capsules, colliding_pairs(arm.embodiment, capsules))
     draw = draw_for(arm.embodiment.num_joints)
     ones = jnp.ones(arm.embodiment.num_joints)

@@ -32,7 +32,7 @@ TINY: dict[str, Any] = {
     "width": 16, "layers": 1, "heads": 2, "guesses": 1, "refinements": 1, "samples": 64, "batch_size": 32, "epochs": 2,
     "evaluations": 2, "validation_poses": 8, "held_out_poses": 2,
 }  # fmt: skip
-FEW_ARMS = {"locked": 1.0, "most_locked": 1, "unseen": ["2", "5", "1+4"]}
+FEW_ARMS = {"locked_fraction": 1.0, "most_locked": 1, "unseen": ["2", "5", "1+4"]}
 
 
 def run_config(run_dir, *, arms: Any = None, seed=0, **settings):
@@ -133,7 +133,8 @@ def test_evaluate_repeats_the_report(trained, tmp_path):
 @pytest.mark.slow
 def test_splits_without_arms_are_left_out(tmp_path):
     """All arms are seen in training; and if the config names none that are, the report draws some."""
-    trainer = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 1.0, "most_locked": 1, "unseen": []}).resolve())
+    config = run_config(tmp_path, arms={"locked_fraction": 1.0, "most_locked": 1, "unseen": []})
+    trainer = AnyArmMapperTrainer(config.resolve())
     distances = np.linspace(0.1, 0.2, 16).reshape(8, 2)
     mapped = Mapped(distances, np.zeros((8, 2, MAX_JOINTS)), distances)
     reference = Reference(distances / 2, mapped.qpos, distances, mapped.qpos, distances, distances + 1)
@@ -141,7 +142,8 @@ def test_splits_without_arms_are_left_out(tmp_path):
     metrics = trainer.metrics({"arms": mapped})
     assert set(metrics["quality"]) == {"train"} and "unseen" not in trainer.status(metrics)
     assert trainer.rows(metrics)[0] == ("number of arms", "8", "0") and trainer.rows(metrics)[1][2] == ""
-    drawn = AnyArmMapperTrainer(run_config(tmp_path, arms={"locked": 0.0, "unseen": [], "random": 1.0}).resolve())
+    config = run_config(tmp_path, arms={"locked_fraction": 0.0, "unseen": [], "random_fraction": 1.0})
+    drawn = AnyArmMapperTrainer(config.resolve())
     assert len(drawn._arms["train"]) == 16 and len(drawn._arms["held_out"]) == 16
 
 

@@ -9,6 +9,7 @@ import pytest
 
 import mimic
 from mimic.commands.fit import Run
+from mimic.envs.family import arms_config
 from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS
 from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import PPOConfig, TrainConfig
@@ -146,7 +147,7 @@ def test_it_goes_on_with_one_arm(finished, tmp_path):
     report = json.loads((tuned / "report.json").read_text())
     assert list(report["arms"]) == ["whole"] and report["optimality_gap"].keys() == {"train"}
     config = load_config(tuned)
-    assert config.learner == "panda" and config.env.arms.most_locked == 0
+    assert config.learner == "panda" and arms_config(config.env).most_locked == 0
     resumed = command("train", f"resume={tuned}", "trainer.num_timesteps=160")
     assert resumed.returncode == 0, resumed.stderr[-2000:]
 

@@ -16,7 +16,6 @@ from mimic.arms.sampler import random_arm
 from mimic.commands import retarget
 from mimic.commands.config import RetargetConfig
 from mimic.envs import env_config
-from mimic.envs.config import ArmsConfig
 from mimic.envs.family import arm_sampler
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers import run_training as session
@@ -31,7 +30,7 @@ TINY: dict[str, Any] = {
     "width": 16, "layers": 1, "heads": 2, "guesses": 1, "refinements": 1, "samples": 64, "batch_size": 32, "epochs": 1,
     "evaluations": 1, "validation_poses": 8, "held_out_poses": 2,
 }  # fmt: skip
-DRAWN = {"expert": "drawn", "locked": 1.0, "most_locked": 1, "unseen": ["2", "5", "1+4"]}
+DRAWN = {"expert": "drawn", "locked_fraction": 1.0, "most_locked": 1, "unseen": ["2", "5", "1+4"]}
 FOUR = mimic.ArmConfig(locked=[3, 6, 7])
 ATOL = 1e-3  # rad: a Newton step magnifies rounding errors
 
@@ -148,13 +147,6 @@ def test_bad_experts_and_poses_are_rejected(mapper):
     for arguments, message in cases:
         with pytest.raises(ValueError, match=message):
             mapper(*arguments)
-
-
-def test_experts_are_drawn_only_where_learners_are():
-    with pytest.raises(ValueError, match="arms.expert: expected fixed where the learner is not drawn .* got drawn"):
-        ArmsConfig(expert="drawn")
-    with pytest.raises(ValueError, match="arms.expert: expected one of fixed, drawn"):
-        ArmsConfig(expert="random", random=1.0)
 
 
 @pytest.mark.slow

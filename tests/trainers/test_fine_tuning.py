@@ -2,6 +2,8 @@
 
 import pytest
 
+from mimic.envs.config import ArmsConfig
+from mimic.envs.family import arms_config
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.fine_tuning import fine_tuned, with_one_learner
 from mimic.trainers.run_config import save_config
@@ -22,7 +24,7 @@ def test_the_learner_is_the_only_arm(run_dir):
     overrides = [f"init={run_dir}", "learner=panda", "seed=3", "trainer.num_timesteps=1000"]
     config = fine_tuned(requested(run_dir, seed=3, run_dir="runs/new"), overrides)
     arms = config.env.arms
-    assert (arms.locked, arms.most_locked, arms.random, arms.perturbed, arms.unseen) == (1, 0, 0, 0, [])
+    assert arms == ArmsConfig(locked_fraction=1.0, most_locked=0)
     assert config.env.name == "panda_family-panda" and config.env.learner.model == "panda"
     assert config.env.learner.armature == 0.1 and config.env.horizon == HORIZON
     assert isinstance(config.trainer, PPOConfig)
@@ -41,7 +43,7 @@ def test_what_the_policy_was_trained_with_stays(run_dir, override):
 def test_the_reward_stays(tmp_path):
     for reward in ("distance", "relative"):
         save_config(tmp_path, TrainConfig(family(arms={"reward": reward}), PPOConfig(preset="any_arm_cpu").resolve()))
-        assert fine_tuned(requested(tmp_path), []).env.arms.reward == reward
+        assert arms_config(fine_tuned(requested(tmp_path), []).env).reward == reward
 
 
 def test_a_run_of_one_learner_is_rejected(tmp_path):
@@ -56,7 +58,7 @@ def test_a_learner_needs_a_run_to_start_from():
 
 def test_an_environment_of_one_learner():
     env = with_one_learner(family(), "panda", [2, 4])
-    assert not env.arms.are_drawn and env.physics == "auto" and env.learner.locked == [2, 4]
+    assert env.kind == "one_arm" and env.physics == "auto" and env.learner.locked == [2, 4]
     assert env.build_arms().learner.embodiment.num_joints == 5
     with pytest.raises(ValueError, match="panda_pair: expected a serial arm, got a tree of 2 chains"):
         with_one_learner(family(), "panda_pair", [])

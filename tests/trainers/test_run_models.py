@@ -15,7 +15,7 @@ import mimic
 from mimic.arms.arm import build_arm
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
-from mimic.envs.family import report_arms
+from mimic.envs.family import arms_config, report_arms
 from mimic.runs.files import CONFIG
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, new_run_dir, save_config
@@ -221,7 +221,7 @@ def family_run(tmp_path):
     files = [write_arm(tmp_path / "arms" / "ur", "mjcf"), write_arm(tmp_path / "urdfs", "urdf")]
     files[0] = files[0].rename(files[0].with_name("robot.xml"))
     run_dir = write_run(tmp_path / "run", [0.1])
-    arms = {"perturbed": 1.0, "models": ["panda", str(files[0])], "evaluated": [str(files[1])]}
+    arms = {"perturbed_fraction": 1.0, "models": ["panda", str(files[0])], "evaluated": [str(files[1])]}
     env = mimic.env_config("any_arm", arms=arms)
     save_models(run_dir, env)
     save_config(run_dir, dataclasses.replace(load_config(run_dir), env=env))
@@ -236,14 +236,16 @@ def test_a_run_keeps_all_of_many_arms(family_run, tmp_path):
         shutil.rmtree(file.parent)
     run_dir = run_dir.rename(tmp_path / "elsewhere")
     env = load_config(run_dir).env
-    assert env.arms.models[0] == "panda" and env.arms.models[1] == str(run_dir / MODELS / "ur" / "robot.xml")
+    assert arms_config(env).models[0] == "panda" and arms_config(env).models[1] == str(
+        run_dir / MODELS / "ur" / "robot.xml"
+    )
     kept = report_arms(env)
     assert {split: list(names) for split, names in kept.items()} == {
         split: list(names) for split, names in arms.items()
     }
     assert "ur" in kept["seen"] and "arm" in kept["unseen"]
     save_models(run_dir, env)
-    assert with_original_models(env).arms.models == ["panda", str(files[0])]
+    assert arms_config(with_original_models(env)).models == ["panda", str(files[0])]
     append(run_dir / MODELS / "ur" / "robot.xml")
     with pytest.raises(ValueError, match="robot.xml' was changed since the training started"):
         load_config(run_dir)

@@ -156,10 +156,10 @@ def exported_function(config: ExportConfig) -> ExportedFunction:
     """The function of a run's network."""
     run_dir = _run_dir(config)
     trained = load_config(run_dir)
-    if trained.env.has_inner_loop and trained.trainer.name == "ppo":
+    if trained.env.kind == "inner_loop" and trained.trainer.name == "ppo":
         raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
     steps = check_checkpoint(run_dir, config.checkpoint)
-    if trained.env.arms.are_drawn:
+    if trained.env.kind == "sampled_arms":
         return any_arm_function(trained, run_dir, steps)
     expert, learner = trained.env.build_arms().embodiments
     if config.learner:
@@ -185,7 +185,7 @@ def _description_writer(config: ExportConfig) -> Callable[[], None] | None:
     if not config.learner or not config.run:
         return None
     trained = load_config(run_dir)
-    if not trained.env.arms.are_drawn:
+    if trained.env.kind != "sampled_arms":
         return None
     check_checkpoint(run_dir, config.checkpoint)
     return description_writer(trained, config.learner, config.locked, config.out)

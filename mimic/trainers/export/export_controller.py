@@ -48,10 +48,10 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
     """Restores a run; the returned function writes its controller, see `export_controller`."""
     trained = load_config(run_dir)
     config = trained.trainer
-    if not isinstance(config, PPOConfig) or not trained.env.has_inner_loop or trained.env.arms.are_drawn:
+    if not isinstance(config, PPOConfig) or trained.env.kind != "inner_loop":
         raise ValueError(
             "format=controller: expected a run of trainer=ppo with an inner loop, as of world=hardware, got one of "
-            f"trainer={config.name} with {'an' if trained.env.has_inner_loop else 'no'} inner loop"
+            f"trainer={config.name} with {'an' if trained.env.kind == 'inner_loop' else 'no'} inner loop"
         )
     check_supported(trained.env.control, trained.env.control_dt)
     steps = check_checkpoint(run_dir, checkpoint)
@@ -67,7 +67,7 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
                 partial / "bundle",
                 policy=policy,
                 features=features,
-                clearance=clearance_constants(env.learner, env.capsules, env.config.world.floor_height),
+                clearance=clearance_constants(env.learner, env.capsules, env.world.floor_height),
                 controller=_description(env, steps) | {"features": config.hidden_layers[0]},
                 expert=expert_table(env),
                 start_poses=np.asarray(env.start_poses, float),

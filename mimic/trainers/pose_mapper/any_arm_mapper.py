@@ -18,7 +18,7 @@ from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, masked_arrays
 from mimic.arms.embodiment import Embodiment
 from mimic.envs import env_config, environments
-from mimic.envs.config import ArmsConfig, EnvConfig
+from mimic.envs.config import EnvConfig
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper.any_arm_model import (
@@ -64,7 +64,7 @@ class AnyArmMapper:
           ValueError: no run directory, a run of another trainer or of one learner, or no such checkpoint.
         """
         config = load_config(Path(run_dir))
-        if not isinstance(config.trainer, PoseMapperConfig) or not config.env.arms.are_drawn:
+        if not isinstance(config.trainer, PoseMapperConfig) or config.env.kind != "sampled_arms":
             kind = f"trainer={config.trainer.name} env={config.env.name}"
             raise ValueError(
                 f"{os.fspath(run_dir)!r}: expected a run of trainer=pose_mapper that draws its arms, as env=any_arm "
@@ -246,7 +246,7 @@ def load_mapper(
       ValueError: see `PoseMapper.load` and `AnyArmMapper.load`.
     """
     env = load_config(Path(run_dir)).env
-    if not env.arms.are_drawn:
+    if env.arms is None:
         return PoseMapper.load(run_dir, checkpoint)
     return AnyArmMapper.load(run_dir, checkpoint).to(
         learner or env.learner, expert if env.arms.expert == "drawn" else None
@@ -255,7 +255,7 @@ def load_mapper(
 
 def one_learner(env: EnvConfig) -> EnvConfig:
     """The environment with its own learner, which is one of those that it may draw."""
-    return dataclasses.replace(env, arms=ArmsConfig())
+    return dataclasses.replace(env, arms=None)
 
 
 def _checked_slots(arm: ArmArrays, qpos: ArrayLike) -> Float[Array, "*batch 8"]:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
 from mimic.envs.config import EnvConfig
+from mimic.envs.family import arms_config
 from mimic.metric.array_kinematics import (
     check_metric,
     correspondence,
@@ -191,7 +192,7 @@ def make_any_arm_model(env: EnvConfig, settings: PoseMapperConfig) -> AnyArmMapp
     """
     expert = arm_arrays(build_arm(env.expert, env.limits, env.metric.links)).astype(np.float32)
     sizes = settings.width, settings.layers, settings.heads, settings.guesses, settings.refinements
-    return AnyArmMapperModel(expert, env.arms.expert == "drawn", check_metric(env.metric), *sizes)
+    return AnyArmMapperModel(expert, arms_config(env).expert == "drawn", check_metric(env.metric), *sizes)
 
 
 def _spread(count: int) -> Float[np.ndarray, "count joints"]:

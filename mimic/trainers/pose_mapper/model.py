@@ -194,7 +194,7 @@ class PoseMapper:
             raise ValueError(
                 f"{os.fspath(run_dir)!r}: expected a run of trainer=pose_mapper, got one of {config.trainer.name}"
             )
-        if config.env.arms.are_drawn:
+        if config.env.kind == "sampled_arms":
             raise ValueError(
                 f"{os.fspath(run_dir)!r}: expected a run with one learner, got env={config.env.name}; load it with "
                 "mimic.AnyArmMapper.load(RUN_DIR).to(LEARNER)"

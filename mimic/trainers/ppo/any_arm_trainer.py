@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from mimic.base.compilation import Background, compiling
 from mimic.envs.config import EnvConfig
-from mimic.envs.family import SEEN, UNSEEN, report_arms
+from mimic.envs.family import SEEN, UNSEEN, arms_config, report_arms
 from mimic.envs.imitation import ImitationEnv, training_and_held_out
 from mimic.envs.make import make_family_env
 from mimic.envs.many_arms import AnyArmEnv
@@ -248,7 +248,7 @@ class AnyArmPPOTrainer(Trainer):
 
 def _without_baseline(config: EnvConfig) -> EnvConfig:
     """The config without what only the reward needs."""
-    return dataclasses.replace(config, arms=dataclasses.replace(config.arms, reward="distance"))
+    return dataclasses.replace(config, arms=dataclasses.replace(arms_config(config), reward="distance"))
 
 
 def _worst(arms: Mapping[str, Mapping[str, Any]]) -> str:

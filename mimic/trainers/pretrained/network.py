@@ -119,7 +119,7 @@ def load(name: str, kind: Literal["policy", "pose_mapper"] = "policy") -> "Pretr
     check_choice("kind", kind, tuple(TRAINERS))
     check_choice("name", name, pretrained_names(kind))
     folder = NETWORKS / f"{name}-{kind}"
-    return read_any_arm_mapper(folder) if env_config(name).arms.are_drawn else read_network(folder, kind)
+    return read_any_arm_mapper(folder) if env_config(name).kind == "sampled_arms" else read_network(folder, kind)
 
 
 def pretrained_names(kind: str) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ def pretrained_names(kind: str) -> tuple[str, ...]:
 
 def names_of_one_learner(kind: str) -> tuple[str, ...]:
     """The environments with a trained network of this kind that do not draw their learner."""
-    return tuple(name for name in pretrained_names(kind) if not env_config(name).arms.are_drawn)
+    return tuple(name for name in pretrained_names(kind) if env_config(name).kind != "sampled_arms")
 
 
 def read_network(folder: Path, kind: str) -> Pretrained:
