@@ -23,7 +23,6 @@ import orbax.checkpoint as ocp
 
 from mimic.base.files import file_digest, read_json, read_text, write_atomically
 from mimic.base.npz import read_arrays
-from mimic.runs.autotuning import keep_choices
 
 FOLDER = "checkpoints"
 WITH_STATE = 2  # newest checkpoints of a run that have the state of the training
@@ -74,8 +73,6 @@ def save_checkpoint(
     try:
         with _no_warnings(), _checkpointer() as checkpointer:
             checkpointer.save(partial, ocp.args.PyTreeSave(plain), force=True)
-        if state is not None and step:  # before the first checkpoint that depends on them
-            keep_choices(run_dir)
         if state is not None:  # not by orbax, which takes 100 ms for the 10 MB of 4096 arms; NumPy takes 6
             np.savez(partial / _STATE, *state)
         content = {"run": _new_run_id(run_dir), "metrics": dict(metrics or {}), "made_with": _software_and_devices()}

@@ -14,7 +14,6 @@ from rich.console import Console
 
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import check_writable, flatten, to_dict, typed
-from mimic.runs.autotuning import use_kept_choices
 from mimic.runs.checkpoints import (
     Checkpoint,
     checkpoint_steps,
@@ -79,7 +78,6 @@ def prepare_training(
     use_compilation_cache(config.compilation_cache)
     resumed_dir = Path(config.resume).expanduser() if config.resume else None
     if resumed_dir:
-        use_kept_choices(resumed_dir)
         config = _resumed_config(resumed_dir, config, overrides)
         check_writable("resume", resumed_dir)
     elif config.learner:
