@@ -17,14 +17,13 @@ from typing import Any
 
 import jax
 import numpy as np
-import optax
 
 import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from mimic.runs.checkpoints import load_checkpoint, load_training, save_checkpoint
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo import programs, training
+from mimic.trainers.ppo import ppo
 
 _REPEATS = 7
 
@@ -57,15 +56,13 @@ def measure(arms: int) -> Row:
     return row
 
 
-def training_state(arms: int) -> programs.TrainingState:
+def training_state(arms: int) -> ppo.TrainingState:
     """The state at the start of a training."""
     env = mimic.make("panda4dof", physics="fused", demonstrations={"count": 2, "held_out": 1})
     preset = PPOConfig(preset="gpu").resolve()
     minibatch = max(preset.batch_size, arms // preset.num_minibatches)  # a batch has an unroll of each arm at least
     config = dataclasses.replace(preset, num_envs=arms, batch_size=minibatch)
-    networks = training.make_networks(config, env.observation_size, env.action_size)
-    functions = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
-    return jax.device_get(functions.start(0))
+    return jax.device_get(ppo.compile_training(env, config, 1).start(0))
 
 
 def _median(action: Callable[[], Any], emptied: Path | None = None) -> float:

@@ -50,8 +50,7 @@ def untrained_bundle(folder: Path) -> Bundle:
     from mimic.runs.checkpoints import save_checkpoint
     from mimic.trainers.config import PPOConfig, TrainConfig
     from mimic.trainers.export.export_controller import export_controller
-    from mimic.trainers.ppo import training
-    from mimic.trainers.ppo.programs import initial_params
+    from mimic.trainers.ppo.ppo import initial_params, make_networks
     from mimic.trainers.ppo.trainer import PPOTrainer
     from mimic.trainers.run_config import save_config
     from mimic.trainers.run_models import save_models
@@ -65,7 +64,7 @@ def untrained_bundle(folder: Path) -> Bundle:
     save_config(run, dataclasses.replace(config, trainer=trainer.settings))
     trainer.save_inputs(run)
     made = trainer.evaluator.env
-    networks = training.make_networks(trainer.settings, made.observation_size, made.action_size)
+    networks = make_networks(trainer.settings, made.observation_size, made.action_size)
     save_checkpoint(run, 0, initial_params(networks, made.observation_size, jax.random.PRNGKey(0)))
     export_controller(run, folder / "bundle")
     return load_bundle(folder / "bundle")

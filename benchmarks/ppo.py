@@ -15,7 +15,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import optax
 from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.networks import make_ppo_networks
 
@@ -25,11 +24,9 @@ from benchmarks.common.record import Row, collect, failure
 from benchmarks.common.timing import summary_of_rates
 from benchmarks.peers import stock
 from mimic.base import compat
-from mimic.envs.imitation import ImitationEnv
 from mimic.envs.wrappers import wrap_for_training
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo import training
-from mimic.trainers.ppo.programs import compile_training
+from mimic.trainers.ppo.ppo import compile_training
 
 STABLE_BASELINES = "stable-baselines3, C MuJoCo"
 EPOCHS = 6  # the first compiles
@@ -54,16 +51,9 @@ def settings(config: PPOConfig) -> dict[str, Any]:
     return {name: getattr(config, name) for name in SETTINGS}
 
 
-def training_epoch(env: ImitationEnv, config: PPOConfig, batches: int) -> Any:
-    """The compiled functions of `mimic.train`: one begins a training, one trains for a number of batches."""
-    networks = training.make_networks(config, env.observation_size, env.action_size)
-    schedule = optax.constant_schedule(config.learning_rate)
-    return compile_training(env, config, networks, batches, schedule, None)
-
-
 def mimic_loop(physics: str, name: str, config: PPOConfig, batches: int) -> dict[str, float]:
     times = [time.perf_counter()]
-    start, _, epoch = training_epoch(mimic.make(name, physics=physics), config, batches)
+    start, _, epoch = compile_training(mimic.make(name, physics=physics), config, batches)
     state = start(0)
     for _ in range(EPOCHS):
         state, metrics = epoch()(state)

@@ -20,8 +20,8 @@ import jax
 import mimic
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
-from benchmarks.ppo import training_epoch
 from mimic.trainers.config import PPOConfig
+from mimic.trainers.ppo.ppo import compile_training
 
 KINDS = {  # of kernels, by patterns of their names; the first that matches
     "copy, host to device": r"memcpy.?h2d|memcpyhtod",
@@ -72,7 +72,7 @@ def busy(events: Iterable[Event]) -> float:
 def profile(name: str, batches: int) -> dict[str, Any]:
     env = mimic.make(name, physics="fused")
     config = PPOConfig().resolve(jax.default_backend(), jax.device_count())
-    start, _, epoch = training_epoch(env, config, batches)
+    start, _, epoch = compile_training(env, config, batches)
     state, _ = jax.block_until_ready(epoch()(start(0)))
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):

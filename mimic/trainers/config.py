@@ -91,7 +91,7 @@ class PPOConfig(TrainerConfig):
       entropy_cost: weight of the policy's entropy in the loss at the start.
       final_entropy_cost: entropy cost at the end as a fraction of entropy_cost; the change is linear.
       clipping_epsilon: the policy ratio is clipped to 1 +- this.
-      max_grad_norm: gradients are clipped to this norm, see `updated` in mimic/trainers/ppo/updates.py.
+      max_grad_norm: gradients are clipped to this norm, see `update` in mimic/trainers/ppo/ppo.py.
       reward_scaling: factor on the reward inside PPO.
       network: "mlp"; or "joints", a policy with a token for each joint, for environments with a drawn arm.
       hidden_layers: widths of the hidden layers of the policy and value networks; with network "joints" of the latter.

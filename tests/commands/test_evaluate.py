@@ -16,7 +16,7 @@ from mimic.physics import step as physics
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
-from mimic.trainers.ppo import training
+from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import save_config
 from tests.helpers.untrained_run import COUNT, HORIZON, environment, untrained_run
@@ -97,7 +97,7 @@ def test_other_demonstrations_replace_the_held_out_ones(run_dir, unseen, tmp_pat
 
 def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
     trained = []
-    monkeypatch.setattr(training, "train", lambda env, *_, **__: trained.append(env))
+    monkeypatch.setattr(ppo, "train", lambda env, *_, **__: trained.append(env))
     trainer = PPOConfig(hidden_layers=[8], preset="cpu", crossovers=3)
     job = make_trainer(TrainConfig(environment(), trainer), None)
     assert isinstance(job, PPOTrainer)

@@ -31,8 +31,7 @@ from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.export.config import ExportConfig
 from mimic.trainers.export.export import prepare_export
 from mimic.trainers.export.export_controller import expert_table, export_controller, prepare_controller
-from mimic.trainers.ppo import training
-from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.ppo.ppo import initial_params, make_controller, make_networks, params_template
 from mimic.trainers.ppo.trainer import PPOTrainer, run_environment
 from mimic.trainers.run_config import load_config, save_config
 from mimic.trainers.run_models import save_models
@@ -53,7 +52,7 @@ def untrained(folder, **settings):
     save_config(folder, dataclasses.replace(config, trainer=trainer.settings))
     trainer.save_inputs(folder)
     env = trainer.evaluator.env
-    networks = training.make_networks(trainer.settings, env.observation_size, env.action_size)
+    networks = make_networks(trainer.settings, env.observation_size, env.action_size)
     save_checkpoint(folder, 0, initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
     return folder
 
@@ -138,7 +137,7 @@ def test_an_exported_policy_is_the_policy(hardware_run, tmp_path):
     env = cast(HardwareEnv, run_environment(trained.env, hardware_run)[0])
     settings = cast(PPOConfig, trained.trainer).resolve()
     statistics, *networks = load_checkpoint(
-        hardware_run, training.params_template(settings, env.observation_size, env.action_size), 0
+        hardware_run, params_template(settings, env.observation_size, env.action_size), 0
     )[1]
     rng = np.random.default_rng(0)
     statistics = statistics.replace(
@@ -151,7 +150,7 @@ def test_an_exported_policy_is_the_policy(hardware_run, tmp_path):
     export_controller(tmp_path / "run", tmp_path / "controller")
     bundle, motions = load_bundle(tmp_path / "controller"), [1, 0, 1]
     policy = Policy(bundle, motions)
-    controller = training.make_controller(settings, env.observation_size, env.action_size)(params)
+    controller = make_controller(settings, env.observation_size, env.action_size)(params)
     past, table = np.zeros((3, SENT_ACTIONS * env.action_size), np.float32), expert_table(env)
     for tick in range(HORIZON + 2):
         measured = rng.uniform(-1, 1, (4, 3, env.learner.num_joints)).astype(np.float32)

@@ -11,8 +11,7 @@ from mimic.envs.config import EnvConfig
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_any_arm_trainer
-from mimic.trainers.ppo import training
-from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.ppo.ppo import initial_params, make_networks
 from mimic.trainers.run_config import save_config
 from mimic.trainers.run_models import save_models
 
@@ -36,6 +35,6 @@ def untrained_family(folder: Path, **changes: Any) -> Path:
     save_config(folder, dataclasses.replace(config, env=trainer.env_config, trainer=trainer.settings))
     trainer.save_inputs(folder)
     size = trainer.evaluator.env.observation_size, trainer.evaluator.env.action_size
-    networks = training.make_networks(trainer.settings, *size)
+    networks = make_networks(trainer.settings, *size)
     save_checkpoint(folder, 0, initial_params(networks, size[0], jax.random.PRNGKey(0)))
     return folder

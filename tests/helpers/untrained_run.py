@@ -11,8 +11,7 @@ import mimic
 from mimic.envs.config import EnvConfig
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.ppo import training
-from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.ppo.ppo import initial_params, make_networks
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import save_config
 from mimic.trainers.run_models import save_models
@@ -41,6 +40,6 @@ def untrained_run(folder: Path, **settings: Any) -> Path:
     save_config(folder, dataclasses.replace(config, trainer=trainer.settings))
     trainer.save_inputs(folder)
     env = trainer.evaluator.env
-    networks = training.make_networks(trainer.settings, env.observation_size, env.action_size)
+    networks = make_networks(trainer.settings, env.observation_size, env.action_size)
     save_checkpoint(folder, 0, initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
     return folder

@@ -10,7 +10,7 @@ from mimic.arms.arrays import MAX_JOINTS
 from mimic.envs.many_arms_observation import JOINT_FEATURES, observation_size
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.networks import Transformer
-from mimic.trainers.ppo.networks import make_networks
+from mimic.trainers.ppo.ppo import make_networks
 
 SIZE, ACTIONS = observation_size(7), MAX_JOINTS
 LOCKED = np.array([0, 0, 1, 0, 0, 0, 0, 1], bool)

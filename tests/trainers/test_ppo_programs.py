@@ -3,11 +3,12 @@
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses
@@ -17,12 +18,17 @@ import mimic
 from mimic.base.compilation import compiler_options
 from mimic.envs.imitation import arm_state
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo import losses as ppo_loss
-from mimic.trainers.ppo import programs, training, updates
+from mimic.trainers.ppo import ppo
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
 HORIZON = 50  # steps of an episode
 _SCHEDULING = "xla_gpu_command_buffer_scheduling_mode"
+
+
+def setup_of(config, observation_size, action_size):
+    """The setup of a training of which no environment is stepped."""
+    env: Any = SimpleNamespace(observation_size=observation_size, action_size=action_size)
+    return ppo.make_setup(env, config, devices=1)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +39,6 @@ def one_batch():
         num_envs=ARMS, unroll_length=1, batch_size=UNROLLS * ARMS // 2, num_minibatches=2, num_updates_per_batch=PASSES,
         hidden_layers=[8],
     ).resolve("cpu")  # fmt: skip
-    networks = training.make_networks(config, env.observation_size, env.action_size)
     along = np.random.default_rng(0).normal(size=env.observation_size).astype(np.float32)
 
     def of_value(params, statistics, unrolls, *_):
@@ -42,18 +47,18 @@ def one_batch():
         return now + 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), after
 
     def of_policy(params, statistics, unrolls, after, *_):
-        metrics = jnp.full(len(ppo_loss.METRICS), after).at[1:3].set(unrolls.elapsed.mean(axis=0))
+        metrics = jnp.full(len(ppo.POLICY_METRICS), after).at[1:3].set(unrolls.elapsed.mean(axis=0))
         return 0.0 * sum(x.sum() for x in jax.tree.leaves(params)), metrics
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(updates, "value_loss", of_value)
-        patch.setattr(updates, "policy_loss", of_policy)
-        start, _, epoch = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+        patch.setattr(ppo, "value_loss", of_value)
+        patch.setattr(ppo, "policy_loss", of_policy)
+        start, _, epoch = ppo.compile_training(env, config, 1)
         state = start(7)
         before = jax.device_get(state)
         after, metrics = jax.device_get(epoch()(state))
     shown = {"now": metrics["value_loss"], "next": metrics["policy_loss"]}
-    shown["elapsed"] = [metrics[name] for name in ppo_loss.METRICS[1:3]]
+    shown["elapsed"] = [metrics[name] for name in ppo.POLICY_METRICS[1:3]]
     return before, after, shown, along
 
 
@@ -96,19 +101,20 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     """The entropy is that of a sample, drawn in the same order only for unrolls of one step."""
     sizes, unrolls = (5, 3), 6
     config = PPOConfig(hidden_layers=[8, 4], entropy_cost=entropy_cost, timed_critic=False).resolve("cpu")
-    networks = training.make_networks(config, *sizes)
+    setup = setup_of(config, *sizes)
+    networks = setup.networks
     rng = np.random.default_rng(time)
 
     def normal(*shape):
         return jnp.asarray(rng.normal(size=shape))
 
-    statistics, *params = programs.initial_params(networks, sizes[0], jax.random.PRNGKey(1))
+    statistics, *params = ppo.initial_params(networks, sizes[0], jax.random.PRNGKey(1))
     statistics = statistics.replace(mean=normal(5), std=jnp.exp(normal(5)))
     params = jax.tree.map(lambda x: x + 0.1 * normal(*x.shape), losses.PPONetworkParams(*params))
     observation, raw_action = normal(unrolls, time + 1, 5), normal(unrolls, time + 1, 3)
     log_prob, reward = normal(unrolls, time + 1), normal(unrolls, time + 1)
     goes_on = jnp.asarray(rng.random((unrolls, time + 1)) < 0.8, float)
-    ours = ppo_loss.Unrolls(observation, raw_action, log_prob - 4, reward, goes_on, jnp.zeros_like(reward))
+    ours = ppo.Unrolls(observation, raw_action, log_prob - 4, reward, goes_on, jnp.zeros_like(reward))
     np.testing.assert_array_equal(ours.unpacked(ours.packed()).raw_action, raw_action)
     now = jax.tree.map(lambda x: x[:, :-1], ours.unpacked(ours.packed()))
     extras = {"raw_action": now.raw_action, "log_prob": now.log_prob}
@@ -120,9 +126,9 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
     key = jax.random.PRNGKey(2)
 
     def own(params):
-        value, advantages = ppo_loss.value_loss(params.value, statistics, ours, networks, config)
-        policy, metrics = ppo_loss.policy_loss(params.policy, statistics, ours, advantages, key, networks, config)
-        return value + policy, dict(zip(ppo_loss.METRICS, metrics, strict=True), value_loss=value)
+        value, advantages = ppo.value_loss(params.value, statistics, ours, setup)
+        policy, metrics = ppo.policy_loss(params.policy, statistics, ours, advantages, key, setup)
+        return value + policy, dict(zip(ppo.POLICY_METRICS, metrics, strict=True), value_loss=value)
 
     def of_brax(params):
         names = "entropy_cost", "discounting", "reward_scaling", "gae_lambda", "clipping_epsilon"
@@ -148,31 +154,28 @@ def test_the_loss_is_that_of_brax(x64, time, entropy_cost):
 def test_a_timed_critic_observes_the_elapsed_time(x64):
     """Its loss is that of a critic without time whose observation has the elapsed time as its last entry."""
     rng = np.random.default_rng(0)
-    unrolls = ppo_loss.Unrolls(*(jnp.asarray(rng.normal(size=(6, 4, *n))) for n in [(5,), (3,), (), (), (), ()]))
+    unrolls = ppo.Unrolls(*(jnp.asarray(rng.normal(size=(6, 4, *n))) for n in [(5,), (3,), (), (), (), ()]))
     statistics = running_statistics.init_state(specs.Array((5,), jnp.dtype("float64")))
     statistics = statistics.replace(mean=jnp.arange(5.0), std=1 + jnp.arange(5.0))
     longer = jax.tree.map(lambda x: x, statistics)
     longer = longer.replace(mean=jnp.append(statistics.mean, 0.0), std=jnp.append(statistics.std, 1.0))
     timed, plain = (PPOConfig(hidden_layers=[8], timed_critic=timed).resolve("cpu") for timed in (True, False))
-    params = training.make_networks(timed, 5, 3).value_network.init(jax.random.PRNGKey(0))
-    loss, _ = ppo_loss.value_loss(params, statistics, unrolls, training.make_networks(timed, 5, 3), timed)
+    params = setup_of(timed, 5, 3).networks.value_network.init(jax.random.PRNGKey(0))
+    loss, _ = ppo.value_loss(params, statistics, unrolls, setup_of(timed, 5, 3))
     extended = unrolls._replace(observation=jnp.concatenate([unrolls.observation, unrolls.elapsed[..., None]], -1))
-    expected, _ = ppo_loss.value_loss(params, longer, extended, training.make_networks(plain, 6, 3), plain)
-    later, _ = ppo_loss.value_loss(
-        params, statistics, unrolls._replace(elapsed=unrolls.elapsed + 1), training.make_networks(timed, 5, 3), timed
-    )
+    expected, _ = ppo.value_loss(params, longer, extended, setup_of(plain, 6, 3))
+    later, _ = ppo.value_loss(params, statistics, unrolls._replace(elapsed=unrolls.elapsed + 1), setup_of(timed, 5, 3))
     assert loss == pytest.approx(float(expected), rel=1e-12) and abs(later - loss) > 1e-3
 
 
 ON_TWO_DEVICES = """
-import sys, jax, numpy as np, optax, mimic
-from mimic.trainers.ppo import programs, training
+import sys, jax, numpy as np, mimic
+from mimic.trainers.ppo import ppo
 from mimic.trainers.config import PPOConfig
 env = mimic.make("planar4dof", physics=sys.argv[1], demonstrations={"count": 3, "held_out": 1})
 config = PPOConfig(num_envs=8, unroll_length=2, batch_size=8, num_minibatches=2, num_updates_per_batch=2,
                    hidden_layers=[8]).resolve("cpu", 2)
-networks = training.make_networks(config, env.observation_size, env.action_size)
-start, _, epoch = programs.compile_training(env, config, networks, 2, optax.constant_schedule(1e-3), None)
+start, _, epoch = ppo.compile_training(env, config, 2)
 state = start(7)
 before = jax.device_get(state.params)
 after, metrics = epoch()(state)
@@ -209,13 +212,14 @@ def test_entropy_cost_and_discount_change_with_the_progress():
 @pytest.mark.slow
 def test_a_batch_learns_by_the_settings_of_its_progress():
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
-    small = {"num_envs": 4, "batch_size": 4, "num_minibatches": 1, "num_updates_per_batch": 1, "hidden_layers": [8]}
+    small = {
+        "num_envs": 4, "unroll_length": 10, "batch_size": 4, "num_minibatches": 1, "num_updates_per_batch": 1,
+        "hidden_layers": [8], "num_timesteps": 80, "learning_rate": 1e-3, "final_learning_rate": 1.0,
+    }  # fmt: skip
 
     def after(batches, **settings):
         config = PPOConfig(**small, **settings).resolve("cpu")  # type: ignore[arg-type]
-        networks = training.make_networks(config, env.observation_size, env.action_size)
-        rate = optax.constant_schedule(1e-3)
-        start, _, epoch = programs.compile_training(env, config, networks, 1, rate, None, lambda count: count / 2)
+        start, _, epoch = ppo.compile_training(env, config, 1)
         state = start(7)
         for _ in range(batches):
             state, _ = epoch()(state)
@@ -234,13 +238,12 @@ def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
     """Compiled anew, its numbers may differ in the last bits: on a GPU, XLA chooses matrix products by their speed."""
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")
-    networks = training.make_networks(config, env.observation_size, env.action_size)
     lowered = []
-    monkeypatch.setattr(programs, "in_background", lambda compiled: lowered.append(compiled.__self__.as_text()))
-    params = jax.device_get(programs.initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
+    monkeypatch.setattr(ppo, "in_background", lambda compiled: lowered.append(compiled.__self__.as_text()))
+    networks = ppo.make_networks(config, env.observation_size, env.action_size)
+    params = jax.device_get(ppo.initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
     for initial in (None, params):
-        schedule = optax.constant_schedule(1e-3)
-        programs.compile_training(env, config, networks, 1, schedule, initial, restored=True)
+        ppo.compile_training(env, config, 1, initial, restored=True)
     assert lowered[0] == lowered[1]
 
 
@@ -248,8 +251,7 @@ def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
 def test_schedules_of_a_restored_state_begin_at_its_updates():
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")
-    networks = training.make_networks(config, env.observation_size, env.action_size)
-    functions = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+    functions = ppo.compile_training(env, config, 1)
     state = functions.start(7, None, 5)
     leaves = jax.tree.leaves(jax.device_get(state.saved))
     restored = functions.restore(leaves, 9)
@@ -263,11 +265,10 @@ def test_schedules_of_a_restored_state_begin_at_its_updates():
 
 
 def test_both_functions_are_compiled_with_the_options_of_a_run(monkeypatch):
-    monkeypatch.setattr(programs, "compiler_options", lambda: {"no_option_of_xla": True})
+    monkeypatch.setattr(ppo, "compiler_options", lambda: {"no_option_of_xla": True})
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
-    networks = training.make_networks(config, env.observation_size, env.action_size)
-    start, _, epoch = programs.compile_training(env, config, networks, 1, optax.constant_schedule(1e-3), None)
+    start, _, epoch = ppo.compile_training(env, config, 1)
     for compiled in (lambda: start(7), epoch):
         with pytest.raises(jax.errors.JaxRuntimeError, match="no_option_of_xla"):
             compiled()
@@ -279,11 +280,10 @@ def test_concurrent_kernels_learn_the_same_as_sequential_ones(physics, monkeypat
     """Bit for bit, where XLA picks the same matrix products and order of sums."""
     env = mimic.make("panda4dof", physics=physics, demonstrations={"count": 8, "held_out": 1})
     config = PPOConfig(num_envs=1024, batch_size=256).resolve("gpu")
-    networks = training.make_networks(config, env.observation_size, env.action_size)
     defaults, learned = compiler_options(), []
     for scheduling in ("SERIALIZE", defaults[_SCHEDULING]):
         options = {**defaults, _SCHEDULING: scheduling, "xla_gpu_autotune_level": 0, "xla_gpu_deterministic_ops": True}
-        monkeypatch.setattr(programs, "compiler_options", lambda options=options: options)
-        start, _, epoch = programs.compile_training(env, config, networks, 5, optax.constant_schedule(1e-3), None)
+        monkeypatch.setattr(ppo, "compiler_options", lambda options=options: options)
+        start, _, epoch = ppo.compile_training(env, config, 5)
         learned.append(jax.device_get(epoch()(start(7))))
     assert jax.tree.all(jax.tree.map(np.array_equal, *learned))

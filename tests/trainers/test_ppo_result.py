@@ -7,7 +7,7 @@ import pytest
 from mimic.runs.checkpoints import Checkpoint, checkpoint_steps, load_checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo import training
+from mimic.trainers.ppo import ppo
 
 
 def run(monkeypatch, run_dir, values, restored=None, score=lambda params: float(params["x"][0]), last=None, **settings):
@@ -24,9 +24,9 @@ def run(monkeypatch, run_dir, values, restored=None, score=lambda params: float(
         evaluated.append(step)
         return step == last
 
-    monkeypatch.setattr(training, "_checkpoints", checkpoints)
+    monkeypatch.setattr(ppo, "_checkpoints", checkpoints)
     config = PPOConfig(num_timesteps=len(values), **settings).resolve("cpu")
-    step, params = training.train(
+    step, params = ppo.train(
         None,  # type: ignore[arg-type]
         config,
         run_dir,

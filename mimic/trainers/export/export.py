@@ -25,7 +25,7 @@ from mimic.trainers.export.export_any_arm import any_arm_function, description_w
 from mimic.trainers.export.export_controller import prepare_controller
 from mimic.trainers.export.exported_function import ExportedFunction, joint_ranges
 from mimic.trainers.pose_mapper.model import PoseMapper
-from mimic.trainers.ppo import training
+from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
 
@@ -214,8 +214,8 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str
         layout = observation_layout(expert, learner, trained.env.preview)
     size = layout[-1]["stop"]
     config = cast(PPOConfig, trained.trainer)
-    params = load_checkpoint(run_dir, training.params_template(config, size, learner.num_joints), steps)[1]
-    controller = training.make_controller(config, size, learner.num_joints)(jax.device_get(params))
+    params = load_checkpoint(run_dir, ppo.params_template(config, size, learner.num_joints), steps)[1]
+    controller = ppo.make_controller(config, size, learner.num_joints)(jax.device_get(params))
     scale = jnp.asarray(torque_scale(arms.learner, trained.env.action_scale, trained.env.control_dt))
 
     def function(observation: jax.Array) -> dict[str, jax.Array]:

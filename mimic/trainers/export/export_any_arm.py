@@ -33,7 +33,7 @@ from mimic.trainers.export.exported_function import ExportedFunction, joint_rang
 from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper, describe_arm
 from mimic.trainers.pose_mapper.any_arm_model import expert_pose
-from mimic.trainers.ppo import training
+from mimic.trainers.ppo import ppo
 
 _LEARNER = "description of an arm, see learner_layout; mimic.export with learner=ARM writes it"
 _ANGLES = "from base to tip, with those of locked joints; 0 where the arm has no joint"
@@ -72,8 +72,8 @@ def _policy(trained: TrainConfig, run_dir: Path, steps: int) -> ExportedFunction
     expert, weights, dt = built.embodiment, check_metric(env.metric), env.control_dt
     expert_arrays: ArmArrays = jax.tree.map(jnp.asarray, arm_arrays(built).astype(np.float32))
     sizes = observation_size(expert.num_links), MAX_JOINTS
-    params = load_checkpoint(run_dir, training.params_template(config, *sizes), steps)[1]
-    controller = training.make_controller(config, *sizes)(jax.device_get(params))
+    params = load_checkpoint(run_dir, ppo.params_template(config, *sizes), steps)[1]
+    controller = ppo.make_controller(config, *sizes)(jax.device_get(params))
 
     def function(
         expert_qpos: Array, expert_qvel: Array, learner: Array, qpos: Array, qvel: Array, memory: Array, random: Array

@@ -23,7 +23,7 @@ from mimic.metric.matrix_kinematics import make_link_vector
 from mimic.retargeting.clearance import clearance_constants
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo import training
+from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
 
@@ -56,7 +56,7 @@ def prepare_controller(run_dir: Path, checkpoint: int | None = None) -> Callable
     check_supported(trained.env.control, trained.env.control_dt)
     steps = check_checkpoint(run_dir, checkpoint)
     env = cast(HardwareEnv, run_environment(trained.env, run_dir)[0])
-    template = training.params_template(config, env.observation_size, env.action_size)
+    template = ppo.params_template(config, env.observation_size, env.action_size)
     params = load_checkpoint(run_dir, template, steps)[1]
 
     def write(out: Path) -> None:
@@ -91,7 +91,7 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
     """What the first layer adds up from the expert's link states, and the policy from that and its other observations.
 
     The states of the expert are five sixths of an observation and known before a motion. The test of the export
-    compares with `control_observation` and the policy of `training.make_controller`.
+    compares with `control_observation` and the policy of `ppo.make_controller`.
     """
     from mimic.trainers.export.onnx_graph import to_onnx  # needs the extra "export"
 

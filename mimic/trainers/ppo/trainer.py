@@ -22,7 +22,7 @@ from mimic.runs.checkpoints import Checkpoint
 from mimic.runs.files import DEMONSTRATIONS
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig, TrainConfig
-from mimic.trainers.ppo import training as ppo
+from mimic.trainers.ppo import ppo
 from mimic.trainers.trainer import Metrics, OnEvaluation, Params, Row, Trainer
 
 

@@ -160,10 +160,10 @@ def read_any_arm_mapper(folder: Path) -> "AnyArmMapper":
 def policy_template(config: TrainConfig) -> tuple[Any, Any]:
     """Shapes of a policy's parameters: statistics of the observations, and the policy network."""
     compat.import_mjx()
-    from mimic.trainers.ppo import training
+    from mimic.trainers.ppo import ppo
 
     observation_size, joints = _policy_sizes(config)
-    return training.params_template(cast(PPOConfig, config.trainer), observation_size, joints)[:2]
+    return ppo.params_template(cast(PPOConfig, config.trainer), observation_size, joints)[:2]
 
 
 def _policy_sizes(config: TrainConfig) -> tuple[int, int]:
@@ -176,12 +176,12 @@ def _policy_sizes(config: TrainConfig) -> tuple[int, int]:
 
 def _policy(folder: Path, config: TrainConfig) -> Function:
     compat.import_mjx()
-    from mimic.trainers.ppo import training  # brax and MJX, which take seconds to import
+    from mimic.trainers.ppo import ppo  # brax and MJX, which take seconds to import
 
     params = read_params(folder, policy_template(config))
     size, joints = _policy_sizes(config)
     no_value_network = (*params, None)
-    controller = training.make_controller(cast(PPOConfig, config.trainer), size, joints)(no_value_network)
+    controller = ppo.make_controller(cast(PPOConfig, config.trainer), size, joints)(no_value_network)
 
     def policy(observation: ArrayLike) -> Array:
         values = jnp.asarray(observation)

@@ -24,8 +24,7 @@ from mimic.runs.distributed import process_group
 from mimic.runs.distributed.local_processes import LocalProcess, LocalProcesses, local_process
 from mimic.runs.distributed.process_group import DistributedConfig, ProcessGroup
 from mimic.trainers.config import PPOConfig
-from mimic.trainers.ppo.programs import initial_params
-from mimic.trainers.ppo.training import make_networks
+from mimic.trainers.ppo.ppo import initial_params, make_networks
 from mimic.trainers.run_config import run_schema
 from tests.helpers.repository import REPOSITORY
 from tests.helpers.tiny import TINY

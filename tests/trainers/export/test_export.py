@@ -20,8 +20,7 @@ from mimic.trainers.export.export_controller import prepare_controller
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
 from mimic.trainers.pose_mapper.any_arm_model import make_any_arm_model
 from mimic.trainers.pose_mapper.model import PoseMapper, make_model
-from mimic.trainers.ppo import training
-from mimic.trainers.ppo.programs import initial_params
+from mimic.trainers.ppo.ppo import initial_params, make_controller, make_networks
 from mimic.trainers.run_config import save_config
 
 pytest.importorskip("onnx")
@@ -33,7 +32,7 @@ def policy_run(run_dir, name="panda4dof"):
     """A run whose policy has random weights and random observation statistics."""
     env = mimic.make(name, demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
-    networks = training.make_networks(config, env.observation_size, env.action_size)
+    networks = make_networks(config, env.observation_size, env.action_size)
     statistics, *networks = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
     rng = np.random.default_rng(0)
     statistics = statistics.replace(
@@ -44,7 +43,7 @@ def policy_run(run_dir, name="panda4dof"):
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env.config, config))
     save_checkpoint(run_dir, 7, params)
-    return env, training.make_controller(config, env.observation_size, env.action_size)(params)
+    return env, make_controller(config, env.observation_size, env.action_size)(params)
 
 
 def mapper_run(run_dir, name="panda4dof", preset="paper", metric=None, **settings):
