@@ -72,8 +72,8 @@ def test_the_training_command_has_the_name(places):
     assert "env.learner=toy7 env.learner.home=bent" in command
 
 
-def test_an_arm_that_is_not_here_names_the_three_ways(places, rejected):
-    message = rejected("inspect", "toy8")
+def test_an_arm_that_is_not_here_names_the_three_ways(places, reason):
+    message = reason("inspect", "toy8")
     for way in ("the package robosuite", "robot_descriptions", "MUJOCO_MENAGERIE", "here are none"):
         assert way in message
     places("robosuite", "toy7")

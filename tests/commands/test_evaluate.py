@@ -125,8 +125,8 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
         (["demonstrations=missing.npz"], "no file at 'missing.npz'"),
     ],
 )
-def test_bad_evaluations(rejected, run_dir, arguments, message):
-    assert message in rejected("evaluate", f"run={run_dir}", "compilation_cache=", *arguments)
+def test_bad_evaluations(reason, run_dir, arguments, message):
+    assert message in reason("evaluate", f"run={run_dir}", "compilation_cache=", *arguments)
 
 
 @pytest.mark.parametrize(
@@ -139,8 +139,8 @@ def test_bad_evaluations(rejected, run_dir, arguments, message):
         ("torque_noise=nan", "randomization.torque_noise: expected a number from 0 to 10, got nan"),
     ],
 )
-def test_bad_randomization(rejected, override, message):
-    assert message in rejected("train", "env=planar4dof", f"env.randomization.{override}")
+def test_bad_randomization(reason, override, message):
+    assert message in reason("train", "env=planar4dof", f"env.randomization.{override}")
 
 
 def too_fast(demonstrations):
@@ -159,28 +159,28 @@ def too_fast(demonstrations):
         (too_fast, "joint3 of demonstration 1 has a velocity of 100 rad/s at 0.4 s, but its velocity limit is"),
     ],
 )
-def test_unfit_demonstrations(rejected, run_dir, unseen, tmp_path, change, message):
+def test_unfit_demonstrations(reason, run_dir, unseen, tmp_path, change, message):
     path = tmp_path / "unfit.npz"
     change(unseen).save(path)
     arguments = [f"run={run_dir}", f"demonstrations={path}", "compilation_cache="]
-    assert message in rejected("evaluate", *arguments)
+    assert message in reason("evaluate", *arguments)
 
 
-def test_a_checkpoint_of_another_environment(rejected, run_dir, tmp_path):
+def test_a_checkpoint_of_another_environment(reason, run_dir, tmp_path):
     other = untrained_run(tmp_path / "other", learner=[0.4, 0.3, 0.3])
     shutil.rmtree(other / "checkpoints")
     shutil.copytree(run_dir / "checkpoints", other / "checkpoints")
-    error = rejected("evaluate", f"run={other}", "compilation_cache=")
+    error = reason("evaluate", f"run={other}", "compilation_cache=")
     # 12 numbers for each link seen: 3 of the learner and twice 3 of the expert, where the other learner has 2.
     assert "does not fit the config of its run" in error and "expected shape (108,), got shape (96,)" in error
 
 
-def test_a_damaged_checkpoint(rejected, run_dir, tmp_path):
+def test_a_damaged_checkpoint(reason, run_dir, tmp_path):
     damaged = tmp_path / "damaged"
     shutil.copytree(run_dir, damaged)
     (checkpoint,) = (damaged / "checkpoints").glob("0*")
     (checkpoint / "_METADATA").write_text("not JSON")
-    assert "is damaged: _METADATA is missing or was changed" in rejected(
+    assert "is damaged: _METADATA is missing or was changed" in reason(
         "evaluate", f"run={damaged}", "compilation_cache="
     )
 

@@ -36,14 +36,14 @@ def run_dir(tmp_path_factory):
         (["learner=no_such_arm"], "model: expected panda, planar, panda_pair, an MJCF or URDF file, or the name"),
     ],
 )
-def test_what_many_arms_do_not_have_is_rejected(run_dir, rejected, settings, message):
-    assert message in rejected("evaluate", f"run={run_dir}", *settings)
+def test_what_many_arms_do_not_have_is_rejected(run_dir, reason, settings, message):
+    assert message in reason("evaluate", f"run={run_dir}", *settings)
 
 
-def test_a_run_of_one_learner_has_its_own(rejected, tmp_path):
+def test_a_run_of_one_learner_has_its_own(reason, tmp_path):
     run_dir = write_run(tmp_path / "one", [0.1])
     (run_dir / "checkpoints" / "1").mkdir(parents=True)
-    assert "learner: expected a run of many arms, got one of env=planar4dof" in rejected(
+    assert "learner: expected a run of many arms, got one of env=planar4dof" in reason(
         "evaluate", f"run={run_dir}", "learner=panda"
     )
 
@@ -56,8 +56,8 @@ def test_a_run_of_one_learner_has_its_own(rejected, tmp_path):
         ("retarget", ["learner=any_arm", "demonstrations=RUN/demonstrations.npz", "out=motions.npz"]),
     ],
 )
-def test_commands_of_one_learner_reject_many(run_dir, rejected, name, arguments):
-    line = rejected(name, *(argument.replace("RUN", str(run_dir)) for argument in arguments))
+def test_commands_of_one_learner_reject_many(run_dir, reason, name, arguments):
+    line = reason(name, *(argument.replace("RUN", str(run_dir)) for argument in arguments))
     assert "expected an environment of one learner, got" in line
 
 
@@ -69,8 +69,8 @@ def test_commands_of_one_learner_reject_many(run_dir, rejected, name, arguments)
         (["learner=panda", "demonstration=9"], "demonstration: "),
     ],
 )
-def test_a_video_is_of_one_of_many_arms(run_dir, rejected, arguments, message):
-    assert message in rejected("render", f"run={run_dir}", *arguments)
+def test_a_video_is_of_one_of_many_arms(run_dir, reason, arguments, message):
+    assert message in reason("render", f"run={run_dir}", *arguments)
 
 
 @pytest.mark.slow

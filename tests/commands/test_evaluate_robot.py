@@ -168,8 +168,8 @@ def test_an_exported_policy_is_the_policy(hardware_run, tmp_path):
         past = np.concatenate([expected, past[:, : -env.action_size]], axis=1)
 
 
-def test_a_run_without_an_inner_loop_has_no_controller(rejected, paper_run):
-    error = rejected("export", f"run={paper_run}", "format=controller", "out=new")
+def test_a_run_without_an_inner_loop_has_no_controller(reason, paper_run):
+    error = reason("export", f"run={paper_run}", "format=controller", "out=new")
     assert "format=controller: expected a run of trainer=ppo with an inner loop" in error
 
 
@@ -191,8 +191,8 @@ def test_what_the_safety_layer_cannot_run_is_rejected(tmp_path, settings, messag
 
 
 @pytest.mark.parametrize("controller", ["pd", "computed_torque", "nearest_pose"])
-def test_controllers_of_torques_do_not_fit_an_inner_loop(rejected, hardware_run, controller):
-    error = rejected("evaluate", f"run={hardware_run}", f"controller={controller}")
+def test_controllers_of_torques_do_not_fit_an_inner_loop(reason, hardware_run, controller):
+    error = reason("evaluate", f"run={hardware_run}", f"controller={controller}")
     assert (
         "controller: expected policy, hold or tracking for a run with an inner loop and control=joint_velocity, got "
         f"{controller}"
@@ -200,17 +200,17 @@ def test_controllers_of_torques_do_not_fit_an_inner_loop(rejected, hardware_run,
 
 
 @pytest.mark.parametrize("robot", [(), ("robot=virtual_panda",)])
-def test_tracking_needs_an_inner_loop(rejected, paper_run, robot):
-    error = rejected("evaluate", f"run={paper_run}", "controller=tracking", *robot)
+def test_tracking_needs_an_inner_loop(reason, paper_run, robot):
+    error = reason("evaluate", f"run={paper_run}", "controller=tracking", *robot)
     assert (
         "controller: expected policy, hold, pd, computed_torque or nearest_pose for a run with no inner loop, "
         "got tracking"
     ) in error
 
 
-def test_tracking_needs_targets_other_than_torques(rejected, tmp_path):
+def test_tracking_needs_targets_other_than_torques(reason, tmp_path):
     run = untrained(tmp_path / "run", world="nominal", control="torque")
-    error = rejected("evaluate", f"run={run}", "controller=tracking")
+    error = reason("evaluate", f"run={run}", "controller=tracking")
     assert "controller: expected policy or hold for a run with an inner loop and control=torque, got tracking" in error
 
 
@@ -239,7 +239,7 @@ def test_tracking_is_the_same_on_a_virtual_robot_as_in_the_environment(tmp_path)
     assert row["mean_distance"] == pytest.approx(report["mean_distance"]["held_out"], abs=0.02)
 
 
-def test_what_does_not_fit_is_rejected(rejected, hardware_run, tmp_path):
+def test_what_does_not_fit_is_rejected(reason, hardware_run, tmp_path):
     run = f"run={hardware_run}"
     cases = [
         (["robot=panda"], "robot: expected one of virtual_panda, virtual_robot, got 'panda'"),
@@ -250,19 +250,19 @@ def test_what_does_not_fit_is_rejected(rejected, hardware_run, tmp_path):
         (["robot=virtual_panda", "episodes=0"], "episodes: expected a whole number from 1"),
     ]
     for arguments, message in cases:
-        assert message in rejected("evaluate", run, "compilation_cache=", *arguments)
+        assert message in reason("evaluate", run, "compilation_cache=", *arguments)
         (tmp_path / "empty").rmdir()
 
 
-def test_a_mapper_has_no_robot(rejected, tmp_path):
+def test_a_mapper_has_no_robot(reason, tmp_path):
     (tmp_path / "run" / "checkpoints" / "0").mkdir(parents=True)
     save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda4dof"), PoseMapperConfig()))
-    error = rejected("evaluate", f"run={tmp_path / 'run'}", "robot=virtual_panda", "compilation_cache=")
+    error = reason("evaluate", f"run={tmp_path / 'run'}", "robot=virtual_panda", "compilation_cache=")
     assert "robot: expected a run of trainer=ppo with one learner" in error
 
 
 @pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
-def test_missing_packages_are_named(rejected, monkeypatch, package):
+def test_missing_packages_are_named(reason, monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
-    error = rejected("evaluate", "run=runs/NAME", "robot=virtual_panda")
+    error = reason("evaluate", "run=runs/NAME", "robot=virtual_panda")
     assert "robot: needs the packages onnx and onnxruntime: pip install 'mimic-arms[deploy,export]'" in error

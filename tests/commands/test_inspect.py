@@ -117,11 +117,14 @@ def test_an_equal_arm_reaches_the_poses_of_the_expert(inspected):
         ),
         (["arm.xml", "limits=soft"], "limits: expected one of none, hardware, got 'soft'"),
         (["arm.xml", "out=missing/out"], "there is no folder 'missing'"),
-        (["arm.xml", "tip=hand"], "tip"),
     ],
 )
-def test_bad_input_of_an_inspection(rejected, arm_file, arguments, message):
-    assert message in rejected("inspect", *(str(arm_file) if word == "arm.xml" else word for word in arguments))
+def test_bad_input_of_an_inspection(reason, arm_file, arguments, message):
+    assert message in reason("inspect", *(str(arm_file) if word == "arm.xml" else word for word in arguments))
+
+
+def test_an_unknown_key_of_the_command(rejected, arm_file):
+    assert "unknown key 'tip'" in rejected("inspect", arm_file, "tip=hand")
 
 
 @pytest.mark.parametrize("role", ["expert", "learner"])

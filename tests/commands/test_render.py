@@ -192,5 +192,5 @@ def test_bad_input_for_a_mapper_is_rejected(mapper_run, files):
         (["run=missing", "split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
-def test_bad_input_of_the_command(rejected, arguments, message):
-    assert message in rejected("render", *arguments)
+def test_bad_input_of_the_command(reason, arguments, message):
+    assert message in reason("render", *arguments)

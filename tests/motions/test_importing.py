@@ -140,11 +140,11 @@ NUMBERED = [f"q_{i}" for i in range(1, 8)]
         (lambda path: table(path, names=NUMBERED), ["joints=[a]"], "joints: expected 7 names"),
     ],
 )  # fmt: skip
-def test_bad_tables(rejected, tmp_path, make, arguments, message):
+def test_bad_tables(reason, tmp_path, make, arguments, message):
     path = tmp_path / "motion.csv"
     if make:
         make(path)
-    assert message in rejected("demonstrations", f"source={path}", "out=new.npz", *arguments)
+    assert message in reason("demonstrations", f"source={path}", "out=new.npz", *arguments)
 
 
 @pytest.mark.parametrize(
@@ -159,9 +159,9 @@ def test_bad_tables(rejected, tmp_path, make, arguments, message):
         ({"qpos": np.zeros((3, 14), object)}, "cannot be read as an npz file of motions"),
     ],
 )
-def test_bad_archives(rejected, tmp_path, changes, message):
+def test_bad_archives(reason, tmp_path, changes, message):
     path = archive(tmp_path / "motion.npz", **changes)
-    assert message in rejected("demonstrations", f"source={path}", "out=new.npz")
+    assert message in reason("demonstrations", f"source={path}", "out=new.npz")
 
 
 def test_joint_names_without_a_file_are_rejected(rejected):
