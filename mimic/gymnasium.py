@@ -4,27 +4,25 @@ Importing this module registers them with Gymnasium, as `gymnasium.make("mimic/p
 `gymnasium.make_vec("mimic/panda4dof-v0", num_envs=512)`. `gymnasium.make("mimic.gymnasium:mimic/...")` needs no import.
 """
 
+import mimic.base.quiet_mjx  # noqa: F401  # before brax
+
+# isort: split
 from typing import Any, cast
 
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+from brax.envs.base import State
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from mimic.arms.rendering import ArmScene
-from mimic.base import compat
 from mimic.base.config import check_choice
 from mimic.envs import env_config, environments
-
-compat.import_mjx()  # first, and quietly: brax imports it too
-
-from brax.envs.base import State  # noqa: E402
-
-from mimic.envs.imitation import ArmState, ImitationEnv  # noqa: E402
-from mimic.envs.make import make_env  # noqa: E402
+from mimic.envs.imitation import ArmState, ImitationEnv
+from mimic.envs.make import make_env
 
 RENDER_MODES = ("rgb_array",)
 

@@ -53,7 +53,8 @@ def test_training_needs_no_meshes_and_no_contacts():
 def test_mjx_and_what_a_view_shows_are_imported_without_a_word_and_without_viser():
     """MJX prints two lines about Warp, an optional backend, once in a process. Only the page of a view needs viser."""
     shown = ("html", "live_session", "playback", "meshes", "tracking", "history", "captured")
-    code = "import sys\nsys.modules['viser'] = None\nimport mimic\nmimic.ImitationEnv\nmimic.export_run\n"
+    code = "import sys\nsys.modules['viser'] = None\nimport mimic\nmimic.metric.distance, mimic.arms.arm\n"
+    code += "mimic.retargeting.pose, mimic.envs.config.EnvConfig, mimic.fit, mimic.export_run, mimic.ImitationEnv\n"
     code += "import mimic.commands.view_any_arm\n" + "\n".join(f"import mimic.viewer.{name}" for name in shown)
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout == "" and "warp" not in result.stderr.lower()

@@ -9,7 +9,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from mimic.base import registry
 from mimic.base.config import check_choice, explain, merged, schema, suggestion, to_dict, typed
+from mimic.base.lazy import modules_of
 from mimic.envs.config import EnvConfig
+
+__getattr__ = modules_of(__name__, __path__)
 
 _PRESETS = importlib.resources.files("mimic") / "conf" / "env"
 _GROUPS = ("metric", "world")  # groups of presets, in folders of that name

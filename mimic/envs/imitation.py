@@ -1,5 +1,8 @@
 """The imitation environment: a torque-controlled learner is rewarded for its similarity to the expert."""
 
+import mimic.base.quiet_mjx  # noqa: F401  # before brax
+
+# isort: split
 import copy
 import dataclasses
 import functools

@@ -6,7 +6,6 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from mimic.base import compat
 from mimic.base.files import read_text, write_atomically
 from mimic.runs.files import METRICS
 
@@ -21,9 +20,11 @@ class MetricsLog:
     """
 
     def __init__(self, run_dir: Path, first_step: int | None = None):
+        from tensorboardX import SummaryWriter  # here: half a second, and most commands train nothing
+
         self._path = run_dir / METRICS
         purge = {} if first_step is None else {"purge_step": first_step}
-        self._writer = compat.import_tensorboard().SummaryWriter(str(run_dir / "tensorboard"), **purge)
+        self._writer = SummaryWriter(str(run_dir / "tensorboard"), **purge)
         self._columns, rows = _read(self._path)
         if first_step is not None and self._columns:
             self._rewrite([row for row in rows if row["step"].isdigit() and int(row["step"]) < first_step])

@@ -29,14 +29,6 @@ def test_lazy_modules_run_once_and_may_be_missing(tmp_path, monkeypatch):
     assert sys.modules["runs"] == ["waiting.part"] and not {"waiting.missing", "missing"}.intersection(sys.modules)
 
 
-def test_tensorboard_does_not_import_torch(tmp_path):
-    (tmp_path / "torch.py").write_text("raise SystemExit('torch was imported')")
-    code = "import sys\nfrom mimic import compat\ncompat.import_tensorboard().SummaryWriter"
-    code += "\nassert 'torch' not in sys.modules"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
-    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
-
-
 def test_hydra_shares_the_config_store_and_copies_loaded_configs(monkeypatch):
     monkeypatch.setattr(ConfigStore, "__deepcopy__", None, raising=False)  # to be put back
     compat.share_config_store()

@@ -1,5 +1,6 @@
 """The documentation site builds without warnings, is complete, and loads nothing from other hosts."""
 
+import inspect
 import os
 import re
 import subprocess
@@ -42,6 +43,8 @@ def test_every_public_name_is_in_the_reference(site):
     pages, _ = site
     reference = "".join(text for name, text in pages.items() if name.startswith("api/"))
     for name in mimic.__all__:
+        if inspect.ismodule(getattr(mimic, name)):
+            continue
         assert reference.count(f'id="mimic.{name}"') == 1, name
     assert 'title="jaxtyping.Float">Float</span>' in reference  # shapes
 

@@ -1,0 +1,63 @@
+"""Public names of mimic: the modules that `mimic/__init__.py` imports at the first use of a name."""
+
+from . import arms as arms
+from . import envs as envs
+from . import metric as metric
+from . import retargeting as retargeting
+from .arms.arm import ArmConfig as ArmConfig
+from .arms.arm import build_arm as build_arm
+from .arms.capsules import Capsules as Capsules
+from .arms.capsules import fit_capsules as fit_capsules
+from .arms.embodiment import Embodiment as Embodiment
+from .arms.embodiment import load_mjcf as load_mjcf
+from .arms.embodiment import panda as panda
+from .arms.embodiment import planar_arm as planar_arm
+from .arms.rendering import ArmScene as ArmScene
+from .base.registry import register as register
+from .commands.fit import Run as Run
+from .commands.fit import fit as fit
+from .envs import env_config as env_config
+from .envs import environments as environments
+from .envs.imitation import ImitationEnv as ImitationEnv
+from .envs.make import make as make
+from .metric.correspondence import arc_length_correspondence as arc_length_correspondence
+from .metric.correspondence import hard_correspondence as hard_correspondence
+from .metric.correspondence import overlap_correspondence as overlap_correspondence
+from .metric.correspondence import soft_correspondence as soft_correspondence
+from .metric.distance import PAPER_WEIGHTS as PAPER_WEIGHTS
+from .metric.distance import DistanceWeights as DistanceWeights
+from .metric.distance import LinkDistance as LinkDistance
+from .metric.distance import PairDistances as PairDistances
+from .metric.distance import adaptive_weights as adaptive_weights
+from .metric.distance import embodiment_distance as embodiment_distance
+from .metric.distance import link_distances as link_distances
+from .metric.distance import rotation_distance as rotation_distance
+from .metric.kinematics import Frames as Frames
+from .metric.kinematics import LinkStates as LinkStates
+from .metric.kinematics import body_twists as body_twists
+from .metric.kinematics import candidate_points as candidate_points
+from .metric.kinematics import forward_kinematics as forward_kinematics
+from .metric.kinematics import link_states as link_states
+from .metric.landscape import distance_landscape as distance_landscape
+from .metric.landscape import local_minima as local_minima
+from .metric.motion_distance import motion_distance as motion_distance
+from .motions.demonstrations import Demonstrations as Demonstrations
+from .motions.demonstrations import check_effort as check_effort
+from .motions.demonstrations import load_demonstrations as load_demonstrations
+from .motions.importing import import_demonstrations as import_demonstrations
+from .motions.recording import record_demonstrations as record_demonstrations
+from .retargeting.costs import Costs as Costs
+from .retargeting.kinematic_bound import ClosestMotion as ClosestMotion
+from .retargeting.kinematic_bound import closest_motion as closest_motion
+from .retargeting.kinematic_bound import kinematic_bound as kinematic_bound
+from .retargeting.pose import PoseImitation as PoseImitation
+from .retargeting.pose import imitate_pose as imitate_pose
+from .retargeting.trajectory import imitate_trajectory as imitate_trajectory
+from .trainers.export.export import export_run as export_run
+from .trainers.pose_mapper.any_arm_mapper import AnyArmMapper as AnyArmMapper
+from .trainers.pose_mapper.model import PoseMapper as PoseMapper
+from .trainers.pretrained.network import Pretrained as Pretrained
+from .trainers.pretrained.network import load as load
+
+__all__: list[str]
+__version__: str
