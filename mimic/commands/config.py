@@ -122,7 +122,6 @@ class RenderConfig:
       locked: numbers or names of the joints of this arm that are locked.
       limits: the `limits` that `retargeted` was computed with, see `EnvConfig`.
       out: video file. Default "": a file in the folder `videos` of the run directory.
-      gif: whether to write a GIF as well.
       compilation_cache: see `TrainConfig`.
     """
 
@@ -137,7 +136,6 @@ class RenderConfig:
     locked: list[Any] = dataclasses.field(default_factory=list)
     limits: str = "none"
     out: str = ""
-    gif: bool = False
     compilation_cache: str = "~/.cache/mimic/jax"
 
     def __post_init__(self) -> None:

@@ -15,7 +15,6 @@ import numpy as np  # noqa: E402
 from jaxtyping import UInt8  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.text import Text  # noqa: E402
-from PIL import Image  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.progress import track  # noqa: E402
 
@@ -30,7 +29,6 @@ _SIZE, _DPI = (1280, 640), 100  # pixels
 _SCENE = 760, 548  # pixels of the arms' picture
 _LEGEND = "same colour: corresponding links; translucent: expert, scaled to the learner; red: locked joints"
 _CAPTIONS = 56  # pixels below it; the title is above it
-_GIF_EVERY, _GIF_SCALE = 3, 0.5
 _LEGEND_ROOM = 1.25  # height of the axes relative to the maximum distance, so that the legend hides no curve
 
 _LABELS_SIDE_BY_SIDE = 8  # below the bars; more are upright
@@ -60,9 +58,7 @@ def prepare_video(config: RenderConfig) -> Callable[[], None]:
         out.parent.mkdir(exist_ok=True)
         with scene:
             frames = draw_frames(scene, clip)
-            thumbnails = _write_video(out, _tracked(console, frames, len(clip.time)))
-        if config.gif:
-            _write_gif(out.with_suffix(".gif"), thumbnails)
+            _write_video(out, _tracked(console, frames, len(clip.time)))
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
@@ -94,8 +90,7 @@ def _new_video(config: RenderConfig, default_out: Path | None) -> Path:
     out = Path(config.out or default_out or "").expanduser()
     if out.suffix != ".mp4":
         raise ValueError(f"out: expected a file that ends in .mp4, got {str(out)!r}")
-    for path in (out, out.with_suffix(".gif")):
-        check_new("out", path, "name a new file")
+    check_new("out", out, "name a new file")
     if config.out and not out.parent.is_dir():
         raise ValueError(f"out: there is no folder {str(out.parent)!r}")
     return out
@@ -200,38 +195,35 @@ def _similarity_at(clip: Clip, frame: int) -> dict[str, float]:
     return {name: float(values[frame]) for name, values in clip.similarity.items()}
 
 
-def _write_video(out: Path, frames: Iterator[_Frame]) -> list[Image.Image]:
-    """Encodes the frames and returns scaled copies of every third one. The file gets its name when it is complete."""
+def _write_video(out: Path, frames: Iterator[_Frame]) -> None:
+    """Encodes the frames. The file gets its name when it is complete."""
     partial = out.with_name(f".{out.stem}.partial.mp4")
     try:
-        count, thumbnails = _encode(partial, frames)
+        count = _encode(partial, frames)
         if _num_frames(partial) != count:
             raise OSError(f"{str(out)!r}: the encoder did not write all {count} frames; the disk may be full")
         os.replace(partial, out)
     finally:
         partial.unlink(missing_ok=True)
-    return thumbnails
 
 
-def _encode(file: Path, frames: Iterator[_Frame]) -> tuple[int, list[Image.Image]]:
-    """Sends the frames to the encoder; returns the number sent and scaled copies of every third one."""
+def _encode(file: Path, frames: Iterator[_Frame]) -> int:
+    """Sends the frames to the encoder; returns the number sent."""
     writer = imageio_ffmpeg.write_frames(str(file), _SIZE, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=2)
     with warnings.catch_warnings():  # JAX warns about forks; this one only starts the encoder
         warnings.filterwarnings("ignore", message=".*os.fork", category=RuntimeWarning)
         writer.send(None)
-    count, thumbnails = 0, []
+    count = 0
     try:
-        for count, frame in enumerate(frames, start=1):
+        for frame in frames:
+            count += 1
             try:
                 writer.send(np.ascontiguousarray(frame))
             except OSError:  # the encoder has ended
                 break
-            if (count - 1) % _GIF_EVERY == 0:
-                size = round(_GIF_SCALE * _SIZE[0]), round(_GIF_SCALE * _SIZE[1])
-                thumbnails.append(Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS))
     finally:
         writer.close()  # does not tell whether the encoder failed
-    return count, thumbnails
+    return count
 
 
 def _num_frames(file: Path) -> int:
@@ -240,11 +232,3 @@ def _num_frames(file: Path) -> int:
         return imageio_ffmpeg.count_frames_and_secs(str(file))[0]
     except RuntimeError:
         return 0
-
-
-def _write_gif(out: Path, frames: list[Image.Image]) -> None:
-    partial = out.with_name(f".{out.stem}.partial.gif")
-    duration = 1000 * _GIF_EVERY // FRAMES_PER_SECOND
-    palettes = [frame.quantize(128, dither=Image.Dither.NONE) for frame in frames]
-    palettes[0].save(partial, save_all=True, append_images=palettes[1:], duration=duration, loop=0)
-    os.replace(partial, out)

@@ -19,7 +19,6 @@ from mimic.viewer.origins import is_local
 
 if TYPE_CHECKING:
     from mimic.viewer.page import LearnerShape, Page
-    from mimic.viewer.recorder import Recorder
 
 _MAX_STEP = 0.1  # s, maximum time step, so that arms do not jump after a pause of the process
 
@@ -65,7 +64,6 @@ def serve(
     """
     from mimic.viewer.meshes import ArmShape
     from mimic.viewer.page import Page
-    from mimic.viewer.recorder import Recorder
     from mimic.viewer.server import make_server
 
     if before is not None:
@@ -86,7 +84,7 @@ def serve(
             expert = ArmShape(env.expert, env.limits, shapes[0].match.expert_colours)
             page = Page(server, (_name(env.expert, env), expert), shapes, title, is_flat)
             print(f"view: {address(config.host, server.get_port())}   (Ctrl-C ends it)", flush=True)
-            show(page, _recorded(Recorder(server), ticks(signals, rate)))
+            show(page, ticks(signals, rate))
         finally:
             with contextlib.redirect_stdout(io.StringIO()):
                 server.stop()
@@ -113,13 +111,6 @@ def address(host: str, port: int) -> str:
     """The address to open in a browser on this machine."""
     name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
     return f"http://[{name}]:{port}" if ":" in name else f"http://{name}:{port}"
-
-
-def _recorded(recorder: "Recorder", times: Iterator[float]) -> Iterator[float]:
-    """The time steps, also of the recording."""
-    for dt in times:
-        recorder.advance(dt)
-        yield dt
 
 
 def ticks(signals: Signals, rate: float = RATE) -> Iterator[float]:

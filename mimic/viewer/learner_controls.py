@@ -29,12 +29,6 @@ class LearnerControls:
             names = [preset.name for preset in self._presets]
             self._arm = gui.add_dropdown("learner", names)
             self._arm.on_update(by_user(self._choose))
-        else:
-            escape = gui.add_checkbox(
-                "leave local minima", session.escape, disabled=not session.by_optimiser,
-                hint="when the expert rests, continue to the best pose of many initial guesses",
-            )  # fmt: skip
-            escape.on_update(by_user(lambda value: setattr(session, "escape", value)))
         self._locks = [
             {name: gui.add_checkbox(f"lock {name}", False, disabled=not can_lock) for name in start}
             for start in self._starts

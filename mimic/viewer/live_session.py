@@ -101,7 +101,6 @@ class LiveSession:
         self.expert: Embodiment = build_arm(env.expert, env.limits, env.metric.links).embodiment
         self.settings: Settings = initial_settings(env)
         self.by_optimiser, self.takes_any_arm = mapper is None and any_arm is None, any_arm is not None
-        self._escape = self.by_optimiser
         self._functions: FunctionSource = any_arm or FunctionCache(env, mapper)
         self._lock_angles = None if self.takes_any_arm else lock_angles(env)  # None: a joint is locked where it is
         self._lock = threading.RLock()
@@ -146,7 +145,7 @@ class LiveSession:
     def seek(self) -> None:
         """Moves the learner to the best pose of many initial guesses before it tracks again; for motions that jump."""
         with self._lock:
-            self._seeks = self._escape
+            self._seeks = self.by_optimiser
 
     def drag(self, position: Float[np.ndarray, "3"]) -> None:
         """Moves the expert's hand to a position in its base frame [m], or near it, and stops any motion."""
@@ -170,16 +169,6 @@ class LiveSession:
         """Stops the motion of the expert."""
         with self._lock:
             self._motion = None
-
-    @property
-    def escape(self) -> bool:
-        """Whether a learner at rest in a local minimum continues to the best pose."""
-        return self._escape
-
-    @escape.setter
-    def escape(self, value: bool) -> None:
-        with self._lock:
-            self._escape, self._rest_key = value, None
 
     def change(self, **settings: Any) -> None:
         """Changes some of the `Settings`.
@@ -320,7 +309,7 @@ class LiveSession:
         pose, is_there = step_towards(arm, current, goal, jump)
         if self._goal is not None:
             self._goal, self._seeks = (None, False) if is_there else (self._goal, self._seeks)
-        elif is_there and self._escape and self._rest_time > _REST_TIME:
+        elif is_there and self.by_optimiser and self._rest_time > _REST_TIME:
             distance = float(functions.compare(self._pose, pose, weights).distance)
             if distance - bound > _MIN_GAIN * max(distance, _MIN_GAIN):
                 self._goal = best

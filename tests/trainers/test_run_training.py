@@ -15,7 +15,6 @@ import imageio_ffmpeg
 import jax
 import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks.interruptions import differences
 from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint, load_checkpoint, save_checkpoint
@@ -118,13 +117,11 @@ def test_evaluate_repeats_the_report(finished, tmp_path):
 @pytest.mark.slow
 def test_a_video_shows_the_whole_motion(finished):
     run_dir, _ = finished
-    result = command("render", f"run={run_dir}", "demonstration=1", "gif=true")
+    result = command("render", f"run={run_dir}", "demonstration=1")
     assert result.returncode == 0, result.stderr[-2000:]
     video = run_dir / "videos" / "held_out-1.mp4"
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
     assert frames == 151 and seconds == pytest.approx(5, abs=0.1)  # 5 s at 30 frames a second, both ends
-    with Image.open(video.with_suffix(".gif")) as gif:
-        assert gif.n_frames == 51 and gif.size == (640, 320)  # type: ignore[attr-defined]
     again = command("render", f"run={run_dir}", "demonstration=1")
     assert again.returncode == 2 and "exists; name a new file" in again.stderr
     beyond = command("render", f"run={run_dir}", "demonstration=2")
