@@ -1,22 +1,13 @@
 """Compiles a model in a process of its own, with limits on time and memory, and checks its magnitudes.
 
-`python -I compile_check.py` reads a request from its input and writes a reply: this module must import nothing of
-mimic, whose import takes seconds.
+That process runs this file: it must import nothing of mimic at its start.
 """
 
-import contextlib
-import json
 import math
-import os
-import signal
-import subprocess
-import sys
-import tempfile
 from collections.abc import Mapping
 from typing import Any
 
-CPU_SECONDS, WALL_SECONDS = 10, 15  # a Panda with meshes needs 1 s
-MEMORY = 2 * 2**30  # bytes of address space, of which a process that imports MuJoCo has 0.2 GiB
+SECONDS = 10  # CPU time; a Panda with meshes needs 1 s
 VELOCITY_LIMIT = "velocity_limit"  # custom numeric with the velocity limit of each joint [rad/s]
 
 # What a model may have of each element; some robots with scenes have a few hundred.
@@ -78,93 +69,29 @@ def _velocity_limits(model: Any) -> list[float]:
 def check_in_process(text: str, attached: Mapping[str, bytes]) -> None:
     """Compiles a model in a process with limits, before this one does, and checks its magnitudes.
 
+    Args:
+      text: the model's XML, which names its files by absolute paths.
+      attached: the XML of the models that it attaches, by their names in it.
+
     Raises:
       ValueError: MuJoCo rejects the model, crashes, or exceeds a limit; or what `check_magnitudes` rejects.
     """
-    request = {"path": [entry for entry in sys.path if os.path.isabs(entry)], "text": text}
-    request["attached"] = {name: content.decode() for name, content in attached.items()}
-    # One thread and one heap: address space is limited, and a thread's heap reserves 64 MiB of it.
-    environment = {**os.environ, "MUJOCO_GL": "disable", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "1"}
-    try:
-        process = subprocess.run(
-            [sys.executable, "-I", __file__],
-            input=json.dumps(request).encode(),
-            capture_output=True,
-            timeout=WALL_SECONDS,
-            cwd=tempfile.gettempdir(),
-            env=environment,
-            start_new_session=True,  # Ctrl-C ends this process, which then ends that one
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        raise ValueError(_too_long(WALL_SECONDS)) from None
-    error = _error(process)
-    if error is not None:
-        raise ValueError(error)
+    from mimic.base.limited_process import call_limited
+
+    texts = {name: content.decode() for name, content in attached.items()}
+    call_limited(__file__, "compile_model", text, texts, library="mujoco", what="the model", seconds=SECONDS)
 
 
-def _error(process: subprocess.CompletedProcess[bytes]) -> str | None:
-    """Why the process rejected the model, or what ended it; None where the model is accepted."""
-    if b"contains a 'NaN'" in process.stderr:  # MuJoCo's warning, in whatever attribute it is
-        return "the model has a number that is not a number: NaN"
-    with contextlib.suppress(ValueError, IndexError, TypeError, KeyError):
-        error = json.loads(process.stdout.splitlines()[-1])["error"]
-        return _TOO_LARGE if error and "allocate memory" in error else error
-    if -process.returncode in (signal.SIGXCPU, signal.SIGKILL):
-        return _too_long(CPU_SECONDS)
-    if b"MemoryError" in process.stderr or b"bad_alloc" in process.stderr:
-        return _TOO_LARGE
-    cause = signal.Signals(-process.returncode).name if process.returncode < 0 else f"exit code {process.returncode}"
-    return f"MuJoCo crashes when it compiles the model ({cause})"
-
-
-_TOO_LARGE = f"the model needs more than {MEMORY // 2**30} GiB of memory to compile"
-
-
-def _too_long(seconds: int) -> str:
-    return f"the model takes more than {seconds} s to compile; expected simpler meshes or fewer elements"
-
-
-def _limit() -> None:
-    try:
-        import resource
-    except ImportError:  # not on this system, where the limit on wall time remains
-        return
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))  # MuJoCo writes its warnings to a file
-    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS + 1))
-    with contextlib.suppress(ValueError, OSError):  # macOS has no such limit
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-
-
-def _compile(request: Mapping[str, Any]) -> None:
+def compile_model(text: str, attached: Mapping[str, str]) -> None:
+    """What `check_in_process` runs there."""
     import mujoco
 
-    attached = {name: content.encode() for name, content in request["attached"].items()}
-    spec = mujoco.MjSpec.from_string(request["text"], include=attached)
+    warnings: list[str] = []
+    mujoco.set_mju_user_warning(warnings.append)
+    spec = mujoco.MjSpec.from_string(text, include={name: content.encode() for name, content in attached.items()})
     spec.compiler.usethread = False
     model = spec.compile()
+    if any("NaN" in warning for warning in warnings):  # in whatever attribute it is
+        raise ValueError("the model has a number that is not a number: NaN")
     check_magnitudes(model)
     mujoco.mj_kinematics(model, mujoco.MjData(model))
-
-
-def main() -> None:
-    """Replies to the request in the input."""
-    request = json.loads(sys.stdin.buffer.read())
-    sys.path[:] = request["path"]
-    import mujoco  # noqa: F401  # before the limits, so that these are of the model alone
-
-    _limit()
-    error = None
-    try:
-        _compile(request)
-    except MemoryError:
-        error = _TOO_LARGE
-    except Exception as failure:  # MuJoCo's own errors, and what C++ raises for sizes that it cannot have
-        error = str(failure) or type(failure).__name__
-    print("\n" + json.dumps({"error": error}), flush=True)
-    os._exit(0)  # without MuJoCo's own clean-up, which takes time and may crash
-
-
-if __name__ == "__main__":
-    main()

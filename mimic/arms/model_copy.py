@@ -3,8 +3,9 @@
 import copy
 from collections.abc import Mapping
 from pathlib import Path
+from xml.etree import ElementTree
 
-from mimic.arms.model_source import Element, ModelSource, write_xml
+from mimic.arms.model_source import ModelSource
 
 _ASSETS = "assets"
 
@@ -20,15 +21,15 @@ def copied_files(source: ModelSource, name: str) -> Mapping[str, bytes | Path]:
     places = {str(file): f"{_ASSETS}/{number}/{file.name}" for number, file in enumerate(source.files)}
     files: dict[str, bytes | Path] = {place: Path(file) for file, place in places.items()}
     for path, root in {name: source.root, **source.attached}.items():
-        files[path] = write_xml(_with_paths(root, places)).encode()
+        files[path] = ElementTree.tostring(_with_paths(root, places))
     return files
 
 
-def _with_paths(root: Element, places: Mapping[str, str]) -> Element:
+def _with_paths(root: ElementTree.Element, places: Mapping[str, str]) -> ElementTree.Element:
     """The model with relative paths of its files."""
     copied = copy.deepcopy(root)
-    for element in copied.walk():
-        for attribute, value in element.attributes.items():
+    for element in copied.iter():
+        for attribute, value in element.attrib.items():
             if attribute.lower().startswith("file"):
-                element.attributes[attribute] = places.get(value, value)
+                element.attrib[attribute] = places.get(value, value)
     return copied

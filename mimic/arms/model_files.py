@@ -13,7 +13,7 @@ from mimic.arms.model_source import ModelSource, read_source
 
 _UNNAMED_MODEL = "MuJoCo Model"  # MuJoCo's name of a model without one
 _MAX_MESSAGE = 400  # characters of MuJoCo's messages, which may repeat a whole attribute
-_OWN_REASONS = ("the model ", "MuJoCo crashes")
+_OWN_REASONS = ("the model ", "mujoco crashes")
 _UNOPENED = re.compile(r"[Ee]rror opening file '([^']*)'")
 _MASSLESS = "mass and inertia of moving bodies must be larger"
 
@@ -97,9 +97,10 @@ def _restore_urdf_data(spec: mujoco.MjSpec, source: ModelSource) -> None:
     spec.compiler.fusestatic = False
     spec.compile()  # numbers the joints
     limits: dict[str | None, float] = {}
-    for joint in (element for element in source.root.walk() if element.tag == "joint"):
-        for limit in (child for child in joint.children[::-1] if child.tag == "limit"):
-            limits[joint.attributes.get("name")] = _number(limit.attributes.get("velocity", "0"))
+    for joint in source.root.iter("joint"):
+        limit = joint.find("limit")
+        if limit is not None:
+            limits[joint.get("name")] = _number(limit.get("velocity", "0"))
     joints = sorted(spec.joints, key=lambda joint: joint.id)
     if joints:
         numeric = spec.add_numeric(name=VELOCITY_LIMIT, size=len(joints))

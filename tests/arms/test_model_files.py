@@ -172,11 +172,11 @@ FILES = {
     "an entity bomb": (BOMB, "'.*arm.xml' declares a document type or entities; expected plain MJCF or URDF$"),
     "an include outside": (
         '<mujoco><include file="../other.xml"/></mujoco>',
-        "'.*arm.xml' includes '../other.xml', which is outside its folder; expected files in ",
+        "'.*arm.xml' needs '../other.xml', which is outside its folder; expected files in ",
     ),
     "an absolute include": (
         '<mujoco><include file="/etc/hosts"/></mujoco>',
-        "'.*arm.xml' includes '/etc/hosts', which is outside",
+        "'.*arm.xml' needs '/etc/hosts', which is outside",
     ),
     "an include of itself": ('<mujoco><include file="arm.xml"/></mujoco>', "'.*arm.xml' is not an MJCF or URDF model"),
     "a missing mesh": (
@@ -190,7 +190,7 @@ FILES = {
     ),
     "huge": (
         " " * (MAX_FILE_SIZE + 1),
-        "'.*arm.xml' cannot be read: expected at most 33,554,432 bytes, got 33,554,433$",
+        "'.*arm.xml' cannot be read: expected at most 8,388,608 bytes, got 8,388,609$",
     ),
     "a broken URDF": ('<robot name="a"><link name="b"></robot>', "'.*arm.xml' is not an MJCF or URDF model"),
 }
