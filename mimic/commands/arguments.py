@@ -22,7 +22,6 @@ _NAMING_KEYS = (
     "env.demonstrations.source",
     "env.observation.terms",
 )
-_MAX_LENGTH = 10_000  # characters of an argument: Hydra's parser takes a second for 50,000
 
 
 def load_plugins(arguments: list[str]) -> list[str]:
@@ -57,9 +56,6 @@ def check_arguments(arguments: list[str]) -> None:
       ValueError: an unknown option, a removed key, an empty value, or a config group without the name of a preset.
       HydraException: an argument that is not in Hydra's syntax.
     """
-    for argument in arguments:
-        if len(argument) > _MAX_LENGTH:
-            raise ValueError(f"{argument[:40]}...: expected at most {_MAX_LENGTH:,} characters, got {len(argument):,}")
     parser = get_args_parser()
     parser.error = _raise_value_error  # type: ignore[method-assign]  # in place of a usage text
     options = parser.parse_args(arguments)
