@@ -52,7 +52,6 @@ class ArmConfig:
       damping: minimum damping of each joint [N m s/rad], or a mapping from joints to it.
       home: start pose: a list with the angle of each joint from base to tip, locked ones included [rad], a mapping from
         joints to angles, or the name of a keyframe of the model. Default None: by `limits`, see `panda`.
-      base_segment: for a file, whether the segment from the base to the first joint is a link; see `load_mjcf`.
     """
 
     model: str = "panda"
@@ -65,7 +64,6 @@ class ArmConfig:
     armature: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
     damping: Any = number(0.0, at_least=0.0, at_most=1e4, by_name=True)
     home: Any = None
-    base_segment: bool = True
 
     def __post_init__(self) -> None:
         if not self.model:
@@ -163,7 +161,6 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         links=cast(Links, links),
         limits=cast(Limits, limits),
         home=config.home,
-        base_segment=config.base_segment,
     )
     notes = () if not config.is_file else ignored_elements(source, config.base, config.tip)
     pose = base_pose(source, config.base, config.tip)

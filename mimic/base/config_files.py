@@ -18,7 +18,7 @@ from mimic.base.files import read_text
 
 MAX_BYTES = 50_000  # a run's config has some 3 kB
 MAX_REFERENCES = 8
-_REFERENCE = re.compile(r"(?<!\\)\$\{\.*[A-Za-z_][\w.]*(?:\[\w+\][\w.]*)*\}")  # as ${seed} or ${..metric.xi}
+_REFERENCE = re.compile(r"(?<!\\)\$\{\.*[A-Za-z_][\w.]*(?:\[\w+\][\w.]*)*\}")  # as ${seed} or ${..metric.rotation}
 
 
 class _Loader(get_yaml_loader()):

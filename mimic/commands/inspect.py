@@ -171,7 +171,6 @@ def _shown_model(arm: ArmConfig) -> str:
 def _arm_words(key: str, arm: ArmConfig) -> list[str]:
     words = [f"{key}={_shown_model(arm)}"]
     words += [f"{key}.{name}={value}" for name in ("base", "tip") if (value := getattr(arm, name))]
-    words += [f"{key}.base_segment=false"] * (not arm.base_segment)
     for name in ("armature", "damping", "locked", "link_lengths", "home"):
         value = getattr(arm, name)
         if value:

@@ -37,6 +37,7 @@ from mimic.metric.distance import (
 )
 
 CORRESPONDENCES = ("arc_length", "overlap", "hard", "soft")
+SOFT_SHARPNESS = -10.0  # xi of the correspondence "soft"
 registry.reserve("correspondence", CORRESPONDENCES)
 
 
@@ -58,7 +59,6 @@ class MetricConfig:
       correspondence: "arc_length" or "overlap" (static), "hard" or "soft" (by distance), a registered name, or a
         .csv or .npz file with a matrix, see `load_correspondence`.
       link_distance: a registered function of two links, in place of the weighted parts; none where empty.
-      xi: sharpness of the soft correspondence, below 0.
       reduction: "mean" or "frobenius".
       chains: which chains of trees correspond: "name" (left to left, thumb to thumb) or "order", see `matched_chains`.
     """
@@ -71,7 +71,6 @@ class MetricConfig:
     adaptive: bool = False
     rotation_measure: str = "cosine"
     correspondence: str = "arc_length"
-    xi: float = number(-10.0, at_least=-1e6, below=0.0)  # a soft minimum
     reduction: str = "mean"
     links: str = "kept"
     link_distance: str = ""
@@ -109,7 +108,7 @@ class MetricConfig:
             "arc_length": lambda: arc_length_correspondence(expert, learner, chains=chains),
             "overlap": lambda: overlap_correspondence(expert, learner, chains=chains),
             "hard": lambda: hard_correspondence,
-            "soft": lambda: partial(soft_correspondence, xi=self.xi),
+            "soft": lambda: partial(soft_correspondence, xi=SOFT_SHARPNESS),
         }
         if self.correspondence in constructors:
             return constructors[self.correspondence]()

@@ -85,8 +85,7 @@ class PPOConfig(TrainerConfig):
       num_updates_per_batch: passes over a batch.
       learning_rate: Adam's learning rate at the start.
       final_learning_rate: learning rate at the end as a fraction of learning_rate; the decay is linear.
-      discounting: discount factor of the reward at the start.
-      final_discounting: discount factor at the end; the change is linear. The same as at the start where None.
+      discounting: discount factor of the reward.
       gae_lambda: lambda of generalised advantage estimation.
       entropy_cost: weight of the policy's entropy in the loss at the start.
       final_entropy_cost: entropy cost at the end as a fraction of entropy_cost; the change is linear.
@@ -121,7 +120,6 @@ class PPOConfig(TrainerConfig):
     learning_rate: FromPreset[float] = number(None, above=0.0, at_most=1.0)
     final_learning_rate: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
     discounting: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
-    final_discounting: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
     gae_lambda: float = number(0.9, at_least=0.0, at_most=1.0)
     entropy_cost: FromPreset[float] = number(None, at_least=0.0, at_most=1000.0)
     final_entropy_cost: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
@@ -150,8 +148,6 @@ class PPOConfig(TrainerConfig):
         if self.target_gap > 0:
             preset = {**preset, "evaluations": _TARGET_GAP_EVALUATIONS * preset["evaluations"]}
         config = _filled_in(self, preset, preset=name)
-        if config.final_discounting is None:
-            config = dataclasses.replace(config, final_discounting=config.discounting)
         config._check(devices)
         if env is not None and config.network != "mlp" and env.kind != "sampled_arms":
             raise ValueError(
@@ -180,17 +176,15 @@ class PPOConfig(TrainerConfig):
         return self.num_timesteps
 
     def at(self, progress: Any) -> Self:
-        """Returns the resolved config with entropy cost and discount factor at a fraction of the training.
+        """Returns the resolved config with the entropy cost at a fraction of the training.
 
         Args:
           progress: in [0, 1], a number or a scalar array.
         """
-        if self.final_entropy_cost == 1 and self.final_discounting == self.discounting:
+        if self.final_entropy_cost == 1:
             return self
         return dataclasses.replace(
-            self,
-            entropy_cost=self.entropy_cost * (1 + progress * (self.final_entropy_cost - 1)),
-            discounting=self.discounting + progress * (self.final_discounting - self.discounting),
+            self, entropy_cost=self.entropy_cost * (1 + progress * (self.final_entropy_cost - 1))
         )
 
     @property

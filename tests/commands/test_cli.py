@@ -33,7 +33,6 @@ from tests.helpers.repository import REPOSITORY
         (["env.demonstrations.path=missing.npz"], "no file"),
         (["resume=missing"], "not a run directory"),
         (["+foo=1"], "foo"),
-        (["env.metric.correspondence=soft", "env.metric.xi=1"], "below 0"),
         (["env.metric.rotation=inf"], "env.metric.rotation: expected a number from 0 to 1e+06, got inf"),
         (
             ["env=planar4dof", "env.learner.link_lengths=[0.5,0]"],

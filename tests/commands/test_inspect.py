@@ -61,7 +61,7 @@ def test_an_inspection_describes_the_arm(inspected, arm_file, tmp_path):
 
 
 def test_the_suggested_command_trains_the_inspected_arm(arm_file, monkeypatch):
-    learner = mimic.ArmConfig(model=str(arm_file), locked=["elbow", 6], tip="pinch", armature=0.2, base_segment=False)
+    learner = mimic.ArmConfig(model=str(arm_file), locked=["elbow", 6], tip="pinch", armature=0.2)
     config = InspectConfig(learner=learner, expert=mimic.ArmConfig(locked={"joint2": 0.5}), limits="hardware")
     words = shlex.split(train_command(config))
     assert words[:4] == ["python", "-m", "mimic.train", "env=pair"]

@@ -44,7 +44,7 @@ def test_presets_are_shown_in_place_of_null(monkeypatch, capsys):
     keys = shown(monkeypatch, capsys, "train")
     cpu, gpu = (PPO_PRESETS[name]["num_envs"] for name in ("cpu", "gpu"))
     assert value(keys, "num_envs") == f"{cpu} (cpu, any_arm_cpu, inner_loop_cpu), {gpu} (gpu, any_arm, inner_loop)"
-    assert value(keys, "unroll_length") == "10" and value(keys, "final_discounting") == "null"
+    assert value(keys, "unroll_length") == "10"
     keys = shown(monkeypatch, capsys, "train", "trainer.preset=gpu", "trainer.crossovers=7")
     assert value(keys, "num_envs") == str(PPO_PRESETS["gpu"]["num_envs"]) and value(keys, "crossovers") == "7"
     keys = shown(monkeypatch, capsys, "train", "trainer=pose_mapper", "trainer.preset=paper")
