@@ -49,6 +49,7 @@ def test_a_limited_sampler_draws_that_many_arms():
     assert len(np.unique(lengths)) == 5
 
 
+@pytest.mark.slow
 def test_a_mixture_draws_from_each_sampler(panda):
     locked = sampler.lock_sampler(panda, sampler.lock_masks(7, 1))
     draw = jax.jit(jax.vmap(sampler.mixed_sampler([locked, sampler.random_arm], [0.25, 0.75])))

@@ -10,7 +10,6 @@ from mimic.arms.capsules import fit_capsules
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import load_mjcf, panda_path, segment_arm
 from mimic.metric.kinematics import body_twists, forward_kinematics, link_state_table, link_states
-from tests.helpers.original_model import package_file
 from tests.helpers.trees import TORSO_TIPS, hand, largest_error, torso
 
 GENERATED = {
@@ -18,16 +17,6 @@ GENERATED = {
     "torso with a locked waist and elbow": (torso(), TORSO_TIPS, {"waist": 0.4, "left_joint1": -0.3}),
     "hand of 19 joints": (hand(), ["*"], {}),
     "locked hand": (hand(), ["*"], {"wrist": 0.2, "thumb_0": 0.5, "index_2": -0.3}),
-}
-# Models that others wrote, in packages that need not be installed.
-OTHERS = {
-    "Baxter": ("robosuite/models/assets/robots/baxter/robot.xml", ["left_hand", "right_hand"], {}),
-    "GR1's upper body": (
-        "robosuite/models/assets/robots/gr1/robot.xml",
-        ["left_eef", "right_eef", "head_pitch"],
-        {"torso_waist_roll": 0.1},
-    ),
-    "Shadow hand": ("gymnasium_robotics/envs/assets/hand/reach.xml", ["*"], {"robot0:WRJ0": 0.3, "robot0:FFJ3": 0.1}),
 }
 
 
@@ -41,14 +30,10 @@ def poses(arm, count=2, seed=0):
 
 
 @pytest.mark.slow_for("locked hand")
-@pytest.mark.parametrize("name", [*GENERATED, *OTHERS])
+@pytest.mark.parametrize("name", GENERATED)
 def test_link_states_are_those_of_mujoco(x64, name):
-    if name in OTHERS:
-        file, tips, locked = OTHERS[name]
-        model = mujoco.MjModel.from_xml_path(str(package_file(file)))
-    else:
-        text, tips, locked = GENERATED[name]
-        model = mujoco.MjModel.from_xml_string(text)
+    text, tips, locked = GENERATED[name]
+    model = mujoco.MjModel.from_xml_string(text)
     arm = load_mjcf(model, tip=tips, locked=locked)
     if name != "torso with a locked waist and elbow":  # its compilation takes longest
         error = largest_error(model, arm, tips, locked, jax.jit(lambda q, v: link_states(arm, q, v, normalized=False)))

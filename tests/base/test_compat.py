@@ -1,7 +1,6 @@
 """Workarounds for the packages that mimic uses."""
 
 import copy
-import logging
 import os
 import subprocess
 import sys
@@ -45,29 +44,9 @@ def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
     assert compat.needs_cpu_flag(version) is needed
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not compat.needs_cpu_flag(), reason="this jax does not need the flag and aborts on it")
-def test_the_cpu_flag_speeds_up_kinematics(capsys):
-    """Times MJX's kinematics of 64 Pandas with and without it, in two processes."""
-    code = (
-        "import time, jax, jax.numpy as jnp, mujoco\nfrom mujoco import mjx\n"
-        "from mimic.arms.embodiment import panda_path\n"
-        "model = mujoco.MjModel.from_xml_path(panda_path())\nmx = mjx.put_model(model)\ndata = mjx.make_data(model)\n"
-        "f = jax.jit(jax.vmap(lambda q: mjx.kinematics(mx, data.replace(qpos=q)).xpos))\nq = jnp.zeros((64, 7))\n"
-        "f(q).block_until_ready()\nstart = time.perf_counter()\n"
-        "for _ in range(3): f(q).block_until_ready()\nprint((time.perf_counter() - start) / 3)\n"
-    )
-    seconds = []
-    for flag in ("false", "true"):
-        environment = {**os.environ, "XLA_FLAGS": f"--xla_cpu_use_fusion_emitters={flag}", "JAX_PLATFORMS": "cpu"}
-        out = subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
-        ).stdout
-        seconds.append(float(out.splitlines()[-1]))
-    logging.getLogger(__name__).info("speed-up by the flag: %.0f", seconds[1] / seconds[0])
-    with capsys.disabled():
-        print(f"\nspeed-up of MJX kinematics by the CPU flag: {seconds[1] / seconds[0]:.0f} times")
-    assert seconds[1] > 5 * seconds[0]  # several hundred times where it was measured first; 5 is beyond noise
+def test_the_cpu_flag_is_set_before_jax_starts():
+    """By `conftest.py`, as by `import mimic`."""
+    assert ("--xla_cpu_use_fusion_emitters=false" in os.environ["XLA_FLAGS"].split()) == compat.needs_cpu_flag()
 
 
 @pytest.mark.parametrize("count", [2, 3])

@@ -36,36 +36,3 @@ def test_an_own_arm_starts_in_its_keyframe(own_registry, tmp_path, monkeypatch):
     (tmp_path / "reacher.xml").write_text(block_with('<mujoco model="reacher">'))
     exec(block_with('"reacher.xml", "tip"'), {"mimic": mimic, "few": SMALL["demonstrations"]})  # noqa: S102
     np.testing.assert_allclose(mimic.make("reacher").learner.home, [0.5, -1.0], atol=1e-6)
-
-
-@pytest.mark.slow
-def test_stable_baselines3_trains(tmp_path):
-    pytest.importorskip("stable_baselines3", reason="needs Stable-Baselines3, which brings PyTorch")
-    from mimic.gymnasium import VectorEnv
-
-    scope: dict = {}
-    exec(block_with("class Arms(VecEnv)"), scope)  # noqa: S102 - our own text
-    from stable_baselines3 import PPO  # type: ignore[import-not-found]
-    from stable_baselines3.common.vec_env import VecMonitor  # type: ignore[import-not-found]
-
-    arms = VecMonitor(scope["Arms"](VectorEnv("planar4dof", num_envs=8, **SMALL)))
-    trained = PPO("MlpPolicy", arms, n_steps=5, batch_size=20, device="cpu").learn(200)
-    assert [episode["l"] for episode in trained.ep_info_buffer] == [SMALL["horizon"]] * (200 // SMALL["horizon"])
-
-
-def test_the_end_of_an_episode_in_stable_baselines3():
-    """The observation before the restart is that of the last step; an episode is never truncated."""
-    pytest.importorskip("stable_baselines3", reason="needs Stable-Baselines3, which brings PyTorch")
-    from mimic.gymnasium import VectorEnv
-
-    scope: dict = {}
-    exec(block_with("class Arms(VecEnv)"), scope)  # noqa: S102 - our own text
-    arms = scope["Arms"](VectorEnv("planar4dof", num_envs=3, **SMALL))
-    arms.seed(0)
-    first, still = arms.reset(), np.zeros((3, *arms.action_space.shape), np.float32)
-    for step in range(SMALL["horizon"]):
-        observations, rewards, ended, infos = arms.step(still)
-        assert ended.all() == (step == SMALL["horizon"] - 1) and rewards.shape == (3,)
-    last = np.stack([info["terminal_observation"] for info in infos])
-    assert not any(info["TimeLimit.truncated"] for info in infos)
-    assert last.shape == first.shape and np.abs(last - observations).max(axis=1).min() > 0.01

@@ -79,6 +79,7 @@ def test_the_distance_gradient_is_that_of_finite_differences(name):
     np.testing.assert_allclose(observed, differences, atol=5e-4)
 
 
+@pytest.mark.slow
 def test_self_collision_is_charged_by_the_distances_of_mujoco():
     """The intrusion of capsules into 5 cm, for a pose that folds the hand to the upper arm."""
     plain = mimic.make("panda7dof", physics="fused", **SMALL)

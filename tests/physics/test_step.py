@@ -247,7 +247,6 @@ def test_load_scales_masses_inertias_and_damping(x64, name):
     assert np.abs(expected - plain).max() > 0.01 * np.abs(plain).max()  # or the load would not be tested
 
 
-@pytest.mark.slow_for("mjx")
 @pytest.mark.parametrize("kind", ["mjx", "fused"])
 def test_both_physics_step_a_loaded_arm_as_mujoco_does(x64, kind):
     """Three steps of RK4 in double precision: the same formula, in another order."""
@@ -385,7 +384,7 @@ def panda_scale():
     return np.asarray(mimic.make("panda7dof", demonstrations={"count": 1, "held_out": 1}).torque_scale)
 
 
-@pytest.mark.slow_for("mjx-load0")
+@pytest.mark.slow_for("mjx-load0", "mjx-load1")
 @pytest.mark.parametrize("load", [Load(), Load(mass=1.2, damping=3.0)])
 @pytest.mark.parametrize("physics", PHYSICS)
 def test_the_panda_moves_as_in_mujoco(panda_scale, physics, load):

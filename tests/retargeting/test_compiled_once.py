@@ -36,7 +36,7 @@ FUNCTIONS = {
 }
 
 
-@pytest.mark.slow_for("imitate_trajectory", "kinematic_bound")
+@pytest.mark.slow_for("imitate_trajectory", "kinematic_bound", "warm")
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_second_call_compiles_nothing(name):
     call, metric = FUNCTIONS[name], MetricConfig()
@@ -50,6 +50,7 @@ def test_a_second_call_compiles_nothing(name):
     assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(second), jax.tree.leaves(other), strict=True))
 
 
+@pytest.mark.slow_for("metric1")
 @pytest.mark.parametrize("metric", [MetricConfig(adaptive=True), MetricConfig(correspondence="soft")])
 def test_functions_of_a_metric_config_are_equal_by_value(metric):
     FUNCTIONS["imitate_pose"](qpos(0), metric.build(*arms()).arguments)

@@ -106,7 +106,8 @@ def test_the_bound_of_two_links_is_that_of_a_grid_search():
     np.testing.assert_allclose(bound, tried, atol=0.01)  # half a degree of slope below 1 / rad, in each of two joints
 
 
-@pytest.mark.parametrize("name", [pytest.param("panda 7->4", marks=pytest.mark.slow), "planar 7->4"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["panda 7->4", "planar 7->4"])
 def test_more_starts_change_nothing(name):
     expert, learner = ARMS[name]
     motion, correspondence, closest = solved(name)

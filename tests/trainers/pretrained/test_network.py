@@ -62,7 +62,8 @@ def test_a_mapper_reaches_its_recorded_distance(name):
     assert report["quality"]["held_out"] < 0.1 and distance.mean() < report["copying_distance"]["held_out"] + 0.05
 
 
-@pytest.mark.parametrize("name", quick(POLICIES))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", POLICIES)
 def test_a_policy_reaches_its_recorded_distance(name):
     policy = mimic.load(name)
     held_out = mimic.envs.imitation.training_and_held_out(policy.config.env)[1]
