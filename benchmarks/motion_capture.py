@@ -23,12 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import mimic
+from benchmarks.common.cut_links import cut_alike
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.peers.frame_matching import match_frames
 from benchmarks.similarity import other_arms
 from mimic.arms.arm import ArmConfig
-from mimic.arms.common_cuts import cut_alike
 from mimic.commands.capture import fixed_fraction, read_arm
 from mimic.commands.config import CaptureConfig
 from mimic.envs.config import EnvConfig

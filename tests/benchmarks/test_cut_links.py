@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mimic.arms.common_cuts import cut_alike
+from benchmarks.common.cut_links import cut_alike
 from mimic.arms.embodiment import load_mjcf, panda, planar_arm
 from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.similarity import centre_line_table
