@@ -14,7 +14,7 @@ from mimic.envs.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.any_arm import ArmReferences, ArmRollouts, ArmsEvaluator, ArmsOutcome
-from mimic.evaluation.arms_plot import plot_arms
+from mimic.evaluation.plots import plot_arms
 from tests.helpers.untrained_family import HELD_OUT, HORIZON, family
 
 NAMES = ["whole", "locked 1", "locked 7", *(f"locked {i}" for i in (2, 3, 4, 5, 6))]
@@ -87,9 +87,10 @@ def test_details_tables_and_plots(evaluator, tmp_path):
     with (tmp_path / "arms.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["arm"] for row in rows] == NAMES and [row["arms"] for row in rows][2:4] == ["seen", "unseen"]
-    plot_arms(details, tmp_path / "arms.png", controller="policy", title="family")
+    options: Any = {"series": {"gap": "policy", "controller_gap": "none"}, "label": "gap [%]", "title": "family"}
+    plot_arms(details, out=tmp_path / "arms.png", **options)
     assert min(Image.open(tmp_path / "arms.png").size) > 300
-    plot_arms({}, tmp_path / "none.png", controller="policy", title="family")
+    plot_arms({}, out=tmp_path / "none.png", **options)
     assert not (tmp_path / "none.png").exists()
 
 

@@ -250,14 +250,22 @@ class AnyArmMapperTrainer(Trainer):
     def save_outcome(self, folder: Path, outcome: Any, controller: str = "policy") -> None:
         """Writes a table of each part, a plot of the arms, and in a run directory a plot of the training."""
         del controller
-        from mimic.evaluation import mapper_arms_plot, plots  # imports matplotlib, which takes a second
+        from mimic.evaluation import plots  # imports matplotlib, which takes a second
 
         tables = {part: self._table(part, mapped) for part, mapped in outcome.items()}
         for part, table in tables.items():
             _write_table(folder / f"{part}.csv", table)
-        mapper_arms_plot.plot_mapper_arms(tables[_ARMS_PART], folder / "arms.png", self._model.starts, title=self._name)
+        texts = (
+            "mapper",
+            "the network's proposals, without Newton steps",
+            f"Newton steps from {self._model.starts} random guesses",
+            "Newton steps from home",
+        )
+        series: dict[str, str] = dict(zip(METHODS, texts, strict=True))
+        label = "above the optimum [%]"
+        plots.plot_arms(tables[_ARMS_PART], series, folder / "arms.png", label=label, title=self._name)
         labels = {"train": "arms seen in training", "held_out": "unseen arms"}
-        plots.plot_training(folder, "quality", "above the optimum [%]", labels=labels, title=self._name)
+        plots.plot_training(folder, "quality", label, labels=labels, title=self._name)
 
 
 def _arms_by_split(

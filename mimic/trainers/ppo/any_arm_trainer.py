@@ -237,13 +237,13 @@ class AnyArmPPOTrainer(Trainer):
     def save_outcome(self, folder: Path, outcome: ArmsOutcome, controller: str = "policy") -> None:
         """Writes a table and a plot of the arms; in a run directory also a plot of the training."""
         from mimic.evaluation import plots  # imports matplotlib, which takes a second
-        from mimic.evaluation.arms_plot import plot_arms
 
         self.evaluator.save_table(outcome, folder / "arms.csv")
-        names = {"controller": controller.replace("_", " "), "title": self._name}
-        plot_arms(self.evaluator.details(outcome), folder / "arms.png", **names)
+        series = {"gap": controller.replace("_", " "), "controller_gap": "controller without learning"}
+        arms, label = self.evaluator.details(outcome), "optimality gap [%]"
+        plots.plot_arms(arms, series, folder / "arms.png", label=label, title=self._name)
         labels = {"train": "arms seen in training", "held_out": "unseen arms"}
-        plots.plot_training(folder, "optimality_gap", "optimality gap [%]", labels=labels, title=self._name)
+        plots.plot_training(folder, "optimality_gap", label, labels=labels, title=self._name)
 
 
 def _without_baseline(config: EnvConfig) -> EnvConfig:
