@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import new_folder
@@ -22,7 +21,6 @@ from mimic.motions.formats.rosbag2 import write_rosbag2
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.runs.files import written_atomically
 from mimic.trainers.make import make_ppo_trainer
-from mimic.trainers.progress import is_animated
 from mimic.trainers.run_config import policy_run
 
 _PACKAGES = {"lerobot": "pyarrow", "rosbag2": "rosbags"}  # the package that writes each format
@@ -125,16 +123,9 @@ def _provenance(kind: str, facts: dict[str, Any]) -> dict[str, Any]:
 
 def _write(format: str, out: Path, episodes: Episodes, console: Console) -> None:
     """Writes the dataset; its folder has its name when it is complete."""
-    columns = BarColumn(), MofNCompleteColumn(), TextColumn("left"), TimeRemainingColumn()
-    with (
-        written_atomically(out) as folder,
-        Progress(TextColumn("[bold]writing"), *columns, console=console, disable=not is_animated(console)) as bar,
-    ):
-        if format == "lerobot":
-            write_lerobot(folder, episodes)
-            return
-        task = bar.add_task("write", total=len(episodes.steps))
-        write_rosbag2(folder, episodes, lambda: bar.advance(task))
+    write = write_lerobot if format == "lerobot" else write_rosbag2
+    with written_atomically(out) as folder, console.status(f"writing {len(episodes.steps)} episodes"):
+        write(folder, episodes)
 
 
 def _lines(format: str, episodes: Episodes) -> list[str]:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from rich import box
@@ -17,7 +17,7 @@ from mimic.trainers.trainer import Trainer
 
 _GAP = "  "  # between texts of a line
 _REFRESHES = 2  # of a bar in a second: its clocks show whole seconds
-_WIDE_BAR, _BAR, _NARROW_BAR, _LONGEST_BAR = 20, 10, 5, 40  # columns
+_LONGEST_BAR = 40  # columns
 
 
 class TrainingProgress:
@@ -92,41 +92,11 @@ class _Display:
         return [f"elapsed {_duration(self.elapsed)}", *(f"left {_duration(seconds)}" for seconds in left)]
 
     def _lines(self) -> Group:
-        head = [f"{self._done:,}/{self.total:,}", *self._times()]
         fraction = self._done / max(self.total, 1)
-        return Group(*_bar_lines(self._console.width, fraction, self._label, head, self._status.split(_GAP)))
-
-
-def _bar_lines(width: int, fraction: float, label: str, head: list[str], body: list[str]) -> list[Table | Text]:
-    """A bar with texts around it: everything in one line where that fits, else the body below, in lines of a width.
-
-    Args:
-      width: of the terminal.
-      fraction: of the bar that is full.
-      label: before the bar; left out where it does not fit.
-      head: texts next to the bar; below it where even they do not fit.
-      body: all other texts.
-    """
-    layouts = (([label], [*head, *body], [], _WIDE_BAR), ([label], head, body, _BAR), ([], head, body, _NARROW_BAR))
-    for before, after, below, least in layouts:
-        room = width - sum(len(text) + len(_GAP) for text in (*before, *after))
-        if room >= least:
-            bar = ProgressBar(total=1.0, completed=fraction, width=min(room, _LONGEST_BAR))
-            row = Table.grid(padding=(0, len(_GAP), 0, 0))
-            row.add_row(*(Text(text, style="bold") for text in before), bar, *map(Text, after))
-            return [row, *_filled_lines(width, below)]
-    return [*_filled_lines(width, [*head, *body])]
-
-
-def _filled_lines(width: int, texts: Sequence[str]) -> list[Text]:
-    """Texts in as few lines as they need."""
-    lines: list[str] = []
-    for text in texts:
-        if lines and len(lines[-1]) + len(_GAP) + len(text) <= width:
-            lines[-1] += _GAP + text
-        else:
-            lines.append(text)
-    return [Text(line) for line in lines]
+        bar = Table.grid()
+        bar.add_row(ProgressBar(total=1.0, completed=fraction, width=min(self._console.width, _LONGEST_BAR)))
+        texts = [self._label, f"{self._done:,}/{self.total:,}", *self._times(), self._status]
+        return Group(bar, Text(_GAP.join(texts)))
 
 
 def _duration(seconds: float) -> str:

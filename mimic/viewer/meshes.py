@@ -9,11 +9,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
-from mimic.arms.arm import ArmConfig, arm_spec, build_arm
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.kinematic_tree import find_chain
 from mimic.arms.link_match import Capsule, Colour
 from mimic.arms.rendering import LOCKED, MARK, SPACING
-from mimic.arms.visual_model import body_links, is_dark
+from mimic.arms.visual_model import visual_spec
 
 _VISIBLE_GROUPS = 3  # MuJoCo draws groups 0, 1 and 2; collision geoms are in higher groups
 _SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
@@ -61,7 +61,7 @@ class ArmShape:
 
     def __init__(self, config: ArmConfig, limits: str = "none", colours: Mapping[str, Colour] | None = None):
         free = build_arm(dataclasses.replace(config, locked=()), limits).embodiment
-        self._model = arm_spec(config).compile()
+        self._model = visual_spec(config, limits, colours)[0].compile()
         self._data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, self._data)
         self._base = find_chain(self._model, config.base, config.tip).base
@@ -69,9 +69,7 @@ class ArmShape:
         self.num_bodies = int(self._model.nbody)
         self.reach = float(free.chain_length)
         marks = [_mark(self._model, name, self.reach) for name in free.joint_names]
-        links = body_links(self._model, config, limits)
-        by_body = {body: colours[link] for body, link in links.items() if link in colours} if colours else {}
-        self.parts: list[Part] = [*_coloured(_visible_parts(self._model), by_body), *marks]
+        self.parts: list[Part] = [*_visible_parts(self._model), *marks]
 
     def base_pose(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]:
         """Position [m] and quaternion of the arm's base frame, in the frame of the model."""
@@ -106,17 +104,6 @@ def _visible_parts(model: mujoco.MjModel) -> list[Part]:
         key = int(model.geom_bodyid[geom]), tuple(float(x) for x in rgba)
         groups.setdefault(key, []).append(mesh)
     return [_part(body, trimesh.util.concatenate(meshes), rgba) for (body, rgba), meshes in groups.items()]
-
-
-def _coloured(parts: Sequence[Part], colours: Mapping[int, Colour]) -> list[Part]:
-    """The parts in the colours of their bodies, except dark ones of bodies that have others."""
-    light = {part.body for part in parts if not is_dark(part.rgba)}
-    return [
-        dataclasses.replace(part, rgba=(*colours[part.body], 1.0))
-        if part.body in colours and not (is_dark(part.rgba) and part.body in light)
-        else part
-        for part in parts
-    ]
 
 
 def capsule_mesh(capsule: Capsule) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:

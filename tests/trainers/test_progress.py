@@ -44,20 +44,19 @@ def clock(monkeypatch):
     return now
 
 
-@pytest.mark.parametrize(("width", "lines"), [(40, 4), (60, 2), (80, 2), (110, 2), (200, 1)])
+@pytest.mark.parametrize("width", [40, 80, 200])
 @pytest.mark.parametrize("total", [3_000_000, 150_000_000])
-def test_a_bar_shows_everything_at_every_width(clock, width, lines, total):
+def test_a_bar_shows_everything_at_every_width(clock, width, total):
     console = terminal(width)
     with TrainingProgress(console, total) as bar:
         clock[0] += 3700
         bar.update(total // 3, STATUS, 17_400.0)
     shown = final_lines(console)
-    assert len(shown) == lines and all(len(line) <= width for line in shown)
+    assert all(len(line) <= width for line in shown) and "━" in shown[0]
     left = progress._duration((total - total // 3) / 17_400)
     text = " ".join(" ".join(shown).split())
     for part in (f"{total // 3:,}/{total:,}", "elapsed 1:01:40", f"left {left}", "17,400 steps/s", *STATUS.split("  ")):
         assert part in text
-    assert ("━" in text) == (width > 40) and ("training" in text) == (width > 60)
 
 
 def test_the_remaining_time_counts_down_between_evaluations(clock):
@@ -66,15 +65,14 @@ def test_the_remaining_time_counts_down_between_evaluations(clock):
         clock[0] += 10
         bar.update(500, STATUS, 10.0)
         clock[0] += 20
-    assert "elapsed 0:30  left 0:30" in final_lines(console)[0]
+    assert "elapsed 0:30  left 0:30" in final_lines(console)[1]
 
 
 def test_a_bar_says_that_it_compiles(clock):
     console = terminal(80)
     with TrainingProgress(console, 1000):
         clock[0] += 5
-    shown = final_lines(console)
-    assert len(shown) == 1 and shown[0].endswith("0/1,000  elapsed 0:05  compiling")
+    assert final_lines(console) == ["training  0/1,000  elapsed 0:05  compiling"]
 
 
 def as_pipe(monkeypatch):

@@ -3,7 +3,7 @@
 Messages are sensor_msgs/JointState, in rad, rad/s and N m. A bag is one motion; a dataset is a folder of bags.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ _MAX_BAGS = 100_000
 _FLOATS_OF_JOINT = 3  # in a message
 
 
-def write_rosbag2(folder: Path, episodes: Episodes, on_written: Callable[[], None] = lambda: None) -> None:
+def write_rosbag2(folder: Path, episodes: Episodes) -> None:
     """Writes a bag for each episode into an empty folder. Needs rosbags.
 
     Topics: /joint_states and /joint_commands, with the prefixes /learner and /expert where both arms are known. Bags
@@ -42,7 +42,6 @@ def write_rosbag2(folder: Path, episodes: Episodes, on_written: Callable[[], Non
     Args:
       folder: the folder.
       episodes: the motions.
-      on_written: called after each bag.
     """
     from rosbags.rosbag2 import Writer
 
@@ -51,7 +50,6 @@ def write_rosbag2(folder: Path, episodes: Episodes, on_written: Callable[[], Non
             for key, value in _custom_data(episodes, index).items():
                 writer.set_custom_data(key, value)
             _write_episode(writer, episodes, index)
-        on_written()
 
 
 def _write_episode(writer: Any, episodes: Episodes, index: int) -> None:

@@ -5,7 +5,7 @@ import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from mimic.metric.kinematics import link_states
 from mimic.retargeting.pose import checked_poses, wrap_angles
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PoseMapperConfig
+from mimic.trainers.pose_mapper.one_pair import OnePairModel
 from mimic.trainers.run_config import load_config
 
 Params = Any
@@ -134,38 +135,6 @@ class MapperModel:
         return (2 * qpos - lower - upper) / (upper - lower)
 
 
-class PoseModel(Protocol):
-    """A mapper to one learner without its parameters: what a `PoseMapper` needs of `MapperModel`."""
-
-    @property
-    def expert(self) -> Embodiment:
-        """Embodiment with n joints."""
-        ...
-
-    @property
-    def learner(self) -> Embodiment:
-        """Embodiment with n_hat joints."""
-        ...
-
-    @property
-    def metric(self) -> MetricConfig:
-        """Config of the metric."""
-        ...
-
-    @property
-    def distance(self) -> PoseDistance:
-        """Embodiment distance between a pose of the expert and a pose of the learner."""
-        ...
-
-    def candidates(self, params: Params, qpos: Array) -> Array:
-        """The poses that the heads propose [rad]."""
-        ...
-
-    def __call__(self, params: Params, qpos: Array) -> Array:
-        """The nearest of these poses [rad]."""
-        ...
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class PoseMapper:
     """A trained mapper: call it with one pose of the expert or a batch of poses. Safe under `jax.jit` and `jax.vmap`.
@@ -175,7 +144,7 @@ class PoseMapper:
       params: parameters of the network.
     """
 
-    model: PoseModel
+    model: MapperModel | OnePairModel
     params: Params
 
     @classmethod
