@@ -22,6 +22,7 @@ from mimic.trainers.export.config import check_locked
 
 ROBOT_WORLDS = ("paper", "nominal", "hardware")
 ROBOTS = ("virtual_panda", "virtual_robot")
+ROBOT_LOOPS = ("mimic", "ruckig")
 CONTROLLERS = ("policy", "hold", "pd", "computed_torque", "nearest_pose", "tracking")
 ROBOT_CONTROLLERS = ("policy", "tracking")
 ARM_SIDES = ("left", "right")
@@ -51,6 +52,8 @@ class EvaluateConfig:
         do; "virtual_robot": the same for another learner. Default "": the environment of the run.
       episodes: number of episodes of `robot`, of each case with `edges`.
       robot_world: preset of the world of `robot`: "paper", "nominal" or "hardware". Default "": that of the run.
+      robot_loop: control loop of `robot`: "mimic", the one of training, or "ruckig", online trajectories as those of
+        franky-control.
       edges: whether there are also cases with each range of the world at its ends.
       seed: of what is drawn for each episode of `robot`.
       out: new folder for report, table and plots. Default "": the report is printed only.
@@ -70,6 +73,7 @@ class EvaluateConfig:
     robot: str = ""
     episodes: int = number(1000, at_least=1, at_most=10_000_000)
     robot_world: str = ""
+    robot_loop: str = "mimic"
     edges: bool = False
     seed: int = number(0, at_least=0, at_most=2**31 - 1)
     out: str = ""
@@ -86,10 +90,11 @@ class EvaluateConfig:
     def _check_robot(self) -> None:
         """Raises a `ValueError` for options of another kind of evaluation."""
         if not self.robot:
-            if self.robot_world or self.edges:
-                raise ValueError("robot_world, edges: expected only with robot=, as in robot=virtual_panda")
+            if self.robot_world or self.robot_loop != "mimic" or self.edges:
+                raise ValueError("robot_world, robot_loop, edges: expected only with robot=, as in robot=virtual_panda")
             return
         check_choice("robot", self.robot, ROBOTS)
+        check_choice("robot_loop", self.robot_loop, ROBOT_LOOPS)
         if self.robot_world:
             check_choice("robot_world", self.robot_world, ROBOT_WORLDS)
         if self.controller not in ROBOT_CONTROLLERS:

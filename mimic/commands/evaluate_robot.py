@@ -69,6 +69,7 @@ def prepare_robot_evaluation(
         rows = {name: summary(trainer.evaluator, result) for (name, *_), result in zip(cases, results, strict=True)}
         report = {
             "robot": config.robot,
+            "robot_loop": config.robot_loop,
             "run": config.run,
             "env": trained.env.name,
             "env_steps": steps,
@@ -122,7 +123,9 @@ def _task(
     first, count = held_out.start, evaluator.env.demonstrations.count - held_out.start
     motion = first + np.arange(config.episodes) % count
     drawn = draw_world(world, config.episodes, robot.num_joints, np.random.default_rng(config.seed), edge)
-    return Task(robot, policy, drawn, motion, np.asarray(evaluator.env.start_poses)[motion], config.seed)
+    return Task(
+        robot, policy, drawn, motion, np.asarray(evaluator.env.start_poses)[motion], config.seed, config.robot_loop
+    )
 
 
 def _run(tasks: list[Task], console: Console) -> list[Episodes]:

@@ -20,6 +20,7 @@ from mimic.control.joint_control import (
 # examples of its manufacturer have 600 to 50. Faster control would need a torque rate beyond the limit.
 FREQUENCY = 20.0  # rad/s
 TORQUE_RATE_FRACTION = 0.6  # of the maximum torque rate, which the jerk of the reference may need
+TRAJECTORY_JERK = 8.0  # of that of the inner loop, within which trajectories reach the ends of its paths in time
 # Where a model states no limits of acceleration, jerk and torque rate, they follow from the times that a Panda needs.
 _SECONDS_TO_VELOCITY, _SECONDS_TO_ACCELERATION, _SECONDS_TO_TORQUE = 0.25, 0.002, 0.087
 
@@ -110,3 +111,17 @@ def joint_parameters(
         # At a constant velocity a reference lags 1 / APPROACH_RATE behind its target.
         reach=velocity * (control_dt + 2 / APPROACH_RATE),
     )
+
+
+def trajectory_limits(limits: JointLimits, parameters: JointParameters) -> JointLimits:
+    """Limits of a robot's own trajectories to targets that the inner loop's reference reaches at each tick.
+
+    With less acceleration or jerk they come late; with all of the jerk the torque cannot follow, and an arm overshoots
+    its velocity.
+
+    Args:
+      limits: the manufacturer's.
+      parameters: of the inner loop.
+    """
+    jerk = np.minimum(limits.jerk, TRAJECTORY_JERK * parameters.jerk)
+    return dataclasses.replace(limits, velocity=np.asarray(parameters.velocity), jerk=jerk)

@@ -1,95 +1,67 @@
-"""A robot without physics for tests and examples: joints with independent inertias."""
-
-import time
+"""A robot without physics for tests and examples: its joints are where they were commanded to be."""
 
 import numpy as np
 
 from mimic.control.joint_control import PERIOD
 from mimic.control.limits import JointLimits
-from mimic.deploy.driver import RobotAbort, RobotState
-
-_TOLERANCE = 1e-9  # relative, of rounding in a torque that changes at its limit
+from mimic.deploy.driver import Command, RobotAbort, RobotState
+from mimic.deploy.path import STEP
 
 
 class FakeRobot:
-    """A `Driver` whose joints are double integrators with viscous friction; it aborts beyond its limits.
+    """A `Driver` and its `Clock`, in simulated time; it aborts beyond its limits.
+
+    At the end of a path without a new command it stops within a step, in the pose in which the arm would come to rest.
 
     Args:
       qpos: [joints] start pose [rad].
       limits: the manufacturer's limits.
-      inertia: [joints] of the joints [kg m^2].
-      damping: [joints] of the joints [N m s/rad].
-      is_paced: whether `read` waits for the next millisecond; otherwise time is simulated.
 
     Attributes:
-      states: list of all states that were read.
+      time: since the start [s].
+      states: list of the states after each step of a path.
+      commands: list of all commands.
     """
 
-    def __init__(
-        self,
-        qpos: np.ndarray,
-        limits: JointLimits,
-        inertia: np.ndarray,
-        damping: np.ndarray | float = 0.1,
-        *,
-        is_paced: bool = False,
-    ):
-        self._qpos, self._limits = np.array(qpos, float), limits
-        self._qvel, self._torque = np.zeros((2, len(self._qpos)))
-        self._inertia, self._damping, self._is_paced = inertia, damping, is_paced
-        self._command: np.ndarray | None = None
-        self._periods, self._missed, self._started = 0, 0, 0.0
-        self.states: list[RobotState] = []
+    def __init__(self, qpos: np.ndarray, limits: JointLimits):
+        self._limits, self.time = limits, 0.0
+        self.states = [RobotState(np.array(qpos, float), np.zeros(len(qpos)))]
+        self.commands: list[Command] = []
+        self._next = 0  # sample of the last command's path
 
     def read(self) -> RobotState:
         """See `Driver`."""
-        if self._is_paced:
-            self._wait()
-        self._move()  # after the wait: the controller's other processes may use the core until then
-        self._check()
-        time_s = (self._periods + self._missed) * PERIOD
-        state = RobotState(time_s, self._qpos.copy(), self._qvel.copy(), self._torque.copy())
-        self.states.append(state)
-        return state
+        qpos, qvel = self.states[-1]
+        lower, upper = self._limits.position.T
+        for cause, is_exceeded in (
+            ("joint position limit", np.any((qpos < lower) | (qpos > upper))),
+            ("joint velocity limit", np.any(np.abs(qvel) > self._limits.velocity)),
+        ):
+            if is_exceeded:
+                raise RobotAbort(cause)
+        return RobotState(qpos.copy(), qvel.copy())
 
-    def write(self, torque: np.ndarray) -> None:
-        """See `Driver`; what is wrong with the torque is raised by the next `read`."""
-        self._command = np.array(torque, float)
+    def write(self, command: Command) -> None:
+        """See `Driver`."""
+        self.commands.append(command)
+        self._next = 0
 
     def stop(self) -> None:
         """See `Driver`."""
-        self._qvel[:] = 0
 
-    def _move(self) -> None:
-        """One period with the commanded torque."""
-        torque, self._command = self._command, None
-        if torque is None:
-            return
-        change = np.abs(torque - self._torque) / PERIOD
-        if np.any(change > self._limits.torque_rate * (1 + _TOLERANCE)):
-            raise RobotAbort("torque rate")
-        self._torque = torque
-        self._qvel += PERIOD * (self._torque - self._damping * self._qvel) / self._inertia
-        self._qpos += PERIOD * self._qvel
-        self._periods += 1
+    def wait_until(self, due: float) -> float:
+        """See `Clock`."""
+        while self.time < due - 1e-9:
+            self.states.append(self._state())
+            self.time += STEP * PERIOD
+        return self.time
 
-    def _wait(self) -> None:
-        now = time.perf_counter()
-        self._started = self._started or now
-        elapsed = (self._periods + (self._command is not None)) * PERIOD  # at the end of the commanded period
-        due = self._started + elapsed
-        if now < due:
-            time.sleep(due - now)
-        else:  # periods that were missed are counted, and not made up for
-            self._missed += int((now - due) / PERIOD)
-            self._started = now - elapsed
-
-    def _check(self) -> None:
-        lower, upper = self._limits.position.T
-        for cause, exceeded in (
-            ("joint position limit", np.any((self._qpos < lower) | (self._qpos > upper))),
-            ("joint velocity limit", np.any(np.abs(self._qvel) > self._limits.velocity)),
-            ("torque limit", np.any(np.abs(self._torque) > self._limits.torque)),
-        ):
-            if exceeded:
-                raise RobotAbort(cause)
+    def _state(self) -> RobotState:
+        """The state after the next step."""
+        if not self.commands:
+            return self.states[-1]
+        path, index = self.commands[-1].path, self._next
+        self._next += 1
+        if index < len(path.qpos):
+            return RobotState(path.qpos[index].copy(), path.qvel[index].copy())
+        return RobotState(self.commands[-1].stop.copy(), np.zeros(len(path.qpos[0])))

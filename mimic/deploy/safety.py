@@ -1,26 +1,25 @@
-"""The safety layer: the inner loop of some robots at 1 kHz, which accepts a target only if it can stop after it.
+"""The safety layer: it accepts a policy's target only if the arm can stop after it.
 
-Each accepted target comes with a path that was checked: the target acts for a tick and a grace time, then the reference
-brakes. A target that is rejected, late or missing changes nothing: the arm then brakes along the path that was checked.
-All arrays are [joints, robots]: a robot alone and thousands in simulation run the same code.
+Each accepted target comes with a path that was checked: the target acts for a tick, then the reference brakes. A target
+that is rejected or missing changes nothing: the arm then brakes along the path that was checked. All arrays are
+[joints, robots]: a robot alone and many in simulation run the same code.
 """
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 
-from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target, action_target
+from mimic.control.joint_control import PERIOD, JointParameters, Reference, action_target
 from mimic.deploy.bundle import Bundle
 from mimic.deploy.config import SafetyConfig
-from mimic.deploy.inner_loop import InnerLoop
-from mimic.deploy.joint_motion import State, joint_reference
-from mimic.deploy.measurements import TRACKING, MeasurementCheck, StartCheck
-from mimic.deploy.path import SAMPLE, PathPrediction
+from mimic.deploy.driver import Command
+from mimic.deploy.path import STEP, PathGenerator, extended
 
 # Interventions, which replace a target, and the causes for which an arm stops for good.
 COLLISION, INVALID, REPEATED, LATE = "clearance", "invalid action", "repeated action", "late policy"
 INTERVENTIONS = (COLLISION, INVALID, REPEATED, LATE)
+START_POSE, NOT_AT_REST, START_CLEARANCE = "start pose", "not at rest", "start clearance"
+INVALID_STATE, TRACKING, POSITION = "invalid state", "tracking error", "near position limit"
 MEASURED_CLEARANCE = "measured clearance"
 _ACTION_TOLERANCE = 1e-3  # beyond [-1, 1]: float32 rounds a saturated tanh
 
@@ -34,7 +33,7 @@ def check_supported(control: str, control_dt: float, config: SafetyConfig | None
       config: thresholds; default: `SafetyConfig()`.
 
     Raises:
-      ValueError: the mode has no braking path, or the check of a target does not fit the tick.
+      ValueError: the mode has no braking path, or the tick does not have whole steps or not time for the check.
     """
     config = config or SafetyConfig()
     if control == "torque":
@@ -42,37 +41,17 @@ def check_supported(control: str, control_dt: float, config: SafetyConfig | None
             "mode: expected joint_position, joint_velocity or joint_impedance, whose targets have a braking path, "
             "got torque"
         )
-    if round(control_dt / PERIOD) <= config.check_periods or _hold_periods(control_dt, config) % SAMPLE:
+    step = STEP * PERIOD
+    are_whole = all(abs(time / step - round(time / step)) < 1e-6 for time in (control_dt, config.latency))
+    if not are_whole or round(control_dt / step) <= round(config.latency / step):
         raise ValueError(
-            f"control_dt, grace: expected a tick of more than {config.check_periods} ms, and a multiple of {SAMPLE} ms "
-            f"together, got {control_dt} s and {config.grace} s"
+            f"control_dt, latency: expected multiples of {step} s and a tick above the latency, got {control_dt} s and "
+            f"{config.latency} s"
         )
 
 
-def _hold_periods(control_dt: float, config: SafetyConfig) -> int:
-    """Periods for which a target acts."""
-    return round(control_dt / PERIOD) + round(config.grace / PERIOD)
-
-
-def _parts(path: PathPrediction, config: SafetyConfig) -> list[int]:
-    """Steps of a path in each second period of a check, without the first and the last one.
-
-    Those of braking have several samples each, whose clearance takes time too. So they are spread over two thirds of
-    the periods, though they are fewer.
-    """
-    count = max(config.check_periods // 2 - 1, 1)
-    hold, brake = count // 3, count - count // 3
-    ends = np.concatenate(
-        [[0], np.linspace(0, path.hold_steps, hold + 1)[1:], np.linspace(path.hold_steps, path.steps, brake + 1)[1:]]
-    )
-    return np.diff(np.ceil(ends).astype(int)).tolist()
-
-
 class SafetyLayer:
-    """The inner loops of some robots with the same controller.
-
-    In each period: `period` gives the torques, `tick` takes the policy's actions where they have arrived, and `work`
-    computes in the rest of the period.
+    """Turns the actions of a policy into commands for some robots with the same controller, once in a tick.
 
     Args:
       bundle: the controller.
@@ -82,9 +61,10 @@ class SafetyLayer:
 
     Attributes:
       cause: [robots] why the arm was stopped for good; empty while it is controlled.
-      has_action: [robots] whether a valid action has ever arrived.
       counts: [robots] number of interventions, by kind.
-      clearance: [robots] smallest clearance of a measured pose [m], but for the last two periods.
+      tracking_error: [robots] largest difference between a measured angle and the reference [rad].
+      clearance: [robots] smallest clearance of a measured pose [m].
+      brake_ticks: ticks in which an arm comes to rest from any motion.
     """
 
     def __init__(
@@ -94,39 +74,25 @@ class SafetyLayer:
         robots: int = 1,
         config: SafetyConfig | None = None,
     ):
-        config = config or SafetyConfig()
-        check_supported(bundle.mode, bundle.control_dt, config)
-        hold = _hold_periods(bundle.control_dt, config)
-        self._mode, self._config, self._clearance, self._hold = bundle.mode, config, clearance, hold
-        full = (np.tile(np.asarray(x, float)[:, None], robots) for x in (*bundle.parameters, bundle.limits.velocity))
-        *parameters, velocity = full
-        self._actions = JointParameters(*parameters)
-        self._joints = self._actions._replace(
-            velocity=config.velocity_scale * self._actions.velocity,
-            acceleration=config.acceleration_scale * self._actions.acceleration,
+        self._config, self._mode, self._clearance = config or SafetyConfig(), bundle.mode, clearance
+        check_supported(bundle.mode, bundle.control_dt, self._config)
+        self._joints = JointParameters(*(np.tile(np.asarray(x, float)[:, None], robots) for x in bundle.parameters))
+        scaled = self._joints._replace(
+            velocity=self._config.velocity_scale * self._joints.velocity,
+            acceleration=self._config.acceleration_scale * self._joints.acceleration,
         )
-        is_position = bundle.mode != "joint_velocity"
-        self._inner_loop = InnerLoop(self._joints, is_position, config.slow_down * velocity)
-        self._path = PathPrediction(self._joints, is_position, config.check_periods, hold, robots)
-        self._parts = _parts(self._path, config)
-        self._path_clearance = np.zeros((self._path.samples, robots))
-        self._start = StartCheck(bundle.limits, config)
-        self._measurements = MeasurementCheck(bundle.limits, config, robots)
+        self._paths = PathGenerator(bundle.mode, scaled, bundle.periods)
+        self._hold = self._paths.hold_steps
+        self._now = self._hold - round(self._config.latency / (STEP * PERIOD))  # steps of the path at a measurement
+        self.brake_ticks = -(-self._paths.brake_steps // self._hold)
+        self._range = bundle.limits.position[:, 0, None], bundle.limits.position[:, 1, None]
         self._size = bundle.num_joints, robots
-        self._value, self._stiffness = np.zeros(self._size), np.ones(self._size)
-        self._action = np.zeros((bundle.action_size, robots))
-        self._left, self._repeats = [0] * robots, np.zeros(robots, int)  # periods that the targets still act
-        self.has_action = np.zeros(robots, bool)
-        self._pending: _Pending | None = None
-        self._checked = 0  # angles of the path whose clearance has been computed
-        self._begun: tuple[list[State], list[int]] | None = None  # references and periods left as the period began
+        self._path = np.zeros((3, self._hold + self._paths.brake_steps, *self._size))  # since the last command
+        self._action, self._repeats = np.zeros((bundle.action_size, robots)), np.zeros(robots, int)
+        self._stiffness, self._has_action = np.ones(self._size), np.zeros(robots, bool)
         self.cause = np.full(robots, "", object)
         self.counts = {name: np.zeros(robots, int) for name in INTERVENTIONS}
-        self.clearance = np.full(robots, np.inf)
-        self._qpos: list[float] = []
-        self._qvel: list[float] = []
-        self._measured: list[list[float]] = []  # angles whose clearance has not been computed
-        self._is_tracked = np.ones(robots, bool)
+        self.tracking_error, self.clearance = np.zeros(robots), np.full(robots, np.inf)
 
     def start(self, qpos: np.ndarray, qvel: np.ndarray, start_pose: np.ndarray) -> np.ndarray:
         """Begins to control arms that are near their start poses and at rest; gives the cause for those that are not.
@@ -135,195 +101,111 @@ class SafetyLayer:
           qpos, qvel: measured [rad, rad/s].
           start_pose: [joints, robots] [rad].
         """
-        self.cause[:] = self._start(qpos, qvel, start_pose)
-        clearance = self._clearance(np.nan_to_num(qpos).T)
-        self.cause[(self.cause == "") & ~(clearance >= self._config.margin - self._config.creep)] = "start clearance"
-        qpos = np.where(np.isfinite(qpos), qpos, start_pose)
-        self._inner_loop.set_reference(Reference(qpos, np.zeros_like(qpos), np.zeros_like(qpos)))
-        self._measurements.begin(qpos.ravel().tolist())
+        lower, upper = self._range
+        is_near = (qpos > lower) & (qpos < upper) & (np.abs(qpos - start_pose) <= self._config.start_distance)
+        is_at_rest = np.abs(qvel) <= self._config.start_speed
+        is_clear = self._clearance(np.nan_to_num(qpos).T) >= self._config.margin - self._config.creep
+        is_finite = np.isfinite(qpos) & np.isfinite(qvel)
+        failed = [~is_finite.all(axis=0), ~is_near.all(axis=0), ~is_at_rest.all(axis=0), ~is_clear]
+        self.cause = np.select(failed, [INVALID_STATE, START_POSE, NOT_AT_REST, START_CLEARANCE], "").astype(object)
+        self._path[:] = 0
+        self._path[0] = np.where(is_finite.all(axis=0), qpos, start_pose)
         return self.cause
-
-    def tick(self, action: np.ndarray, is_present: np.ndarray) -> None:
-        """Takes the actions of a tick, whose targets act `check_periods` after this period if their paths are safe.
-
-        Args:
-          action: [numbers, robots] in [-1, 1].
-          is_present: [robots] whether a new action has arrived; otherwise the last one is used again.
-
-        Raises:
-          RuntimeError: it is not called between `period` and `work`; nothing has changed then.
-        """
-        states, left = self._beginning("tick")
-        is_active = self.cause == ""
-        is_valid = np.all(np.abs(action) <= 1 + _ACTION_TOLERANCE, axis=0)  # False for NaN
-        self.counts[INVALID] += is_active & is_present & ~is_valid
-        is_new = is_present & is_valid
-        self._action = np.where(is_new, action, self._action)
-        self.has_action |= is_new
-        self._repeats = np.where(is_present, 0, self._repeats + 1)
-        is_repeated = ~is_present & (self._repeats <= self._config.repeats)
-        is_missing = is_active & ~is_present & self.has_action
-        self.counts[REPEATED] += is_missing & is_repeated
-        self.counts[LATE] += is_missing & ~is_repeated
-        self._pending = _Pending(is_active & (is_new | is_repeated) & self.has_action)
-        self._path.begin(joint_reference(states, self._size), self._value, np.array(left))
-        self._checked, self._path_clearance[:] = 0, -np.inf  # what has not been checked is not safe
 
     @property
     def reference(self) -> Reference:
-        """The motion that the arms track, [joints, robots] each."""
-        return self._inner_loop.reference
+        """The motion that the arms track when the states of a tick are measured, [joints, robots] each."""
+        return Reference(*self._path[:, self._now - 1])
 
-    @property
-    def observed_reference(self) -> Reference:
-        """The motion that the arms tracked when the states of this period were measured, [joints, robots] each.
+    def tick(
+        self, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray | None, is_present: np.ndarray | None = None
+    ) -> Command:
+        """The command that follows the last one when that has ended, `latency` after the measurement.
 
-        Raises:
-          RuntimeError: it is not read between `period` and `work`.
+        Args:
+          qpos, qvel: measured [rad, rad/s].
+          action: [numbers, robots] in [-1, 1]; None makes all arms brake.
+          is_present: [robots] whether a new action has arrived; otherwise the last one is used again. Default: all.
         """
-        return joint_reference(self._beginning("observed_reference")[0], self._size)
+        self._check_measured(qpos, qvel)
+        begin, rest = Reference(*self._path[:, self._hold - 1]), self._rest()
+        self._path, self._stiffness = rest, self._stiffness.copy()
+        is_candidate = np.zeros(self._size[1], bool) if action is None else self._candidates(action, is_present)
+        if np.any(is_candidate):
+            target = action_target(self._mode, self._action, begin, self._joints, np)
+            path = self._paths.target_path(begin, target.value)
+            is_safe = self._is_safe(np.concatenate([begin.qpos[None], path[0]]))
+            self.counts[COLLISION] += is_candidate & ~is_safe
+            self._path = np.where(is_candidate & is_safe, extended(path, rest.shape[1]), rest)
+            self._stiffness = np.where(is_candidate & is_safe, target.stiffness, self._stiffness)
+        return Command(Reference(*self._path[:, : self._hold]), self._path[0, -1], self._stiffness)
 
-    @property
-    def torque(self) -> np.ndarray:
-        """The torques [joints, robots] of the last period [N m]."""
-        return self._inner_loop.torque
-
-    @property
-    def tracking_error(self) -> np.ndarray:
-        """The largest tracking error [robots] [rad]."""
-        return self._measurements.tracking_error
-
-    @property
-    def is_checking(self) -> bool:
-        """Whether the check of a target is under way."""
-        return self._pending is not None
-
-    def period(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """The torques [N m] of a period, for measured angles [rad] and velocities [rad/s]."""
-        inner_loop = self._inner_loop
-        self._qpos, self._qvel = qpos.ravel().tolist(), qvel.ravel().tolist()
-        self._measured.append(self._qpos)
-        self._begun = inner_loop.states, self._left
-        cause = self._measurements(self._qpos, self._qvel, inner_loop.states)
-        if cause is not None:
-            self._stop(cause)
-        is_held = [left > 0 for left in self._left] * self._size[0]
-        self._left = [max(left - 1, 0) for left in self._left]
-        inner_loop.period(self._qpos, self._qvel, is_held, self._measurements.is_lost)
-        return inner_loop.torque
-
-    def work(self) -> None:
-        """Computes a part of the check that is under way, and the clearance of measured poses.
-
-        It computes steps of the path in one period and clearances in the next one: so less code runs in a period, and
-        less of it is missing in the processor's caches. In the first period of a check the policy's action is taken, in
-        the last one the target is accepted or not.
-        """
-        self._begun, pending = None, self._pending
-        if pending is None:
-            if len(self._measured) > 1:
-                self._compute_clearances()
-            return
-        pending.periods += 1
-        turn, is_odd = divmod(pending.periods, 2)
-        is_last = pending.periods == self._config.check_periods
-        if not is_odd and turn <= len(self._parts):
-            self._path.advance(self._parts[turn - 1], self._new_target)
-        if (is_odd and turn) or is_last:
-            self._compute_clearances()
-        if is_last:
-            self._accept(pending)
+    def skip(self) -> None:
+        """Counts a tick that has passed without a command: the arms have begun to brake by themselves."""
+        self.counts[LATE] += self.cause == ""
+        self._path = self._rest()
 
     def stop(self, cause: str) -> None:
         """Makes all arms that are controlled brake and hold, for good."""
-        self._stop(np.full(len(self.cause), cause, object))
+        self.cause[self.cause == ""] = cause
 
     def release(self, robots: np.ndarray, cause: str) -> None:
-        """No longer controls some arms: their robots stopped by themselves."""
-        if np.any(robots & (self.cause != cause)):
-            self.cause[robots], self._is_tracked[robots] = cause, False
-            self._left = np.where(robots, 0, self._left).tolist()
-            self._measurements.release(robots)
+        """No longer controls some arms [robots]: their robots stopped by themselves."""
+        self.cause[robots] = cause
 
-    def _beginning(self, name: str) -> tuple[list[State], list[int]]:
-        """The references and the periods left as the period began; `name` of what asks is for the error."""
-        if self._begun is None:
-            raise RuntimeError(f"{name}: expected after `period` and before `work`")
-        return self._begun
+    def _rest(self) -> np.ndarray:
+        """The path after the end of the last command: the arms brake."""
+        return extended(self._path[:, self._hold :], self._path.shape[1])
 
-    def _compute_clearances(self) -> None:
-        """The clearances of poses that were measured, and of angles of the path, since the last time."""
-        first, (joints, robots) = self._checked, self._size
-        path, measured = self._path.path[first:], np.reshape(self._measured, (-1, joints, robots))
-        poses = np.concatenate([measured, path]).transpose(0, 2, 1).reshape(-1, joints)
-        clearance = self._clearance(poses).reshape(-1, robots)
-        self._check_measured(clearance[: len(measured)])
-        self._checked = first + len(path)
-        self._path_clearance[first : self._checked] = clearance[len(measured) :]
-        self._measured = []
+    def _check_measured(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Stops arms whose measurement is not plausible or too near to something, see `tick`."""
+        is_controlled = self.cause == ""
+        is_finite = (np.isfinite(qpos) & np.isfinite(qvel)).all(axis=0)
+        error = np.where(is_finite, np.abs(qpos - self.reference.qpos).max(axis=0), 0.0)
+        clearance = np.where(is_finite, self._clearance(np.nan_to_num(qpos).T), np.inf)
+        self.tracking_error = np.where(is_controlled, np.maximum(self.tracking_error, error), self.tracking_error)
+        self.clearance = np.where(is_controlled, np.minimum(self.clearance, clearance), self.clearance)
+        lower, upper = self._range
+        near = self._config.position
+        is_inside = ((qpos >= lower + near) & (qpos <= upper - near)).all(axis=0)
+        failed = [~is_finite, error > self._config.tracking, ~is_inside, ~(clearance >= self._config.measured_margin)]
+        cause = np.select(failed, [INVALID_STATE, TRACKING, POSITION, MEASURED_CLEARANCE], "").astype(object)
+        self.cause = np.where(is_controlled, cause, self.cause)
+        is_blocked = is_controlled & (cause == TRACKING)
+        if np.any(is_blocked):  # brakes from the measured motion: the reference would push the arm on
+            self._path = np.where(is_blocked, self._measured_path(qpos, qvel), self._path)
 
-    def _check_measured(self, clearance: np.ndarray) -> None:
-        """Stops arms for which one of some measured poses [poses, robots] has no clearance left."""
-        smallest = np.where(np.isnan(clearance), np.inf, clearance).min(axis=0)
-        np.minimum(self.clearance, smallest, out=self.clearance, where=self._is_tracked)
-        is_near = smallest < self._config.measured_margin
-        if np.count_nonzero(is_near):
-            self._stop(np.where(is_near, MEASURED_CLEARANCE, ""))
+    def _measured_path(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        """The path on which arms brake from their measured motion, as if it had been commanded a tick ago."""
+        bound = self._joints.velocity
+        measured = Reference(np.nan_to_num(qpos), np.clip(np.nan_to_num(qvel), -bound, bound), np.zeros(self._size))
+        before = np.repeat(np.stack(measured)[:, None], self._hold, axis=1)
+        path = np.concatenate([before, self._paths.braking_path(measured)], axis=1)
+        return extended(path, self._path.shape[1])
 
-    def _new_target(self, reference: Reference) -> np.ndarray:
-        """The target of the pending actions, relative to the reference when they begin to act."""
-        target = action_target(self._mode, self._action, reference, self._actions, np)
-        assert self._pending is not None
-        stiffness = np.maximum(target.stiffness, self._config.min_stiffness)
-        self._pending.target = Target(np.array(target.value), stiffness)
-        return self._pending.target.value
+    def _candidates(self, action: np.ndarray, is_present: np.ndarray | None) -> np.ndarray:
+        """Whether there is an action [robots], which is then noted; counts those that are not used."""
+        is_active = self.cause == ""
+        is_present = np.ones(self._size[1], bool) if is_present is None else is_present
+        is_valid = np.all(np.abs(action) <= 1 + _ACTION_TOLERANCE, axis=0)  # False for NaN
+        is_new = is_present & is_valid
+        self._action = np.where(is_new, action, self._action)
+        self._has_action |= is_new
+        self._repeats = np.where(is_present, 0, self._repeats + 1)
+        is_missing = is_active & ~is_present & self._has_action
+        is_repeated = is_missing & (self._repeats <= self._config.repeats)
+        self.counts[INVALID] += is_active & is_present & ~is_valid
+        self.counts[REPEATED] += is_repeated
+        self.counts[LATE] += is_missing & ~is_repeated
+        return is_active & is_new | is_repeated
 
-    def _is_safe(self, clearance: np.ndarray) -> np.ndarray:
-        """Whether the clearance along each path is above the margin, or not less than where the path begins."""
+    def _is_safe(self, qpos: np.ndarray) -> np.ndarray:
+        """Whether the clearance along paths [samples, joints, robots] is above the margin, or no less than at first.
+
+        A path from within the margin may not come nearer, and none may come nearer than margin - creep.
+        """
+        samples, joints, robots = qpos.shape
+        clearance = self._clearance(qpos.transpose(0, 2, 1).reshape(-1, joints)).reshape(samples, robots)
         floor = self._config.margin - self._config.creep
         required = np.minimum(self._config.margin, np.maximum(clearance[0], floor))
-        return np.all(clearance[1:] >= required, axis=0)
-
-    def _accept(self, pending: "_Pending") -> None:
-        assert pending.target is not None
-        self._pending = None
-        is_safe = self._is_safe(self._path_clearance)
-        is_accepted = pending.is_candidate & is_safe & (self.cause == "")
-        self.counts[COLLISION] += pending.is_candidate & ~is_safe
-        self._value = np.where(is_accepted, pending.target.value, self._value)
-        self._stiffness = np.where(is_accepted, pending.target.stiffness, self._stiffness)
-        self._inner_loop.set_targets(self._value, self._stiffness)
-        self._left = np.where(is_accepted, self._hold, self._left).tolist()
-
-    def _stop(self, cause: np.ndarray) -> None:
-        """Makes arms brake: those with a cause that have not been stopped yet."""
-        is_stopped = (self.cause == "") & (cause != "")
-        if not np.count_nonzero(is_stopped):
-            return
-        self.cause[is_stopped] = cause[is_stopped]
-        self._left = np.where(is_stopped, 0, self._left).tolist()
-        self._stiffness = np.where(is_stopped, 1.0, self._stiffness)
-        self._inner_loop.set_targets(self._value, self._stiffness)
-        is_blocked = is_stopped & (cause == TRACKING)
-        if np.count_nonzero(is_blocked):  # brakes from the measured motion: the reference would push the arm on
-            reference, most = self.reference, self._joints.velocity
-            qpos, qvel = np.reshape(self._qpos, self._size), np.clip(np.reshape(self._qvel, self._size), -most, most)
-            measured = Reference(qpos, qvel, reference.qacc)
-            self._inner_loop.set_reference(
-                Reference(*(np.where(is_blocked, x, y) for x, y in zip(measured, reference, strict=True)))
-            )
-
-
-@dataclasses.dataclass
-class _Pending:
-    """The check of a target.
-
-    Attributes:
-      is_candidate: [robots] whether there is a target to check.
-      periods: since it began.
-      target: computed from the reference when it would begin to act.
-    """
-
-    is_candidate: np.ndarray
-    periods: int = 0
-    target: Target | None = None
+        return np.all(clearance[1:] >= required, axis=0)  # False for NaN

@@ -20,10 +20,9 @@ from mimic.commands.evaluate_robot import prepare_robot_evaluation, summary
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import load_bundle
 from mimic.deploy.fake_robot import FakeRobot
-from mimic.deploy.policy_process import LocalPolicy
+from mimic.deploy.policy import Policy
 from mimic.deploy.runner import run_controller
 from mimic.deploy.safety import INTERVENTIONS
-from mimic.deploy.sessions import Policy
 from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv, control_observation
 from mimic.evaluation.virtual_robot.episodes import Episodes
 from mimic.runs.checkpoints import load_checkpoint, save_checkpoint
@@ -74,8 +73,10 @@ def evaluate(run_dir, out, **settings):
     return json.loads((out / "report.json").read_text())
 
 
-def test_a_policy_of_the_hardware_world(hardware_run, tmp_path, capsys):
-    report = evaluate(hardware_run, tmp_path / "new")
+@pytest.mark.parametrize("loop", ["mimic", "ruckig"])
+def test_a_policy_of_the_hardware_world(hardware_run, tmp_path, capsys, loop):
+    report = evaluate(hardware_run, tmp_path / "new", robot_loop=loop)
+    assert report["robot_loop"] == loop
     row = report["cases"]["all ranges"]
     assert report["robot"] == "virtual_panda" and report["world"]["payload"] == [0.0, 3.0]
     assert row["episodes"] == row["completed"] == 4 and row["aborts"] == row["stops"] == {}
@@ -126,8 +127,8 @@ def test_a_controller_is_exported(hardware_run, tmp_path, capsys):
     prepare_export(ExportConfig(str(hardware_run), str(tmp_path / "controller"), "controller"))()
     bundle = load_bundle(tmp_path / "controller")
     assert bundle.mode == "joint_velocity" and bundle.ticks == HORIZON and bundle.joint_names[6] == "joint7"
-    robot = FakeRobot(bundle.start_poses[0], bundle.limits, bundle.parameters.inertia, 1.0)
-    assert run_controller(robot, bundle, policy=LocalPolicy(bundle, 0)).is_complete
+    robot = FakeRobot(bundle.start_poses[0], bundle.limits)
+    assert run_controller(robot, bundle, clock=robot).is_complete
     assert "results: " in capsys.readouterr().out
 
 
@@ -161,7 +162,6 @@ def test_an_exported_policy_is_the_policy(hardware_run, tmp_path):
         expected = np.asarray(controller(SimpleNamespace(obs=observation)))
         qpos, qvel, *reference = measured
         observed = tick, qpos, qvel, Reference(reference[0], reference[1], reference[1])
-        policy.evaluate(tick)  # a rehearsal
         action = policy.act(*observed)
         assert np.ptp(expected) > 0.1
         np.testing.assert_allclose(action, expected, atol=1e-5)  # float32, sums in another order
@@ -177,7 +177,7 @@ def test_a_run_without_an_inner_loop_has_no_controller(reason, paper_run):
     ("settings", "message"),
     [
         ({"control": "torque"}, "got torque"),
-        ({"control_dt": 0.02}, "got 0.02 s"),  # as long as the check of a target
+        ({"control_dt": 0.02}, "got 0.02 s"),  # as long as the latency
         ({"control_dt": 0.025}, "got 0.025 s"),
     ],
 )
@@ -243,7 +243,9 @@ def test_what_does_not_fit_is_rejected(reason, hardware_run, tmp_path):
     run = f"run={hardware_run}"
     cases = [
         (["robot=panda"], "robot: expected one of virtual_panda, virtual_robot, got 'panda'"),
-        (["edges=true"], "robot_world, edges: expected only with robot="),
+        (["edges=true"], "robot_world, robot_loop, edges: expected only with robot="),
+        (["robot_loop=ruckig"], "robot_world, robot_loop, edges: expected only with robot="),
+        (["robot=virtual_panda", "robot_loop=mars"], "robot_loop: expected one of mimic, ruckig"),
         (["robot=virtual_panda", "robot_world=mars"], "robot_world: expected one of paper, nominal, hardware"),
         (["robot=virtual_panda", "controller=pd"], "controller: expected policy or tracking with robot=, got pd"),
         (["robot=virtual_panda", "mass=1.2"], "expected none with robot="),

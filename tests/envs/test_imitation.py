@@ -155,10 +155,16 @@ def test_hardware_limits_are_penalised_near_and_beyond_them():
     for env, weight in ((free, 0.0), (limited, 2.0)):
         state = env.reset(jax.random.PRNGKey(0))
         arm = state.pipeline_state.replace(qvel=still.at[1].set(1.2 * limit[1]))
-        after = jax.jit(env.step)(state.replace(pipeline_state=arm), still)
+        step = jax.jit(env.step)
+        after = step(state.replace(pipeline_state=arm), still)
         costs = after.metrics["distance"] + weight * after.metrics["limit_excess"]
-        assert after.metrics["limit_excess"] > 0
+        assert after.metrics["limit_excess"] > 0 and after.metrics["runaway"] == 0
         assert after.reward == pytest.approx(-float(costs), rel=1e-6)
+        fast = state.pipeline_state.replace(qvel=still + 100.0)
+        runaway = step(state.replace(pipeline_state=fast), still)  # all joints are charged, in all remaining steps
+        assert runaway.metrics["runaway"] == runaway.metrics["limit_excess"] == 1
+        worst = env.config.horizon * (float(runaway.metrics["distance"]) + weight)
+        assert runaway.reward == pytest.approx(-worst, rel=1e-5)
 
 
 def test_training_and_held_out_demonstrations_differ():

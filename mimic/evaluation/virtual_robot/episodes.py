@@ -10,9 +10,11 @@ from mimic.control.joint_control import PERIOD, Reference, action_towards
 from mimic.deploy.bundle import Bundle
 from mimic.deploy.clearance import Clearance
 from mimic.deploy.config import SafetyConfig
+from mimic.deploy.policy import Policy, open_session
+from mimic.deploy.runner import TickPolicy
 from mimic.deploy.safety import INTERVENTIONS, SafetyLayer
-from mimic.deploy.sessions import Policy, open_session
 from mimic.evaluation.virtual_robot.draws import World
+from mimic.evaluation.virtual_robot.loops import ControlLoop
 from mimic.evaluation.virtual_robot.robots import VirtualRobots
 
 ABORTED = "aborted"  # the cause for which the safety layer no longer controls a robot
@@ -69,10 +71,6 @@ class Controller(Protocol):
         """The torques of a period, from a measurement."""
         ...
 
-    def work(self) -> None:
-        """Is called at the end of each period."""
-        ...
-
     def drop(self, is_aborted: np.ndarray) -> None:
         """Is told which robots have aborted."""
         ...
@@ -91,7 +89,6 @@ def run_episodes(robots: VirtualRobots, controller: Controller, motion: np.ndarr
             if period == 0:
                 controller.tick(tick, *measured)
             robots.step(controller.torque(*measured))
-            controller.work()
             controller.drop(~robots.is_active)
         rows.append((robots.qpos.copy(), robots.qvel * robots.is_active[:, None], robots.torque.copy()))
     qpos, qvel, torque = (np.stack(x, axis=1) for x in zip(*rows, strict=True))
@@ -120,14 +117,6 @@ class Channel:
         ticks = len(self._actions) - 1 - self._action_delay
         is_lost = self._rng.uniform(size=len(ticks)) < self._loss
         return np.stack(self._actions)[np.maximum(ticks, 0), self._robots], (ticks >= 0) & ~is_lost
-
-
-class TickPolicy(Protocol):
-    """Gives the targets of an inner loop; all arrays are [robots, ...]."""
-
-    def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
-        """The actions of a tick, see `mimic.deploy.sessions.Policy`."""
-        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,13 +148,14 @@ class Tracker:
 
 
 class SafeController:
-    """A policy with the inner loop and the safety layer of a bundle, as `mimic.deploy` runs them on a robot.
+    """A policy with the safety layer of a bundle, as `mimic.deploy` runs them, and the control loops of the robots.
 
     Args:
       bundle: see `load_bundle`.
       motion: [robots] index of the motion.
       world: its delays and losses.
       robots: to be controlled.
+      loop: of the robots, see `ControlLoop`.
       config: thresholds.
       seed: of the losses.
       policy: default None: that of the bundle.
@@ -177,38 +167,38 @@ class SafeController:
         motion: np.ndarray,
         world: World,
         robots: VirtualRobots,
+        loop: str = "mimic",
         config: SafetyConfig | None = None,
         seed: int = 0,
         policy: TickPolicy | None = None,
     ):
+        config = config or SafetyConfig()
         self._policy = policy or Policy(bundle, motion.tolist())
         self._layer = SafetyLayer(bundle, Clearance(bundle), len(motion), config)
         self._channel = Channel(world, bundle.action_size, seed)
-        self._sent: tuple[np.ndarray, np.ndarray] | None = None  # actions of this period, then of the last one
-        self._arrived: tuple[np.ndarray, np.ndarray] | None = None
         self.ticks, self.periods = bundle.ticks, bundle.periods
+        self._latency, self._left, self._command = round(config.latency / PERIOD), -1, None
         qpos, qvel = robots.measure()
         self._layer.start(qpos.T, qvel.T, bundle.start_poses[motion].T)
+        self._loop = ControlLoop(loop, bundle.parameters, bundle.limits, qpos)
 
     def tick(self, tick: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
         """See `Controller`."""
         reference = self._layer.reference
         values = np.concatenate([qpos, qvel, reference.qpos.T, reference.qvel.T], axis=1)
         seen = np.split(self._channel.observed(values), 4, axis=1)
-        action = self._policy.act(tick, seen[0], seen[1], Reference(seen[2], seen[3], seen[3]))
-        self._sent = self._channel.arrived(action)
+        action, is_present = self._channel.arrived(
+            self._policy.act(tick, seen[0], seen[1], Reference(seen[2], seen[3], seen[3]))
+        )
+        self._command = self._layer.tick(qpos.T, qvel.T, action.T, is_present)
+        self._left = self._latency
 
     def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-        """See `Controller`."""
-        return self._layer.period(qpos.T, qvel.T).T
-
-    def work(self) -> None:
-        """See `Controller`; the actions of a tick arrive in its second period, as from the policy's process."""
-        if self._arrived is not None:
-            action, is_present = self._arrived
-            self._layer.tick(action.T, is_present)
-        self._layer.work()
-        self._arrived, self._sent = self._sent, None
+        """See `Controller`; the command of a tick acts after the latency."""
+        if self._left == 0 and self._command is not None:
+            self._loop.command(self._command)
+        self._left -= 1
+        return self._loop.torque(qpos, qvel)
 
     def drop(self, is_aborted: np.ndarray) -> None:
         """See `Controller`."""
@@ -266,9 +256,6 @@ class TorqueController:
     def torque(self, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
         """See `Controller`."""
         return self._torque
-
-    def work(self) -> None:
-        """Does nothing."""
 
     def drop(self, is_aborted: np.ndarray) -> None:
         """Does nothing."""

@@ -40,6 +40,7 @@ class Task:
       motion: [episodes] index of the motion.
       start_poses: [episodes, joints] [rad].
       seed: of noise and losses.
+      loop: of the robots, see `ControlLoop`.
     """
 
     robot: RobotModel
@@ -48,6 +49,7 @@ class Task:
     motion: np.ndarray
     start_poses: np.ndarray
     seed: int
+    loop: str = "mimic"
 
 
 def run_task(task: Task) -> Episodes:
@@ -61,10 +63,10 @@ def run_task(task: Task) -> Episodes:
         tracker = Tracker(task.policy, bundle, task.motion)
         # It knows the reference of the inner loop itself, without the delay of a measurement.
         world = dataclasses.replace(task.world, observation_delay=np.zeros_like(task.world.observation_delay))
-        controller = SafeController(bundle, task.motion, world, robots, seed=task.seed, policy=tracker)
+        controller = SafeController(bundle, task.motion, world, robots, task.loop, seed=task.seed, policy=tracker)
     else:
         bundle = load_bundle(task.policy)
-        controller = SafeController(bundle, task.motion, task.world, robots, seed=task.seed)
+        controller = SafeController(bundle, task.motion, task.world, robots, task.loop, seed=task.seed)
     return run_episodes(robots, controller, task.motion)
 
 

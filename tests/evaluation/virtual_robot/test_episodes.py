@@ -9,12 +9,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mimic.deploy.policy_process import LocalPolicy
+from mimic.control.joint_control import Reference
+from mimic.deploy.clearance import Clearance
+from mimic.deploy.driver import Command
 from mimic.deploy.runner import run_controller
-from mimic.deploy.safety import COLLISION, LATE, REPEATED
+from mimic.deploy.safety import COLLISION, LATE, REPEATED, SafetyLayer
 from mimic.evaluation.virtual_robot import runs
 from mimic.evaluation.virtual_robot.driver import VirtualRobot
 from mimic.evaluation.virtual_robot.episodes import ABORTED, Channel, SafeController, run_episodes
+from mimic.evaluation.virtual_robot.loops import LOOPS
 from mimic.evaluation.virtual_robot.robots import TORQUE_RATE, VirtualRobots
 from mimic.evaluation.virtual_robot.runs import Task, groups, run_task, run_tasks
 from mimic.physics.world import WorldConfig
@@ -28,28 +31,28 @@ LONGEST = 20  # ticks for which a random action is held
 class Adversary(SafeController):
     """Random actions in [-1, 1], half of them at the ends, each for 1 to 20 ticks, through the safety layer."""
 
-    def __init__(self, bundle, motion, drawn, robots, seed):
-        super().__init__(bundle, motion, drawn, robots, seed=seed)
+    def __init__(self, bundle, motion, drawn, robots, loop, seed):
+        super().__init__(bundle, motion, drawn, robots, loop, seed=seed, policy=self)
         self._random, self._size = np.random.default_rng(seed), bundle.action_size
         self._action = np.zeros((len(motion), self._size))
         self._held = np.zeros(len(motion), int)
 
-    def tick(self, tick, qpos, qvel):
+    def act(self, tick, qpos, qvel, reference):
         rng, robots = self._random, len(self._held)
         action = rng.uniform(-1, 1, self._action.shape)
         action = np.where(rng.uniform(size=(robots, 1)) < 0.5, np.sign(action), action)
         is_new, self._held = self._held <= 1, self._held - 1
         self._action = np.where(is_new[:, None], action, self._action)
         self._held = np.where(is_new, rng.integers(1, LONGEST + 1, robots), self._held)
-        self._arrived = self._channel.arrived(self._action)
+        return self._action
 
 
-def adversarial_episodes(folder, mode, episodes, seed, ticks=TICKS):
+def adversarial_episodes(folder, mode, episodes, seed, loop="mimic", ticks=TICKS):
     zero = [0.0] * (14 if mode == "joint_impedance" else 7)
     bundle = bundles.make_bundle(folder, bundles.constant(*zero), mode=mode, ticks=ticks)
     drawn, motion = world(hardware(), episodes, seed), np.zeros(episodes, int)
     robots = VirtualRobots(model(), drawn, bundle.start_poses[motion], seed)
-    return run_episodes(robots, Adversary(bundle, motion, drawn, robots, seed), motion)
+    return run_episodes(robots, Adversary(bundle, motion, drawn, robots, loop, seed), motion)
 
 
 def check_safe(episodes):
@@ -61,15 +64,16 @@ def check_safe(episodes):
     assert moved.mean() > 2  # rad: the arms moved
 
 
-@pytest.mark.parametrize("mode", ["joint_velocity", pytest.param("joint_position", marks=pytest.mark.slow)])
-def test_random_actions_are_safe(tmp_path, mode):
-    check_safe(adversarial_episodes(tmp_path / "bundle", mode, 8, seed=5))
+@pytest.mark.parametrize("loop", LOOPS)
+def test_random_actions_are_safe(tmp_path, loop):
+    check_safe(adversarial_episodes(tmp_path / "bundle", "joint_velocity", 4, seed=5, loop=loop))
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("loop", LOOPS)
 @pytest.mark.parametrize("mode", ["joint_velocity", "joint_position", "joint_impedance"])
-def test_many_random_actions_are_safe(tmp_path, mode):
-    check_safe(adversarial_episodes(tmp_path / "bundle", mode, 100, seed=11))
+def test_many_random_actions_are_safe(tmp_path, mode, loop):
+    check_safe(adversarial_episodes(tmp_path / "bundle", mode, 50, seed=11, loop=loop))
 
 
 @pytest.fixture(scope="module")
@@ -82,27 +86,41 @@ def task(bundle, config, episodes, seed=0):
     return Task(model(), bundle.folder, world(config, episodes, seed), motion, bundle.start_poses[motion], seed)
 
 
-def test_lockstep_is_a_robot_alone(bundle):
+@pytest.mark.parametrize("loop", LOOPS)
+def test_lockstep_is_a_robot_alone(bundle, loop):
     """The runtime of a real robot, on a virtual one, gives the same motion."""
-    episodes = run_task(task(bundle, WorldConfig(), 3))
+    episodes = run_task(dataclasses.replace(task(bundle, WorldConfig(), 3), loop=loop))
     qpos = []
 
     class Watching(VirtualRobot):
-        def write(self, torque):
-            super().write(torque)
+        def read(self):
             qpos.append(self.robots.qpos[0].copy())
+            return super().read()
 
-    driver = Watching(model(), world(), bundle.start_pose)
-    assert run_controller(driver, bundle, policy=LocalPolicy(bundle, 0)).is_complete
-    np.testing.assert_allclose(episodes.qpos[0], qpos[49:1000:50], atol=1e-6)  # a batch of the network rounds otherwise
-    np.testing.assert_allclose(episodes.qpos[0], episodes.qpos[2], atol=1e-6)
+    driver = Watching(model(), world(), bundle, bundle.start_pose, loop)
+    assert run_controller(driver, bundle, clock=driver).is_complete
+    assert np.ptp(episodes.qpos[0], axis=0).min() > 0.05
+    tolerance = 1e-6 if loop == "mimic" else 3e-3  # a batch of the network rounds otherwise; Ruckig's profiles branch
+    np.testing.assert_allclose(episodes.qpos[0], qpos[2:22], atol=tolerance)
+    np.testing.assert_allclose(episodes.qpos[0], episodes.qpos[2], atol=tolerance)
 
 
-def test_a_virtual_robot_in_real_time(bundle):
-    """Periods that are missed on a busy machine cost at most an abort for the communication."""
-    driver = VirtualRobot(model(), world(hardware()), bundle.start_pose, is_paced=True)
-    report = run_controller(driver, bundle)
-    assert report.cause in ("", "communication") and (report.aborted or driver.robots.periods > 1000)
+@pytest.mark.parametrize("loop", LOOPS)
+def test_a_robot_without_another_command_stops_where_its_path_was_checked(bundle, loop):
+    """As where the program ends in the middle of a motion."""
+    driver = VirtualRobot(model(), world(), bundle, bundle.start_pose, loop)
+    layer, pose = SafetyLayer(bundle, Clearance(bundle)), bundle.start_pose[:, None]
+    layer.start(pose, 0 * pose, pose)
+    for tick in range(8):
+        command = layer.tick(layer.reference.qpos, layer.reference.qvel, np.full((7, 1), 0.5))
+        driver.write(
+            Command(Reference(*(x[..., 0] for x in command.path)), command.stop[:, 0], command.stiffness[:, 0])
+        )
+        driver.wait_until(0.05 * (tick + 1))
+    assert np.abs(driver.read().qvel).max() > 0.5
+    driver.wait_until(2.0)
+    np.testing.assert_allclose(driver.read().qpos, command.stop[:, 0], atol=0.02)
+    assert np.abs(driver.read().qvel).max() < 0.01
 
 
 def test_processes_give_the_same_episodes(bundle):

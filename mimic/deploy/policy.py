@@ -59,64 +59,24 @@ class Policy:
     Args:
       bundle: see `load_bundle`.
       motions: indices of the motions.
-
-    Attributes:
-      observed: [4, robots, joints] what `evaluate` reads: measured angles and velocities, then those of the references
-        [rad, rad/s].
     """
 
     def __init__(self, bundle: Bundle, motions: Sequence[int]):
-        joints, size, robots = bundle.num_joints, bundle.action_size, len(motions)
+        joints, size = bundle.num_joints, bundle.action_size
         self._features, self._row = _expert_features(bundle, motions)
-        self.observed = np.zeros((4, robots, joints), np.float32)
-        self._inputs = {
-            "past_actions": np.zeros((robots, bundle.past_actions * size), np.float32),
-            "features": np.zeros((robots, bundle.features), np.float32),
-            **dict(zip(_OBSERVED, self.observed, strict=True)),
-        }
-        self._action = np.zeros((robots, size), np.float32)
-        sizes = {name: array.shape[-1] for name, array in self._inputs.items()}
+        self._past = np.zeros((len(motions), bundle.past_actions * size), np.float32)
+        sizes = dict.fromkeys(_OBSERVED, joints) | {"past_actions": self._past.shape[1], "features": bundle.features}
         self._session = open_session(bundle.folder / POLICY, sizes, {"action": size})
-        self._binding = _bind(self._session, self._inputs, {"action": self._action})
-        self._last, self._size = bundle.ticks, size
-        self._tick: int | None = None  # of the features
 
     def act(self, tick: int, qpos: np.ndarray, qvel: np.ndarray, reference: Reference) -> np.ndarray:
         """The actions [robots, numbers] at a tick, of measured and reference motions [robots, joints]."""
-        for observed, values in zip(self.observed, (qpos, qvel, reference.qpos, reference.qvel), strict=True):
-            observed[:] = values
-        action = self.evaluate(tick).astype(float)
-        self.remember()
-        return action
-
-    def evaluate(self, tick: int) -> np.ndarray:
-        """The actions [robots, numbers] at a tick, of what is observed; the next call overwrites them."""
-        if tick != self._tick:
-            features = self._features[min(tick, self._last)]
-            np.take(features, self._row, axis=0, out=self._inputs["features"], mode="clip")
-            self._tick = tick
-        self._session.run_with_iobinding(self._binding)
-        return self._action
-
-    def remember(self) -> None:
-        """Makes the last actions the newest of the past ones that the policy observes."""
-        past, size = self._inputs["past_actions"], self._size
-        if past.size:
-            past[:, size:] = past[:, :-size]
-            past[:, :size] = self._action
-
-
-def _bind(
-    session: "onnxruntime.InferenceSession", inputs: dict[str, np.ndarray], outputs: dict[str, np.ndarray]
-) -> "onnxruntime.IOBinding":
-    """Lets a session read and write these arrays, which costs less in each run than arguments and results."""
-    from onnxruntime import OrtValue
-
-    binding = session.io_binding()
-    for bind, arrays in ((binding.bind_ortvalue_input, inputs), (binding.bind_ortvalue_output, outputs)):
-        for name, array in arrays.items():
-            bind(name, OrtValue.ortvalue_from_numpy(array))
-    return binding
+        features = self._features[min(tick, len(self._features) - 1)][self._row]
+        observed = dict(zip(_OBSERVED, (qpos, qvel, reference.qpos, reference.qvel), strict=True))
+        feed = observed | {"past_actions": self._past, "features": features}
+        (action,) = self._session.run(["action"], {name: np.asarray(x, np.float32) for name, x in feed.items()})
+        action = np.asarray(action)
+        self._past = np.concatenate([action, self._past], axis=1)[:, : self._past.shape[1]]
+        return action.astype(float)
 
 
 def _expert_features(bundle: Bundle, motions: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
