@@ -9,6 +9,7 @@ import functools
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -242,6 +243,8 @@ def use_compilation_cache(folder: str) -> None:
             return
         jax.config.update("jax_compilation_cache_dir", str(Path(folder).expanduser()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        # On a full disk: an entry that is not written, or truncated, is compiled anew.
+        warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
 
 
 def compilation_cache() -> Path | None:

@@ -1,10 +1,14 @@
 """The metrics log of a training: CSV and TensorBoard events."""
 
+import contextlib
 import csv
 import io
 import os
+import socket
+import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from mimic.base.files import read_text, write_atomically
 from mimic.runs.files import METRICS
@@ -20,11 +24,18 @@ class MetricsLog:
     """
 
     def __init__(self, run_dir: Path, first_step: int | None = None):
-        from tensorboardX import SummaryWriter  # here: half a second, and most commands train nothing
+        import tensorboardX  # here: half a second, and most commands train nothing
 
         self._path = run_dir / METRICS
-        purge = {} if first_step is None else {"purge_step": first_step}
-        self._writer = SummaryWriter(str(run_dir / "tensorboard"), **purge)
+        self._tensorboard = tensorboardX
+        name = f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}"
+        (run_dir / "tensorboard").mkdir(exist_ok=True)
+        # Not by its SummaryWriter, whose thread prints the error of a full disk and goes on without writing.
+        self._records = self._tensorboard.record_writer.RecordWriter(str(run_dir / "tensorboard" / name))
+        self._write_event(file_version="brain.Event:2")
+        if first_step is not None:
+            log = self._tensorboard.proto.event_pb2.SessionLog
+            self._write_event(step=first_step, session_log=log(status=log.START))
         self._columns, rows = _read(self._path)
         if first_step is not None and self._columns:
             self._rewrite([row for row in rows if row["step"].isdigit() and int(row["step"]) < first_step])
@@ -49,7 +60,12 @@ class MetricsLog:
             os.truncate(self._path, size)
             raise
         for name, value in metrics.items():
-            self._writer.add_scalar(name, value, step)
+            self._write_event(step=step, summary=self._tensorboard.summary.scalar(name, value))
+        self._records.flush()
+
+    def _write_event(self, **content: Any) -> None:
+        event = self._tensorboard.proto.event_pb2.Event(wall_time=time.time(), **content)
+        self._records.write(event.SerializeToString())
 
     def _rewrite(self, rows: list[dict[str, str]]) -> None:
         text = io.StringIO(newline="")
@@ -59,8 +75,9 @@ class MetricsLog:
         write_atomically(self._path, text.getvalue())
 
     def close(self) -> None:
-        """Writes buffered events."""
-        self._writer.close()
+        """Closes the file of events; what could not be written is dropped."""
+        with contextlib.suppress(OSError):
+            self._records.close()
 
 
 def _read(path: Path) -> tuple[list[str], list[dict[str, str]]]:

@@ -11,7 +11,7 @@ import jax
 from mimic.base import distribution
 from mimic.base.files import read_text
 
-_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
+_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")
 
 
 def versions() -> dict[str, str]:

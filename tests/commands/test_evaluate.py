@@ -179,10 +179,8 @@ def test_a_damaged_checkpoint(reason, run_dir, tmp_path):
     damaged = tmp_path / "damaged"
     shutil.copytree(run_dir, damaged)
     (checkpoint,) = (damaged / "checkpoints").glob("0*")
-    (checkpoint / "_METADATA").write_text("not JSON")
-    assert "is damaged: _METADATA is missing or was changed" in reason(
-        "evaluate", f"run={damaged}", "compilation_cache="
-    )
+    (checkpoint / "params.npz").write_text("not JSON")
+    assert "is damaged: params.npz was changed" in reason("evaluate", f"run={damaged}", "compilation_cache=")
 
 
 def test_a_mapper_has_no_controllers(rejected, tmp_path):

@@ -66,7 +66,7 @@ def test_a_pipe_in_a_run_directory(tmp_path, name):
         assert left_out[0].reason == "report.json cannot be read: expected a regular file, got a named pipe"
 
 
-@pytest.mark.parametrize("name", ["kernel/.zarray", "kernel/0.0", "_METADATA", "checkpoint.json", "training.npz"])
+@pytest.mark.parametrize("name", ["params.npz", "checkpoint.json", "training.npz"])
 def test_a_pipe_in_a_checkpoint(tmp_path, name, capsys):
     params = {"kernel": np.zeros((2, 3), np.float32)}
     for step in (0, 10):

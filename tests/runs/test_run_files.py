@@ -2,8 +2,12 @@
 
 import csv
 import json
+import resource
+import signal
+import struct
 
 import pytest
+import tensorboardX
 
 from mimic.runs.files import REPORT, write_report
 from mimic.runs.metrics_log import MetricsLog
@@ -74,6 +78,40 @@ def test_a_row_that_cannot_be_written_leaves_the_file_as_it_was(tmp_path, monkey
         log.write(20, {"loss": 0.25})
     log.close()
     assert (tmp_path / "metrics.csv").read_bytes() == before
+
+
+def test_a_full_disk_is_an_error_of_the_write(tmp_path):
+    """Not one that a thread prints; by the maximum size of a file of this process."""
+    log = MetricsLog(tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300, before[1]))
+        with pytest.raises(OSError, match="File too large"):
+            for step in range(20):
+                log.write(step, {"loss": 0.5})
+        log.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert [row["step"] for row in rows_of(tmp_path)][:2] == ["0", "1"]
+
+
+def test_events_are_those_of_the_metrics(tmp_path):
+    """In TensorBoard's format: for each record its length, a checksum, an event, and a checksum."""
+    log = MetricsLog(tmp_path, first_step=2)
+    log.write(2, {"quality/gap": 0.5})
+    log.close()
+    (file,) = (tmp_path / "tensorboard").iterdir()
+    content, events, event_class = file.read_bytes(), [], tensorboardX.proto.event_pb2.Event
+    while content:
+        (size,) = struct.unpack("<Q", content[:8])
+        events.append(event_class.FromString(content[12 : 12 + size]))
+        content = content[16 + size :]
+    version, start, scalar = events
+    assert version.file_version == "brain.Event:2"
+    assert (start.step, start.session_log.status) == (2, 1)  # hides what another file has from this step on
+    assert (scalar.step, scalar.summary.value[0].tag, scalar.summary.value[0].simple_value) == (2, "quality/gap", 0.5)
 
 
 def test_a_damaged_file_loses_its_damaged_rows_alone(tmp_path):

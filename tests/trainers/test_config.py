@@ -1,5 +1,7 @@
 """Resolved configs of trainers."""
 
+import math
+
 import pytest
 
 import mimic
@@ -34,3 +36,33 @@ def test_the_network_of_joints_needs_a_drawn_learner():
     config = TrainConfig(mimic.env_config("planar4dof"), PPOConfig(network="joints"))
     with pytest.raises(ValueError, match="trainer.network: expected mlp for one learner, got joints"):
         make_trainer(config, None)
+
+
+BAD = {
+    "num_envs": (lambda: PPOConfig(num_envs=500).resolve("cpu"), "must be a multiple of num_envs = 500"),
+    "learning_rate": (
+        lambda: PPOConfig(learning_rate=math.inf),
+        "trainer.learning_rate: expected a number above 0 and at most 1, got inf",
+    ),
+    "rotation": (
+        lambda: mimic.env_config("panda4dof", metric={"rotation": math.inf}),
+        r"rotation: expected a number from 0 to 1e\+06, got inf",
+    ),
+    "link_lengths": (
+        lambda: mimic.env_config("planar4dof", learner={"link_lengths": [0.5, 0.0]}),
+        r"each from 0.001 to 100, got \[0.5, 0.0\]",
+    ),
+    "batch_size": (
+        lambda: PoseMapperConfig(batch_size=1000).resolve("cpu"),
+        "expected a divisor of samples = 65536, got 1000",
+    ),
+    "heads": (lambda: PoseMapperConfig(heads=0), "trainer.heads: expected a whole number from 1 to 1,000, got 0"),
+    "inputs": (lambda: PoseMapperConfig(inputs="pixels").resolve("cpu"), "expected one of angles, link_states"),
+}
+
+
+@pytest.mark.parametrize(("make", "message"), BAD.values(), ids=BAD)
+def test_bad_values_are_one_line(make, message):
+    with pytest.raises(ValueError, match=message) as error:
+        make()
+    assert "\n" not in str(error.value)

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -204,17 +205,17 @@ def test_a_damaged_last_checkpoint_is_trained_again(finished, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_old_run_is_resumed_from_its_parameters(finished, tmp_path):
-    """Its checkpoints have neither state nor metrics. No row of metrics.csv is lost; a line says what starts anew."""
+def test_a_run_without_a_state_is_resumed_from_its_parameters(finished, tmp_path):
+    """No row of metrics.csv is lost; a line says what starts anew."""
     run_dir = shutil.copytree(finished[0], tmp_path / "run")
     for step in checkpoint_steps(run_dir):
-        for name in ("training.npz", "checkpoint.json"):
-            (run_dir / "checkpoints" / f"{step:012d}" / name).unlink(missing_ok=True)
+        (run_dir / "checkpoints" / f"{step:012d}" / "training.npz").unlink(missing_ok=True)
     before = rows_of(run_dir)
     result = command("train", f"resume={run_dir}", "trainer.num_timesteps=8000")
     assert result.returncode == 0, result.stderr[-2000:]
     assert "optimizer and environments start anew" in result.stderr
-    assert rows_of(run_dir)[: len(before)] == before and len(rows_of(run_dir)) > len(before)
+    assert rows_of(run_dir)[: len(before) - 1] == before[:-1]  # the last one is evaluated again
+    assert len(rows_of(run_dir)) > len(before)
 
 
 @pytest.mark.slow
@@ -237,6 +238,25 @@ def test_a_folder_that_another_process_has_taken_is_not_written(finished, tmp_pa
     before = (tmp_path / "run" / "report.json").read_bytes()
     assert work() == 2
     assert (tmp_path / "run" / "report.json").read_bytes() == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [2000, 30_000])  # bytes of a file: the events, and a checkpoint
+def test_a_full_disk_is_one_line(finished, tmp_path, limit):
+    run_dir = shutil.copytree(finished[0], tmp_path / "run")
+    (run_dir / "report.json").unlink()
+    before = checkpoint_steps(run_dir)
+    result = command(
+        "train",
+        f"resume={run_dir}",
+        "trainer.num_timesteps=20000",
+        env={**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"},  # it would keep truncated entries
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
+    assert result.returncode == 1 and result.stderr.count("\n") == 1, result.stderr[-3000:]
+    line = result.stderr.rstrip()
+    assert "File too large" in line and line.endswith(f"train resume={run_dir}")
+    assert checkpoint_steps(run_dir) == before and not list(run_dir.glob("checkpoints/*.partial"))
 
 
 @pytest.mark.slow

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from mimic.base.files import read_json
-from mimic.base.npz import read_arrays
 from mimic.runs.files import REPORT, write_report
+from mimic.runs.parameters import named_leaves, read_parameters
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, save_config
 
@@ -61,27 +60,14 @@ def read_params(folder: Path, template: Any) -> Any:
     Raises:
       ValueError: the file is missing, cannot be read, or has parameters of another network.
     """
-    path, leaves = folder / PARAMETERS, _named(template)
+    path = folder / PARAMETERS
     try:
-        arrays = read_arrays(path, list(leaves), _MAX_BYTES)
-        for name, leaf in leaves.items():
-            if name not in arrays:
-                raise ValueError(f"expected the array {name!r}, got none")
-            if arrays[name].shape != leaf.shape:
-                raise ValueError(f"{name}: expected shape {leaf.shape}, got {arrays[name].shape}")
+        return read_parameters(path, template, max_bytes=_MAX_BYTES, cast=True)
     except ValueError as error:
         raise ValueError(f"{str(path)!r} cannot be read: {error}") from error
-    values = [arrays[name].astype(leaf.dtype) for name, leaf in leaves.items()]
-    return jax.tree.unflatten(jax.tree.structure(template), values)
 
 
 def _stored(params: Any, half: bool) -> dict[str, np.ndarray]:
     """The arrays by name. Vectors keep their type: they are small, and some counts do not fit float16."""
-    arrays = {name: np.asarray(leaf) for name, leaf in _named(params).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()}
     return {name: array.astype(np.float16) if half and array.ndim > 1 else array for name, array in arrays.items()}
-
-
-def _named(tree: Any) -> dict[str, Any]:
-    """The leaves of a pytree by their path, as in "params/Dense_0/kernel"."""
-    paths, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in paths}

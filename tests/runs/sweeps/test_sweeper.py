@@ -67,7 +67,7 @@ def slurm(tmp_path):
 @pytest.mark.slow_for("basic", "submitit_slurm")
 # Any command can be swept, and this one is quick: collecting a folder with a run, and one that is not there.
 @pytest.mark.parametrize(
-    "launcher", ["basic", pytest.param("submitit_local", marks=pytest.mark.slow), "submitit_slurm", "ray"]
+    "launcher", ["submitit_slurm", *(pytest.param(name, marks=pytest.mark.slow) for name in ("submitit_local", "ray"))]
 )
 def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
     if launcher == "ray":
@@ -290,10 +290,9 @@ SHORT = [*TINY, "trainer.num_timesteps=2000", "trainer.evaluations=1"]
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("launcher", [["basic"], ["submitit_local", "hydra.launcher.parallel=2"]], ids=lambda x: x[0])
-def test_a_sweep_of_2_x_3_runs_is_collected(launcher, tmp_path):
-    choice = [f"hydra/launcher={launcher[0]}", *launcher[1:], "hydra.sweep.dir=runs/mine"]
-    swept = ["env=planar4dof,planar7dof", "seed=0,1,2"]
+def test_a_sweep_is_collected(tmp_path):
+    choice = ["hydra/launcher=submitit_local", "hydra.launcher.parallel=2", "hydra.sweep.dir=runs/mine"]
+    swept = ["env=planar4dof,planar7dof", "seed=0,1"]
     result = command("train", "-m", *SHORT[1:], *swept, *choice, folder=tmp_path)
     assert result.returncode == 0, result.stderr[-2000:]
     assert "python -m mimic.collect runs/mine" in result.stdout
@@ -301,14 +300,14 @@ def test_a_sweep_of_2_x_3_runs_is_collected(launcher, tmp_path):
     assert result.returncode == 0, result.stderr[-2000:]
     collected = json.loads((tmp_path / "runs" / "mine" / "collected.json").read_text())
     assert [(group["label"], group["seeds"]) for group in collected["groups"]] == [
-        ("planar4dof", [0, 1, 2]),
-        ("planar7dof", [0, 1, 2]),
+        ("planar4dof", [0, 1]),
+        ("planar7dof", [0, 1]),
     ]
     assert collected["groups"][0]["runs"][1] == "1-planar4dof-ppo-seed1"
     imports = [group["numbers"]["wall_time_s.import"]["max"] for group in collected["groups"]]
     assert max(imports) < 60  # from the start of each run, not of the sweep
     gap = collected["groups"][1]["numbers"]["optimality_gap.held_out"]
-    assert gap["low"] < gap["min"] < gap["mean"] < gap["max"] < gap["high"]  # of three, t / sqrt(3) is 2.5
+    assert gap["low"] < gap["min"] < gap["mean"] < gap["max"] < gap["high"]
     for name in ("collected.csv", "collected.png"):
         assert (tmp_path / "runs" / "mine" / name).stat().st_size > 0
 

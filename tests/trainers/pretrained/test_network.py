@@ -176,10 +176,10 @@ def test_damaged_folders_are_reported_in_one_line(copy):
 def test_parameters_of_another_network_are_reported(copy):
     config = (copy / "config.yaml").read_text()
     (copy / "config.yaml").write_text(config.replace("- 128\n", "- 64\n", 1))
-    with pytest.raises(ValueError, match=r"params/Dense_0/bias: expected shape \(64,\), got \(128,\)"):
+    with pytest.raises(ValueError, match=r"params/Dense_0/bias: expected shape \(64,\), got shape \(128,\)"):
         read_network(copy, "pose_mapper")
     (copy / "config.yaml").write_text(config.replace("inputs: link_states", "inputs: angles"))
-    with pytest.raises(ValueError, match=r"params/Dense_0/kernel: expected shape \(7, 128\), got \(42, 128\)"):
+    with pytest.raises(ValueError, match=r"params/Dense_0/kernel: expected shape \(7, 128\), got shape \(42, 128\)"):
         read_network(copy, "pose_mapper")
 
 
