@@ -12,7 +12,7 @@ from mimic.arms.model_files import read_model
 from mimic.base import files
 from mimic.base.config_files import read_config
 from mimic.base.npz import read_arrays
-from mimic.deploy.sessions import open_session
+from mimic.deploy.policy import open_session
 from mimic.metric.correspondence_files import load_correspondence
 from mimic.motions.demonstrations import load_demonstrations
 from mimic.motions.formats.lerobot_reading import read_lerobot
@@ -162,7 +162,7 @@ ALLOWED = {  # by module and function, with the reason
     ("base/npz.py", "archive.open"): "an entry of an open file",
     ("base/npz.py", "zipfile.ZipFile"): "of an open file",
     ("commands/fit.py", "Image.open"): "of an open file",
-    ("deploy/sessions.py", "onnxruntime.InferenceSession"): "of bytes",
+    ("deploy/policy.py", "onnxruntime.InferenceSession"): "of bytes",
     ("envs/__init__.py", "OmegaConf.load"): "our own presets",
     ("motions/formats/lerobot_reading.py", "pq.ParquetFile"): "checked",
     ("motions/formats/lerobot_reading.py", "pq.read_metadata"): "checks",

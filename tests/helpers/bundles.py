@@ -15,6 +15,7 @@ from mimic.control.clearance import ClearanceConstants
 from mimic.control.joint_control import JointParameters, action_size
 from mimic.deploy.bundle import load_bundle, write_bundle
 from mimic.envs import env_config
+from mimic.physics.plant import make_plant
 from mimic.retargeting.clearance import clearance_constants
 from mimic.trainers.export.onnx_graph import to_onnx
 
@@ -40,18 +41,9 @@ def panda_clearance(locked: tuple[int, ...] = ()) -> ClearanceConstants:
 def parameters(locked: tuple[int, ...] = ()) -> JointParameters:
     """The parameters of the inner loop of a Panda in the hardware world."""
     config = env_config("panda7dof", world="hardware", learner={"locked": list(locked)})
-    return JointParameters(
-        *(
-            np.asarray(x, float)
-            for x in make_plant(
-                config.learner,
-                panda(locked),
-                config.world,
-                action_scale=config.action_scale,
-                control_dt=config.control_dt,
-            ).constants.parameters
-        )
-    )
+    scales = {"action_scale": config.action_scale, "control_dt": config.control_dt}
+    plant = make_plant(config.learner, panda(locked), config.world, **scales)
+    return JointParameters(*(np.asarray(x, float) for x in plant.constants.parameters))
 
 
 def policy(joints: int, size: int, action: Any) -> bytes:

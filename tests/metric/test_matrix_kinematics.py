@@ -7,7 +7,7 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.control.clearance import joint_frames, moved_points
-from mimic.deploy.sessions import open_session
+from mimic.deploy.policy import open_session
 from mimic.metric.kinematics import forward_kinematics, link_states
 from mimic.metric.matrix_kinematics import frame_constants, make_link_vector, point_columns
 from mimic.trainers.export.onnx_graph import to_onnx
