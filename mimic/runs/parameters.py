@@ -46,9 +46,11 @@ def read_parameters(path: Path, template: Any, *, max_bytes: int, cast: bool = F
     with open_file(path) as file, zipfile.ZipFile(file) as archive:
         stored = {name.removesuffix(".npy") for name in archive.namelist()}
     for name in [*leaves, *sorted(stored - leaves.keys())]:
-        expected, got = (_text(array, with_type=not cast) for array in (leaves.get(name), arrays.get(name)))
-        if expected != got or name not in leaves:
-            raise OtherParameters(f"{name}: expected {expected}, got {got if name in leaves else 'an array'}")
+        expected, got = _shape(leaves.get(name)), _shape(arrays.get(name)) if name in leaves else "an array"
+        if expected == got and not cast:
+            expected, got = f"type {leaves[name].dtype}", f"type {arrays[name].dtype}"
+        if expected != got:
+            raise OtherParameters(f"{name}: expected {expected}, got {got}")
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"{name}: expected finite numbers, got others")
@@ -56,7 +58,5 @@ def read_parameters(path: Path, template: Any, *, max_bytes: int, cast: bool = F
     return jax.tree.unflatten(jax.tree.structure(template), values)
 
 
-def _text(array: Any, *, with_type: bool) -> str:
-    if array is None:
-        return "no such array"
-    return f"shape {tuple(array.shape)}" + (f" of {array.dtype}" if with_type else "")
+def _shape(array: Any) -> str:
+    return "no such array" if array is None else f"shape {tuple(array.shape)}"
