@@ -167,7 +167,7 @@ def reason(monkeypatch, tmp_path, schemas):
     """
 
     def run(name, *arguments):
-        from omegaconf import OmegaConf
+        from omegaconf import DictConfig, OmegaConf
 
         from mimic.base.config import to_dict, typed
         from mimic.commands import cli
@@ -181,13 +181,8 @@ def reason(monkeypatch, tmp_path, schemas):
         monkeypatch.chdir(folder)
         with pytest.raises(ValueError) as error:
             schema = schemas(typing.get_type_hints(prepare)["config"])
-            prepare(
-                typed(
-                    OmegaConf.merge(
-                        schema, preset, OmegaConf.from_dotlist([f"{key}={value}" for key, value in settings.items()])
-                    )
-                )
-            )
+            given = OmegaConf.from_dotlist([f"{key}={value}" for key, value in settings.items()])
+            prepare(typed(DictConfig(OmegaConf.merge(schema, preset, given))))
         assert not list(folder.iterdir())
         return str(error.value)
 

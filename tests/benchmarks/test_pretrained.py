@@ -79,5 +79,9 @@ def test_a_mapper_to_any_arm_is_stored_without_the_files_of_its_report(tmp_path)
     row = pretrained.make_network(tmp_path / "run", tmp_path / "out", "c0ffee", True)
     mapper = read_any_arm_mapper(tmp_path / "out" / "panda_family-pose_mapper")
     assert row["gap"] == mapper.report["quality"] and set(mapper.report["arms"]) >= {"locked 2", "panda"}
-    assert mapper.env.arms.evaluated == [] and "evaluated" not in mapper.report["source"]["command"]
+    assert (
+        mapper.env.arms is not None
+        and mapper.env.arms.evaluated == []
+        and "evaluated" not in mapper.report["source"]["command"]
+    )
     assert mapper(np.zeros(7), "panda4dof").shape == (4,)

@@ -165,11 +165,16 @@ def test_a_motion_is_run(bundle):
     np.testing.assert_array_equal(positions[-1], motions[9].waypoints[1].target.position)  # it stops where it must
 
 
-def test_a_robot_without_commands_stops_where_the_path_was_checked(bundle):
+def test_a_robot_without_commands_stops_where_the_path_was_checked(bundle, monkeypatch):
     module = library(bundle.start_pose)
     driver = FrankyDriver("192.0.2.1", bundle, library=module)
     commands, write = [], driver.write
-    driver.write = lambda command: (commands.append(command), write(command))
+
+    def note(command):
+        commands.append(command)
+        write(command)
+
+    monkeypatch.setattr(driver, "write", note)
     run_controller(driver, bundle, clock=module.robot)
     for command, motion in zip(commands, module.robot.moves, strict=False):
         end, stop = motion.waypoints

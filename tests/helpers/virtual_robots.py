@@ -22,7 +22,9 @@ def model():
 
 @functools.cache
 def hardware() -> WorldConfig:
-    return env_config("panda7dof", world="hardware").world
+    config = env_config("panda7dof", world="hardware").world
+    assert config is not None
+    return config
 
 
 def world(config=IDEAL, robots=1, seed=0, edge=""):
