@@ -25,12 +25,12 @@ from benchmarks.common.processes import run_parallel
 from benchmarks.common.record import WIDTH, Row, write_results
 from benchmarks.figures import study_figures
 from mimic.arms.arm import ArmConfig, build_arm
+from mimic.base.overrides import setting
 from mimic.commands.collect.collect import prepare_collection
 from mimic.commands.collect.finished_runs import find_runs
 from mimic.commands.config import CollectConfig
 from mimic.motions.recording import KINDS, record_demonstrations
 from mimic.runs.files import REPORT
-from mimic.runs.sweeps.sweeper import path_override
 
 STUDY = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text())
 UNSEEN_SEED, UNSEEN = 1000, 32  # demonstrations that no run is trained on, the same for all
@@ -47,7 +47,7 @@ class Case(NamedTuple):
     def command(self, folder: Path) -> list[str]:
         """The sweep that trains them, each in folder/NAME/SEED."""
         seeds, sweep = ",".join(map(str, range(self.seeds))), folder / self.name
-        paths = path_override("run_dir", f"{sweep}/${{seed}}"), path_override("hydra.sweep.dir", str(sweep))
+        paths = setting("run_dir", f"{sweep}/${{seed}}"), setting("hydra.sweep.dir", str(sweep))
         return [sys.executable, "-m", "mimic.train", "-m", *self.arguments, f"seed={seeds}", *paths]
 
     def done(self, folder: Path) -> bool:
@@ -83,7 +83,7 @@ def evaluations(chosen: Sequence[Case], folder: Path, unseen: dict[str, str]) ->
             for kind, arguments in kinds.items():
                 for seed in range(seeds.get(name, 0) if kind == "unseen" else min(seeds.get(name, 0), 1)):
                     run, out = folder / name / str(seed), folder / f"{name}--{kind}" / str(seed)
-                    paths = path_override("run", str(run)), path_override("out", str(out))
+                    paths = setting("run", str(run)), setting("out", str(out))
                     overrides = [unseen.get(argument, argument) for argument in arguments.split()]
                     commands[out] = [sys.executable, "-m", "mimic.evaluate", *paths, *overrides]
     return commands
@@ -94,7 +94,7 @@ def unseen_demonstrations(folder: Path) -> dict[str, str]:
     overrides = {}
     for kind in KINDS:
         path = folder / f"unseen-{kind}.npz"
-        overrides[f"{{{kind}}}"] = path_override("demonstrations", str(path))
+        overrides[f"{{{kind}}}"] = setting("demonstrations", str(path))
         if not path.exists():
             record_demonstrations(build_arm(ArmConfig()), UNSEEN, kind=kind, seed=UNSEEN_SEED).save(path)
     return overrides

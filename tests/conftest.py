@@ -174,12 +174,12 @@ def reason(monkeypatch, tmp_path, schemas):
         from mimic.envs import env_config
 
         prepare = importlib.import_module(f"mimic.{name}").prepare
-        keys = [cli.expand_shorthand(str(argument), name) for argument in arguments]
-        settings = {key: value or "''" for key, _, value in (key.partition("=") for key in keys)}
-        preset = {"env": to_dict(env_config(settings.pop("env")))} if "env" in settings else {}
         (folder := tmp_path / "empty").mkdir()
         monkeypatch.chdir(folder)
         with pytest.raises(ValueError) as error:
+            keys = cli.expand_arguments(list(map(str, arguments)), name)
+            settings = {key: value or "''" for key, _, value in (key.partition("=") for key in keys)}
+            preset = {"env": to_dict(env_config(settings.pop("env")))} if "env" in settings else {}
             schema = schemas(typing.get_type_hints(prepare)["config"])
             given = OmegaConf.from_dotlist([f"{key}={value}" for key, value in settings.items()])
             prepare(typed(DictConfig(OmegaConf.merge(schema, preset, given))))

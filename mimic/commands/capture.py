@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from mimic.arms.arm import build_arm
+from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.embodiment import Embodiment
-from mimic.commands.config import ROBOT_WORLDS, CaptureConfig, RecordingConfig
-from mimic.envs import env_config
-from mimic.envs.config import EnvConfig
+from mimic.arms.kinematic_tree import ALL_ENDS
+from mimic.base.overrides import setting, shell_words
+from mimic.commands.config import CaptureConfig, RecordingConfig
+from mimic.commands.printed import train_command
+from mimic.envs.config import DemonstrationConfig, EnvConfig, ObservationConfig, RewardConfig
 from mimic.metric.kinematics import link_state_table
 from mimic.motions.mocap.arms import SIDES, find_arms
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
@@ -134,21 +136,26 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
             console.print(line, soft_wrap=True, highlight=False, markup=False)
         console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}, {model}", soft_wrap=True, highlight=False)
-        command = (
-            f"python -m mimic.train env={env.name} env.expert={model} env.demonstrations.path={out} "
-            f"env.demonstrations.count={cut.training} env.demonstrations.held_out={cut.held_out} "
-        )
-        console.print(f"train on it: {command}{train_options(env)}", soft_wrap=True, highlight=False, markup=False)
+        expert = ArmConfig(model=str(model), tip=[ALL_ENDS] if config.arm == BOTH else None)
+        demonstrations = DemonstrationConfig(path=str(out), count=cut.training, held_out=cut.held_out)
+        command = train_command(training_env(env, expert, demonstrations))
+        console.print(f"train on it: {command}", soft_wrap=True, highlight=False, markup=False)
 
     return run
 
 
-def train_options(env: EnvConfig) -> str:
-    """What a training on a person's motion needs else. A robot starts in its ready pose, and must not touch itself."""
+def training_env(env: EnvConfig, expert: ArmConfig, demonstrations: DemonstrationConfig) -> EnvConfig:
+    """The environment of a training on a person's motion; a robot starts in its ready pose, and must not touch itself.
+
+    Args:
+      env: environment with the learner.
+      expert: the person's arm.
+      demonstrations: its motion.
+    """
+    changes: dict[str, Any] = {"reward": RewardConfig({"self_collision": 2.0})}
     if env.kind != "inner_loop":
-        return "env.start=nearest 'env.observation.terms=[distance_gradient]'"
-    world = next((name for name in ROBOT_WORLDS if env_config(env.name, world=name).world == env.world), "hardware")
-    return f"world={world} 'env.reward.terms={{self_collision: 2}}'"
+        changes = {"start": "nearest", "observation": ObservationConfig(["distance_gradient"])}
+    return dataclasses.replace(env, expert=expert, demonstrations=demonstrations, **changes)
 
 
 def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | None) -> Callable[[], None]:
@@ -170,7 +177,8 @@ def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | 
         both = [f"{BOTH} env=bimanual"] if len(find_arms(body)) == len(SIDES) else []
         for side in [*find_arms(body), *both]:
             out_file = f"{source.stem}_{side.split()[0]}.npz"
-            command = f"python -m mimic.demonstrations source={source} arm={side} out={out_file}"
+            words = [setting("source", str(source)), *(f"arm={side}".split()), setting("out", out_file)]
+            command = f"python -m mimic.demonstrations {shell_words(words)}"
             console.print(f"demonstrations: {command}", soft_wrap=True, highlight=False, markup=False)
 
     return run

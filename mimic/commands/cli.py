@@ -28,6 +28,7 @@ from mimic.base.config import BAD_INPUT, explain, schema, suggestion, typed
 from mimic.base.distribution import VERSION
 from mimic.base.files import read_text
 from mimic.commands.arguments import check_arguments, load_plugins
+from mimic.commands.arm_keys import expand_arms
 from mimic.commands.config import (
     CollectConfig,
     DatasetConfig,
@@ -49,12 +50,7 @@ from mimic.trainers.config import TrainConfig, trainer_config, trainers
 from mimic.trainers.export.config import ExportConfig
 
 _LONGEST_MESSAGE = 1000  # characters: Hydra repeats the argument
-ARM_KEYS = {  # keys of each command whose value may be just the name or file of an arm
-    "train": ("env.expert", "env.learner"),
-    "demonstrations": ("env.expert", "env.learner"),
-    "inspect": ("expert", "learner"),
-}
-FIRST_KEY = {"inspect": "learner.model", "collect": "folder"}  # key of each command's positional argument
+FIRST_KEY = {"inspect": "learner", "collect": "folder"}  # key of each command's positional argument
 FIRST_KEY_OF_SUFFIX = {  # the same where the argument is a file of another kind
     "inspect": {".bvh": "clip", ".c3d": "clip", ".trc": "clip", ".csv": "clip"},
 }
@@ -85,7 +81,7 @@ def run(prepare: Callable[[Any], Work], config_name: str) -> None:
         return
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:
-        sys.argv[1:] = [expand_shorthand(argument, config_name) for argument in load_plugins(sys.argv[1:])]
+        sys.argv[1:] = expand_arguments(load_plugins(sys.argv[1:]), config_name)
         register()
     except ValueError as error:  # of a plugin
         _exit_with_error(error)
@@ -174,14 +170,20 @@ def _sweep_run(prepare: Callable[[Any], Work], config: DictConfig) -> Outcome:
     return Outcome(exit_code, f"exit code {exit_code}" if exit_code else "")
 
 
-def expand_shorthand(argument: str, command: str) -> str:
-    """Returns an argument in Hydra's syntax: env.learner=ARM.xml becomes env.learner.model=ARM.xml."""
-    key, equals, value = argument.partition("=")
-    if command in FIRST_KEY and not equals and not argument.startswith("-"):
-        of_suffix = FIRST_KEY_OF_SUFFIX.get(command, {})
-        return f"{of_suffix.get(Path(argument).suffix.lower(), FIRST_KEY[command])}={argument}"
-    is_arm = key in ARM_KEYS.get(command, ()) and not value.startswith("{")
-    return f"{key}.model={value}" if equals and is_arm else argument
+def expand_arguments(arguments: Sequence[str], command: str) -> list[str]:
+    """Returns the arguments of a command in Hydra's syntax: its positional argument, and keys of arms.
+
+    Raises:
+      ValueError: see `expand_arms`.
+    """
+    return expand_arms([_with_key(argument, command) for argument in arguments], command)
+
+
+def _with_key(argument: str, command: str) -> str:
+    if command not in FIRST_KEY or "=" in argument or argument.startswith("-"):
+        return argument
+    of_suffix = FIRST_KEY_OF_SUFFIX.get(command, {})
+    return f"{of_suffix.get(Path(argument).suffix.lower(), FIRST_KEY[command])}={argument}"
 
 
 def _key_of_nothing(arguments: Sequence[str]) -> str:

@@ -9,10 +9,11 @@ from typing import Any
 
 from mimic.arms.arm import ArmConfig
 from mimic.arms.embodiment import LIMITS
-from mimic.arms.named_arms import is_arm_name
+from mimic.arms.named_arms import BUILT_IN, is_arm_name
 from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, checkpoint_number, number, seed_number
-from mimic.envs import env_config, environments
+from mimic.commands.arm_keys import arm_of_environment
+from mimic.envs import environments
 from mimic.envs.config import EnvConfig
 from mimic.evaluation.labels import SPLITS
 from mimic.physics.world import PHYSICS
@@ -313,18 +314,18 @@ class RetargetConfig:
 
     Attributes:
       demonstrations: file of the expert's demonstrations.
-      learner: name of the environment that defines the arms and the metric.
-      mapper: run directory of a pose mapper of that environment, used instead of the optimiser.
-      limits: see `EnvConfig`.
+      env: environment that defines the arms and the metric.
+      mapper: run directory of a pose mapper of these arms, used instead of the optimiser.
+      limits: see `EnvConfig`. Default None: those of the environment.
       out: file of the learner's motions; must not exist.
       costs: see `Costs`; of the optimiser.
       seed: seed of the random initial poses of the optimiser.
     """
 
     demonstrations: str = ""
-    learner: str = "panda4dof"
+    env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
     mapper: str = ""
-    limits: str = "none"
+    limits: str | None = None
     out: str = ""
     costs: Costs = dataclasses.field(default_factory=Costs)
     seed: int = seed_number()
@@ -333,6 +334,10 @@ class RetargetConfig:
         check_ranges(self)
         if self.mapper and self.costs != Costs():
             raise ValueError("costs: expected none with a mapper, which does not minimise them")
+
+    def resolve(self) -> EnvConfig:
+        """Returns the environment with the limits set in this config."""
+        return dataclasses.replace(self.env, **_without_none({"limits": self.limits}))
 
 
 _LEARNERS = "panda", "panda4dof", "panda3dof"  # to choose from in a view
@@ -345,12 +350,10 @@ class ViewConfig:
 
     Attributes:
       env: environment that defines the arms and the metric.
-      expert, learner: replace the arms of the environment: "panda", the name of an environment or of an arm (see
-        `named_arm`), or an MJCF file.
       mapper: pose mapper that moves the learner instead of the optimiser: a run directory, or the name of one that
         comes with mimic, such as "any_arm". Its arms are used.
-      learners: with a pose mapper to any arm, the learners to choose from on the page, each as `learner`. The first one
-        is shown first. Default []: the one of its environment, panda, panda4dof and panda3dof.
+      learners: with a pose mapper to any arm, the learners to choose from on the page: names of arms or environments,
+        or files. The first one is shown first. Default []: the one of its environment, panda, panda4dof and panda3dof.
       run: run directory of a policy to play. Its arms and demonstrations are used.
       source: motion capture file of a person to play as the expert, or tcp://localhost:PORT, a socket of this machine
         that takes points as lines of JSON.
@@ -364,8 +367,6 @@ class ViewConfig:
     """
 
     env: EnvConfig = dataclasses.field(default_factory=EnvConfig)
-    expert: str = ""
-    learner: str = ""
     mapper: str = ""
     learners: list[str] = dataclasses.field(default_factory=list)
     run: str = ""
@@ -383,31 +384,14 @@ class ViewConfig:
         check_choice("split", self.split, SPLITS)
         if self.run and self.mapper:
             raise ValueError(f"run, mapper: expected one of them, got {self.run!r} and {self.mapper!r}")
-        if (self.run or self.mapper) and (self.expert or self.learner):
-            raise ValueError(
-                "expert, learner: expected neither with run= or mapper=, whose arms are used; "
-                "mapper=any_arm takes learners=[NAME,...]"
-            )
         if self.learners and not self.mapper:
             raise ValueError("learners: expected with mapper=, as in mapper=any_arm learners=[panda,ur5e.xml]")
-        if self.source and (self.run or self.mapper or self.expert):
-            raise ValueError("expert, run, mapper: expected none with source=, whose person is the expert")
+        if self.source and (self.run or self.mapper):
+            raise ValueError("run, mapper: expected none with source=, whose person is the expert")
         if not self.source and (self.arm or self.capture != CaptureConfig()):
             raise ValueError("arm, capture: expected only with source=")
         if self.arm:
             check_choice("arm", self.arm, ARM_SIDES)
-
-    def resolve_env(self) -> EnvConfig:
-        """Returns the environment with the arms named in `expert` and `learner`.
-
-        Raises:
-          ValueError: an arm does not exist.
-        """
-        arms = {role: _arm(role, name) for role in ("expert", "learner") if (name := getattr(self, role))}
-        if "learner" not in arms:
-            self.env.check_one_learner()
-        env = dataclasses.replace(self.env, **arms)
-        return dataclasses.replace(env, arms=None) if "learner" in arms else env
 
     def resolve_learners(self, own: ArmConfig) -> dict[str, ArmConfig]:
         """The arms to choose from, by the name that the page shows.
@@ -430,13 +414,9 @@ def _without_none(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _arm(role: str, name: str) -> ArmConfig:
-    if name == "panda":
-        return ArmConfig()
     if name in environments():
-        return getattr(env_config(name), role.removesuffix("s"))
-    if is_arm_name(name):
-        return ArmConfig(model=name)
-    if not Path(name).expanduser().is_file():
+        return arm_of_environment(role.removesuffix("s"), name)
+    if name not in BUILT_IN and not is_arm_name(name) and not Path(name).expanduser().is_file():
         valid = ", ".join(environments())
         raise ValueError(f"{role}: expected panda, an MJCF file, or an environment ({valid}), got {name!r}")
-    return ArmConfig(model=str(Path(name).expanduser()))
+    return ArmConfig(model=name)

@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import os
-import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,13 +16,13 @@ from rich.markup import escape  # noqa: E402
 from rich.table import Table  # noqa: E402
 
 from mimic.arms.arm import Arm, ArmConfig, finite_velocity_limit, torque_scale
-from mimic.arms.named_arms import is_arm_name, named_arms  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
 from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.base.config import new_folder  # noqa: E402
 from mimic.commands import arm_checks  # noqa: E402
 from mimic.commands.config import InspectConfig  # noqa: E402
 from mimic.commands.pose_picture import nearest_poses, readable_poses, save_poses  # noqa: E402
+from mimic.commands.printed import train_command  # noqa: E402
 from mimic.envs.config import EnvConfig  # noqa: E402
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
 from mimic.motions.demonstrations import Demonstrations  # noqa: E402
@@ -109,7 +107,7 @@ def _inspect(
         warnings=[*arm_checks.warnings(config.learner, learner), *([reason] if reason else [])],
         reachable=reachable,
         similarity=similarity,
-        command=train_command(dataclasses.replace(config, learner=stable_config)),
+        command=train_command(dataclasses.replace(env, learner=stable_config)),
     )
 
 
@@ -148,35 +146,6 @@ def _write(out: Path, inspection: Inspection, expert: Arm, learner: Arm, env: En
         "train": inspection.command,
     }
     (out / _RESULTS).write_text(json.dumps(results, indent=2) + "\n")
-
-
-def train_command(config: InspectConfig) -> str:
-    """The command that trains the inspected learner."""
-    words = ["python -m mimic.train env=pair"]
-    words += [word for role in ("expert", "learner") for word in _arm_words(f"env.{role}", getattr(config, role))]
-    if config.limits != "none":
-        words.append(f"env.limits={config.limits}")
-    return " ".join(words)
-
-
-def _shown_model(arm: ArmConfig) -> str:
-    """The name of an arm that has one, else its file, relative to the current folder if it is inside."""
-    if not arm.is_file:
-        return arm.model
-    names = {os.path.abspath(file): name for name, file in named_arms().items() if is_arm_name(name)}
-    path = os.path.relpath(arm.model)
-    return names.get(arm.model) or (arm.model if path.startswith("..") else path)
-
-
-def _arm_words(key: str, arm: ArmConfig) -> list[str]:
-    words = [f"{key}={_shown_model(arm)}"]
-    words += [f"{key}.{name}={value}" for name in ("base", "tip") if (value := getattr(arm, name))]
-    for name in ("armature", "damping", "locked", "link_lengths", "home"):
-        value = getattr(arm, name)
-        if value:
-            shown = value if isinstance(value, dict | str | float | int) else list(value)
-            words.append(f"{key}.{name}={str(shown).replace(' ', '')}")
-    return [shlex.quote(word) if "{" in word else word for word in (word.replace("'", "") for word in words)]
 
 
 def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]:

@@ -18,7 +18,6 @@ from mimic.arms.embodiment import Embodiment
 from mimic.arms.pose_limits import continuous_joints
 from mimic.base.config import new_file
 from mimic.commands.config import RetargetConfig
-from mimic.envs import env_config
 from mimic.evaluation.rollout_metrics import pose_similarity
 from mimic.metric.config import MetricConfig
 from mimic.motions.demonstrations import Demonstrations, load_demonstrations
@@ -161,7 +160,7 @@ def prepare_retargeting(config: RetargetConfig) -> Callable[[], None]:
     if not config.demonstrations:
         raise ValueError("demonstrations: expected a file, as in demonstrations=FILE")
     out = new_file("out", config.out)
-    env = env_config(config.learner, limits=config.limits)
+    env = config.resolve()
     expert, learner = env.build_arms().embodiments
     demonstrations = load_demonstrations(Path(config.demonstrations).expanduser())
     _check(demonstrations, expert)

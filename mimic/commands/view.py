@@ -58,10 +58,9 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
     # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     if config.source:
-        return _prepare_captured(config, config.resolve_env())
+        return _prepare_captured(config, config.env)
     if not config.mapper:
-        env = config.resolve_env()
-        return _prepare_live(config, env, LiveSession(env))
+        return _prepare_live(config, config.env, LiveSession(config.env))
     return _prepare_mapper(config)
 
 

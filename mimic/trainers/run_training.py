@@ -14,6 +14,7 @@ from rich.console import Console
 
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import check_writable, flatten, to_dict, typed
+from mimic.base.overrides import setting, shell_words
 from mimic.runs.checkpoints import (
     Checkpoint,
     checkpoint_steps,
@@ -277,7 +278,7 @@ def _new_run(run_dir: Path, trainer: Trainer) -> RunLock:
 
 def _stopped(console: Console, run_dir: Path, error: Interrupted | Diverged | OSError | RunExists) -> int:
     """Prints why a training stopped and how to continue; returns the exit code."""
-    command = f"python -m mimic.train resume={run_dir}"
+    command = f"python -m mimic.train {shell_words([setting('resume', str(run_dir))])}"
     if isinstance(error, Interrupted):
         console.print(f"stopped by {error}; continue with: {command}", soft_wrap=True)
         return error.exit_code

@@ -5,8 +5,9 @@ import pytest
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.named_arms import MENAGERIE, named_arms
-from mimic.commands.config import InspectConfig, ViewConfig
-from mimic.commands.inspect import train_command
+from mimic.commands.config import ViewConfig
+from mimic.commands.printed import train_command
+from mimic.envs.config import EnvConfig
 from tests.arms.test_start_pose import ARM
 
 
@@ -46,7 +47,7 @@ def test_each_place_has_arms_by_name(place, places):
     config = mimic.env_config("pair", learner="toy7").learner
     assert config.model == str(file)
     assert build_arm(config).embodiment.joint_names == ("a", "b", "c")
-    assert ViewConfig(learner="toy7").resolve_env().learner.model == str(file)
+    assert ViewConfig(mapper="any_arm", learners=["toy7"]).resolve_learners(config)["toy7"].model == str(file)
 
 
 def test_the_first_place_is_used(places):
@@ -68,8 +69,8 @@ def test_our_own_arms_keep_their_names(places):
 
 def test_the_training_command_has_the_name(places):
     places("menagerie", "toy7")
-    command = train_command(InspectConfig(learner=ArmConfig(model="toy7", home="bent")))
-    assert "env.learner=toy7 env.learner.home=bent" in command
+    command = train_command(EnvConfig("pair", learner=ArmConfig(model="toy7", home="bent")))
+    assert "env.learner.model=toy7 env.learner.home=bent" in command
 
 
 def test_an_arm_that_is_not_here_names_the_three_ways(places, reason):

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shlex
 import subprocess
 import sys
 
@@ -13,8 +12,6 @@ from PIL import Image
 import mimic
 from mimic import inspect
 from mimic.commands import arm_checks, cli
-from mimic.commands.config import InspectConfig
-from mimic.commands.inspect import train_command
 from mimic.envs.config import EnvConfig
 from tests.helpers import original_model
 
@@ -58,18 +55,6 @@ def test_an_inspection_describes_the_arm(inspected, arm_file, tmp_path):
     np.testing.assert_allclose(fractions, 1, rtol=1e-6)  # float32
     assert Image.open(tmp_path / "out" / "arms.png").size == (1300, 560)
     assert said.splitlines()[-1] == f"train it: {inspection['train']}"
-
-
-def test_the_suggested_command_trains_the_inspected_arm(arm_file, monkeypatch):
-    learner = mimic.ArmConfig(model=str(arm_file), locked=["elbow", 6], tip="pinch", armature=0.2)
-    config = InspectConfig(learner=learner, expert=mimic.ArmConfig(locked={"joint2": 0.5}), limits="hardware")
-    words = shlex.split(train_command(config))
-    assert words[:4] == ["python", "-m", "mimic.train", "env=pair"]
-    prepared = []
-    monkeypatch.setattr(sys, "argv", ["mimic.train", *words[3:]])
-    cli.run(lambda config: prepared.append(config.env) or (lambda: 0), "train")
-    expected = EnvConfig(name="pair", expert=config.expert, learner=learner, limits="hardware")
-    assert prepared == [expected]
 
 
 def test_armature_is_suggested_for_an_arm_that_runs_away(inspected, tmp_path):

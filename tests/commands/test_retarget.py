@@ -30,7 +30,7 @@ def command(*arguments, **more):
 @pytest.mark.slow
 def test_the_motions_load_and_do_not_jump(recorded, tmp_path):
     out = tmp_path / "learner.npz"
-    result = command(f"demonstrations={recorded}", "learner=planar4dof", f"out={out}")
+    result = command(f"demonstrations={recorded}", "env=planar4dof", f"out={out}")
     assert result.returncode == 0, result.stderr[-2000:]
     assert "maximum jump" in result.stdout
     motions = mimic.load_demonstrations(out)
@@ -61,14 +61,18 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows(with_ma
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["learner=planar4dof"], "demonstrations: expected a file"),
-        (["demonstrations={recorded}", "learner=planar4dof"], "out: expected a file"),
-        (["demonstrations=missing.npz", "learner=planar4dof", "out=new.npz"], "no file"),
-        (["demonstrations={recorded}", "learner=panda5dof", "out=new.npz"], "unknown environment 'panda5dof'"),
+        (["env=planar4dof"], "demonstrations: expected a file"),
+        (["demonstrations={recorded}", "env=planar4dof"], "out: expected a file"),
+        (["demonstrations=missing.npz", "env=planar4dof", "out=new.npz"], "no file"),
+        (["demonstrations={recorded}", "learner=panda5dof", "out=new.npz"], "got 'panda5dof'"),
         (["demonstrations={recorded}", "learner=panda4dof", "out=new.npz"], "recorded with the joints"),
-        (["demonstrations={recorded}", "learner=planar4dof", "out={recorded}"], "exists; name a new file"),
-        (["demonstrations={recorded}", "learner=planar4dof", "out=no/new.npz"], "there is no folder"),
-        (["demonstrations={recorded}", "learner=planar4dof", "out=new.npz", "mapper=."], "not a run directory"),
+        (
+            ["demonstrations={recorded}", "learner=pair", "out=new.npz"],
+            "learner: expected an arm, or an environment",
+        ),
+        (["demonstrations={recorded}", "env=planar4dof", "out={recorded}"], "exists; name a new file"),
+        (["demonstrations={recorded}", "env=planar4dof", "out=no/new.npz"], "there is no folder"),
+        (["demonstrations={recorded}", "env=planar4dof", "out=new.npz", "mapper=."], "not a run directory"),
     ],
 )
 def test_bad_input(reason, recorded, arguments, message):
@@ -76,4 +80,4 @@ def test_bad_input(reason, recorded, arguments, message):
 
 
 def test_bad_input_of_the_command(rejected):
-    assert "demonstrations: expected a file" in rejected("retarget", "learner=planar4dof")
+    assert "demonstrations: expected a file" in rejected("retarget", "env=planar4dof")

@@ -9,6 +9,7 @@ import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.commands.config import ViewConfig
 from mimic.commands.view_any_arm import AnyLearnerFunctions, read_learners
+from mimic.envs import env_config
 from mimic.metric.similarity import centre_line, similarity
 from mimic.viewer.live_session import LiveSession
 from mimic.viewer.tracking import shown_preset
@@ -44,7 +45,7 @@ def functions(mapper, choices):
 
 @pytest.fixture
 def live(mapper, functions):
-    learner = ViewConfig(learner="panda4dof").resolve_env().learner
+    learner = env_config("panda4dof").learner
     return LiveSession(dataclasses.replace(mapper.env, arms=None, learner=learner), any_arm=functions)
 
 

@@ -219,7 +219,7 @@ def test_motions_are_retargeted_to_any_learner(trained, tmp_path):
     env.demonstrations.save(tmp_path / "expert.npz")
     for learner, joints in (("panda4dof", 4), ("panda3dof", 3)):
         out = tmp_path / f"{learner}.npz"
-        config = RetargetConfig(str(tmp_path / "expert.npz"), learner, str(trained[0]), out=str(out))
+        config = RetargetConfig(str(tmp_path / "expert.npz"), env_config(learner), str(trained[0]), out=str(out))
         retarget.prepare_retargeting(config)()
         assert mimic.load_demonstrations(out).qpos.shape == (2, 51, joints)
 

@@ -178,7 +178,7 @@ def test_motions_of_other_experts_are_retargeted(runs, tmp_path, own_registry):
     env = mimic.make("from_four", demonstrations={"count": 2, "held_out": 1})
     env.demonstrations.save(tmp_path / "expert.npz")
     config = RetargetConfig(
-        str(tmp_path / "expert.npz"), "from_four", str(runs["drawn"]), out=str(tmp_path / "learner.npz")
+        str(tmp_path / "expert.npz"), env_config("from_four"), str(runs["drawn"]), out=str(tmp_path / "learner.npz")
     )
     retarget.prepare_retargeting(config)()
     assert mimic.load_demonstrations(tmp_path / "learner.npz").qpos.shape == (2, 51, 7)

@@ -109,7 +109,7 @@ def test_retargeted_motions_do_not_jump(trained, tmp_path):
     env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
     out = tmp_path / "learner.npz"
     env.demonstrations.save(tmp_path / "expert.npz")
-    config = RetargetConfig(str(tmp_path / "expert.npz"), "planar4dof", str(trained[0]), out=str(out))
+    config = RetargetConfig(str(tmp_path / "expert.npz"), env_config("planar4dof"), str(trained[0]), out=str(out))
     retarget.prepare_retargeting(config)()
     motions = mimic.load_demonstrations(out)
     motions.check_fits(env.learner, 0.1, 50)

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from mimic.base.files import read_text
+from mimic.base.overrides import setting
 from mimic.runs.signals import NOTED, STOPPED_BY_SIGNAL
-from mimic.runs.sweeps.sweeper import FAILED, Outcome, path_override
+from mimic.runs.sweeps.sweeper import FAILED, Outcome
 
 _POLL_S = 0.2
 _FORWARDED = tuple(number for number in NOTED if number.name in ("SIGTERM", "SIGHUP"))
@@ -76,7 +77,7 @@ class RunCommand:
         with contextlib.suppress(ChildProcessError):  # already ended and reaped
             os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
         can_resume = self.run_dir and (Path(self.folder) / self.run_dir / "config.yaml").exists()
-        arguments = [path_override("resume", self.run_dir)] if can_resume else self.arguments
+        arguments = [setting("resume", self.run_dir)] if can_resume else self.arguments
         return submitit.helpers.DelayedSubmission(dataclasses.replace(self, arguments=arguments))
 
     def _outcome(self, exit_code: int) -> Outcome:

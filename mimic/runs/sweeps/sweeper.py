@@ -7,7 +7,6 @@ import dataclasses
 import itertools
 import json
 import os
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -26,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from mimic.base.config import check_writable
 from mimic.base.config_files import check_references
 from mimic.base.files import read_json
+from mimic.base.overrides import setting, shell_words
 from mimic.runs.files import CONFIG, REPORT
 from mimic.runs.signals import exit_hook
 from mimic.runs.sweeps.hydra_plugins import register, target
@@ -137,7 +137,8 @@ class Sweeper(hydra.plugins.sweeper.Sweeper):
         failed = [(run, outcome) for run, outcome in zip(planned, outcomes, strict=True) if outcome.exit_code]
         print(f"sweep: {len(planned) - len(failed)} of {len(planned)} runs done; results: {folder}")
         if any(run.run_dir for run in planned) and len(failed) < len(planned):
-            print(f"one table and plot of them: python -m mimic.collect {folder}")
+            words = shell_words([setting("folder", str(folder))])
+            print(f"one table and plot of them: python -m mimic.collect {words}")
         for run, outcome in failed:
             print(f"failed: {run.label}: {outcome.reason}", file=sys.stderr)
         if failed:
@@ -169,19 +170,13 @@ def _run_dir(config: DictConfig, folder: Path, number: str) -> tuple[str, list[s
             return config[key], []
     env, trainer = (OmegaConf.select(config, f"{group}.name") for group in ("env", "trainer"))
     path = str(folder / f"{number}-{env}-{trainer}-seed{config.seed}")
-    return path, [path_override("run_dir", path)]
-
-
-def path_override(key: str, path: str) -> str:
-    """KEY=PATH in Hydra's syntax, quoted if necessary."""
-    quoted = path if re.fullmatch(r"[\w./-]+", path) else "'" + path.replace("'", r"\'") + "'"
-    return f"{key}={quoted}"
+    return path, [setting("run_dir", path)]
 
 
 def path_of(override: str) -> str:
-    """The path in an override made by `path_override`."""
-    value = override.partition("=")[2]
-    return value[1:-1].replace(r"\'", "'") if value.startswith("'") else value
+    """The path in an override made by `setting`."""
+    value = OverridesParser.create().parse_override(override).value()
+    return str(getattr(value, "text", value))  # a quoted string has its text apart
 
 
 def _remaining(folder: Path, planned: Sequence[PlannedRun]) -> dict[int, list[str]]:
@@ -208,7 +203,7 @@ def _resumed(run: PlannedRun) -> list[str]:
     if not run.run_dir or not (run_dir / CONFIG).is_file():
         return run.overrides
     of_process = [override for override in run.overrides if override.startswith(("compilation_cache=", "logger="))]
-    return [path_override("resume", run.run_dir), *of_process]
+    return [setting("resume", run.run_dir), *of_process]
 
 
 def _write_sweep(folder: Path, planned: Sequence[PlannedRun], outcomes: Sequence[Outcome]) -> None:

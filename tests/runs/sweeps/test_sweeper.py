@@ -16,10 +16,11 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.errors import HydraException
 
 from mimic import train
+from mimic.base.overrides import setting
 from mimic.commands import cli
 from mimic.runs.sweeps.launchers import gpus_of
 from mimic.runs.sweeps.run_command import RunCommand
-from mimic.runs.sweeps.sweeper import Outcome, Sweeper, path_of, path_override
+from mimic.runs.sweeps.sweeper import Outcome, Sweeper, path_of
 from tests.helpers.run_directories import write_run
 from tests.helpers.tiny import TINY
 
@@ -158,9 +159,9 @@ def test_the_same_sweep_continues(tmp_path, monkeypatch, capsys):
 def test_any_path_is_an_override(path):
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
-    (override,) = OverridesParser.create().parse_overrides([path_override("run_dir", path)])
+    (override,) = OverridesParser.create().parse_overrides([setting("run_dir", path)])
     assert override.value() == path and not override.is_sweep_override()
-    assert path_of(path_override("run_dir", path)) == path
+    assert path_of(setting("run_dir", path)) == path
 
 
 @pytest.fixture
@@ -295,7 +296,7 @@ def test_a_sweep_is_collected(tmp_path):
     swept = ["env=planar4dof,planar7dof", "seed=0,1"]
     result = command("train", "-m", *SHORT[1:], *swept, *choice, folder=tmp_path)
     assert result.returncode == 0, result.stderr[-2000:]
-    assert "python -m mimic.collect runs/mine" in result.stdout
+    assert "python -m mimic.collect folder=runs/mine" in result.stdout
     result = command("collect", "runs/mine", folder=tmp_path)
     assert result.returncode == 0, result.stderr[-2000:]
     collected = json.loads((tmp_path / "runs" / "mine" / "collected.json").read_text())

@@ -1,0 +1,74 @@
+"""Keys of arms on the command line, with one meaning in all commands: expert=ARM, learner=ARM, and their fields.
+
+An arm is named by a built-in arm, the name or file of a model, or an environment, whose arm it then is. Naming an arm
+replaces all of the arm that the environment has, its locked joints included; other keys, such as learner.tip=NAME and
+learner.locked=[3,6], change fields of it, in any order.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+from mimic.arms.arm import ArmConfig
+from mimic.base.overrides import setting
+from mimic.envs import env_config, environments
+
+ROLES = ("expert", "learner")
+_PREFIXES = {"train": "env.", "demonstrations": "env.", "retarget": "env.", "view": "env.", "inspect": ""}
+_TEMPLATE = "pair"  # the environment whose arms are the user's
+_OWN_ARMS = ("run", "mapper")  # keys of the command view that bring arms along
+
+
+def expand_arms(arguments: Sequence[str], command: str) -> list[str]:
+    """The arguments of a command with the keys of arms in Hydra's syntax; those that name an arm come first.
+
+    Raises:
+      ValueError: an environment that has no arms of its own, or arms where they have no effect.
+    """
+    if command not in _PREFIXES:
+        return list(arguments)
+    keys = {argument.partition("=")[0] for argument in arguments if "=" in argument}
+    named: list[str] = []
+    others: list[str] = []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        name = key.removeprefix(_PREFIXES[command])
+        role, dot, field = name.partition(".")
+        # In a training that starts from a run, `learner` is the one arm of many that it goes on with.
+        if not equals or role not in ROLES or (command == "train" and key == "learner" and {"init", "resume"} & keys):
+            others.append(argument)
+            continue
+        if command == "view" and {*_OWN_ARMS} & keys:
+            raise ValueError(
+                "expert, learner: expected neither with run= or mapper=, whose arms are used; "
+                "mapper=any_arm takes learners=[NAME,...]"
+            )
+        if command == "view" and role == "expert" and "source" in keys:
+            raise ValueError("expert: expected none with source=, whose person is the expert")
+        full = f"{_PREFIXES[command]}{role}"
+        if dot or value.startswith(("{", "$")):
+            others.append(f"{full}{dot}{field}={value}")
+        else:
+            named += _arm(full, role, value)
+    return [*named, *others]
+
+
+def _arm(key: str, role: str, value: str) -> Iterator[str]:
+    """The overrides for all fields of an arm."""
+    arm = ArmConfig()
+    if value in environments():
+        arm = arm_of_environment(role, value)
+    fields = {field.name: getattr(arm, field.name) for field in dataclasses.fields(arm)}
+    for name, entry in fields.items():
+        is_text = name == "model" and value not in environments()
+        yield f"{key}.model={value}" if is_text else setting(f"{key}.{name}", entry)
+
+
+def arm_of_environment(role: str, name: str) -> ArmConfig:
+    """The expert or the learner of an environment.
+
+    Raises:
+      ValueError: an environment that has no arms of its own.
+    """
+    if name == _TEMPLATE:
+        raise ValueError(f"{role}: expected an arm, or an environment with arms of its own, got {name!r}")
+    return getattr(env_config(name), role)
