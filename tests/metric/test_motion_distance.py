@@ -219,7 +219,6 @@ def test_the_kernel_equals_the_plain_function(count):
         np.testing.assert_allclose(values, reference, rtol=1e-6)  # float32, fused and not
 
 
-@pytest.mark.slow_for("long")
 def test_value_and_gradient_are_one_kernel_on_a_gpu():
     arms = PAIRS["planar"]
     distance = motion_distance(*arms, overlap_correspondence(*arms))
