@@ -136,3 +136,10 @@ def test_the_clearance_of_another_arm_is_rejected(tmp_path):
     clearance = bundles.panda_clearance((3, 6, 7))
     with pytest.raises(ValueError, match="clearance.npz: parent: expected finite numbers of the shape \\(7,\\)"):
         bundles.make_bundle(tmp_path / "bundle", clearance=clearance)
+
+
+@pytest.mark.parametrize("parent", [[0, 0, 1, 2, 3, 4, 5], [-1, 0, 1, 2, 3, 4, -2]])
+def test_a_clearance_whose_joints_do_not_follow_their_parents_is_rejected(tmp_path, parent):
+    clearance = bundles.panda_clearance()._replace(parent=parent)
+    with pytest.raises(ValueError, match="clearance.npz: expected parents before their children"):
+        bundles.make_bundle(tmp_path / "bundle", clearance=clearance)

@@ -267,6 +267,14 @@ def test_a_blocked_arm_is_not_pushed_on(layer):
     assert command.stop[0, 0] - block < 0.01 and np.all(command.qvel == 0)
 
 
+def test_an_arm_that_is_pushed_away_brakes_within_its_limits(layer, bundle):
+    fast = velocity(0, 20.0)[:, None]
+    command = layer.tick(layer.reference.qpos + 0.3, fast, None)
+    limits = bundle.parameters
+    assert layer.cause[0] == safety.TRACKING and np.all(command.path.qvel[..., 0] <= limits.velocity)
+    assert 0.3 < command.stop[0, 0] < 0.3 + limits.velocity[0] ** 2 / limits.acceleration[0] + 1
+
+
 def test_what_has_stopped_an_arm_stays(layer):
     layer.tick(layer.reference.qpos + 0.3, layer.reference.qvel, None)
     layer.tick(layer.reference.qpos * np.nan, layer.reference.qvel, None)
