@@ -1,88 +1,83 @@
-"""A part of the fuzzed inputs, which `python -m benchmarks.fuzz` runs as a whole, and how they are counted."""
+"""A part of the fuzzed inputs, which `python -m benchmarks.fuzz` runs as a whole, and how harm is counted."""
 
-import multiprocessing
 import os
-from pathlib import Path
+import time
 
 import pytest
 
-from benchmarks import fuzzing
-from benchmarks.fuzzing import ACCEPTED, Case, runner
-from benchmarks.fuzzing.captures import CAPTURE_DAMAGES
-from benchmarks.fuzzing.files import MODEL_DAMAGES, NPZ_DAMAGES
-from benchmarks.fuzzing.runner import GOOD, REJECTED, run_cases, run_here, summary
+from benchmarks import fuzz
 
-COUNTS = {
-    "npz": 6 * len(NPZ_DAMAGES),
-    "models": 3 * len(MODEL_DAMAGES),
-    "captures": 4 * len(CAPTURE_DAMAGES),
-}  # each damage some times
+COUNTS = {"motions": 34, "models": 17, "captures": 34, "runs": 17, "command_lines": 17}  # each change once or twice
 
 
-@pytest.mark.slow_for("models", "npz")
-@pytest.mark.parametrize("kind", COUNTS)
-def test_fuzzed_inputs_are_accepted_or_rejected_in_one_line(kind):
-    rows = run_here(kind, range(COUNTS[kind]))
-    assert [row for row in rows if row["outcome"] not in GOOD] == []
-    assert {row["outcome"] for row in rows} == set(GOOD)
-    assert max(row["s"] for row in rows) < runner.TIME_LIMIT
-
-
-def test_a_case_is_the_same_each_time(tmp_path):
-    contents = []
-    for folder in (tmp_path / "first", tmp_path / "second"):
-        folder.mkdir()
-        case = fuzzing.make_case("npz")(0)
-        case.write(folder)
-        contents.append((folder / "motions.npz").read_bytes())
-    assert contents[0] == contents[1]
-
-
-def _hang(_):
-    while True:
-        pass
-
-
-def _crash(_):
-    os._exit(3)
-
-
-def _raise(_):
-    raise KeyError("name")
-
-
-def _two_lines(_):
-    raise ValueError("one\ntwo")
-
-
-def _one_line(_):
-    raise ValueError("one")
-
-
-def _large(_):
-    assert bytearray(400 * 2**20)
-    return ACCEPTED
-
-
-READS = (_one_line, lambda _: ACCEPTED, _raise, _two_lines, _hang, _crash, _large, _one_line)
-OUTCOMES = (REJECTED, ACCEPTED, runner.TRACEBACK, runner.TRACEBACK, runner.HANG, runner.CRASH, runner.MEMORY, REJECTED)
-
-
-def harmful_case(number):
-    return Case("test", lambda _: None, READS[number])
+@pytest.fixture(autouse=True)
+def secret(monkeypatch):
+    monkeypatch.setenv(fuzz.SECRET_NAME, fuzz.SECRET)
 
 
 @pytest.mark.slow
-def test_harm_is_counted_and_the_next_inputs_run(monkeypatch):
-    monkeypatch.setitem(fuzzing.KINDS, "npz", ("tests.benchmarks.test_fuzz", "harmful_case"))
-    monkeypatch.setattr(runner, "TIME_LIMIT", 5.0)
-    resident, shared = map(int, Path("/proc/self/statm").read_text().split()[1:3])
-    private = (resident - shared) * os.sysconf("SC_PAGE_SIZE")  # a forked process starts with as much
-    monkeypatch.setattr(runner, "MEMORY_LIMIT", private + 200 * 2**20)
-    fork = multiprocessing.get_context("fork")  # the processes know of what is replaced here
-    monkeypatch.setattr(runner.multiprocessing, "get_context", lambda _: fork)
-    rows = run_cases("npz", len(READS), 1)
-    assert tuple(row["outcome"] for row in rows) == OUTCOMES
-    counts = summary("npz", rows)
-    assert counts["inputs"] == len(READS) and counts[runner.TRACEBACK] == 2 and counts[runner.HANG] == 1
-    assert [row["number"] for row in counts["bad"]] == [2, 3, 4, 5, 6]
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("kind", COUNTS)
+def test_changed_files_are_accepted_or_rejected_in_one_line(kind):
+    rows = [fuzz.run_case(kind, number) for number in range(COUNTS[kind])]
+    assert [row for row in rows if row["outcome"] not in fuzz.GOOD] == []
+    assert {row["outcome"] for row in rows} == set(fuzz.GOOD)
+
+
+def test_a_case_is_the_same_each_time(tmp_path, monkeypatch):
+    contents = []
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        _, changed = fuzz.write_case("captures", 3)
+        contents.append(changed.read_bytes())
+    assert contents[0] == contents[1] != fuzz.example("captures")[changed]
+
+
+def _raise(message):
+    raise ValueError(message)
+
+
+READS = {
+    fuzz.REJECTED: lambda *_: _raise("one line"),
+    fuzz.ACCEPTED: lambda *_: 1,
+    fuzz.TRACEBACK: lambda *_: _raise("two\nlines"),
+    fuzz.REVEALED: lambda *_: _raise(fuzz.SECRET),
+}
+
+
+@pytest.mark.parametrize("outcome", READS)
+def test_outcomes(monkeypatch, outcome):
+    monkeypatch.setitem(fuzz.KINDS, "command_lines", (fuzz.KINDS["command_lines"][0], READS[outcome]))
+    assert fuzz.run_case("command_lines", 0)["outcome"] == outcome
+
+
+def test_other_numbers_of_a_file_with_checksums_are_harm(monkeypatch):
+    monkeypatch.setattr(fuzz, "_value_of_example", lambda *_: b"")
+    number = next(n for n in range(200) if _changed(n).endswith("recorded.npz"))
+    monkeypatch.setitem(fuzz.KINDS, "motions", (fuzz.KINDS["motions"][0], lambda *_: 1))
+    assert fuzz.run_case("motions", number)["outcome"] == fuzz.OTHER_NUMBERS
+
+
+def _changed(number):
+    import contextlib
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        return str(fuzz.write_case("motions", number)[1])
+
+
+def _crash(kind, number):
+    os._exit(3)
+
+
+def _hang(kind, number):
+    time.sleep(0.2)
+    os._exit(3)
+
+
+@pytest.mark.parametrize(("end", "limit", "outcome"), [(_crash, 60, fuzz.CRASH), (_hang, 0.1, fuzz.HANG)])
+def test_a_process_that_ends_is_counted_and_replaced(monkeypatch, end, limit, outcome):
+    monkeypatch.setattr(fuzz, "run_limited_case", end)
+    monkeypatch.setattr(fuzz, "TIME_LIMIT", limit)
+    assert [row["outcome"] for row in fuzz.run_cases("runs", range(2), 1)] == [outcome] * 2
