@@ -106,7 +106,7 @@ def read_command_lines(folder: Path, changed: Path) -> Any:
         configs.append(config)
         if command == "train":
             new_run_dir(config)
-            check_training_memory(config)
+            check_training_memory(config.resolve("cpu", 1))
         return lambda: 0
 
     code: Any = 0
@@ -165,7 +165,6 @@ def changes(data: bytes, rng: Generator) -> dict[str, Callable[[], bytes]]:
     line, flip = lines[int(rng.integers(len(lines)))], 1 << int(rng.integers(8))
     return {
         "odd word": lambda: data[:first] + odd + data[last:],
-        "another word": lambda: data[:first] + odd + data[last:],
         "odd text inserted": lambda: data[:start] + odd + data[start:],
         "odd text repeated": lambda: data[:start] + odd * 300 + data[start:],
         "flipped bit": lambda: data[:start] + bytes(b ^ flip for b in data[start : start + 1]) + data[start + 1 :],
