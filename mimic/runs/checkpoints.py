@@ -71,7 +71,7 @@ def save_checkpoint(
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True)
-        write_parameters(partial / _PARAMS, {name: np.asarray(leaf) for name, leaf in named_leaves(params).items()})
+        write_parameters(partial / _PARAMS, {name: _array(leaf) for name, leaf in named_leaves(params).items()})
         if state is not None:
             np.savez(partial / _STATE, *state)
         content = {"run": _new_run_id(run_dir), "metrics": dict(metrics or {}), "made_with": _software_and_devices()}
@@ -246,6 +246,11 @@ def _software_and_devices() -> dict[str, str]:
         "jaxlib": jaxlib.__version__,
         "device": f"{len(devices)} x {devices[0].device_kind}",
     }
+
+
+def _array(leaf: Any) -> np.ndarray:
+    """A leaf as an array; a number of Python has the type that JAX gives it."""
+    return np.asarray(leaf, getattr(leaf, "dtype", None) or jax.dtypes.result_type(leaf))
 
 
 def _max_bytes(file: Path) -> int:
