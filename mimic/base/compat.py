@@ -8,8 +8,9 @@ import importlib.util
 import io
 import logging
 import os
+import pkgutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,17 +46,6 @@ def prepare_cpu() -> None:
                      "without it kinematics run several hundred times slower", _SLOW_CPU_FLAG)  # fmt: skip
         return
     os.environ["XLA_FLAGS"] = f"{flags} {_SLOW_CPU_FLAG}".strip()
-
-
-def scan_sizes(params: Mapping[str, Any]) -> tuple[int, int]:
-    """Numbers of the constants and of the carried values of a `jax.lax.scan`, by the parameters of its equation.
-
-    JAX 0.11 has groups of arguments instead of `num_consts` and `num_carry`: constants, carried values, and the rest.
-    """
-    if "num_consts" in params:
-        return params["num_consts"], params["num_carry"]
-    consts, carried, _ = params["ft_in"].unpack()
-    return len(list(consts)), len(list(carried))
 
 
 def import_mujoco() -> None:
@@ -109,6 +99,22 @@ def _import_later(name: str) -> None:
 
     module.__getattr__ = load  # type: ignore[method-assign]
     sys.modules[name] = module
+
+
+def import_jax2onnx() -> Any:
+    """Imports jax2onnx with the conversions of JAX's primitives alone, and makes its log silent.
+
+    Its others convert functions of flax, equinox and dm_pix. They take 13 of 14 s of processor time, and dm_pix fails.
+    """
+    module = importlib.import_module("jax2onnx")
+    plugins: Any = importlib.import_module("jax2onnx.plugins.plugin_system")
+    if not plugins._already_imported_plugins:
+        plugins._already_imported_plugins = True
+        primitives = importlib.import_module("jax2onnx.plugins.jax.lax")
+        for plugin in pkgutil.iter_modules(primitives.__path__, f"{primitives.__name__}."):
+            importlib.import_module(plugin.name)
+    logging.getLogger("onnx_ir").setLevel(logging.ERROR)  # warns of each intermediate value without a type
+    return module
 
 
 def share_config_store() -> None:

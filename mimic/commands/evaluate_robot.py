@@ -27,7 +27,8 @@ from mimic.evaluation.virtual_robot.draws import draw_world, edge_cases
 from mimic.evaluation.virtual_robot.episodes import Episodes, TorquePolicy, TrackingPolicy
 from mimic.evaluation.virtual_robot.robots import LIMIT_CAUSES, SELF_CONTACT
 from mimic.evaluation.virtual_robot.runs import Task, run_tasks
-from mimic.metric.kinematics import link_state_table, link_states
+from mimic.metric.kinematics import link_state_table
+from mimic.metric.matrix_kinematics import make_link_vector
 from mimic.physics.world import WorldConfig
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import write_report
@@ -172,18 +173,17 @@ def _expert_table(evaluator: Evaluator) -> np.ndarray:
 def _torque_model(evaluator: Evaluator, run_dir: Path, steps: int) -> bytes:
     """The exported policy behind its observation, as ONNX: from qpos, qvel and expert to torque."""
     from mimic.trainers.export.export import exported_function
-    from mimic.trainers.export.onnx_graph import to_onnx  # needs the extra "export"
+    from mimic.trainers.export.onnx_model import to_onnx
 
     env = evaluator.env
     policy = exported_function(ExportConfig(str(run_dir), checkpoint=steps))
+    link_vector = make_link_vector(env.learner)
 
     def function(qpos: jax.Array, qvel: jax.Array, expert: jax.Array) -> dict[str, jax.Array]:
-        own = [leaf.ravel() for leaf in jax.tree.leaves(link_states(env.learner, qpos, qvel))]
-        return {"torque": policy.function(jnp.concatenate([*own, expert]))["torque"]}
+        return {"torque": policy.function(jnp.concatenate([link_vector(qpos, qvel), expert]))["torque"]}
 
     joints, experts = env.learner.num_joints, (env.config.preview + 1) * env.expert.num_links * 12
-    model = to_onnx(function, name="policy", inputs={"qpos": joints, "qvel": joints, "expert": experts}, metadata={})
-    return model.SerializeToString()
+    return to_onnx(function, name="policy", inputs={"qpos": joints, "qvel": joints, "expert": experts})
 
 
 def summary(evaluator: Evaluator, episodes: Episodes) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from mimic.deploy.bundle import load_bundle, write_bundle
 from mimic.envs import env_config
 from mimic.physics.plant import make_plant
 from mimic.retargeting.clearance import clearance_constants
-from mimic.trainers.export.onnx_graph import to_onnx
+from mimic.trainers.export.onnx_model import to_onnx
 
 ON_FLOOR = np.array([0, 1.7, 0, -0.9, 0, 1.57, 0.785])  # poses in which a Panda touches the floor, and itself
 FOLDED = np.array([0, 0.6, 0, -3.05, 2.8, 3.7, 0])
@@ -57,16 +57,13 @@ def policy(joints: int, size: int, action: Any) -> bytes:
         unused = 0 * sum(jnp.sum(value) for value in values)  # keeps all inputs in the graph
         return {"action": jnp.clip(action(by_name) + unused, -1, 1)}
 
-    return to_onnx(function, name="policy", inputs=inputs, metadata={}).SerializeToString()
+    return to_onnx(function, name="policy", inputs=inputs)
 
 
 @functools.cache
 def expert_phases() -> bytes:
     """The first number of the expert now and at the later ticks of the preview, as ONNX."""
-    model = to_onnx(
-        lambda expert: {"features": expert[:: LINKS * 12]}, name="features", inputs={"expert": EXPERT}, metadata={}
-    )
-    return model.SerializeToString()
+    return to_onnx(lambda expert: {"features": expert[:: LINKS * 12]}, name="features", inputs={"expert": EXPERT})
 
 
 def sine(values: dict[str, Any]) -> Any:

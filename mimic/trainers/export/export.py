@@ -1,35 +1,37 @@
 """`python -m mimic.export`: writes a trained policy or pose mapper to a file that runs without mimic."""
 
+import dataclasses
 import importlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from rich.console import Console
 
+from mimic.arms.arm import ArmConfig
+from mimic.arms.description import SUFFIXES, save_description
 from mimic.arms.embodiment import Embodiment
 from mimic.base.config import check_choice, new_file, new_folder
-from mimic.base.distribution import VERSION, install_command
+from mimic.base.distribution import install_command
 from mimic.base.files import write_atomically
 from mimic.envs import env_config
-from mimic.envs.imitation import layout_of, observation_layout, torque_scale
-from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
-from mimic.trainers.config import PPOConfig, TrainConfig
+from mimic.envs.many_arms_control import torque_scale
+from mimic.runs.checkpoints import check_checkpoint
+from mimic.trainers.config import TrainConfig
 from mimic.trainers.export.config import CONTROLLER, EXPORT_FORMATS, ExportConfig
-from mimic.trainers.export.export_any_arm import any_arm_function, description_writer
 from mimic.trainers.export.export_controller import prepare_controller
-from mimic.trainers.export.exported_function import ExportedFunction, joint_ranges
-from mimic.trainers.pose_mapper.model import PoseMapper
-from mimic.trainers.ppo import ppo
-from mimic.trainers.ppo.trainer import run_environment
+from mimic.trainers.export.functions import ExportedFunction, make_function
+from mimic.trainers.export.onnx_model import to_onnx
+from mimic.trainers.fine_tuning import with_one_learner
+from mimic.trainers.pose_mapper.any_arm_mapper import describe_arm
 from mimic.trainers.run_config import load_config
 
-_PACKAGES = {"onnx": "onnx", "jax": "flatbuffers", CONTROLLER: "onnx"}  # the package that writes each format
+_PACKAGES = {"onnx": "jax2onnx", "jax": "flatbuffers", CONTROLLER: "jax2onnx"}  # the package that writes each format
 _JAX_PLATFORMS = ("cpu", "cuda")
 
 
@@ -159,24 +161,9 @@ def exported_function(config: ExportConfig) -> ExportedFunction:
     if trained.env.kind == "inner_loop" and trained.trainer.name == "ppo":
         raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
     steps = check_checkpoint(run_dir, config.checkpoint)
-    if trained.env.kind == "sampled_arms":
-        return any_arm_function(trained, run_dir, steps)
-    expert, learner = trained.env.build_arms().embodiments
     if config.learner:
-        _check_arms(config, expert, learner)
-    common = {
-        "mimic_version": VERSION,
-        "env": trained.env.name,
-        "trainer": trained.trainer.name,
-        "checkpoint": steps,
-        "expert": expert.name,
-        "expert_joints": list(expert.joint_names),
-        "learner": learner.name,
-        "learner_joints": list(learner.joint_names),
-    }
-    if trained.trainer.name == "ppo":
-        return _policy(trained, run_dir, steps, common)
-    return _mapper(PoseMapper.load(run_dir, steps), common)
+        _check_arms(config, *trained.env.build_arms().embodiments)
+    return make_function(trained, run_dir, steps)
 
 
 def _description_writer(config: ExportConfig) -> Callable[[], None] | None:
@@ -188,7 +175,45 @@ def _description_writer(config: ExportConfig) -> Callable[[], None] | None:
     if trained.env.kind != "sampled_arms":
         return None
     check_checkpoint(run_dir, config.checkpoint)
-    return description_writer(trained, config.learner, config.locked, config.out)
+    return _write_description(trained, config.learner, config.locked, config.out)
+
+
+def _write_description(trained: TrainConfig, learner: str, locked: Sequence[Any], out: str) -> Callable[[], None]:
+    """Writes the description of an arm for the exported function of a run whose learner is any arm.
+
+    Args:
+      trained: config of the run.
+      learner: the arm.
+      locked: its locked joints, by number or name.
+      out: file to write.
+
+    Raises:
+      ValueError: another suffix than those of descriptions, no such arm, or one that the run's function does not take.
+    """
+    file = new_file("out", out)
+    if file.suffix not in SUFFIXES:
+        raise ValueError(
+            f"out: expected a file {' or '.join(SUFFIXES)} for the description of learner={learner}, got {out!r}; "
+            "export the network, which takes any arm, without learner="
+        )
+    is_policy = trained.trainer.name == "ppo"
+    env, arm = trained.env, learner
+    if is_policy:
+        arm = with_one_learner(env, learner, locked).learner  # of up to 8 joints, locked ones included
+    elif locked:
+        arm = ArmConfig(model=learner, locked=list(locked))
+    described = describe_arm(env, arm)
+    arrays = described.arrays
+    if is_policy:  # the function would need many times as many operations with the inertia in the home pose
+        max_torque = torque_scale(jax.tree.map(jnp.asarray, arrays), env.action_scale, env.control_dt)
+        arrays = dataclasses.replace(arrays, torque_limit=np.asarray(max_torque))
+
+    def run() -> None:
+        name = described.arm.embodiment.name
+        save_description(file, arrays, name, described.slots, has_dynamics=is_policy)
+        Console().print(f"results: {file}", soft_wrap=True, highlight=False)
+
+    return run
 
 
 def _check_arms(config: ExportConfig, expert: Embodiment, learner: Embodiment) -> None:
@@ -205,53 +230,6 @@ def _check_arms(config: ExportConfig, expert: Embodiment, learner: Embodiment) -
             )
 
 
-def _policy(trained: TrainConfig, run_dir: Path, steps: int, common: Mapping[str, Any]) -> ExportedFunction:
-    arms = trained.env.build_arms()
-    expert, learner = arms.embodiments
-    if trained.env.observation.terms or trained.env.environment:
-        layout = layout_of(run_environment(trained.env, run_dir)[0])
-    else:
-        layout = observation_layout(expert, learner, trained.env.preview)
-    size = layout[-1]["stop"]
-    config = cast(PPOConfig, trained.trainer)
-    params = load_checkpoint(run_dir, ppo.params_template(config, size, learner.num_joints), steps)[1]
-    controller = ppo.make_controller(config, size, learner.num_joints)(jax.device_get(params))
-    scale = jnp.asarray(torque_scale(arms.learner, trained.env.action_scale, trained.env.control_dt))
-
-    def function(observation: jax.Array) -> dict[str, jax.Array]:
-        action = controller(SimpleNamespace(obs=observation))  # type: ignore[arg-type]
-        return {"action": action, "torque": action * scale}
-
-    metadata = {
-        **common,
-        "inputs": {"observation": "see observation_layout"},
-        "outputs": {
-            "action": "fraction of the maximum torque of each joint, in [-1, 1]",
-            "torque": "N m, in addition to gravity compensation; constant for control_dt",
-        },
-        "observation_layout": layout,
-        "torque_scale": [float(torque) for torque in scale],
-        "control_dt": trained.env.control_dt,
-    }
-    return ExportedFunction(function, "policy", {"observation": size}, metadata)
-
-
-def _mapper(mapper: PoseMapper, common: Mapping[str, Any]) -> ExportedFunction:
-    params = jax.device_get(mapper.params)
-
-    def function(qpos: jax.Array) -> dict[str, jax.Array]:
-        return {"learner_qpos": mapper.model(params, qpos)}
-
-    metadata = {
-        **common,
-        "inputs": {"expert_qpos": "rad, in the order of expert_joints"},
-        "outputs": {"learner_qpos": "rad, in the order of learner_joints"},
-        "expert_range": joint_ranges(mapper.expert),
-        "learner_range": joint_ranges(mapper.learner),
-    }
-    return ExportedFunction(function, "pose_mapper", {"expert_qpos": mapper.expert.num_joints}, metadata)
-
-
 def _write(exported: ExportedFunction, out: Path, format: str) -> None:
     content = {"onnx": _onnx_bytes, "jax": _jax_bytes}[format](exported)
     partial = out.with_name(out.name + ".partial")
@@ -262,16 +240,15 @@ def _write(exported: ExportedFunction, out: Path, format: str) -> None:
 
 
 def _onnx_bytes(exported: ExportedFunction) -> bytes:
-    from mimic.trainers.export.onnx_graph import to_onnx  # needs the extra "export"
-
     texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in exported.metadata.items()}
-    model = to_onnx(
+    return to_onnx(
         exported.function,
         name=exported.kind,
         inputs=exported.inputs,
         metadata=texts,
+        samples=exported.samples,
+        has_batch=exported.has_batch,
     )
-    return model.SerializeToString()
 
 
 def _jax_bytes(exported: ExportedFunction) -> bytes:

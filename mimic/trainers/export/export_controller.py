@@ -23,6 +23,7 @@ from mimic.metric.matrix_kinematics import make_link_vector
 from mimic.retargeting.clearance import clearance_constants
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import PPOConfig
+from mimic.trainers.export.onnx_model import to_onnx
 from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import run_environment
 from mimic.trainers.run_config import load_config
@@ -93,8 +94,6 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
     The states of the expert are five sixths of an observation and known before a motion. The test of the export
     compares with `control_observation` and the policy of `ppo.make_controller`.
     """
-    from mimic.trainers.export.onnx_graph import to_onnx  # needs the extra "export"
-
     statistics, policy, *_ = params
     layers = [policy["params"][f"hidden_{index}"] for index in range(len(policy["params"]))]
     joints, own_links = env.learner.num_joints, _NUMBERS * env.learner.num_links
@@ -123,11 +122,10 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
     inputs: dict[str, int] = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), joints)
     inputs |= {"past_actions": SENT_ACTIONS * env.action_size, "features": len(layers[0]["bias"])}
     metadata = {"mimic_version": VERSION}
-    graphs = (
+    return (
         to_onnx(features, name="features", inputs={"expert": expert_size}, metadata=metadata),
         to_onnx(action, name="policy", inputs=inputs, metadata=metadata),
     )
-    return graphs[0].SerializeToString(), graphs[1].SerializeToString()
 
 
 def _description(env: HardwareEnv, steps: int) -> dict[str, Any]:

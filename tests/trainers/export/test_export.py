@@ -159,9 +159,10 @@ def test_an_onnx_mapper_to_any_arm_equals_the_mapper(tmp_path, expert):
         "random": description(jax.device_get(random_arm(jax.random.PRNGKey(1)))),
     }
     for (name, vector), joints in zip(arms.items(), (7, 4, 7), strict=True):
-        batch = np.tile(np.asarray(vector, np.float32), (len(poses), 1))
-        (outputs,) = session.run(["learner_qpos"], {"expert_qpos": poses, "learner": batch})
-        expected = np.asarray(mapper(poses, jax.device_get(described_arm(jnp.asarray(batch[0])))))
+        learner = np.asarray(vector, np.float32)
+        inputs = [{"expert_qpos": pose[None], "learner": learner[None]} for pose in poses]
+        outputs = np.concatenate([session.run(["learner_qpos"], values)[0] for values in inputs])
+        expected = np.asarray(mapper(poses, jax.device_get(described_arm(jnp.asarray(learner)))))
         off = np.abs(np.angle(np.exp(1j * (outputs - expected)))).max(axis=1)
         assert np.mean(off < 1e-3) >= 0.95, name  # Newton steps magnify rounding errors
         assert np.sum(np.ptp(expected, axis=0) > 0.1) == np.sum(np.ptp(outputs, axis=0) > 1e-6) == joints
@@ -250,6 +251,6 @@ def test_a_mapper_whose_arms_differ_from_its_config_is_rejected(rejected, tmp_pa
 
 def test_a_missing_package_is_named(rejected, tmp_path, monkeypatch):
     mapper_run(tmp_path / "run")
-    monkeypatch.setitem(sys.modules, "onnx", None)
+    monkeypatch.setitem(sys.modules, "jax2onnx", None)
     message = rejected("export", f"run={tmp_path / 'run'}", "out=new.onnx")
-    assert "format=onnx needs the package onnx: pip install 'mimic-arms[export]'" in message
+    assert "format=onnx needs the package jax2onnx: pip install 'mimic-arms[export]'" in message
