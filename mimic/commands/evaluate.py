@@ -49,11 +49,11 @@ def prepare_evaluation(config: EvaluateConfig, started: float) -> Callable[[], N
 def _robot_evaluation(config: EvaluateConfig) -> Callable[[], None]:
     """An evaluation on virtual robots, see `prepare_robot_evaluation`."""
     try:
-        for package in ("onnx", "onnxruntime"):
+        for package in ("jax2onnx", "onnxruntime"):
             importlib.import_module(package)
     except ImportError as error:
         raise ValueError(
-            f"robot: needs the packages onnx and onnxruntime: {install_command('deploy,export')}"
+            f"robot: needs the packages jax2onnx and onnxruntime: {install_command('deploy,export')}"
         ) from error
     from mimic.commands.evaluate_robot import prepare_robot_evaluation  # brax and MJX, which take seconds to import
 

@@ -267,4 +267,4 @@ def test_a_mapper_has_no_robot(reason, tmp_path):
 def test_missing_packages_are_named(reason, monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     error = reason("evaluate", "run=runs/NAME", "robot=virtual_panda")
-    assert "robot: needs the packages onnx and onnxruntime: pip install 'mimic-arms[deploy,export]'" in error
+    assert "robot: needs the packages jax2onnx and onnxruntime: pip install 'mimic-arms[deploy,export]'" in error

@@ -103,12 +103,6 @@ def test_the_runtime_needs_neither_jax_nor_mujoco(bundle):
     assert result.returncode == 0, result.stderr[-2000:]
 
 
-def test_controllers_are_exported_where_onnxruntime_is_not_installed():
-    code = "import sys; sys.modules['onnxruntime'] = None; import mimic.trainers.export.export, mimic.deploy"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=REPOSITORY)
-    assert result.returncode == 0, result.stderr[-2000:]
-
-
 class Busy(FakeRobot):
     """A robot with a computer that pauses once for some seconds from a time on."""
 

@@ -31,7 +31,12 @@ from mimic.trainers.fine_tuning import with_one_learner
 from mimic.trainers.pose_mapper.any_arm_mapper import describe_arm
 from mimic.trainers.run_config import load_config
 
-_PACKAGES = {"onnx": "jax2onnx", "jax": "flatbuffers", CONTROLLER: "jax2onnx"}  # the package that writes each format
+# The packages that write each format.
+_PACKAGES = {
+    "onnx": ("jax2onnx", "onnxruntime"),
+    "jax": ("flatbuffers",),
+    CONTROLLER: ("jax2onnx", "onnxruntime"),
+}
 _JAX_PLATFORMS = ("cpu", "cuda")
 
 
@@ -53,8 +58,8 @@ def export_run(
     Of a run whose learner is any arm, the function has an input `learner`: the description of an arm, which this
     function writes too. With the metadata's `learner_layout` it can also be made without mimic, see `ArmArrays` in
     mimic/arms/arrays.py. Angles and torques are then [batch, 8], with those of locked joints, and 0 where the arm
-    has no joint. A policy of any arm is a step of its controller, with the poses that it follows as an input and an
-    output; the metadata says what the inputs are.
+    has no joint; in the format "onnx" the batch size is 1. A policy of any arm is a step of its controller, with the
+    poses that it follows as an input and an output; the metadata says what the inputs are.
 
     Args:
       run: run directory.
@@ -129,12 +134,12 @@ def _run_dir(config: ExportConfig) -> Path:
 
 
 def _check_package(format: str) -> None:
-    """Raises a `ValueError` where the package that writes a format is not installed."""
-    package = _PACKAGES[format]
-    try:
-        importlib.import_module(package)
-    except ImportError as error:
-        raise ValueError(f"format={format} needs the package {package}: {install_command('export')}") from error
+    """Raises a `ValueError` where a package that writes a format is not installed."""
+    for package in _PACKAGES[format]:
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise ValueError(f"format={format} needs the package {package}: {install_command('export')}") from error
 
 
 def _file(config: ExportConfig) -> Path:

@@ -218,8 +218,8 @@ def _scan(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any
     return carried
 
 
-# stack, tile, unstack and platform_index are missing in jax2onnx 0.13; it converts the others wrongly, or not at all, where
-# the batch size is not known.
+# jax2onnx 0.13 has no stack, tile, unstack and platform_index. It converts the others wrongly, or not at all, where the
+# batch size is not known; a loop of many operations, always.
 _COMPOSED: dict[str, Callable[[list[Any], Mapping[str, Any], Sequence[Any]], Sequence[Any]]] = {
     "dynamic_slice": _dynamic_slice,
     "gather": _gather,
