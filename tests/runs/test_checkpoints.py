@@ -20,6 +20,7 @@ from mimic.runs.checkpoints import (
     delete_partial_checkpoints,
     load_checkpoint,
     load_training,
+    mark_damaged_after,
     save_checkpoint,
     thin_checkpoints,
 )
@@ -238,6 +239,14 @@ def test_partial_checkpoints_are_no_checkpoints(run_dir):
         *(f"{step:012d}" for step in (0, 10, 20)),
         "run_id",
     }
+
+
+def test_damaged_checkpoints_are_renamed(run_dir):
+    for _ in range(2):  # a step may be damaged again
+        mark_damaged_after(run_dir, 10)
+        assert checkpoint_steps(run_dir) == [0, 10]
+        assert (run_dir / "checkpoints" / "000000000020.damaged" / "params.npz").is_file()
+        save_checkpoint(run_dir, 20, PARAMS)
 
 
 def test_a_step_is_written_anew_only_after_it_was_damaged(run_dir):

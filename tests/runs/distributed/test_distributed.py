@@ -342,7 +342,7 @@ def group(monkeypatch):
     monkeypatch.setattr(process_group, "_GRACE_S", 0.0)
     monkeypatch.setattr(process_group, "EXIT_HOOKS", [])
     monkeypatch.setattr(process_group.atexit, "register", lambda *_: None)
-    monkeypatch.setattr(process_group, "_disconnect", lambda: None)
+    monkeypatch.setattr(process_group, "_disconnect", lambda: client.ended.append(True))
     monkeypatch.setattr(process_group.compat, "coordination_client", lambda: client)
     client, groups = Client(), []
 
@@ -368,7 +368,7 @@ class Client:
     """The coordination service's keys: each is set once."""
 
     def __init__(self):
-        self.keys, self.codes = {}, []
+        self.keys, self.codes, self.ended = {}, [], []
 
     def key_value_set(self, key, value):
         if key in self.keys:
@@ -405,7 +405,7 @@ def test_the_end_is_announced_once(group):
     first, client = group(0)
     for code in (0, 1):
         first.end(code)
-    assert client.keys == {process_group._ENDED: "0 0"}
+    assert client.keys == {process_group._ENDED: "0 0"} and len(client.ended) == 1
 
 
 def test_a_broken_connection_is_one_line_and_another_error_a_traceback(group, capsys):
