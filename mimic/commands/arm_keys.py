@@ -67,8 +67,11 @@ def arm_of_environment(role: str, name: str) -> ArmConfig:
     """The expert or the learner of an environment.
 
     Raises:
-      ValueError: an environment that has no arms of its own.
+      ValueError: an environment that has no arms of its own, or as learner one that draws them.
     """
     if name == _TEMPLATE:
         raise ValueError(f"{role}: expected an arm, or an environment with arms of its own, got {name!r}")
-    return getattr(env_config(name), role)
+    env = env_config(name)
+    if role == "learner":
+        env.check_one_learner()
+    return getattr(env, role)

@@ -57,6 +57,8 @@ def prepare_view(config: ViewConfig) -> Callable[[], int]:
         return _prepare_playback(config)
     # Poses take less than it takes to wake a thread of XLA's up, which on busy cores has to wait for its turn.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+    if not config.mapper:
+        config.env.check_one_learner()
     if config.source:
         return _prepare_captured(config, config.env)
     if not config.mapper:

@@ -161,6 +161,8 @@ ALLOWED = {  # by module and function, with the reason
     ("arms/model_files.py", "mujoco.MjSpec.from_file"): "our own models",
     ("base/npz.py", "archive.open"): "an entry of an open file",
     ("base/npz.py", "zipfile.ZipFile"): "of an open file",
+    ("runs/parameters.py", "zipfile.ZipFile"): "of an open file",
+    ("trainers/export/onnx_model.py", "onnxruntime.InferenceSession"): "of bytes",
     ("commands/fit.py", "Image.open"): "of an open file",
     ("deploy/policy.py", "onnxruntime.InferenceSession"): "of bytes",
     ("envs/__init__.py", "OmegaConf.load"): "our own presets",

@@ -38,7 +38,7 @@ def test_every_run_and_evaluation_has_arguments_that_the_commands_take(preset, c
         config = compose("train", case.arguments)
         assert config.env.physics == ("mjx" if case.group == "mjx" else "auto")
     evaluated = study.evaluations(cases, tmp_path, UNSEEN)
-    assert len(evaluated) == (45 if preset == "paper" else 41)
+    assert len(evaluated) == (42 if preset == "paper" else 38)
     for out, command in evaluated.items():
         config = compose("evaluate", command[3:])
         run = Path(config.run)

@@ -13,6 +13,7 @@ from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs.imitation import training_and_held_out
 from mimic.physics import step as physics
+from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
@@ -184,7 +185,8 @@ def test_a_damaged_checkpoint(reason, run_dir, tmp_path):
 
 
 def test_a_mapper_has_no_controllers(rejected, tmp_path):
-    (tmp_path / "run" / "checkpoints" / "0").mkdir(parents=True)
+    (tmp_path / "run").mkdir()
     save_config(tmp_path / "run", TrainConfig(environment(), PoseMapperConfig()))
+    save_checkpoint(tmp_path / "run", 0, {"weight": np.zeros(1, np.float32)})
     error = rejected("evaluate", f"run={tmp_path / 'run'}", "controller=pd", "compilation_cache=")
     assert "expected a run of trainer=ppo, got one of pose_mapper" in error

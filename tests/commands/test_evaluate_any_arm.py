@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from mimic.commands.arm_keys import arm_of_environment
 from mimic.commands.clips import prepare_clip
 from mimic.commands.config import EvaluateConfig, RenderConfig
 from mimic.commands.evaluate import prepare_evaluation
+from mimic.runs.checkpoints import save_checkpoint
 from tests.helpers.run_directories import write_run
 from tests.helpers.untrained_family import COUNT, HELD_OUT, HORIZON, untrained_family
 
@@ -42,7 +44,7 @@ def test_what_many_arms_do_not_have_is_rejected(run_dir, reason, settings, messa
 
 def test_a_run_of_one_learner_has_its_own(reason, tmp_path):
     run_dir = write_run(tmp_path / "one", [0.1])
-    (run_dir / "checkpoints" / "1").mkdir(parents=True)
+    save_checkpoint(run_dir, 1, {"weight": np.zeros(1, np.float32)})
     assert "learner: expected a run of many arms, got one of env=planar4dof" in reason(
         "evaluate", f"run={run_dir}", "learner=panda"
     )
@@ -53,12 +55,16 @@ def test_a_run_of_one_learner_has_its_own(reason, tmp_path):
     [
         ("view", ["env=panda_family"]),
         ("view", ["run=RUN"]),
-        ("retarget", ["learner=any_arm", "demonstrations=RUN/demonstrations.npz", "out=motions.npz"]),
     ],
 )
 def test_commands_of_one_learner_reject_many(run_dir, reason, name, arguments):
     line = reason(name, *(argument.replace("RUN", str(run_dir)) for argument in arguments))
     assert "expected an environment of one learner, got" in line
+
+
+def test_a_learner_by_the_name_of_an_environment_of_many_is_rejected():
+    with pytest.raises(ValueError, match="expected an environment of one learner, got 'any_arm'"):
+        arm_of_environment("learner", "any_arm")
 
 
 @pytest.mark.parametrize(

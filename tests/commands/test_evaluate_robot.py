@@ -257,8 +257,9 @@ def test_what_does_not_fit_is_rejected(reason, hardware_run, tmp_path):
 
 
 def test_a_mapper_has_no_robot(reason, tmp_path):
-    (tmp_path / "run" / "checkpoints" / "0").mkdir(parents=True)
+    (tmp_path / "run").mkdir()
     save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda4dof"), PoseMapperConfig()))
+    save_checkpoint(tmp_path / "run", 0, {"weight": np.zeros(1, np.float32)})
     error = reason("evaluate", f"run={tmp_path / 'run'}", "robot=virtual_panda", "compilation_cache=")
     assert "robot: expected a run of trainer=ppo with one learner" in error
 

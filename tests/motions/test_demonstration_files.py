@@ -72,8 +72,11 @@ DAMAGES = {
     "cut early": (lambda path: path.write_bytes(path.read_bytes()[:300]), NOT_WHOLE),
     "text": (lambda path: path.write_text("not an archive"), NOT_WHOLE),
     "pickle": (lambda path: path.write_bytes(pickle.dumps(arrays(path))), NOT_WHOLE),
-    "one array": (save_array, NOT_WHOLE + "it has a single array"),
-    "pickled array": (with_arrays(goals=np.array([{}, None], object)), NOT_WHOLE + "it has pickled objects"),
+    "one array": (save_array, NOT_WHOLE + "it is no zip archive"),
+    "pickled array": (
+        with_arrays(goals=np.array([{}, None], object)),
+        NOT_WHOLE + "goals has type object",
+    ),
     "no velocities": (without("qvel"), "it lacks qvel; expected are "),
     "another format": (with_arrays(format=np.array("other")), "has format 'other', expected "),
     "integers": (with_arrays(qpos=np.zeros((2, 51, 7), int)), "qpos in .* must be floating point, got int64"),

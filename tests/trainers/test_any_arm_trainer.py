@@ -89,9 +89,9 @@ def test_status_rows_and_target(trainer):
 def test_too_large_trainings_are_rejected(unchecked):
     too_many = dataclasses.replace(family().demonstrations, count=100_000)
     config = dataclasses.replace(family(), horizon=50, demonstrations=too_many)
-    check_training_memory(TrainConfig(family(), PPOConfig()))
+    check_training_memory(TrainConfig(family(), PPOConfig()).resolve())
     with pytest.raises(ValueError, match="trainer.hidden_layers"):
-        check_training_memory(TrainConfig(config, PPOConfig(hidden_layers=[65_536] * 8)))
+        check_training_memory(TrainConfig(config, PPOConfig(hidden_layers=[65_536] * 8)).resolve())
 
 
 def test_fit_takes_no_environment_of_many_arms():

@@ -9,9 +9,12 @@ from mimic.base.memory import check_memory, device_memory, host_memory
 from mimic.envs import env_config
 from mimic.trainers import memory
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
-from mimic.trainers.memory import check_training_memory
 
 GIB = 2**30
+
+
+def check_training_memory(config):
+    memory.check_training_memory(config.resolve())
 
 
 @pytest.fixture
