@@ -264,7 +264,7 @@ def test_a_mapper_has_no_robot(reason, tmp_path):
     assert "robot: expected a run of trainer=ppo with one learner" in error
 
 
-@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+@pytest.mark.parametrize("package", ["jax2onnx", "onnxruntime"])
 def test_missing_packages_are_named(reason, monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     error = reason("evaluate", "run=runs/NAME", "robot=virtual_panda")

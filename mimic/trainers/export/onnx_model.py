@@ -168,6 +168,12 @@ def _pad(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]
     return [values]
 
 
+def _clamp(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
+    low, values, high = arguments
+    low, high = (jnp.broadcast_to(bound, values.shape) for bound in (low, high))
+    return [lax.min(lax.max(values, low), high)]
+
+
 def _select(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any]) -> list[Any]:
     """Runtimes have no choice between truth values."""
     condition, if_false, if_true = arguments
@@ -221,6 +227,7 @@ def _scan(arguments: list[Any], params: Mapping[str, Any], results: Sequence[Any
 # jax2onnx 0.13 has no stack, tile, unstack and platform_index. It converts the others wrongly, or not at all, where the
 # batch size is not known; a loop of many operations, always.
 _COMPOSED: dict[str, Callable[[list[Any], Mapping[str, Any], Sequence[Any]], Sequence[Any]]] = {
+    "clamp": _clamp,
     "dynamic_slice": _dynamic_slice,
     "gather": _gather,
     "pad": _pad,
