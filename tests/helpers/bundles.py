@@ -42,6 +42,7 @@ def parameters(locked: tuple[int, ...] = ()) -> JointParameters:
     """The parameters of the inner loop of a Panda in the hardware world."""
     config = env_config("panda7dof", world="hardware", learner={"locked": list(locked)})
     scales = {"action_scale": config.action_scale, "control_dt": config.control_dt}
+    assert config.world is not None
     plant = make_plant(config.learner, panda(locked), config.world, **scales)
     return JointParameters(*(np.asarray(x, float) for x in plant.constants.parameters))
 
