@@ -49,18 +49,24 @@ def make_env(config: EnvConfig, demonstrations: Demonstrations | None = None) ->
       demonstrations: motions to imitate. Default None: the training demonstrations of the config.
 
     Raises:
-      ValueError: an unknown class, arms or demonstrations that do not fit.
+      ValueError: an unknown class, arms or demonstrations that do not fit, a reward term that fails.
     """
     from mimic.envs.imitation import ImitationEnv, env_class
+    from mimic.envs.terms import check_reward_terms
 
     config.check_one_learner()
-    if config.kind == "one_arm":
-        return env_class(config)(config, demonstrations)
-    from mimic.envs.world_env import HardwareEnv
+    make_class = env_class(config)
+    if config.kind == "inner_loop":
+        from mimic.envs.world_env import HardwareEnv
 
-    if env_class(config) is not ImitationEnv:
-        raise ValueError(f"environment: expected none with an inner loop (control, world), got {config.environment!r}")
-    return HardwareEnv(config, demonstrations)
+        if make_class is not ImitationEnv:
+            raise ValueError(
+                f"environment: expected none with an inner loop (control, world), got {config.environment!r}"
+            )
+        make_class = HardwareEnv
+    env = make_class(config, demonstrations)
+    check_reward_terms(env)
+    return env
 
 
 def make_family_env(config: EnvConfig, demonstrations: Demonstrations | None = None) -> "AnyArmEnv":

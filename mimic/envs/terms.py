@@ -54,11 +54,35 @@ class WeightedTerm(NamedTuple):
         return f"reward/{self.name}"
 
     def value(self, env: Env, transition: Transition) -> Float[Array, ""]:
-        """The unweighted term. Raises a ValueError where it is no number."""
-        value = jnp.asarray(self.function(env, transition), jnp.float32)
+        """The unweighted term. Raises a ValueError where it fails or is no number."""
+        value = _value("reward_term", self.name, self.function, env, transition)
         if value.shape != ():
             raise ValueError(f"reward_term {self.name!r}: expected a number, got shape {list(value.shape)}")
         return value
+
+
+def _value(kind: str, name: str, function: Callable[..., Any], *arguments: Any) -> Array:
+    """The value of a term as an array. Raises a ValueError with its name where the function raises anything."""
+    try:
+        return jnp.asarray(function(*arguments), jnp.float32)
+    except Exception as error:
+        first_line = str(error).strip().partition("\n")[0]
+        raise ValueError(f"{kind} {name!r}: {type(error).__name__}: {first_line}") from error
+
+
+def check_reward_terms(env: Env) -> None:
+    """Traces each reward term once. Raises a ValueError that names the first one that fails or is no number."""
+
+    def values(key: Array) -> list[Array]:
+        start = env.start(key)
+        action, torque = jnp.zeros(env.action_size), jnp.zeros(env.learner.num_joints)
+        learner_states = link_states(env.learner, start.qpos, start.qvel)
+        expert_states = env.expert_at(start.demonstration, start.step)
+        transition = Transition(start, start, action, torque, learner_states, expert_states)
+        return [term.value(env, transition) for term in env.reward_terms]
+
+    if env.reward_terms:
+        jax.eval_shape(values, jax.random.PRNGKey(0))
 
 
 def self_collision(env: Env, transition: Transition) -> Float[Array, ""]:
@@ -118,8 +142,8 @@ def observation_terms(names: Sequence[str]) -> tuple[tuple[str, ObservationTerm]
 
 
 def observed(name: str, term: ObservationTerm, env: Env, state: ArmState) -> Float[Array, " numbers"]:
-    """The value of an observation term. Raises a ValueError where it is no vector."""
-    value = jnp.asarray(term(env, state), jnp.float32)
+    """The value of an observation term. Raises a ValueError where it fails or is no vector."""
+    value = _value("observation_term", name, term, env, state)
     if value.ndim != 1:
         raise ValueError(f"observation_term {name!r}: expected a vector, got shape {list(value.shape)}")
     return value

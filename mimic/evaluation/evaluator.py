@@ -46,6 +46,7 @@ class Rollouts:
       command: [demonstrations, T, joints] what the controller commanded: the torque, or with an inner loop the target,
         see `ImitationEnv.command`. None where it was not recorded.
       start: [demonstrations, joints] joint angles before the first step [rad]. None where they were not recorded.
+      reward_terms: [demonstrations, T] value of each of the environment's reward terms, unweighted, by name.
     """
 
     qpos: Float[Array, "demonstrations time joints"]
@@ -54,6 +55,7 @@ class Rollouts:
     distance: Float[Array, "demonstrations time"]
     command: Float[Array, "demonstrations time joints"] | None = None
     start: Float[Array, "demonstrations joints"] | None = None
+    reward_terms: dict[str, Float[Array, "demonstrations time"]] = struct.field(default_factory=dict)
 
 
 class Evaluator:
@@ -124,8 +126,9 @@ class Evaluator:
             state = env.step(carry[0], action)
             after: Any = state.pipeline_state
             torque, command = env.commanded_torque(after, action), env.command(carry[0].pipeline_state, action)
-            rollouts = Rollouts(after.qpos, after.qvel, torque, state.metrics["distance"], command)
-            return (state, memory), rollouts
+            terms = {term.name: state.metrics[term.metric] for term in env.reward_terms}
+            distance = state.metrics["distance"]
+            return (state, memory), Rollouts(after.qpos, after.qvel, torque, distance, command, reward_terms=terms)
 
         # `vmap` is inside the loop: around the loop, JAX would trace a step twice, without and with the batch.
         start = jax.vmap(begin)(jnp.arange(env.demonstrations.count))
@@ -163,7 +166,10 @@ class Evaluator:
         return means_by_split(tables, self.parts)
 
     def table(self, rollouts: Rollouts) -> Table:
-        """One row for each demonstration: gap, mean distance, bound, distance of the start pose, and `measure`'s."""
+        """One row for each demonstration: gap, mean distance, bound, distance of the start pose, and `measure`'s.
+
+        `reward.NAME` is the mean of a reward term, unweighted.
+        """
         qpos, qvel, torque = (np.asarray(x) for x in (rollouts.qpos, rollouts.qvel, rollouts.torque))
         states = link_state_table(self.env.learner, qpos, qvel)
         distances = np.asarray(rollouts.distance), self.lower_bound, self.hold_distance
@@ -174,6 +180,7 @@ class Evaluator:
             "lower_bound": bound,
             "hold_distance": hold,
             **measure(self.env, states, qpos, qvel, torque),
+            **{f"reward.{name}": np.asarray(x).mean(axis=1, dtype=float) for name, x in rollouts.reward_terms.items()},
         }
 
     def summary(self, rollouts: Rollouts) -> dict[str, Any]:

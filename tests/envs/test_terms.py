@@ -12,7 +12,9 @@ import mimic
 from mimic.envs.imitation import layout_of
 from mimic.envs.make import make_env
 from mimic.envs.wrappers import fresh_episodes
+from mimic.evaluation.evaluator import Evaluator, References
 from mimic.metric.capsule_distances import capsule_axes
+from mimic.metric.kinematics import link_state_table
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_plugins import used_plugins
 
@@ -164,16 +166,42 @@ def test_a_runaway_is_charged_the_own_distance(own_registry):
     ("kind", "thing", "settings", "message"),
     [
         ("reward_term", lambda env, t: t.after.qpos, {"reward": {"terms": {"bad": 1.0}}}, r"a number, got shape \[4\]"),
-        ("observation_term", lambda env, s: s.step, {"observation": {"terms": ["bad"]}}, r"a vector, got shape \[\]"),
+        ("reward_term", lambda env, t: t.speed, {"reward": {"terms": {"bad": 1.0}}}, "reward_term 'bad': AttributeErr"),
         ("demonstrations", lambda expert, config: None, {"demonstrations": {"source": "bad"}}, "expected Demonst"),
         ("environment", dict, {"environment": "bad"}, "expected a subclass of ImitationEnv"),
     ],
 )  # fmt: skip
-def test_a_thing_that_returns_something_else_is_one_line(own_registry, kind, thing, settings, message):
+def test_a_thing_that_fails_or_returns_something_else_is_one_line(own_registry, kind, thing, settings, message):
     mimic.register(kind, "bad", thing)
     with pytest.raises(ValueError, match=message):
-        env = mimic.make("planar4dof", physics="fused", **{**SMALL, **settings})
-        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(4)), jax.random.PRNGKey(0))
+        mimic.make("planar4dof", physics="fused", **{**SMALL, **settings})
+
+
+@pytest.mark.parametrize(
+    ("term", "message"),
+    [
+        (lambda env, state: state.step, r"observation_term 'bad': expected a vector, got shape \[\]"),
+        (lambda env, state: {}["speed"], "observation_term 'bad': KeyError: 'speed'"),
+    ],
+)
+def test_an_observation_term_that_fails_is_one_line(own_registry, term, message):
+    mimic.register("observation_term", "bad", term)
+    env = mimic.make("planar4dof", physics="fused", observation={"terms": ["bad"]}, **SMALL)
+    with pytest.raises(ValueError, match=message):
+        _ = env.observation_size
+
+
+def test_the_report_has_the_mean_of_a_reward_term(terms, monkeypatch):
+    env = mimic.make("planar4dof", physics="fused", **SMALL, **terms)
+    evaluator = Evaluator(env, env.demonstrations.select([0]))
+    zeros = np.zeros((3, 5))  # in place of the bound and the baselines, which are not under test
+    monkeypatch.setattr(evaluator, "_references", lambda: References(zeros, zeros, {}))
+    rollouts = jax.jit(lambda: evaluator.rollout(lambda state: jnp.full(4, 0.5)))()
+    last = link_state_table(env.learner, np.asarray(rollouts.qpos), np.asarray(rollouts.qvel)).position[:, :, -1, 1]
+    expected = np.mean(last - 0.05, axis=1)
+    summary = evaluator.summary(rollouts)
+    assert summary["reward.height"]["train"] == pytest.approx(expected[:2].mean(), abs=1e-5)  # float32
+    assert summary["reward.height"]["held_out"] == pytest.approx(expected[2], abs=1e-5)
 
 
 def test_terms_are_named_once_with_finite_weights(terms):

@@ -228,6 +228,15 @@ class PPOTrainer(Trainer):
             (label, _text(form, metrics[key]["train"]), _text(form, metrics[key]["held_out"]))
             for label, key, form in by_split
         ]
+        rows += [
+            (
+                f"reward term {key.removeprefix('reward.')}",
+                _text("{:.4f}", value["train"]),
+                _text("{:.4f}", value["held_out"]),
+            )
+            for key, value in metrics.items()
+            if key.startswith("reward.")
+        ]
         if "mjx" in metrics:
             on_mjx = {split: _text("{:.2%}", gap) for split, gap in metrics["mjx"]["optimality_gap"].items()}
             rows.insert(1, ("  evaluated on MJX", on_mjx["train"], on_mjx["held_out"]))
