@@ -8,6 +8,7 @@ from omegaconf import MISSING
 from mimic.base import registry
 from mimic.base.config import check_choice
 from mimic.base.ranges import check_ranges, number, seed_number
+from mimic.envs import env_config, environments
 from mimic.envs.config import EnvConfig
 from mimic.runs.distributed.process_group import DistributedConfig
 from mimic.trainers.presets import MAPPER_PRESETS, PPO_PRESETS, PPO_PRESETS_OF
@@ -199,6 +200,11 @@ _MAPPER_FIELDS_OF = {
     "to one learner": ("inputs", "outputs", "hidden_layers", "activation"),
     "to any arm (env.arms)": ("width", "layers", "guesses", "refinements"),
 }
+# Fields of an environment that a mapper does not use: it maps poses and simulates nothing.
+_NOT_OF_MAPPERS = (
+    *("demonstrations", "start", "horizon", "preview", "reward", "observation", "limit_weight", "speed_bound"),
+    *("control_dt", "substeps", "physics", "randomization", "action_scale"),
+)
 ATTENTION_HEADS = 4  # of each layer of the network of any arm
 MAPPER_INPUTS, MAPPER_OUTPUTS, ACTIVATIONS = ("angles", "link_states"), ("tanh", "circle"), ("leaky_relu", "gelu")
 
@@ -401,3 +407,16 @@ class TrainConfig:
     def resolve(self, backend: str = "cpu", devices: int = 1) -> Self:
         """The config with a resolved trainer, see `TrainerConfig.resolve`."""
         return dataclasses.replace(self, trainer=self.trainer.resolve(backend, devices, env=self.env))
+
+    def check_used(self) -> None:
+        """Raises a ValueError for a field of the environment that its user changed and the trainer does not use."""
+        env = self.env
+        if self.trainer.name != "pose_mapper" or env.world is not None:  # the preset of a world sets many fields
+            return
+        preset = env_config(env.name) if env.name in environments() else EnvConfig()
+        for field in _NOT_OF_MAPPERS:
+            if getattr(env, field) != getattr(preset, field):
+                raise ValueError(
+                    f"env.{field}: expected no change with trainer=pose_mapper, which simulates nothing, "
+                    f"got {getattr(env, field)!r:.80}"
+                )

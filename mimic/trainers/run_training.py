@@ -86,6 +86,8 @@ def prepare_training(
     if group and config.trainer.name != "ppo":
         raise ValueError(f"distributed: expected trainer=ppo, got {config.trainer.name}, which trains in one process")
     is_first = group is None or group.first
+    if not resumed_dir:
+        config.check_used()
     check_loggers(config.loggers)
     run_dir = resumed_dir or (new_run_dir(config) if is_first else Path())
     lock = RunLock(run_dir) if resumed_dir and is_first else None  # before its checkpoints are read

@@ -57,6 +57,10 @@ BAD = {
         "expected a divisor of samples = 65536, got 1000",
     ),
     "heads": (lambda: PoseMapperConfig(heads=0), "trainer.heads: expected a whole number from 1 to 1,000, got 0"),
+    "horizon": (
+        lambda: TrainConfig(mimic.env_config("any_arm", horizon=10), PoseMapperConfig()).check_used(),
+        "env.horizon: expected no change with trainer=pose_mapper, which simulates nothing, got 10",
+    ),
     "inputs": (lambda: PoseMapperConfig(inputs="pixels").resolve("cpu"), "expected one of angles, link_states"),
 }
 
