@@ -1,6 +1,7 @@
 """Distance between two embodiments: distances of link pairs, their weights, and the reduction to one number."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from mimic.base import spatial
+from mimic.base.batches import over_batch
 from mimic.base.config import check_choice
 from mimic.metric.kinematics import LinkStates
 
@@ -96,11 +98,12 @@ def rotation_distance(
 
 def link_distances(
     expert_states: LinkStates, learner_states: LinkStates, weights: Weights, *, rotation: RotationMeasure = "cosine"
-) -> Float[Array, "expert learner"]:
+) -> Float[Array, "*batch expert learner"]:
     """Matrix D' of the distances between each link of the expert and each link of the learner (paper, eqs. 8, 19).
 
     Args:
-      expert_states: link states of the expert; normalized, to compare arms of different size.
+      expert_states: link states of the expert; normalized, to compare arms of different size. Batch axes before those
+        of a sample broadcast with those of the learner.
       learner_states: link states of the learner.
       weights: constants, or a function of the unweighted distances of one pair, such as `adaptive_weights`; or a
         `LinkDistance`.
@@ -110,6 +113,13 @@ def link_distances(
       ValueError: an unknown measure, or a weight on a part that candidate points lack.
     """
     check_choice("rotation", rotation, ROTATION_MEASURES)
+    distances = functools.partial(_link_distances, weights, rotation)
+    return over_batch(distances, expert_states, learner_states, axes=2)
+
+
+def _link_distances(
+    weights: Weights, rotation: RotationMeasure, expert_states: LinkStates, learner_states: LinkStates
+) -> Float[Array, "expert learner"]:
     if isinstance(weights, LinkDistance):
         own = jax.vmap(jax.vmap(weights.function, in_axes=(None, 0)), in_axes=(0, None))
         return own(expert_states, learner_states)
@@ -165,11 +175,13 @@ class Metric:
         constant = not callable(self.correspondence) and isinstance(self.weights, DistanceWeights)
         return constant and self.reduction == "mean"
 
-    def __call__(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, ""]:
+    def __call__(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, "*batch"]:
         """See `embodiment_distance`."""
-        return self.reduced(self.link_distances(expert_states, learner_states))
+        return over_batch(self.reduced, self.link_distances(expert_states, learner_states), axes=2)
 
-    def link_distances(self, expert_states: LinkStates, learner_states: LinkStates) -> Float[Array, "expert learner"]:
+    def link_distances(
+        self, expert_states: LinkStates, learner_states: LinkStates
+    ) -> Float[Array, "*batch expert learner"]:
         """See `link_distances`."""
         return link_distances(expert_states, learner_states, self.weights, rotation=self.rotation)
 
@@ -203,11 +215,11 @@ def embodiment_distance(
     *,
     rotation: RotationMeasure = "cosine",
     reduction: Reduction = "mean",
-) -> Float[Array, ""]:
+) -> Float[Array, "*batch"]:
     """Distance between two embodiments: the reduction of W o D' to one number (paper, Algorithm 1).
 
     Args:
-      expert_states: link states of the expert.
+      expert_states: link states of the expert. Batch axes before those of a sample broadcast with those of the learner.
       learner_states: link states of the learner.
       correspondence: see `Metric`.
       weights: see `link_distances`.

@@ -1,4 +1,7 @@
-"""Link frames, twists and link states of an embodiment: one sample per call, batched by `jax.vmap`."""
+"""Link frames, twists and link states of an embodiment.
+
+Joint angles and velocities may have batch axes before that of the joints. These broadcast; `jax.vmap` gives the same.
+"""
 
 import dataclasses
 import functools
@@ -14,6 +17,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import LONG, Embodiment
 from mimic.base import spatial
+from mimic.base.batches import over_batch
 from mimic.base.spatial import Rotation, Vector
 
 
@@ -68,17 +72,23 @@ class LinkVectors(NamedTuple):
 BASE = JointFrame(spatial.IDENTITY, spatial.ZERO, spatial.ZERO, spatial.ZERO)
 
 
-def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Frames:
+def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, "*batch joints"]) -> Frames:
     """Link frames (paper, eq. 5).
 
     Args:
       arm: the embodiment.
       qpos: joint angles [rad].
 
+    Returns:
+      Frames with the batch axes of `qpos`, if any, before their own.
+
     Raises:
-      ValueError: `qpos` is not one angle for each joint.
+      ValueError: `qpos` is not [..., joints].
     """
-    qpos = joint_values(arm, qpos, "qpos")
+    return over_batch(functools.partial(_frames, arm), joint_values(arm, qpos, "qpos"), axes=1)
+
+
+def _frames(arm: Embodiment, qpos: Float[Array, " joints"]) -> Frames:
     frames = joint_frames(arm, qpos, None)
     positions, rotations = [], []
     for link, joint in enumerate(arm.link_joint):
@@ -93,8 +103,8 @@ def forward_kinematics(arm: Embodiment, qpos: Float[ArrayLike, " joints"]) -> Fr
 
 def link_states(
     arm: Embodiment,
-    qpos: Float[ArrayLike, " joints"],
-    qvel: Float[ArrayLike, " joints"] | None = None,
+    qpos: Float[ArrayLike, "*#batch joints"],
+    qvel: Float[ArrayLike, "*#batch joints"] | None = None,
     *,
     normalized: bool = True,
 ) -> LinkStates:
@@ -106,12 +116,21 @@ def link_states(
       qvel: joint velocities [rad/s]; zero where None.
       normalized: divide positions and linear velocities by the chain length.
 
+    Returns:
+      States with the batch axes of `qpos` and `qvel`, if any, before their own.
+
     Raises:
-      ValueError: `qpos` or `qvel` is not one number for each joint.
+      ValueError: `qpos` or `qvel` is not [..., joints].
     """
-    qpos = joint_values(arm, qpos, "qpos")
+    motion = [joint_values(arm, qpos, "qpos")]
     if qvel is not None:
-        qvel = joint_values(arm, qvel, "qvel")
+        motion.append(joint_values(arm, qvel, "qvel"))
+    return over_batch(functools.partial(_link_states, arm, normalized), *motion, axes=1)
+
+
+def _link_states(
+    arm: Embodiment, normalized: bool, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"] | None = None
+) -> LinkStates:
     if arm.num_joints > LONG:
         arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, qpos.dtype), arm)
         return _states_of_long_arm(arm, qpos, jnp.zeros_like(qpos) if qvel is None else qvel, normalized)
@@ -227,8 +246,8 @@ def candidate_points(states: LinkStates) -> LinkStates:
 
 
 def body_twists(
-    arm: Embodiment, qpos: Float[ArrayLike, " joints"], qvel: Float[ArrayLike, " joints"]
-) -> Float[Array, "links 6"]:
+    arm: Embodiment, qpos: Float[ArrayLike, "*#batch joints"], qvel: Float[ArrayLike, "*#batch joints"]
+) -> Float[Array, "*batch links 6"]:
     """Body twists [omega, v] of the link frames, by the recursion over adjoint maps (paper, eq. 7).
 
     Units: omega [rad/s] and v [m/s], both in the link's own frame.
@@ -239,10 +258,13 @@ def body_twists(
       qvel: joint velocities [rad/s].
 
     Raises:
-      ValueError: `qpos` or `qvel` is not one number for each joint.
+      ValueError: `qpos` or `qvel` is not [..., joints].
     """
-    qpos = joint_values(arm, qpos, "qpos")
-    qvel = joint_values(arm, qvel, "qvel")
+    motion = joint_values(arm, qpos, "qpos"), joint_values(arm, qvel, "qvel")
+    return over_batch(functools.partial(_twists, arm), *motion, axes=1)
+
+
+def _twists(arm: Embodiment, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"]) -> Float[Array, "links 6"]:
     twists = [(spatial.ZERO, spatial.ZERO)]
     for joint, parent in enumerate(arm.joint_parent):
         omega, v = twists[parent + 1]
@@ -359,7 +381,7 @@ def _zero_offset(arm: Embodiment, link: int, joint: int) -> Vector:
 
 
 def joint_values(arm: Embodiment, values: ArrayLike, name: str) -> Array:
-    """The values as a floating-point array, checked to be one number for each joint.
+    """The values as a floating-point array, checked to be [..., joints].
 
     Args:
       arm: the embodiment.
@@ -370,10 +392,7 @@ def joint_values(arm: Embodiment, values: ArrayLike, name: str) -> Array:
       ValueError: another shape.
     """
     values = jnp.asarray(values)
-    if values.shape != (arm.num_joints,):
-        raise ValueError(
-            f"{name}: expected shape ({arm.num_joints},), one number for each joint of {arm.name}, got {values.shape}"
-            + ("; batch with jax.vmap" if values.ndim > 1 else "")
-        )
+    if values.ndim == 0 or values.shape[-1] != arm.num_joints:
+        raise ValueError(f"{name}: expected shape [..., {arm.num_joints}] for {arm.name}, got {values.shape}")
     is_floating = jnp.issubdtype(values.dtype, jnp.floating)
     return values if is_floating else values.astype(jnp.result_type(values.dtype, jnp.float32))

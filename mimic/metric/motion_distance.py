@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.embodiment import LONG, Embodiment, in_chain_lengths
 from mimic.base import fused_kernel
+from mimic.base.batches import over_batch
 from mimic.metric import analytic_gradient
 from mimic.metric.distance import (
     PAPER_WEIGHTS,
@@ -42,13 +43,13 @@ def motion_distance(
 ) -> MotionDistance:
     """Returns a function (expert_qpos, expert_qvel, learner_qpos, learner_qvel) -> embodiment distance.
 
-    The function takes one sample and equals `embodiment_distance` of both arms' `link_states`. Create it once for two
-    arms: their constants are then folded into it.
+    The function equals `embodiment_distance` of both arms' `link_states`. Batch axes before that of the joints
+    broadcast. Create it once for two arms: their constants are then folded into it.
 
     A static metric (constant W and weights, rotation "cosine", reduction "mean") has its own implementation. It skips
     pairs of links that do not correspond and parts of weight 0. Its gradient is in closed form, in forward and reverse
-    mode, and only with respect to the differentiated arguments. `jax.vmap` of the function, or of its gradient, is one
-    kernel on NVIDIA GPUs.
+    mode, and only with respect to the differentiated arguments. A batch of the function, or `jax.vmap` of its gradient,
+    is one kernel on NVIDIA GPUs.
 
     Any other metric, and any metric where an arm has more than 16 joints, composes `link_states` and
     `embodiment_distance`, with automatic differentiation: the unrolled code of long arms takes minutes to compile.
@@ -62,7 +63,7 @@ def motion_distance(
       reduction: see `embodiment_distance`.
 
     Returns:
-      The function; batch it with `jax.vmap`. It raises ValueError if an argument is not one number for each joint.
+      The function. It raises ValueError if an argument is not [..., joints].
 
     Raises:
       ValueError: what `embodiment_distance` rejects.
@@ -90,7 +91,7 @@ def motion_distance(
             joint_values(learner, learner_qvel, "learner_qvel"),
         ]
         dtype = jnp.result_type(*motion)
-        return distance(*(values.astype(dtype) for values in motion))
+        return over_batch(distance, *(values.astype(dtype) for values in motion), axes=1)
 
     return of_motions
 

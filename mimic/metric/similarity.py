@@ -44,8 +44,8 @@ class CentreLine:
     chains: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
 
-def centre_line(arm: Embodiment, qpos: Float[ArrayLike, " joints"], *, samples: int = SAMPLES) -> CentreLine:
-    """Centre line of an arm in one pose.
+def centre_line(arm: Embodiment, qpos: Float[ArrayLike, "*batch joints"], *, samples: int = SAMPLES) -> CentreLine:
+    """Centre line of an arm in one pose, or in each pose of a batch.
 
     Args:
       arm: the embodiment.
@@ -53,7 +53,7 @@ def centre_line(arm: Embodiment, qpos: Float[ArrayLike, " joints"], *, samples: 
       samples: number of points at equal arc length.
 
     Raises:
-      ValueError: `qpos` is not one angle for each joint, or `samples` is below 1.
+      ValueError: `qpos` is not [..., joints], or `samples` is below 1.
     """
     return _sampled(arm, link_states(segment_arm(arm), qpos, normalized=False), samples)
 

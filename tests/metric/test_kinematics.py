@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -194,13 +195,17 @@ def test_states_at_rest_and_unnormalized():
     np.testing.assert_array_equal(points.position, rest.position)
 
 
-def test_a_batch_is_a_vmap_is_a_loop():
-    arm = panda(locked=(3, 6, 7))
-    qpos, qvel = (x.astype(np.float32) for x in motions(4))
-    batch = jax.vmap(link_states, in_axes=(None, 0, 0))(arm, qpos, qvel)
+@pytest.mark.parametrize("function", [forward_kinematics, link_states, body_twists])
+def test_a_batch_is_a_vmap_is_a_loop(function):
+    """Batch axes come first, and broadcast."""
+    arm = planar_arm([0.4, 0.6])
+    motion = tuple(x.astype(np.float32) for x in motions(2))[: 1 if function is forward_kinematics else 2]
+    mapped = jax.vmap(lambda *x: function(arm, *x))(*motion)
+    batch = function(arm, motion[0][:, None], *(x[0] for x in motion[1:]))
     for k in range(POSES):
-        one = link_states(arm, qpos[k], qvel[k])
-        jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k], b), batch, one)
+        one, first = function(arm, *(x[k] for x in motion)), function(arm, motion[0][k], *(x[0] for x in motion[1:]))
+        jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k], b), mapped, one)
+        jax.tree.map(lambda a, b, k=k: np.testing.assert_array_equal(a[k, 0], b), batch, first)
 
 
 @pytest.mark.slow_for("18-body_twists", "18-forward_kinematics")
@@ -241,11 +246,11 @@ def test_integer_angles_are_accepted(unchecked):
 
 
 def test_annotated_shapes_are_checked_while_testing():
-    with pytest.raises(jaxtyping.TypeCheckError, match="qpos"):
-        link_states(planar_arm([0.4, 0.6]), np.zeros((5, 2), np.float32))
+    with pytest.raises(jaxtyping.TypeCheckError, match="qvel"):
+        link_states(planar_arm([0.4, 0.6]), np.zeros(2, np.float32), np.zeros(3, np.float32))
 
 
-@pytest.mark.parametrize("shape", [(), (6,), (8,), (7, 1), (5, 7)])
+@pytest.mark.parametrize("shape", [(), (6,), (7, 1)])
 def test_wrong_shapes_are_rejected(unchecked, shape):
     arm, good, bad = panda(), np.zeros(7, np.float32), np.zeros(shape, np.float32)
     for what, call in {
@@ -257,10 +262,10 @@ def test_wrong_shapes_are_rejected(unchecked, shape):
         "qvel": [lambda: link_states(arm, good, bad), lambda: body_twists(arm, good, bad)],
     }.items():
         for function in call:
-            with pytest.raises(ValueError, match=rf"^{what}: expected shape \(7,\).* panda, got .*$") as error:
+            with pytest.raises(
+                ValueError, match=rf"^{what}: expected shape \[\.\.\., 7\] for panda, got {re.escape(str(shape))}$"
+            ):
                 function()
-            assert "\n" not in str(error.value)
-            assert ("jax.vmap" in str(error.value)) == (len(shape) > 1)
 
 
 @pytest.mark.usefixtures("x64")
