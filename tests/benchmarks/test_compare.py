@@ -1,12 +1,10 @@
 """`python -m benchmarks.compare`."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 
-from benchmarks.compare import Value, changed, read_values
+from benchmarks.compare import Value, changed, main, read_values
 
 
 def _results(**rows):
@@ -47,19 +45,19 @@ def test_a_change_is_beyond_the_spread_and_the_minimum(before, after, is_changed
     assert changed(before, after, 0.05) == is_changed
 
 
-def _compare(*paths):
-    return subprocess.run(
-        [sys.executable, "-m", "benchmarks.compare", *map(str, paths)], capture_output=True, text=True, check=False
-    )
+def test_the_command_shows_what_changed_and_rejects_other_files(tmp_path, monkeypatch, capsys):
+    def compare(*paths):
+        monkeypatch.setattr("sys.argv", ["compare", *map(str, paths)])
+        main()
 
-
-def test_the_command_shows_what_changed_and_rejects_other_files(tmp_path):
     old, new, other = (tmp_path / name for name in ("old.json", "new.json", "other.json"))
     old.write_text(json.dumps(_results(rows=[{"case": "x", "time": 1.0, "gone": 1.0}])))
     new.write_text(json.dumps(_results(rows=[{"case": "x", "time": 2.0}])))
     other.write_text(json.dumps({**_results(), "benchmark": "c"}))
-    shown = _compare(old, new).stdout
+    compare(old, new)
+    shown = capsys.readouterr().out
     assert "+100.0%" in shown and "1 of 1 values changed" in shown and "1 values are not in the new file" in shown
     for wrong in (tmp_path / "none.json", other):
-        rejected = _compare(old, wrong)
-        assert rejected.returncode == 1 and rejected.stderr.startswith("error: ") and rejected.stderr.count("\n") == 1
+        with pytest.raises(SystemExit, match="^error: ") as error:
+            compare(old, wrong)
+        assert "\n" not in str(error.value)

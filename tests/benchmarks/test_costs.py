@@ -19,14 +19,6 @@ def test_all_has_the_weight_of_each_row():
         assert weight == plain | {name: total[name]} and weight[name] > 0
 
 
-def test_random_motions_stay_within_the_limits():
-    arm = mimic.panda(limits="hardware")
-    motions = benchmark.random_motions(arm, 3)
-    lower, upper = np.asarray(arm.joint_range, np.float32).T
-    assert motions.shape == (3, benchmark.STEPS, 7) and np.all((motions >= lower) & (motions <= upper))
-    assert np.abs(np.diff(motions, axis=1)).max() < 1.0  # rad in a step: no jump
-
-
 def test_rows_say_what_the_learner_does(monkeypatch):
     """A learner that copies the free joints: its hand is off, and a step of its motion is that of the expert."""
     free = [0, 1, 3, 4]

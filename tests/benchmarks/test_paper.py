@@ -7,15 +7,9 @@ import pytest
 from benchmarks.figures import paper
 
 
-def test_a_figure_is_written_as_png_and_pdf(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["paper", "--out", str(tmp_path), "--only", "links"])
-    paper.main()
-    assert {path.name for path in tmp_path.iterdir()} == {"links.png", "links.pdf"}
-
-
 @pytest.mark.slow
 def test_figures_without_a_mapper(tmp_path, monkeypatch):
-    names = ["correspondence", "points", "similarity", "weights", "contours"]
+    names = ["links", "correspondence", "points", "similarity", "weights", "contours"]
     monkeypatch.setattr(sys, "argv", ["paper", "--out", str(tmp_path), "--only", *names])
     paper.main()
     assert {path.name for path in tmp_path.iterdir()} == {f"{name}.{kind}" for name in names for kind in ("png", "pdf")}

@@ -1,9 +1,7 @@
 """`python -m benchmarks.pretrained`: run directories become the networks that come with mimic."""
 
-import dataclasses
 import json
 import shlex
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from mimic.envs import env_config
 from mimic.runs.files import REPORT
 from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
-from mimic.trainers.pretrained.network import NETWORKS, read_any_arm_mapper, read_network
+from mimic.trainers.pretrained.network import NETWORKS, read_network
 from mimic.trainers.run_config import load_config
 from tests.helpers import pages
 from tests.helpers.untrained_run import untrained_run
@@ -29,7 +27,11 @@ def test_the_command_names_what_differs_from_the_defaults():
     ]
 
 
-@pytest.mark.parametrize("folder", sorted(NETWORKS.iterdir()), ids=lambda folder: folder.name)
+FOLDERS = sorted(NETWORKS.iterdir())
+
+
+@pytest.mark.slow_for(*(folder.name for folder in FOLDERS if not folder.name.startswith(("any_arm", "planar4dof"))))
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_the_recorded_commands_are_valid(folder, monkeypatch):
     pages.check(shlex.split(read_json(folder / REPORT)["source"]["command"]), monkeypatch)
 
@@ -58,30 +60,3 @@ def test_a_mapper_is_measured_as_it_is_stored(tmp_path):
     mapper = read_network(tmp_path / "out" / "planar4dof-pose_mapper", "pose_mapper")
     assert row["gap"] == mapper.report["quality"] == trained["quality"]
     assert mapper.report["copying_distance"]["held_out"] > mapper.report["optimal_distance"]["held_out"]
-
-
-@pytest.mark.slow
-def test_a_mapper_to_any_arm_is_stored_without_the_files_of_its_report(tmp_path):
-    settings: dict[str, Any] = {
-        "width": 16,
-        "layers": 1,
-        "heads": 2,
-        "guesses": 1,
-        "refinements": 1,
-        "samples": 64,
-        "batch_size": 32,
-        "epochs": 1,
-    }
-    trainer = PoseMapperConfig(**settings, evaluations=1, validation_poses=8, held_out_poses=2)
-    arms = {"locked_fraction": 1.0, "most_locked": 1, "unseen": ["2"], "evaluated": ["panda"]}
-    config = TrainConfig(env_config("panda_family", arms=arms), trainer, run_dir=str(tmp_path / "run"))
-    assert train.prepare_training(dataclasses.replace(config, compilation_cache=""), 0.0)() == 0
-    row = pretrained.make_network(tmp_path / "run", tmp_path / "out", "c0ffee", True)
-    mapper = read_any_arm_mapper(tmp_path / "out" / "panda_family-pose_mapper")
-    assert row["gap"] == mapper.report["quality"] and set(mapper.report["arms"]) >= {"locked 2", "panda"}
-    assert (
-        mapper.env.arms is not None
-        and mapper.env.arms.evaluated == []
-        and "evaluated" not in mapper.report["source"]["command"]
-    )
-    assert mapper(np.zeros(7), "panda4dof").shape == (4,)

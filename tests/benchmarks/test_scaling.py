@@ -1,6 +1,5 @@
 """`python -m benchmarks.scaling`."""
 
-import argparse
 import json
 import sys
 
@@ -9,11 +8,6 @@ import pytest
 from benchmarks import scaling
 
 OF_ONE = {"num_envs": 16, "batch_size": 16, "num_timesteps": 3000}
-SMALL = (
-    "env.demonstrations.count=2", "env.demonstrations.held_out=1",
-    "trainer.preset=cpu", "trainer.num_minibatches=2", "trainer.num_updates_per_batch=1", 
-    "trainer.hidden_layers=[8]",
-)  # fmt: skip
 
 
 def test_a_run_sees_so_many_devices(monkeypatch):
@@ -41,7 +35,7 @@ def test_weak_scaling_multiplies_and_the_speed_leaves_out_what_compiled(tmp_path
     assert (row["steps_per_s"], row["spread"]) == (110.0, pytest.approx(10 / 110, abs=1e-4))
 
 
-def test_efficiency_is_relative_to_the_fewest_devices(tmp_path):
+def test_efficiency_is_relative_to_the_fewest_devices():
     rates = {("weak", 2, 1): 200.0, ("weak", 4, 4): 360.0, ("weak", 4, 1): 300.0, ("strong", 2, 1): 100.0}
     results = [
         {"scaling": kind, "devices": devices, "processes": processes, "seed": seed, "steps_per_s": rate + seed - 1}
@@ -54,8 +48,6 @@ def test_efficiency_is_relative_to_the_fewest_devices(tmp_path):
         ("weak", 2, 1, 1.0), ("weak", 4, 1, 0.75), ("weak", 4, 4, 0.9), ("strong", 2, 1, 1.0),
     ]  # fmt: skip
     assert rows[0]["gap"] == pytest.approx(0.01) and rows[0]["gap_deviation"] == pytest.approx(0.01)
-    scaling.draw(rows, "made up", tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").stat().st_size > 10_000
 
 
 def test_a_run_that_fails_loses_none_of_those_before_it(tmp_path, monkeypatch):
@@ -76,21 +68,3 @@ def test_a_run_that_fails_loses_none_of_those_before_it(tmp_path, monkeypatch):
     assert [(row["scaling"], row["devices"]) for row in runs] == [
         ("weak", 1), ("strong", 1), ("weak", 2), ("strong", 2),
     ]  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)  # eight trainings
-def test_two_devices_train_the_same_in_all_ways(monkeypatch):
-    monkeypatch.setattr(scaling, "_EVALUATIONS", 3)
-    sizes = {"env": "planar4dof", "num_envs": 16, "batch_size": 16, "steps": 3000, "arguments": SMALL}
-    lists = {"devices": [1, 2], "kinds": scaling.KINDS, "processes": scaling.PROCESSES, "seeds": [0]}
-    results = list(scaling.run(argparse.Namespace(**sizes, **lists)))
-    by_case = {(row["scaling"], row["devices"], row["processes"]): row for row in results}
-    counts = (1, 1), (2, 1), (2, 2)
-    assert sorted(by_case) == sorted((kind, *count) for kind in scaling.KINDS for count in counts)
-    assert min(row["steps_per_s"] for row in results) > 0
-    alone = by_case["weak", 1, 1]
-    for processes in (1, 2):
-        weak, strong = by_case["weak", 2, processes], by_case["strong", 2, processes]
-        assert weak["env_steps"] == pytest.approx(2 * alone["env_steps"], rel=0.2)  # whole batches
-        assert strong["env_steps"] == alone["env_steps"]

@@ -18,11 +18,7 @@ def test_all_single_and_double_locks_and_two_more():
     assert {pair.name for pair in pairs} >= {*benchmark.SUBSET, benchmark.FULL}
 
 
-def test_arms_that_are_not_there_are_named(tmp_path):
-    pairs, missing = benchmark.other_arms(tmp_path)
-    assert pairs == [] and missing == list(benchmark.ROBOSUITE)
-
-
+@pytest.mark.slow
 def test_one_compiled_function_serves_all_weights():
     expert, learner = (ArmConfig(model="planar", link_lengths=lengths) for lengths in ([0.5, 0.5], [0.6, 0.4]))
     qpos = np.random.default_rng(0).uniform(-np.pi, np.pi, (5, 2))
@@ -80,10 +76,7 @@ def test_the_front_leaves_out_what_another_beats():
     assert summary.pareto_front(compared) == ["kept overlap 1"]
 
 
-@pytest.mark.parametrize("rows", [ROWS, []])
-def test_tables_and_plot(rows, tmp_path, capsys):
-    summary.print_tables(rows)
-    if rows:
-        assert "locks, demonstrations" in capsys.readouterr().out
-        summary.plot(rows, tmp_path / "front.png")
-        assert (tmp_path / "front.png").stat().st_size > 0
+def test_tables(capsys):
+    summary.print_tables([])
+    summary.print_tables(ROWS)
+    assert "locks, demonstrations" in capsys.readouterr().out

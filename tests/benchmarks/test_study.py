@@ -3,7 +3,6 @@
 import csv
 import json
 import sys
-import time
 from pathlib import Path
 
 import hydra
@@ -30,17 +29,16 @@ def compose():
 def test_every_run_and_evaluation_has_arguments_that_the_commands_take(preset, compose, tmp_path):
     cases = study.cases(preset)
     assert len({case.name for case in cases}) == len(cases)
-    for case in cases:
-        if preset == "quick" and case.group == "locked":
-            continue  # composing takes its time, and what differs is seen already
+    for case in cases if preset == "paper" else {case.group: case for case in cases}.values():
         command = case.command(tmp_path)
         assert command[1:4] == ["-m", "mimic.train", "-m"] and f"hydra.sweep.dir={tmp_path / case.name}" in command
         config = compose("train", case.arguments)
         assert config.env.physics == ("mjx" if case.group == "mjx" else "auto")
     evaluated = study.evaluations(cases, tmp_path, UNSEEN)
     assert len(evaluated) == (42 if preset == "paper" else 38)
-    for out, command in evaluated.items():
-        config = compose("evaluate", command[3:])
+    kinds = {out.parent.name.partition("--")[2]: out for out in evaluated}
+    for out in evaluated if preset == "paper" else kinds.values():
+        config = compose("evaluate", evaluated[out][3:])
         run = Path(config.run)
         assert (config.out, run.parent.name) == (str(out), out.parent.name.partition("--")[0])
         assert any(case.name == run.parent.name and int(run.name) < case.seeds for case in cases)
@@ -55,13 +53,7 @@ def test_the_sweep_locks_every_joint_and_every_pair():
 def test_the_variants_change_the_metric_as_they_are_named(compose):
     cases = {case.name: case for case in study.cases("paper") if case.group == "variants"}
     reference = MetricConfig()
-    for name, correspondence, links in (
-        ("hard", "hard", "kept"),
-        ("soft", "soft", "kept"),
-        ("overlap", "overlap", "kept"),
-        ("paper_metric", "overlap", "merged"),
-        ("reference", reference.correspondence, reference.links),
-    ):
+    for name, correspondence, links in (("hard", "hard", "kept"), ("paper_metric", "overlap", "merged")):
         metric = compose("train", cases[f"variant-{name}"].arguments).env.metric
         assert (metric.correspondence, metric.links) == (correspondence, links)
     assert f"env.metric.translation={4 * reference.translation:g}" in cases["variant-positions_x4"].arguments
@@ -75,13 +67,6 @@ def test_a_failed_command_is_named_and_the_rest_goes_on(tmp_path, capsys):
     assert run_parallel(commands, jobs=1, devices=1) == [tmp_path / "bad.log"]
     assert "bad failed: no arm" in capsys.readouterr().out
     assert (tmp_path / "good.log").read_text() == "0\n"
-
-
-def test_as_many_commands_run_in_parallel_as_there_are_jobs(tmp_path):
-    began = time.monotonic()
-    wait = [sys.executable, "-c", "import time; time.sleep(1.5)"]
-    assert run_parallel({tmp_path / f"{i}.log": wait for i in range(4)}, jobs=4, devices=0) == []
-    assert time.monotonic() - began < 4 * 1.5
 
 
 def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):

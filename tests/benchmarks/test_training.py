@@ -34,8 +34,6 @@ def test_a_case_runs_cold_and_warm(monkeypatch):
     cold, warm = training.run_case("small", 1, ("cold", "warm"))
     assert (cold["start"], warm["start"]) == ("cold", "warm")
     assert 0 < cold["to_goal_s"] < cold["process_wall_s"] + 1
-    # Programs come out of the cache, and the same seed gives the same policy.
-    assert warm["report"]["wall_time_s"]["compile"] < cold["report"]["wall_time_s"]["compile"]
     assert warm["report"]["optimality_gap"] == cold["report"]["optimality_gap"]
     print_table([cold, warm], training.COLUMNS)
 
