@@ -151,20 +151,12 @@ def captured_similarity(results: Results) -> list[Cells]:
 
 
 def captured_methods(results: Results) -> list[Cells]:
-    what = {
-        "mimic": "nearest poses by the metric that form a motion",
-        "mimic_hand": "the same with `Costs(hand_position=300)`",
-        "pose_mapper": "network trained on the poses of the clip; each pose alone",
-        "align_segments": "closed form: directions of upper arm, forearm and hand",
-        "frame_matching": "inverse kinematics of elbow, wrist and hand by mink",
-        "hand_ik": "inverse kinematics of the scaled hand by mink",
-    }
-    rows: list[Cells] = [("method", "what it does", "speed [rad/s]", "jerk [rad/s<sup>3</sup>]")]
+    rows: list[Cells] = [("method", "speed [rad/s]", "jerk [rad/s<sup>3</sup>]")]
     for method, name in METHODS.items():
         entries = where(results["results"], method=method)
         speed = max(entry["largest_speed"] for entry in entries)
         jerk = statistics.median(entry["jerk_rms"] for entry in entries)
-        rows.append((name, what[method], f"{speed:.0f}", f"{jerk:,.0f}"))
+        rows.append((name, f"{speed:.0f}", f"{jerk:,.0f}"))
     return rows
 
 
