@@ -1,5 +1,7 @@
 """The environment: observations, rewards, ends of episodes, and its config."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +10,14 @@ import pytest
 import mimic
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.wrappers import fresh_episodes
+from tests.helpers.tiny import SHORT_ARMS
 
 FEW = {"count": 6, "held_out": 2}
 
 
 @pytest.fixture(scope="module")
 def planar_env():
-    return mimic.make("planar4dof", demonstrations=FEW)
+    return mimic.make("planar4dof", **SHORT_ARMS, demonstrations=FEW)
 
 
 OF_MANY_ARMS = ("any_arm", "panda_family")
@@ -59,8 +62,8 @@ def test_every_environment_of_many_arms_resets_and_steps(name, limits):
     assert np.all(np.isfinite(after.obs)) and not after.done
 
 
-def test_the_default_physics_is_resolved_and_can_be_replaced():
-    env = mimic.make("planar4dof", demonstrations=FEW)
+def test_the_default_physics_is_resolved_and_can_be_replaced(planar_env):
+    env = planar_env
     assert mimic.env_config("planar4dof").physics == "auto" and env.config.physics == env.backend == "fused"
     on_mjx = env.with_physics("mjx")
     assert on_mjx.config.physics == on_mjx.backend == "mjx" and env.config.physics == "fused"
@@ -69,23 +72,27 @@ def test_the_default_physics_is_resolved_and_can_be_replaced():
 
 def test_reward_and_observation_follow_the_demonstration_step_by_step():
     """After i steps both use sample i of the demonstration. 1e-5: float32, of a table made in double precision."""
-    env = mimic.make("planar4dof", preview=2, horizon=6, demonstrations=FEW)
+    env = mimic.make("planar4dof", **SHORT_ARMS, preview=2, horizon=6, demonstrations=FEW)
     motions, which = env.demonstrations, 3
+    expert_states, learner_states = (
+        jax.jit(functools.partial(mimic.link_states, arm)) for arm in (env.expert, env.learner)
+    )
     expert = [
-        mimic.link_states(env.expert, *(np.asarray(x[which, sample], np.float32) for x in (motions.qpos, motions.qvel)))
+        expert_states(*(np.asarray(x[which, sample], np.float32) for x in (motions.qpos, motions.qvel)))
         for sample in range(7)
     ]
     metric = env.metric.correspondence, env.metric.weights
+    distance = jax.jit(lambda expert, learner: mimic.embodiment_distance(expert, learner, *metric))
     actions = np.random.default_rng(0).uniform(-1, 1, (6, env.action_size)).astype(np.float32)
-    state, step = env.begin(env.start(jax.random.PRNGKey(0), which)), jax.jit(env.step)
+    state, step = jax.jit(lambda key: env.begin(env.start(key, which)))(jax.random.PRNGKey(0)), jax.jit(env.step)
     for i in range(7):
         arm = state.pipeline_state
-        learner = mimic.link_states(env.learner, arm.qpos, arm.qvel)
+        learner = learner_states(arm.qpos, arm.qvel)
         shown = [learner, *(expert[min(i + ahead, 6)] for ahead in range(3))]  # the last sample stays
         leaves = [np.ravel(leaf) for states in shown for leaf in jax.tree.leaves(states)]
         np.testing.assert_allclose(state.obs, np.concatenate(leaves), atol=1e-5)
         assert state.done == (i == 6)
-        distances = [mimic.embodiment_distance(each, learner, *metric) for each in expert]
+        distances = [distance(each, learner) for each in expert]
         if i > 0:
             assert state.reward == pytest.approx(-float(distances[i]), abs=1e-5)
             others = np.delete(distances, i)
@@ -109,25 +116,25 @@ class MoreThanLinks(mimic.ImitationEnv):
 
 
 def test_an_overridden_observation_is_observed_everywhere():
-    env = JointsAndStep(mimic.env_config("planar4dof", demonstrations=FEW))
-    assert env.observation_size == 9
+    env = JointsAndStep(mimic.env_config("planar4dof", **SHORT_ARMS, demonstrations=FEW))
+    assert env.observation_size == 5
     episodes = fresh_episodes(env)
-    state = episodes.reset(jax.random.split(jax.random.PRNGKey(0), 3))  # at random steps
-    states = [state, jax.jit(episodes.step)(state, jnp.ones((3, 4)))]
-    states.append(env.restart_done(states[-1].replace(done=jnp.array([1.0, 0.0, 1.0]))))
+    state = jax.jit(episodes.reset)(jax.random.split(jax.random.PRNGKey(0), 3))  # at random steps
+    states = [state, jax.jit(episodes.step)(state, jnp.ones((3, 2)))]
+    states.append(jax.jit(env.restart_done)(states[-1].replace(done=jnp.array([1.0, 0.0, 1.0]))))
     for state in states:
         np.testing.assert_array_equal(state.obs, jax.vmap(env.observe)(state.pipeline_state))
-    assert states[2].obs[:, 8].tolist() == [0, states[1].obs[1, 8], 0]
-    assert env.reset(jax.random.PRNGKey(0)).obs.shape == (9,)
+    assert states[2].obs[:, 4].tolist() == [0, states[1].obs[1, 4], 0]
+    assert jax.eval_shape(env.reset, jax.random.PRNGKey(0)).obs.shape == (5,)
 
 
 def test_an_observation_is_extended_and_others_stay():
-    config = mimic.env_config("planar4dof", demonstrations=FEW)
+    config = mimic.env_config("planar4dof", **SHORT_ARMS, demonstrations=FEW)
     plain, extended = mimic.ImitationEnv(config), MoreThanLinks(config)
     assert extended.observation_size == plain.observation_size + 1
-    first, action = plain.reset(jax.random.PRNGKey(0)), jnp.ones(4)
+    first, action = jax.jit(plain.reset)(jax.random.PRNGKey(0)), jnp.ones(2)
     for state, expected in (
-        (extended.reset(jax.random.PRNGKey(0)), first),
+        (jax.jit(extended.reset)(jax.random.PRNGKey(0)), first),
         (jax.jit(extended.step)(first, action), jax.jit(plain.step)(first, action)),
     ):
         np.testing.assert_allclose(state.obs, np.append(expected.obs, 7), atol=1e-5)  # float32, of a table in float64
@@ -135,8 +142,8 @@ def test_an_observation_is_extended_and_others_stay():
 
 def test_a_runaway_ends_the_episode_and_never_pays(planar_env):
     state = planar_env.reset(jax.random.PRNGKey(0))
-    fast = state.pipeline_state.replace(qvel=jnp.full(4, 100.0))
-    after = jax.jit(planar_env.step)(state.replace(pipeline_state=fast), jnp.zeros(4))
+    fast = state.pipeline_state.replace(qvel=jnp.full(2, 100.0))
+    after = jax.jit(planar_env.step)(state.replace(pipeline_state=fast), jnp.zeros(2))
     assert after.done == 1 and after.metrics["runaway"] == 1
     worst_rest = -planar_env.config.horizon * float(after.metrics["distance"])
     assert after.reward == pytest.approx(worst_rest, rel=1e-5)

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -35,12 +36,17 @@ def varied():
     return make(**RANGES)
 
 
+@functools.cache
+def compiled(env):
+    return jax.jit(env.reset), jax.jit(env.step)
+
+
 def stepped(env, load=None, action=ACTION, steps=1, key=0):
     """Joint state of a learner with a load after some steps."""
-    state = env.reset(jax.random.PRNGKey(key))
+    reset, step = compiled(env)
+    state = reset(jax.random.PRNGKey(key))
     if load is not None:
         state = state.replace(pipeline_state=state.pipeline_state.replace(load=load))
-    step = jax.jit(env.step)
     for _ in range(steps):
         state = step(state, action)
     return np.concatenate([state.pipeline_state.qpos, state.pipeline_state.qvel])
@@ -48,7 +54,7 @@ def stepped(env, load=None, action=ACTION, steps=1, key=0):
 
 def test_loads_differ_between_episodes_and_fill_their_range(varied):
     """1000 draws miss the 2 % at an end of the range in one case of 10^8."""
-    loads = jax.vmap(lambda key: varied.start(key).load)(jax.random.split(jax.random.PRNGKey(0), 1000))
+    loads = jax.jit(jax.vmap(lambda key: varied.start(key).load))(jax.random.split(jax.random.PRNGKey(0), 1000))
     for drawn, (least, largest) in zip(loads, RANGES.values(), strict=True):
         assert least <= drawn.min() < least + 0.02 * (largest - least)
         assert largest - 0.02 * (largest - least) < drawn.max() <= largest
@@ -144,9 +150,10 @@ def test_noise_has_the_given_size_and_torques_stay_within_the_maximum(noisy):
 def test_noise_shares_no_key_with_the_next_episode(noisy):
     """Folding a small number into a key gives the keys that splitting it gives."""
     env = noisy
-    state = env.reset(jax.random.PRNGKey(0))
+    reset, step = compiled(env)
+    state = reset(jax.random.PRNGKey(0))
     keys = jax.random.split(state.pipeline_state.key, 3)
     for _ in range(3):
-        state = env.step(state, jnp.zeros(2))
+        state = step(state, jnp.zeros(2))
         noise = state.pipeline_state.qvel / env.torque_scale / 0.1
         assert not any(np.allclose(noise, jax.random.normal(key, (2,)), atol=1e-3) for key in keys)

@@ -13,6 +13,7 @@ from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.rollout_frames import RolloutFrames
 from mimic.metric.capsule_distances import capsule_axes, pair_distances
 from mimic.motions.demonstrations import Demonstrations
+from tests.helpers.tiny import SHORT_ARMS
 
 SETTINGS = {"demonstrations": {"count": 3, "held_out": 2}, "horizon": 6}
 
@@ -26,14 +27,14 @@ def moved(demonstrations, seed):
 
 @pytest.fixture(scope="module")
 def evaluator():
-    config = mimic.env_config("planar4dof", start="nearest", **SETTINGS)
+    config = mimic.env_config("planar4dof", **SHORT_ARMS, start="nearest", **SETTINGS)
     training, held_out = training_and_held_out(config)
     return Evaluator(ImitationEnv(config, moved(training, 0)), moved(held_out, 1))
 
 
 def test_each_episode_starts_at_rest_in_the_nearest_pose_of_its_demonstration(evaluator):
     env = evaluator.env
-    start_of, distance, observe = map(jax.jit, (env.start, env.distance, env.observe))
+    start_of, begin, distance, observe = map(jax.jit, (env.start, env.begin, env.distance, env.observe))
 
     def distance_of(demonstration, qpos):
         return float(distance(qpos, np.zeros(len(qpos), np.float32), demonstration, 0))
@@ -47,7 +48,7 @@ def test_each_episode_starts_at_rest_in_the_nearest_pose_of_its_demonstration(ev
         nearest = distance_of(demonstration, start.qpos)
         assert nearest < min(distance_of(demonstration, pose) for pose in poses)
         assert nearest < distance_of(demonstration, np.asarray(env.learner.home, np.float32)) - 0.05
-        np.testing.assert_allclose(jax.jit(env.begin)(start).obs, observe(start), atol=1e-6)
+        np.testing.assert_allclose(begin(start).obs, observe(start), atol=1e-6)
 
 
 @pytest.mark.slow
@@ -65,11 +66,11 @@ def test_holding_the_start_pose_and_videos_begin_there(evaluator):
     env = evaluator.env
     still = np.tile(env.start_poses[:, None], (1, 6, 1))
     held = [
-        [float(env.distance(still[i, t], jnp.zeros(4), jnp.asarray(i), jnp.asarray(t + 1))) for t in range(6)]
+        [float(env.distance(still[i, t], jnp.zeros(2), jnp.asarray(i), jnp.asarray(t + 1))) for t in range(6)]
         for i in range(env.demonstrations.count)
     ]
     np.testing.assert_allclose(evaluator.hold_distance, held, atol=1e-5)
-    rollouts = jax.jit(lambda: evaluator.rollout(lambda state: jnp.zeros(4)))()
+    rollouts = jax.jit(lambda: evaluator.rollout(lambda state: jnp.zeros(2)))()
     frames = RolloutFrames(evaluator, rollouts, 1, 30)
     np.testing.assert_allclose(frames.learner[0], env.start_poses[1], atol=1e-6)
 
@@ -86,7 +87,7 @@ def test_episodes_that_restart_do_so_where_their_demonstration_starts(evaluator)
 
 
 def test_home_is_the_default_and_other_names_are_rejected():
-    env = mimic.make("planar4dof", **SETTINGS)
+    env = mimic.make("planar4dof", **SHORT_ARMS, **SETTINGS)
     assert env.config.start == "home"
     np.testing.assert_array_equal(env.start_poses, np.tile(np.float32(env.learner.home), (3, 1)))
     with pytest.raises(ValueError, match="start: expected one of home, nearest"):

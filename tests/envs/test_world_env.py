@@ -20,7 +20,7 @@ TICKS = 6
 
 
 def make(**fields) -> HardwareEnv:
-    env = mimic.make("panda4dof", demonstrations=FEW, **{"world": "nominal", **fields})
+    env = mimic.make("panda3dof", demonstrations=FEW, **{"world": "nominal", **fields})
     assert isinstance(env, HardwareEnv)
     return env
 
@@ -87,6 +87,7 @@ def test_the_latency_shifts_actions_within_a_tick(actions):
         assert np.abs(state.pipeline_state.qvel).max() > 0
 
 
+@pytest.mark.slow_for("1")
 @pytest.mark.parametrize("delay", [1, 3])
 def test_a_delayed_observation_has_old_measurements_and_new_actions(nominal, actions, undelayed, delay):
     env = with_world(nominal, observation_delay=[delay, delay])

@@ -9,11 +9,12 @@ from brax.training import pmap as brax_pmap
 
 import mimic
 from mimic.envs.wrappers import wrap_for_training
+from tests.helpers.tiny import SHORT_ARMS
 
 
 def test_observations_of_new_episodes_match_their_states():
     """In a batch where some episodes end: the wrapper composes the observations itself."""
-    env = mimic.make("planar4dof", demonstrations={"count": 3})
+    env = mimic.make("planar4dof", **SHORT_ARMS, demonstrations={"count": 3})
     wrapped = wrap_for_training(env, env.config.horizon + 1)
     state = jax.jit(wrapped.reset)(jax.random.split(jax.random.PRNGKey(0), 16))
     step, observe = jax.jit(wrapped.step), jax.jit(jax.vmap(env.observe))
@@ -30,7 +31,7 @@ FEW = {"count": 6, "held_out": 2}
 
 @pytest.fixture(scope="module")
 def planar_env():
-    return mimic.make("planar4dof", demonstrations=FEW)
+    return mimic.make("planar4dof", **SHORT_ARMS, demonstrations=FEW)
 
 
 def test_episodes_end_at_the_horizon_and_draw_new_demonstrations(planar_env):
@@ -57,7 +58,7 @@ def test_episodes_end_at_the_horizon_and_draw_new_demonstrations(planar_env):
 
 @pytest.fixture(scope="module")
 def short_env():
-    return mimic.make("planar4dof", physics="fused", horizon=2, demonstrations=FEW)
+    return mimic.make("planar4dof", **SHORT_ARMS, physics="fused", horizon=2, demonstrations=FEW)
 
 
 def demonstrations_over_time(wrapped, env, steps=6, count=8):

@@ -20,6 +20,7 @@ from mimic.evaluation.tracking_controllers import run_controller
 from mimic.metric.kinematics import link_state_table
 from mimic.trainers.ppo.trainer import PPOTrainer
 from tests.helpers.metric_cases import planar_optimum
+from tests.helpers.tiny import SHORT_ARMS
 
 COUNT, HELD_OUT, HORIZON = 5, 4, 30
 SPLITS = {"train": slice(0, COUNT), "held_out": slice(COUNT, None)}
@@ -255,10 +256,7 @@ def test_the_bound_of_an_equal_arm_needs_no_search(monkeypatch):
 
 def test_no_rollout_goes_below_the_bound():
     """Random controllers on the planar arm. 1e-4: the tolerance of the search."""
-    from mimic.envs.imitation import training_and_held_out
-    from mimic.evaluation.evaluator import Evaluator
-
-    config = mimic.env_config("planar4dof", demonstrations={"count": 3, "held_out": 2})
+    config = mimic.env_config("planar4dof", **SHORT_ARMS, demonstrations={"count": 3, "held_out": 2}, horizon=HORIZON)
     training, held_out = training_and_held_out(config)
     evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
     rollout = jax.jit(lambda gain: evaluator.rollout(lambda state: gain @ state.obs))
@@ -279,7 +277,7 @@ def test_bound_and_hold_distance_belong_to_the_samples_after_each_step():
     """Closed forms for the directions of planar arms. 1e-4: the tolerance of the search."""
     metric = {"correspondence": "overlap", "translation": 0.0, "linear_velocity": 0.0, "angular_velocity": 0.0}
     few = {"count": 1, "held_out": 1}
-    config = mimic.env_config("planar4dof", demonstrations=few, horizon=12, metric=metric)
+    config = mimic.env_config("planar4dof", **SHORT_ARMS, demonstrations=few, horizon=12, metric=metric)
     training, held_out = training_and_held_out(config)
     evaluator = Evaluator(mimic.ImitationEnv(config, training), held_out)
     env = evaluator.env

@@ -1,7 +1,10 @@
-"""Settings of the smallest training run that uses every part."""
+"""A planar pair that compiles quickly, and the settings of the smallest training run that uses every part."""
 
+SHORT_ARMS = {"expert": {"link_lengths": [0.4, 0.3, 0.3]}, "learner": {"link_lengths": [0.5, 0.5]}}
 TINY = [
     "env=planar4dof",
+    "env.expert.link_lengths=[0.4,0.3,0.3]",
+    "env.learner.link_lengths=[0.5,0.5]",
     "env.demonstrations.count=4",
     "env.demonstrations.held_out=2",
     "trainer.num_envs=64",

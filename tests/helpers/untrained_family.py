@@ -36,5 +36,6 @@ def untrained_family(folder: Path, **changes: Any) -> Path:
     trainer.save_inputs(folder)
     size = trainer.evaluator.env.observation_size, trainer.evaluator.env.action_size
     networks = make_networks(trainer.settings, *size)
-    save_checkpoint(folder, 0, initial_params(networks, size[0], jax.random.PRNGKey(0)))
+    initial = jax.jit(lambda key: initial_params(networks, size[0], key))
+    save_checkpoint(folder, 0, initial(jax.random.PRNGKey(0)))
     return folder

@@ -15,6 +15,7 @@ from mimic.trainers.ppo.ppo import initial_params, make_networks
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import save_config
 from mimic.trainers.run_models import save_models
+from tests.helpers.tiny import SHORT_ARMS
 
 COUNT, HELD_OUT, HORIZON = 4, 2, 20
 
@@ -23,7 +24,7 @@ def environment(learner: Sequence[float] = (0.5, 0.5), model: str = "planar") ->
     """A planar pair that compiles quickly; `model` is a file of another learner."""
     return mimic.env_config(
         "planar4dof",
-        expert={"link_lengths": [0.4, 0.3, 0.3]},
+        expert=SHORT_ARMS["expert"],
         learner={"link_lengths": list(learner), "model": model},
         demonstrations={"count": COUNT, "held_out": HELD_OUT},
         horizon=HORIZON,
@@ -41,5 +42,6 @@ def untrained_run(folder: Path, **settings: Any) -> Path:
     trainer.save_inputs(folder)
     env = trainer.evaluator.env
     networks = make_networks(trainer.settings, env.observation_size, env.action_size)
-    save_checkpoint(folder, 0, initial_params(networks, env.observation_size, jax.random.PRNGKey(0)))
+    initial = jax.jit(lambda key: initial_params(networks, env.observation_size, key))
+    save_checkpoint(folder, 0, initial(jax.random.PRNGKey(0)))
     return folder

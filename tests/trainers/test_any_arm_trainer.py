@@ -1,5 +1,6 @@
 """Training of one policy for many arms: what the trainer says, and a run, its resumption and its fine-tuning."""
 
+import copy
 import dataclasses
 import json
 import subprocess
@@ -14,7 +15,6 @@ from mimic.evaluation.any_arm import EVALUATED_DEMONSTRATIONS
 from mimic.runs.checkpoints import checkpoint_steps
 from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
-from mimic.trainers.memory import check_training_memory
 from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
 from mimic.trainers.run_config import load_config
 from tests.helpers.untrained_family import ARMS, COUNT, HELD_OUT, family
@@ -50,21 +50,17 @@ def command(module, *arguments):
 
 @pytest.fixture(scope="module")
 def trainer():
-    return make_trainer(TrainConfig(family(), PPOConfig(hidden_layers=[8], preset="cpu", crossovers=4)), None)
+    env = family()
+    env = dataclasses.replace(env, demonstrations=dataclasses.replace(env.demonstrations, held_out=12))
+    return make_trainer(TrainConfig(env, PPOConfig(hidden_layers=[8], preset="cpu", crossovers=4)), None)
 
 
 def test_it_is_chosen_where_the_learner_is_drawn(trainer):
     assert isinstance(trainer, AnyArmPPOTrainer)
     assert trainer.headline == f"panda_family: {COUNT} demonstrations, 512 arms in parallel"
-    assert "report: 3 arms seen in training and 5 others, on 2 held-out demonstrations" in trainer.simulation
+    assert "report: 3 arms seen in training and 5 others, on 8 held-out demonstrations" in trainer.simulation
     assert trainer.env_config.physics == "fused" and trainer.columns == ("seen arms", "unseen arms")
-    assert trainer._env.demonstrations.count == COUNT + 4 and trainer._demonstrations.count == COUNT + HELD_OUT
-
-
-def test_the_report_takes_few_demonstrations():
-    config = dataclasses.replace(family(), demonstrations=dataclasses.replace(family().demonstrations, held_out=12))
-    trainer = make_trainer(TrainConfig(config, PPOConfig()), None)
-    assert isinstance(trainer, AnyArmPPOTrainer)
+    assert trainer._env.demonstrations.count == COUNT + 4 and trainer._demonstrations.count == COUNT + 12
     assert trainer.evaluator.env.demonstrations.count == EVALUATED_DEMONSTRATIONS
 
 
@@ -81,22 +77,15 @@ def test_status_rows_and_target(trainer):
     assert ("    which is", "whole", "none") in rows and ("arms", "1", "1") in rows
     assert rows[-1] == ("  without gap (span below 25%)", "0", "1")
     assert "none" in trainer.status(metrics_of(float("nan")))
-    trained = make_trainer(TrainConfig(family(), PPOConfig(target_gap=0.1)), None)
+    trained = copy.copy(trainer)
+    trained.settings = dataclasses.replace(trainer.settings, target_gap=0.1)
     assert trained.good_enough(metrics_of(0.1)) and not trained.good_enough(metrics_of(float("nan")))
     assert not trainer.good_enough(metrics_of(0.1))
 
 
-def test_too_large_trainings_are_rejected(unchecked):
-    too_many = dataclasses.replace(family().demonstrations, count=100_000)
-    config = dataclasses.replace(family(), horizon=50, demonstrations=too_many)
-    check_training_memory(TrainConfig(family(), PPOConfig()).resolve())
-    with pytest.raises(ValueError, match="trainer.hidden_layers"):
-        check_training_memory(TrainConfig(config, PPOConfig(hidden_layers=[65_536] * 8)).resolve())
-
-
-def test_fit_takes_no_environment_of_many_arms():
+def test_fit_takes_no_environment_of_many_arms(trainer):
     with pytest.raises(ValueError, match="env: expected the name or the config of an environment of many arms"):
-        mimic.fit(mimic.make("panda_family", horizon=5, demonstrations={"count": 1, "held_out": 1}))
+        mimic.fit(trainer._env)
 
 
 @pytest.fixture(scope="module")

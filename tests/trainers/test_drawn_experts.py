@@ -12,7 +12,6 @@ import pytest
 
 import mimic
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, stack_arms
-from mimic.arms.sampler import random_arm
 from mimic.commands import retarget
 from mimic.commands.config import RetargetConfig
 from mimic.envs import env_config
@@ -40,7 +39,8 @@ def untrained_run(run_dir, expert):
     config = PoseMapperConfig(**TINY).resolve(env=env)
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env, config))
-    save_checkpoint(run_dir, 1, jax.jit(make_any_arm_model(env, config).init)(jax.random.key(0)))
+    shapes, rng = jax.eval_shape(make_any_arm_model(env, config).init, jax.random.key(0)), np.random.default_rng(0)
+    save_checkpoint(run_dir, 1, jax.tree.map(lambda x: rng.normal(0, 0.2, x.shape).astype(x.dtype), shapes))
     return run_dir
 
 
@@ -109,7 +109,7 @@ def test_each_sample_has_an_expert_and_a_learner_of_its_own(runs, mapper):
 
     def sampler(key):
         keys.append(key)
-        return random_arm(key)
+        return mapper.model.expert
 
     for model, count in ((mapper.model, 2), (AnyArmMapper.load(runs["fixed"]).model, 1)):
         keys.clear()

@@ -19,6 +19,7 @@ from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training
 from mimic.trainers.pose_mapper.model import make_model
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
+from tests.helpers.tiny import SHORT_ARMS
 
 SMALL = {"samples": 8192, "batch_size": 256, "epochs": 40, "evaluations": 2, "hidden_layers": [64, 64]}
 SHORT: dict[str, Any] = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1}
@@ -30,9 +31,9 @@ REPORT_KEYS = {
 }  # fmt: skip
 
 
-def run_config(run_dir, *, env="planar4dof", seed=0, limits="none", **settings):
+def run_config(run_dir, *, env="planar4dof", arms=None, seed=0, limits="none", **settings):
     trainer = PoseMapperConfig(**{**SMALL, **FEW, **settings})
-    environment = env_config(env, limits=limits)
+    environment = env_config(env, limits=limits, **(arms or {}))
     return TrainConfig(environment, trainer, seed=seed, run_dir=str(run_dir), compilation_cache="")
 
 
@@ -43,9 +44,9 @@ def train(run_dir, **settings):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A run of one second."""
+    """A run of one second, of short arms."""
     run_dir = tmp_path_factory.mktemp("mapper") / "run"
-    return run_dir, train(run_dir, **SHORT)
+    return run_dir, train(run_dir, arms=SHORT_ARMS, **SHORT)
 
 
 def poses(mapper, count, seed=0):
@@ -89,7 +90,7 @@ def test_a_loaded_mapper_takes_one_pose_or_many(trained):
     np.testing.assert_allclose(batch[3], mapper(qpos[3]), atol=1e-5)
     np.testing.assert_allclose(batch, jax.jit(mapper)(qpos), atol=1e-5)
     np.testing.assert_allclose(batch, jax.vmap(mapper)(qpos), atol=1e-5)
-    np.testing.assert_allclose(mapper(qpos.reshape(3, 4, 7)), batch.reshape(3, 4, 4), atol=1e-5)
+    np.testing.assert_allclose(mapper(qpos.reshape(3, 4, -1)), batch.reshape(3, 4, -1), atol=1e-5)
     np.testing.assert_allclose(mapper(qpos + 2 * np.pi), batch, atol=1e-3)  # a full turn is the same pose
     distance = jax.vmap(mapper.model.distance)(jnp.asarray(qpos), batch)
     assert np.mean(distance) < report["random_distance"]["held_out"]
@@ -106,10 +107,10 @@ def test_the_nearest_head_is_taken(trained):
 @pytest.mark.slow
 def test_retargeted_motions_do_not_jump(trained, tmp_path):
     mapper = mimic.PoseMapper.load(trained[0])
-    env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
+    env = mimic.make("planar4dof", **SHORT_ARMS, demonstrations={"count": 3, "held_out": 1})
     out = tmp_path / "learner.npz"
     env.demonstrations.save(tmp_path / "expert.npz")
-    config = RetargetConfig(str(tmp_path / "expert.npz"), env_config("planar4dof"), str(trained[0]), out=str(out))
+    config = RetargetConfig(str(tmp_path / "expert.npz"), env.config, str(trained[0]), out=str(out))
     retarget.prepare_retargeting(config)()
     motions = mimic.load_demonstrations(out)
     motions.check_fits(env.learner, 0.1, 50)
@@ -175,7 +176,8 @@ def test_limited_joints_stay_within_their_limits():
 def test_weights_decay_and_biases_do_not():
     settings = {**SMALL, "learning_rate": 1e-2, "final_learning_rate": 1.0, "weight_decay": 0.5}
     model = make_model(env_config("planar4dof"), PoseMapperConfig(**settings).resolve())
-    params = jax.tree.map(jnp.ones_like, model.init(jax.random.key(0)))
+    shapes = jax.eval_shape(model.init, jax.random.key(0))
+    params = jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), shapes)
     optimiser = training._optimiser(model.config)
     change, _ = optimiser.update(jax.tree.map(jnp.zeros_like, params), optimiser.init(params), params)
     for path, value in jax.tree_util.tree_leaves_with_path(change):
@@ -185,11 +187,11 @@ def test_weights_decay_and_biases_do_not():
 
 def test_dropout_is_for_training_only():
     models = [
-        make_model(env_config("planar4dof"), PoseMapperConfig(**SMALL, dropout=dropout).resolve())
+        make_model(env_config("planar4dof", **SHORT_ARMS), PoseMapperConfig(**SMALL, dropout=dropout).resolve())
         for dropout in (0.0, 0.5)
     ]
     whole, dropping = models
-    params, qpos = whole.init(jax.random.key(0)), jnp.full(7, 0.3)
+    params, qpos = jax.jit(whole.init)(jax.random.key(0)), jnp.full(3, 0.3)
     candidates = {model: jax.jit(model.candidates) for model in models}
     np.testing.assert_array_equal(candidates[dropping](params, qpos), candidates[whole](params, qpos))  # evaluation
     key, other = jax.random.split(jax.random.key(1))
@@ -231,8 +233,8 @@ def test_bad_regularisation_is_rejected(settings, message):
 @pytest.mark.parametrize(
     ("qpos", "message"),
     [
-        (np.zeros(6), r"expected shape \[\.\.\., 7\] for planar7, got \(6,\)"),
-        (np.full(7, np.nan), "expected finite angles"),
+        (np.zeros(6), r"expected shape \[\.\.\., 3\] for planar3, got \(6,\)"),
+        (np.full(3, np.nan), "expected finite angles"),
         (np.zeros(()), "expected shape"),
     ],
 )
@@ -245,7 +247,7 @@ def test_bad_poses_are_rejected(trained, qpos, message):
 def test_a_mapper_of_other_arms_or_of_no_run_is_rejected(trained, tmp_path):
     mapper = mimic.PoseMapper.load(trained[0])
     mapper.check_fits(mapper.expert, mapper.learner)
-    with pytest.raises(ValueError, match="its learner is planar4"):
+    with pytest.raises(ValueError, match="its learner is planar2"):
         mapper.check_fits(mapper.expert, mimic.panda())
     with pytest.raises(ValueError, match="not a run directory"):
         mimic.PoseMapper.load(tmp_path)

@@ -21,7 +21,7 @@ def policy():
     """The distribution's parameters as a function of an observation; for untrained and for random parameters."""
     networks = make_networks(PPOConfig(hidden_layers=[8], network="joints").resolve(), SIZE, ACTIONS)
     statistics = running_statistics.init_state(specs.Array((SIZE,), jnp.dtype("float32")))
-    params = networks.policy_network.init(jax.random.PRNGKey(0))
+    params = jax.jit(networks.policy_network.init)(jax.random.PRNGKey(0))
     leaves, structure = jax.tree.flatten(params)
     keys = jax.random.split(jax.random.PRNGKey(1), len(leaves))
     noise = [0.3 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]

@@ -1,5 +1,6 @@
 """The compiled functions of PPO: the transitions that they collect, and the loss."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from mimic.base.compilation import compiler_options
 from mimic.envs.imitation import arm_state
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import ppo
+from tests.helpers.tiny import SHORT_ARMS
 
 UNROLLS, ARMS, PASSES = 2, 4, 3
 HORIZON = 50  # steps of an episode
@@ -34,7 +36,7 @@ def setup_of(config, observation_size, action_size):
 @pytest.fixture(scope="module")
 def one_batch():
     """States before and after a batch; losses without gradient record observations, projected on `along`, and time."""
-    env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
+    env = mimic.make("planar4dof", **SHORT_ARMS, demonstrations={"count": 3, "held_out": 1})
     config = PPOConfig(
         num_envs=ARMS, unroll_length=1, batch_size=UNROLLS * ARMS // 2, num_minibatches=2, num_updates_per_batch=PASSES,
         hidden_layers=[8],
@@ -161,10 +163,14 @@ def test_a_timed_critic_observes_the_elapsed_time(x64):
     longer = longer.replace(mean=jnp.append(statistics.mean, 0.0), std=jnp.append(statistics.std, 1.0))
     timed, plain = (PPOConfig(hidden_layers=[8], timed_critic=timed).resolve("cpu") for timed in (True, False))
     params = setup_of(timed, 5, 3).networks.value_network.init(jax.random.PRNGKey(0))
-    loss, _ = ppo.value_loss(params, statistics, unrolls, setup_of(timed, 5, 3))
+    timed_loss, plain_loss = (
+        jax.jit(functools.partial(ppo.value_loss, setup=setup))
+        for setup in (setup_of(timed, 5, 3), setup_of(plain, 6, 3))
+    )
+    loss, _ = timed_loss(params, statistics, unrolls)
     extended = unrolls._replace(observation=jnp.concatenate([unrolls.observation, unrolls.elapsed[..., None]], -1))
-    expected, _ = ppo.value_loss(params, longer, extended, setup_of(plain, 6, 3))
-    later, _ = ppo.value_loss(params, statistics, unrolls._replace(elapsed=unrolls.elapsed + 1), setup_of(timed, 5, 3))
+    expected, _ = plain_loss(params, longer, extended)
+    later, _ = timed_loss(params, statistics, unrolls._replace(elapsed=unrolls.elapsed + 1))
     assert loss == pytest.approx(float(expected), rel=1e-12) and abs(later - loss) > 1e-3
 
 
@@ -210,7 +216,7 @@ def test_the_entropy_cost_changes_with_the_progress():
 
 @pytest.mark.slow
 def test_a_batch_learns_by_the_settings_of_its_progress():
-    env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("planar4dof", **SHORT_ARMS, demonstrations={"count": 1, "held_out": 1})
     small = {
         "num_envs": 4, "unroll_length": 10, "batch_size": 4, "num_minibatches": 1, "num_updates_per_batch": 1,
         "hidden_layers": [8], "num_timesteps": 80, "learning_rate": 1e-3, "final_learning_rate": 1.0,
@@ -235,7 +241,7 @@ def test_a_batch_learns_by_the_settings_of_its_progress():
 @pytest.mark.slow
 def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
     """Compiled anew, its numbers may differ in the last bits: on a GPU, XLA chooses matrix products by their speed."""
-    env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("planar4dof", **SHORT_ARMS, demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")
     lowered = []
     monkeypatch.setattr(ppo, "in_background", lambda compiled: lowered.append(compiled.__self__.as_text()))
@@ -248,7 +254,7 @@ def test_a_restored_state_needs_the_same_compiled_epoch(monkeypatch):
 
 @pytest.mark.slow
 def test_schedules_of_a_restored_state_begin_at_its_updates():
-    env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("planar4dof", **SHORT_ARMS, demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1, hidden_layers=[8]).resolve("cpu")
     functions = ppo.compile_training(env, config, 1)
     state = functions.start(7, None, 5)
@@ -265,7 +271,7 @@ def test_schedules_of_a_restored_state_begin_at_its_updates():
 
 def test_both_functions_are_compiled_with_the_options_of_a_run(monkeypatch):
     monkeypatch.setattr(ppo, "compiler_options", lambda: {"no_option_of_xla": True})
-    env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("planar4dof", **SHORT_ARMS, demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(num_envs=4, batch_size=4, num_minibatches=1).resolve("cpu")
     start, _, epoch = ppo.compile_training(env, config, 1)
     for compiled in (lambda: start(7), epoch):

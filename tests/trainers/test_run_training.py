@@ -1,8 +1,11 @@
 """`python -m mimic.train`: the run directory, evaluation, resuming and signals."""
 
+import contextlib
 import csv
 import dataclasses
+import io
 import json
+import logging
 import os
 import re
 import resource
@@ -18,6 +21,8 @@ import numpy as np
 import pytest
 
 from benchmarks.interruptions import differences
+from mimic import train
+from mimic.commands import cli
 from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint, load_checkpoint, save_checkpoint
 from mimic.runs.lock import RunLock
 from mimic.trainers.config import TrainConfig
@@ -52,16 +57,25 @@ def rows_of(run_dir):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """One tiny run that logs what it compiles."""
+    """One tiny run, what it prints, and what it compiles."""
     run_dir = tmp_path_factory.mktemp("runs") / "tiny"
-    environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
-    result = command("train", *TINY, f"run_dir={run_dir}", "compilation_cache=", env=environment)
-    assert result.returncode == 0, result.stderr[-2000:]
-    return run_dir, result
+    compiled, printed = [], io.StringIO()
+    handler = logging.Handler()
+    handler.emit = lambda record: compiled.append(record.getMessage())
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.setattr(sys, "argv", ["mimic.train", *TINY, f"run_dir={run_dir}", "compilation_cache="])
+        logging.getLogger("jax").addHandler(handler)
+        jax.config.update("jax_log_compiles", True)  # in all threads
+        try:
+            cli.run(train.prepare, "train")
+        finally:
+            jax.config.update("jax_log_compiles", False)
+            logging.getLogger("jax").removeHandler(handler)
+    return run_dir, printed.getvalue(), "\n".join(compiled)
 
 
 def test_a_run_directory_holds_everything(finished):
-    run_dir, _ = finished
+    run_dir, *_ = finished
     names = {path.name for path in run_dir.iterdir()}
     assert {"config.yaml", "report.json", "metrics.csv", "demonstrations.npz", "checkpoints", "tensorboard"} <= names
     report = json.loads((run_dir / "report.json").read_text())
@@ -77,21 +91,20 @@ def test_a_run_directory_holds_everything(finished):
 
 def test_the_report_has_the_gap_on_mjx_too(finished):
     """1e-3: the joint angles of both differ by 1e-4 rad after 5 s, and the distance is of that order."""
-    run_dir, result = finished
+    run_dir, printed, _ = finished
     report = json.loads((run_dir / "report.json").read_text())
-    lines = result.stdout.splitlines()
+    lines = printed.splitlines()
     assert lines[1] == (
         "physics: fused (auto: it covers the learner exactly); the report evaluates the policy on MJX too"
     )
     for key in ("optimality_gap", "mean_distance"):
         assert report["mjx"][key] == pytest.approx(report[key], rel=1e-3)
-    assert "evaluated on MJX" in result.stdout
+    assert "evaluated on MJX" in printed
 
 
 def test_a_run_compiles_few_functions(finished):
     """Each takes a tenth of a second or more on a GPU."""
-    _, result = finished
-    names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", result.stderr)
+    names = re.findall(r"Compiling jit\((\w+)\) with global shapes and types", finished[2])
     for function in ("start", "epoch", "rollouts", "rollouts_on_mjx", "closest"):
         assert names.count(function) == 1
     assert len(names) < 22  # 54 with brax's own training loop
@@ -99,7 +112,7 @@ def test_a_run_compiles_few_functions(finished):
 
 @pytest.mark.slow
 def test_evaluate_repeats_the_report(finished, tmp_path):
-    run_dir, _ = finished
+    run_dir, *_ = finished
     out = tmp_path / "again"
     result = command("evaluate", f"run={run_dir}", f"out={out}")
     assert result.returncode == 0, result.stderr[-2000:]
@@ -117,7 +130,7 @@ def test_evaluate_repeats_the_report(finished, tmp_path):
 
 @pytest.mark.slow
 def test_a_video_shows_the_whole_motion(finished):
-    run_dir, _ = finished
+    run_dir, *_ = finished
     result = command("render", f"run={run_dir}", "demonstration=1")
     assert result.returncode == 0, result.stderr[-2000:]
     video = run_dir / "videos" / "held_out-1.mp4"
@@ -142,7 +155,7 @@ def test_resume_continues_from_the_last_checkpoint(finished, tmp_path):
 @pytest.mark.slow
 def test_a_resumed_run_ends_as_if_it_had_not_been_interrupted(finished, tmp_path):
     """As after a SIGKILL while a checkpoint was written, and one before the report."""
-    reference, _ = finished
+    reference, *_ = finished
     run_dir = shutil.copytree(reference, tmp_path / "run")
     last = max(checkpoint_steps(run_dir))
     delete_checkpoint(run_dir, last)
@@ -158,7 +171,7 @@ def test_a_resumed_run_ends_as_if_it_had_not_been_interrupted(finished, tmp_path
 
 @pytest.mark.slow
 def test_a_run_without_a_checkpoint_starts_anew_when_resumed(finished, tmp_path):
-    reference, _ = finished
+    reference, *_ = finished
     run_dir = tmp_path / "run"
     run_dir.mkdir()
     for name in ("config.yaml", "demonstrations.npz"):
@@ -195,7 +208,7 @@ def test_a_run_starts_from_the_parameters_of_another_run(finished, tmp_path):
 
 @pytest.mark.slow
 def test_a_damaged_last_checkpoint_is_trained_again(finished, tmp_path):
-    reference, _ = finished
+    reference, *_ = finished
     run_dir = shutil.copytree(reference, tmp_path / "run")
     state = run_dir / "checkpoints" / f"{max(checkpoint_steps(run_dir)):012d}" / "training.npz"
     state.write_bytes(state.read_bytes() + b"0")
@@ -269,13 +282,10 @@ def test_a_report_that_cannot_be_written_is_one_line(finished, tmp_path):
 
 
 def test_a_run_that_another_process_writes_is_not_resumed(finished):
-    lock = RunLock(finished[0])
-    try:
-        result = command("train", f"resume={finished[0]}", "trainer.num_timesteps=8000")
-    finally:
-        lock.close()
-    assert result.returncode == 2 and f"is in use by process {os.getpid()} on" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
+    config = TrainConfig(resume=str(finished[0]), compilation_cache="")
+    with contextlib.closing(RunLock(finished[0])), pytest.raises(ValueError) as error:
+        prepare_training(config, time.perf_counter(), ["trainer.num_timesteps=8000"])
+    assert f"is in use by process {os.getpid()} on" in str(error.value) and "\n" not in str(error.value)
 
 
 @pytest.mark.slow

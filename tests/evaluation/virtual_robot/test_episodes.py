@@ -61,12 +61,13 @@ def check_safe(episodes):
     assert episodes.clearance.min() > 0.01
     assert episodes.interventions[COLLISION].sum() > len(episodes.motion)  # the safety layer had something to do
     moved = np.abs(np.diff(episodes.qpos, axis=1)).sum(axis=1)
-    assert moved.mean() > 2  # rad: the arms moved
+    assert moved.mean() > 0.02 * episodes.qpos.shape[1]  # rad: the arms moved
 
 
+@pytest.mark.slow_for("ruckig")
 @pytest.mark.parametrize("loop", LOOPS)
 def test_random_actions_are_safe(tmp_path, loop):
-    check_safe(adversarial_episodes(tmp_path / "bundle", "joint_velocity", 4, seed=5, loop=loop))
+    check_safe(adversarial_episodes(tmp_path / "bundle", "joint_velocity", 3, seed=5, loop=loop, ticks=40))
 
 
 @pytest.mark.slow
@@ -123,6 +124,7 @@ def test_a_robot_without_another_command_stops_where_its_path_was_checked(bundle
     assert np.abs(driver.read().qvel).max() < 0.01
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_episodes(bundle):
     done: list[int] = []
     tasks = [task(bundle, hardware(), 3), task(bundle, hardware(), 2, seed=1)]
@@ -149,7 +151,8 @@ def test_numpy_has_one_thread_in_each_process(bundle, monkeypatch, chosen):
         yield SimpleNamespace(imap=map)
 
     monkeypatch.setattr(multiprocessing, "get_context", lambda _: SimpleNamespace(Pool=pool))
-    run_tasks([task(bundle, WorldConfig(), 1), task(bundle, WorldConfig(), 1)], lambda _: None, processes=2)
+    results = run_tasks([task(bundle, WorldConfig(), 1), task(bundle, WorldConfig(), 2)], lambda _: None, processes=2)
+    assert [len(episodes.motion) for episodes in results] == [1, 2]
     assert inherited == ([chosen, None, None, None] if chosen else ["1"] * 4)
     assert dict(os.environ) == before
 

@@ -27,7 +27,7 @@ from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo.ppo import initial_params, make_networks
 from mimic.trainers.run_config import run_schema
 from tests.helpers.repository import REPOSITORY
-from tests.helpers.tiny import TINY
+from tests.helpers.tiny import SHORT_ARMS, TINY
 
 LONG = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"  # with many checkpoints
 
@@ -90,7 +90,7 @@ def test_the_variables_of_slurm_are_enough(tmp_path):
 
 @pytest.mark.slow
 def test_the_first_process_reports_a_divergence(tmp_path):
-    env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})
+    env = mimic.make("planar4dof", **SHORT_ARMS, physics="fused", demonstrations={"count": 1, "held_out": 1})
     networks = make_networks(PPOConfig(hidden_layers=[16]).resolve(), env.observation_size, env.action_size)
     statistics, policy, value = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
     (tmp_path / "start").mkdir()

@@ -1,7 +1,9 @@
 """`python -m mimic.export`: exported networks give the results of JAX and describe their inputs and outputs."""
 
 import json
+import shutil
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -22,15 +24,18 @@ from mimic.trainers.pose_mapper.any_arm_model import make_any_arm_model
 from mimic.trainers.pose_mapper.model import PoseMapper, make_model
 from mimic.trainers.ppo.ppo import initial_params, make_controller, make_networks
 from mimic.trainers.run_config import save_config
+from tests.helpers.tiny import SHORT_ARMS
 
 pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 TOLERANCE = 1e-5  # rad, or a fraction of the maximum torque: float32, sums in another order
 
 
-def policy_run(run_dir, name="panda4dof"):
-    """A run whose policy has random weights and random observation statistics."""
-    env = mimic.make(name, demonstrations={"count": 1, "held_out": 1})
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    """The environment and the policy of a run with random weights and observation statistics, and its export."""
+    run_dir = tmp_path_factory.mktemp("policy") / "run"
+    env = mimic.make("panda4dof", demonstrations={"count": 1, "held_out": 1})
     config = PPOConfig(hidden_layers=[16, 8]).resolve("cpu")
     networks = make_networks(config, env.observation_size, env.action_size)
     statistics, *networks = initial_params(networks, env.observation_size, jax.random.PRNGKey(0))
@@ -43,14 +48,15 @@ def policy_run(run_dir, name="panda4dof"):
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env.config, config))
     save_checkpoint(run_dir, 7, params)
-    return env, make_controller(config, env.observation_size, env.action_size)(params)
+    controller = make_controller(config, env.observation_size, env.action_size)(params)
+    return env, controller, session_of(mimic.export_run(run_dir, run_dir.parent / "policy.onnx"))
 
 
-def mapper_run(run_dir, name="panda4dof", preset="paper", metric=None, **settings):
+def mapper_run(run_dir, name="panda4dof", preset="paper", **settings):
     """A run whose mapper has random weights."""
-    env = mimic.env_config(name, **({"metric": metric} if metric else {}), **settings)
+    env = mimic.env_config(name, **settings)
     config = PoseMapperConfig(preset=preset, hidden_layers=[16, 16]).resolve()
-    params = make_model(env, config).init(jax.random.key(3))
+    params = jax.jit(make_model(env, config).init)(jax.random.key(3))
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env, config))
     save_checkpoint(run_dir, 5, params)
@@ -66,30 +72,25 @@ def random_poses(arm, count, seed=0):
     return np.random.default_rng(seed).uniform(lower, upper, (count, arm.num_joints)).astype(np.float32)
 
 
-@pytest.mark.slow_for("1")
 @pytest.mark.parametrize("batch", [1, 33])
-def test_an_onnx_policy_equals_the_policy(tmp_path, batch):
-    env, controller = policy_run(tmp_path / "run")
-    path = mimic.export_run(tmp_path / "run", tmp_path / "policy.onnx")
-    session = session_of(path)
+def test_an_onnx_policy_equals_the_policy(policy, batch):
+    env, controller, session = policy
     observations = np.random.default_rng(1).normal(size=(batch, env.observation_size)).astype(np.float32)
     action, torque = session.run(["action", "torque"], {"observation": observations})
-    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), batch)).replace(obs=jnp.asarray(observations))
-    expected = controller(state)
+    expected = jax.jit(lambda obs: controller(SimpleNamespace(obs=obs)))(observations)
     assert np.asarray(expected).std() > 0.1  # a check that can fail
     np.testing.assert_allclose(action, expected, rtol=0, atol=TOLERANCE)
     np.testing.assert_allclose(torque, expected * env.torque_scale, rtol=TOLERANCE, atol=1e-4)  # N m, up to 87
 
 
-def test_the_metadata_describes_inputs_and_outputs(tmp_path):
-    env, _ = policy_run(tmp_path / "run")
-    session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "policy.onnx"))
+def test_the_metadata_describes_inputs_and_outputs(policy):
+    env, _, session = policy
     metadata = session.get_modelmeta().custom_metadata_map
     assert metadata["env"] == "panda4dof" and metadata["mimic_version"] == mimic.__version__
     assert json.loads(metadata["learner_joints"]) == ["joint1", "joint2", "joint4", "joint5"]
     np.testing.assert_allclose(json.loads(metadata["torque_scale"]), env.torque_scale)
     layout = {part["name"]: part for part in json.loads(metadata["observation_layout"])}
-    state = env.reset(jax.random.key(0))
+    state = jax.jit(env.reset)(jax.random.key(0))
     own = mimic.link_states(env.learner, state.pipeline_state.qpos)
     ahead = env.expert_at(state.pipeline_state.demonstration, jnp.array(1))
     for whose, states in {"learner": own, "expert 1 steps ahead": ahead}.items():
@@ -101,20 +102,22 @@ def test_the_metadata_describes_inputs_and_outputs(tmp_path):
 
 
 @pytest.mark.slow_for(
-    "panda3dof-large-metric4", "panda4dof-large-None", "panda4dof-paper-None", "planar7dof-large-metric3"
+    "panda3dof-large-metric4", "panda4dof-large-metric1", "planar4dof-large-metric2", "planar7dof-large-metric3"
 )
 @pytest.mark.parametrize(
     ("name", "preset", "metric"),
     [
-        ("panda4dof", "paper", None),
-        ("panda4dof", "large", None),
+        ("panda4dof", "paper", MetricConfig()),
+        ("panda4dof", "large", MetricConfig()),
         ("planar4dof", "large", MetricConfig(adaptive=True)),
         ("planar7dof", "large", MetricConfig(translation=1.0, correspondence="soft", rotation_measure="angle")),
         ("panda3dof", "large", MetricConfig(translation=1.0, reduction="frobenius")),
+        ("short", "large", MetricConfig()),
     ],
 )
 def test_an_onnx_pose_mapper_equals_the_mapper(tmp_path, name, preset, metric):
-    mapper = mapper_run(tmp_path / "run", name, preset, metric)
+    arms = {} if name != "short" else SHORT_ARMS
+    mapper = mapper_run(tmp_path / "run", "planar4dof" if arms else name, preset, metric=metric, **arms)
     session = session_of(mimic.export_run(tmp_path / "run", tmp_path / "mapper.onnx"))
     poses = random_poses(mapper.expert, 200)
     (outputs,) = session.run(None, {"expert_qpos": poses})
@@ -136,7 +139,7 @@ def any_arm_run(run_dir, expert="fixed"):
     """A run whose mapper to any arm has random weights."""
     env = mimic.env_config("any_arm", arms={"expert": expert})
     config = PoseMapperConfig(preset="any_arm", width=16, layers=1, heads=2, guesses=1, refinements=2).resolve()
-    params = make_any_arm_model(env, config).init(jax.random.key(3))
+    params = jax.jit(make_any_arm_model(env, config).init)(jax.random.key(3))
     run_dir.mkdir()
     save_config(run_dir, TrainConfig(env, config))
     save_checkpoint(run_dir, 5, params)
@@ -184,12 +187,6 @@ def test_a_description_is_the_arm(tmp_path):
         np.testing.assert_array_equal(getattr(again, part["name"]), getattr(arm, part["name"]))
 
 
-def test_a_description_needs_a_file_for_it(rejected, tmp_path):
-    any_arm_run(tmp_path / "run")
-    message = rejected("export", f"run={tmp_path / 'run'}", f"out={tmp_path / 'new.onnx'}", "learner=panda")
-    assert "out: expected a file .json or .npz for the description of learner=panda" in message
-
-
 @pytest.mark.slow
 def test_jax_reads_a_mapper_to_any_arm(tmp_path):
     pytest.importorskip("flatbuffers")
@@ -207,7 +204,7 @@ def test_jax_reads_its_own_format(tmp_path):
     pytest.importorskip("flatbuffers")
     from jax import export
 
-    mapper = mapper_run(tmp_path / "run", preset="large")
+    mapper = mapper_run(tmp_path / "run")
     path = mimic.export_run(tmp_path / "run", tmp_path / "mapper.jax", format="jax")
     poses = random_poses(mapper.expert, 9)
     outputs = export.deserialize(bytearray(path.read_bytes())).call(poses)["learner_qpos"]
@@ -215,42 +212,43 @@ def test_jax_reads_its_own_format(tmp_path):
     assert json.loads((tmp_path / "mapper.jax.json").read_text())["learner_joints"][2] == "joint4"
 
 
-def test_bad_input_is_rejected(rejected, tmp_path):
-    mapper_run(tmp_path / "run")
-    taken = tmp_path / "taken.onnx"
-    taken.write_text("")
-    run = f"run={tmp_path / 'run'}"
-    cases = [
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("mapper") / "run"
+    mapper_run(run_dir)
+    return run_dir
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
         ([], "out: expected a file"),
-        (["out=new.onnx"], "run: expected the run directory to export"),
+        (["out=new.onnx", "run="], "run: expected the run directory to export"),
         (["out=new.onnx", "run=missing"], "'missing' is not a run directory"),
-        (["out=new.onnx", run, "checkpoint=6"], "has no checkpoint 6; it has 5"),
-        ([f"out={taken}", run], "exists; name a new file"),
-        (["out=no/new.onnx", run], "there is no folder 'no'"),
-        (["out=new.onnx", run, "format=tflite"], "expected one of onnx, jax, controller, got 'tflite'"),
-        (
-            ["out=new.onnx", run, "learner=panda3dof"],
-            "but the run's is panda-joint3-joint6-joint7 with joints",
-        ),
-        (
-            ["out=new.onnx", run, "learner=panda9dof"],
-            "unknown environment 'panda9dof'; valid are any_arm, bimanual, pair",
-        ),
-    ]
-    for arguments, message in cases:
-        assert message in rejected("export", *arguments)
-        (tmp_path / "empty").rmdir()
+        (["out=new.onnx", "checkpoint=6"], "has no checkpoint 6; it has 5"),
+        ([f"out={__file__}"], "exists; name a new file"),
+        (["out=no/new.onnx"], "there is no folder 'no'"),
+        (["out=new.onnx", "format=tflite"], "expected one of onnx, jax, controller, got 'tflite'"),
+        (["out=new.onnx", "learner=panda3dof"], "but the run's is panda-joint3-joint6-joint7 with joints"),
+        (["out=new.onnx", "learner=panda9dof"], "unknown environment 'panda9dof'; valid are any_arm, bimanual, pair"),
+    ],
+)
+def test_bad_input_is_rejected(mapped, reason, arguments, message):
+    assert message in reason("export", f"run={mapped}", *arguments)
 
 
-def test_a_mapper_whose_arms_differ_from_its_config_is_rejected(rejected, tmp_path):
-    mapper_run(tmp_path / "run")
+def test_bad_input_is_one_line(mapped, rejected):
+    assert "has no checkpoint 6; it has 5" in rejected("export", f"run={mapped}", "out=new.onnx", "checkpoint=6")
+
+
+def test_a_mapper_whose_arms_differ_from_its_config_is_rejected(mapped, reason, tmp_path):
+    run_dir = shutil.copytree(mapped, tmp_path / "run")
     config = PoseMapperConfig(preset="paper", hidden_layers=[16, 16]).resolve()
-    save_config(tmp_path / "run", TrainConfig(mimic.env_config("panda3dof"), config))
-    assert "it has other arms or another network" in rejected("export", f"run={tmp_path / 'run'}", "out=new.onnx")
+    save_config(run_dir, TrainConfig(mimic.env_config("panda3dof"), config))
+    assert "it has other arms or another network" in reason("export", f"run={run_dir}", "out=new.onnx")
 
 
-def test_a_missing_package_is_named(rejected, tmp_path, monkeypatch):
-    mapper_run(tmp_path / "run")
+def test_a_missing_package_is_named(mapped, reason, monkeypatch):
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
-    message = rejected("export", f"run={tmp_path / 'run'}", "out=new.onnx")
+    message = reason("export", f"run={mapped}", "out=new.onnx")
     assert "format=onnx needs the package jax2onnx: pip install 'mimic-arms[export]'" in message

@@ -77,15 +77,15 @@ def with_locks(arm, joints):
         (["out=new.json", "learner=panda", "checkpoint=6"], "has no checkpoint 6; it has "),
     ],
 )
-def test_bad_input_is_rejected(run_dir, rejected, arguments, message):
-    assert message in rejected("export", f"run={run_dir}", *arguments)
+def test_bad_input_is_rejected(run_dir, reason, arguments, message):
+    assert message in reason("export", f"run={run_dir}", *arguments)
 
 
-def test_an_arm_that_evaluate_rejects_has_no_description(run_dir, rejected, tmp_path):
+def test_an_arm_that_evaluate_rejects_has_no_description(run_dir, reason, tmp_path):
     """Of 9 joints, one of them locked: a policy moves arms of up to 8, locked ones included."""
     model = tmp_path / "nine.xml"
     mujoco.mj_saveLastXML(str(model), random_model(0, joints=9))
-    error = rejected("export", f"run={run_dir}", "out=new.json", f"learner={model}", "locked=[1]")
+    error = reason("export", f"run={run_dir}", "out=new.json", f"learner={model}", "locked=[1]")
     assert "expected at most 8 joints and 12 links, got 9 and 9" in error
 
 
