@@ -130,10 +130,10 @@ def own_registry(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture(scope="session")
 def schemas():
-    """`mimic.base.config.schema`, once for each class: a third of the time of a command that is rejected."""
-    from mimic.base.config import schema
+    """`mimic.base.config.schema`, once for each class."""
+    from tests.helpers import commands
 
-    return functools.cache(schema)
+    return commands.schemas
 
 
 @pytest.fixture
@@ -172,14 +172,21 @@ def reason(monkeypatch, tmp_path, schemas):
         from mimic.base.config import to_dict, typed
         from mimic.commands import cli
         from mimic.envs import env_config
+        from mimic.trainers.config import trainer_config
 
         prepare = importlib.import_module(f"mimic.{name}").prepare
+        monkeypatch.setattr(cli, "overrides", lambda: list(arguments))
         (folder := tmp_path / "empty").mkdir()
         monkeypatch.chdir(folder)
         with pytest.raises(ValueError) as error:
             keys = cli.expand_arguments(list(map(str, arguments)), name)
             settings = {key: value or "''" for key, _, value in (key.partition("=") for key in keys)}
-            preset = {"env": to_dict(env_config(settings.pop("env")))} if "env" in settings else {}
+            preset: dict[str, typing.Any] = {}
+            if "env" in settings:
+                preset["env"] = to_dict(env_config(settings.pop("env")))
+            if name == "train":
+                trainer = settings.pop("trainer", "ppo")
+                preset["trainer"] = OmegaConf.merge(schemas(trainer_config(trainer)), {"name": trainer})
             schema = schemas(typing.get_type_hints(prepare)["config"])
             given = OmegaConf.from_dotlist([f"{key}={value}" for key, value in settings.items()])
             prepare(typed(DictConfig(OmegaConf.merge(schema, preset, given))))

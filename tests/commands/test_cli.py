@@ -18,34 +18,27 @@ from tests.helpers.repository import REPOSITORY
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["env=panda5dof"],
-            "unknown env 'panda5dof'; valid are any_arm, bimanual, pair, panda3dof, panda4dof, panda7dof",
-        ),
-        (["trainer=sac"], "unknown trainer 'sac'; valid are "),
         (["env.world.payload=[0,1]"], "env.world.payload: expected with an inner loop, as in world=ideal"),
-        (["env.arms.distinct=3"], "env.arms.distinct: expected with sampled arms, as in env=any_arm"),
         (["env.previw=1"], "unknown key 'env.previw'; valid are"),
         (["seed=one"], "could not be converted to Integer"),
-        (["resume=missing"], "not a run directory"),
         (["+foo=1"], "foo"),
         (["env.learner.model=missing.xml"], "missing.xml"),
-        (
-            ["trainer=pose_mapper", "trainer.preset=huge"],
-            "expected one of auto, paper, large, any_arm, any_arm_cpu, got 'huge'",
-        ),
         (["trainer=pose_mapper", "trainer.num_envs=8"], "unknown key 'trainer.num_envs'; valid are name, preset"),
+        (["xyz=1"], "unknown key 'xyz'"),
     ],
 )
 def test_bad_training_input(rejected, arguments, message):
-    assert message in rejected("train", *arguments)
+    error = rejected("train", *arguments)
+    assert message in error and ("did you mean" in error) == ("previw" in message or "num_envs" in message)
 
 
 def test_bad_input_ends_the_process_with_one_line():
     result = subprocess.run(
-        [sys.executable, "-m", "mimic.train", "env=panda5dof"], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-m", "mimic.train", "env=panda5dof"], capture_output=True, text=True, timeout=280, check=False
     )
-    assert result.returncode == 2 and result.stderr.count("\n") == 1 and "unknown env" in result.stderr
+    valid = "any_arm, bimanual, pair, panda3dof, panda4dof, panda7dof"
+    assert result.returncode == 2 and result.stderr.count("\n") == 1
+    assert f"unknown env 'panda5dof'; valid are {valid}" in result.stderr
 
 
 @pytest.mark.parametrize("command", ["train", "inspect"])
@@ -95,37 +88,23 @@ def test_bad_commands(arguments, message, capsys):
 
 @pytest.mark.parametrize(
     ("arguments", "name"),
-    [
-        (["env=panda4dfo"], "panda4dof"),
-        (["trainer=po"], "ppo"),
-        (["env.previw=1"], "env.preview"),
-        (["learning_rate=1"], "trainer.learning_rate"),
-        (["env.limits=hardwere"], "hardware"),
-    ],
+    [(["env=panda4dfo"], "panda4dof"), (["learning_rate=1"], "trainer.learning_rate")],
 )
 def test_errors_suggest_the_closest_name(arguments, name, rejected):
     assert rejected("train", *arguments).endswith(f"; did you mean {name}?\n")
 
 
-def test_nothing_is_suggested_where_nothing_is_close(rejected):
-    assert "did you mean" not in rejected("train", "xyz=1")
+def test_choices_suggest_the_closest_name(reason):
+    assert reason("train", "env=panda4dof", "env.limits=hardwere").endswith("; did you mean hardware?")
 
 
-def test_a_bad_arm_file(rejected, tmp_path):
-    path = tmp_path / "arm.xml"
-    path.write_text("<mujoco><worldbody><body")
-    assert "unclosed token" in rejected("train", "env=planar4dof", f"env.learner.model={path}")
-
-
-def test_bad_run_directories(rejected, tmp_path):
+def test_a_run_directory_that_exists(reason, tmp_path):
     run_dir = tmp_path / "run"
     run_dir.mkdir()
     (run_dir / "notes.txt").touch()
-    assert "exists" in rejected("train", f"run_dir={run_dir}")
+    assert "exists" in reason("train", "env=planar4dof", f"run_dir={run_dir}")
 
 
-@pytest.mark.slow_for("None-not a run directory-train-resume")
-@pytest.mark.parametrize(("command", "key"), [("train", "resume"), ("evaluate", "run"), ("render", "run")])
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -133,20 +112,13 @@ def test_bad_run_directories(rejected, tmp_path):
         ("trainer: {name: sac}\n", "expected one of"),
         ("trainer: {name: ppo, previw: 1}\n", "previw"),
         ("a: [\n", "cannot be read"),
+        ("trainer: {name: ppo}\n", "no checkpoint"),
     ],
 )
-def test_unreadable_run_directories(rejected, tmp_path, command, key, config, message):
-    run_dir = tmp_path / "run"
-    run_dir.mkdir()
+def test_unreadable_run_directories(reason, tmp_path, config, message):
     if config is not None:
-        (run_dir / "config.yaml").write_text(config)
-    assert message in rejected(command, f"{key}={run_dir}")
-
-
-@pytest.mark.parametrize("command", ["evaluate", "render"])
-def test_run_directories_without_a_checkpoint(rejected, tmp_path, command):
-    (tmp_path / "config.yaml").write_text("trainer: {name: ppo}\n")
-    assert "no checkpoint" in rejected(command, f"run={tmp_path}")
+        (tmp_path / "config.yaml").write_text(config)
+    assert message in reason("evaluate", f"run={tmp_path}")
 
 
 def test_hydra_completes_keys_and_choices(monkeypatch, capsys):
@@ -157,16 +129,8 @@ def test_hydra_completes_keys_and_choices(monkeypatch, capsys):
     assert capsys.readouterr().out == "env=planar4dof\n"
 
 
-def test_all_commands_are_listed():
+def test_all_commands_are_listed(capsys):
     commands = {file.stem for file in (Path(mimic.__file__).parent / "conf").glob("*.yaml")}
-    result = subprocess.run([sys.executable, "-m", "mimic"], capture_output=True, text=True, timeout=60, check=False)
-    listed = [line.split(maxsplit=1) for line in result.stdout.splitlines()[2:]]
-    names = {words[0] for words in listed if len(words) == 2 and words[0] != "mimic"}
-    assert result.returncode == 0 and names == set(commands)
-
-
-def test_help_names_the_environments():
-    result = subprocess.run(
-        [sys.executable, "-m", "mimic.train", "--help"], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert result.returncode == 0 and "panda4dof" in result.stdout and "resume=DIR" in result.stdout
+    assert main([]) == 0
+    listed = [line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[2:]]
+    assert {words[0] for words in listed if len(words) == 2 and words[0] != "mimic"} == set(commands)

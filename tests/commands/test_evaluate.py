@@ -12,6 +12,7 @@ import pytest
 from mimic.commands.config import EvaluateConfig
 from mimic.commands.evaluate import prepare_evaluation
 from mimic.envs.imitation import training_and_held_out
+from mimic.evaluation import evaluator
 from mimic.physics import step as physics
 from mimic.runs.checkpoints import save_checkpoint
 from mimic.runs.signals import Signals
@@ -20,7 +21,7 @@ from mimic.trainers.make import make_trainer
 from mimic.trainers.ppo import ppo
 from mimic.trainers.ppo.trainer import PPOTrainer
 from mimic.trainers.run_config import save_config
-from tests.helpers.untrained_run import COUNT, HORIZON, environment, untrained_run
+from tests.helpers.untrained_run import COUNT, HELD_OUT, HORIZON, environment, untrained_run
 
 
 @pytest.fixture(scope="module")
@@ -43,11 +44,13 @@ def evaluate(run_dir, out, **settings):
         return json.loads((out / "report.json").read_text()), list(csv.DictReader(file))
 
 
-def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path):
-    """With other physics than in training. 1e-5: float32, once from rollouts and once from the home pose."""
-    report, rows = evaluate(run_dir, tmp_path / "new", controller="hold", physics="mjx")
-    assert report["physics"] == "mjx" and "mjx" not in report
-    assert report["trainer"] == "hold"
+def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path, monkeypatch):
+    """Whatever the bound. 1e-5: float32, once from rollouts and once from the home pose."""
+    bound = np.zeros((COUNT + HELD_OUT, HORIZON)), np.zeros((COUNT + HELD_OUT, HORIZON, 2))
+    monkeypatch.setattr(evaluator, "_lower_bound", lambda *_: bound)
+    report, rows = evaluate(run_dir, tmp_path / "new", controller="hold", physics="fused", mass=1.5)
+    assert report["physics"] == "fused" and "mjx" not in report
+    assert report["trainer"] == "hold" and report["evaluated"]["mass"] == [1.5, 1.5]
     assert report["optimality_gap"] == pytest.approx({"train": 1, "held_out": 1}, abs=1e-5)
     assert [float(row["optimality_gap"]) for row in rows] == pytest.approx([1] * 6, abs=1e-5)
     assert report["torque_rms"] == {"train": 0, "held_out": 0}
@@ -119,10 +122,8 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
         (["physics=bullet"], "physics: expected one of mjx, fused, got 'bullet'"),
         (["checkpoint=7"], "has no checkpoint 7; it has 0"),
         (["out=."], "exists; name a new folder"),
-        (["out=no/new"], "there is no folder 'no'"),
         (["mass=0"], "mass: expected a number from 0.001 to 1000, got 0.0"),
         (["torque_noise=-1"], "torque_noise: expected a number from 0 to 10, got -1"),
-        (["mass=[0,1]"], "mass"),
         (["demonstrations=missing.npz"], "no file at 'missing.npz'"),
     ],
 )
@@ -135,8 +136,6 @@ def test_bad_evaluations(reason, run_dir, arguments, message):
     [
         ("mass=[0,1]", "randomization.mass: expected 2 numbers, each from 0.001 to 1000, got [0.0, 1.0]"),
         ("damping=[2,1]", "randomization.damping: expected [minimum, maximum], got [2.0, 1.0]"),
-        ("mass=[1]", "randomization.mass: expected 2 numbers, each from 0.001 to 1000, got [1.0]"),
-        ("torque_noise=-1", "randomization.torque_noise: expected a number from 0 to 10, got -1"),
         ("torque_noise=nan", "randomization.torque_noise: expected a number from 0 to 10, got nan"),
     ],
 )
@@ -184,9 +183,9 @@ def test_a_damaged_checkpoint(reason, run_dir, tmp_path):
     assert "is damaged: params.npz was changed" in reason("evaluate", f"run={damaged}", "compilation_cache=")
 
 
-def test_a_mapper_has_no_controllers(rejected, tmp_path):
+def test_a_mapper_has_no_controllers(reason, tmp_path):
     (tmp_path / "run").mkdir()
     save_config(tmp_path / "run", TrainConfig(environment(), PoseMapperConfig()))
     save_checkpoint(tmp_path / "run", 0, {"weight": np.zeros(1, np.float32)})
-    error = rejected("evaluate", f"run={tmp_path / 'run'}", "controller=pd", "compilation_cache=")
+    error = reason("evaluate", f"run={tmp_path / 'run'}", "controller=pd", "compilation_cache=")
     assert "expected a run of trainer=ppo, got one of pose_mapper" in error

@@ -15,7 +15,7 @@ import pytest
 
 import mimic
 from mimic.commands.config import EvaluateConfig
-from mimic.commands.evaluate import prepare_evaluation
+from mimic.commands.evaluate import _check_commands, prepare_evaluation
 from mimic.commands.evaluate_robot import prepare_robot_evaluation, summary
 from mimic.control.joint_control import Reference
 from mimic.deploy.bundle import load_bundle
@@ -30,6 +30,7 @@ from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.export.config import ExportConfig
 from mimic.trainers.export.export import prepare_export
 from mimic.trainers.export.export_controller import expert_table, export_controller, prepare_controller
+from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.ppo.ppo import initial_params, make_controller, make_networks, params_template
 from mimic.trainers.ppo.trainer import PPOTrainer, run_environment
 from mimic.trainers.run_config import load_config, save_config
@@ -66,6 +67,26 @@ def paper_run(tmp_path_factory):
     return untrained(tmp_path_factory.mktemp("runs") / "paper")
 
 
+@pytest.fixture(scope="module")
+def evaluation(hardware_run, tmp_path_factory):
+    """A function that evaluates the run in the hardware world, whose trainer and bundle are made once."""
+    trained = load_config(hardware_run)
+    trainer = make_ppo_trainer(trained, hardware_run)
+    exported = tmp_path_factory.mktemp("bundles") / "bundle"
+    export_controller(hardware_run, exported, 0)
+
+    def run(out, **settings):
+        settings = {"robot": "virtual_panda", "episodes": 4, **settings}
+        config = EvaluateConfig(str(hardware_run), out=str(out), compilation_cache="", **settings)
+        prepare_robot_evaluation(config, trained, trainer, hardware_run)()
+        return json.loads((out / "report.json").read_text())
+
+    with pytest.MonkeyPatch.context() as patch:
+        copy = lambda run_dir, folder, steps: shutil.copytree(exported, folder)  # noqa: E731
+        patch.setattr("mimic.trainers.export.export_controller.export_controller", copy)
+        yield run
+
+
 def evaluate(run_dir, out, **settings):
     settings = {"robot": "virtual_panda", "episodes": 4, **settings}
     config = EvaluateConfig(str(run_dir), out=str(out), compilation_cache="", **settings)
@@ -74,8 +95,8 @@ def evaluate(run_dir, out, **settings):
 
 
 @pytest.mark.parametrize("loop", ["mimic", "ruckig"])
-def test_a_policy_of_the_hardware_world(hardware_run, tmp_path, capsys, loop):
-    report = evaluate(hardware_run, tmp_path / "new", robot_loop=loop)
+def test_a_policy_of_the_hardware_world(evaluation, tmp_path, capsys, loop):
+    report = evaluation(tmp_path / "new", robot_loop=loop)
     assert report["robot_loop"] == loop
     row = report["cases"]["all ranges"]
     assert report["robot"] == "virtual_panda" and report["world"]["payload"] == [0.0, 3.0]
@@ -95,21 +116,15 @@ def test_a_policy_of_the_papers_world_aborts(paper_run, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_edges_of_the_world(hardware_run, tmp_path):
-    report = evaluate(hardware_run, tmp_path / "new", episodes=1, edges=True)
+def test_the_edges_of_the_world(evaluation, tmp_path):
+    report = evaluation(tmp_path / "new", episodes=1, edges=True)
     assert {"all ranges", "payload=0", "payload=3", "all: corners", "action_delay=3"} <= report["cases"].keys()
     assert all(row["episodes"] == 1 and not row["aborts"] for row in report["cases"].values())
 
 
 def test_the_gap_is_that_of_the_evaluator(hardware_run):
     """An arm that stays in its start pose has a gap of one, and one in the nearest poses that of the evaluator."""
-    config = EvaluateConfig(str(hardware_run), compilation_cache="")
-    from mimic.commands.evaluate import _run_to_evaluate, _trainer_to_evaluate
-
-    run_dir, trained = _run_to_evaluate(config)
-    trainer = _trainer_to_evaluate(trained, run_dir, config)[1]
-    assert isinstance(trainer, PPOTrainer)
-    evaluator = trainer.evaluator
+    evaluator = make_ppo_trainer(load_config(hardware_run), hardware_run).evaluator
     motion = np.arange(2, 2 + HELD_OUT)
     held = np.repeat(np.asarray(evaluator.env.start_poses)[motion][:, None], HORIZON, axis=1)
     zero, none = np.zeros(HELD_OUT), np.full(HELD_OUT, "", object)
@@ -190,36 +205,34 @@ def test_what_the_safety_layer_cannot_run_is_rejected(tmp_path, settings, messag
         prepare_robot_evaluation(EvaluateConfig(robot="virtual_panda"), trained, None, tmp_path)
 
 
-@pytest.mark.parametrize("controller", ["pd", "computed_torque", "nearest_pose"])
-def test_controllers_of_torques_do_not_fit_an_inner_loop(reason, hardware_run, controller):
-    error = reason("evaluate", f"run={hardware_run}", f"controller={controller}")
-    assert (
-        "controller: expected policy, hold or tracking for a run with an inner loop and control=joint_velocity, got "
-        f"{controller}"
-    ) in error
+@pytest.mark.parametrize(
+    ("settings", "controller", "message"),
+    [
+        (
+            {"world": "nominal"},
+            "pd",
+            "policy, hold or tracking for a run with an inner loop and control=joint_velocity",
+        ),
+        ({"world": "nominal", "control": "torque"}, "tracking", "policy or hold for a run with an inner loop and"),
+        ({}, "tracking", "policy, hold, pd, computed_torque or nearest_pose for a run with no inner loop"),
+    ],
+)
+def test_controllers_whose_commands_the_run_does_not_have(settings, controller, message):
+    with pytest.raises(ValueError, match=f"controller: expected {message}.*, got {controller}"):
+        _check_commands(mimic.env_config("panda7dof", **settings), controller)
 
 
-@pytest.mark.parametrize("robot", [(), ("robot=virtual_panda",)])
-def test_tracking_needs_an_inner_loop(reason, paper_run, robot):
-    error = reason("evaluate", f"run={paper_run}", "controller=tracking", *robot)
-    assert (
-        "controller: expected policy, hold, pd, computed_torque or nearest_pose for a run with no inner loop, "
-        "got tracking"
-    ) in error
-
-
-def test_tracking_needs_targets_other_than_torques(reason, tmp_path):
-    run = untrained(tmp_path / "run", world="nominal", control="torque")
-    error = reason("evaluate", f"run={run}", "controller=tracking")
-    assert "controller: expected policy or hold for a run with an inner loop and control=torque, got tracking" in error
+def test_tracking_needs_an_inner_loop(reason, paper_run):
+    error = reason("evaluate", f"run={paper_run}", "controller=tracking", "robot=virtual_panda")
+    assert "for a run with no inner loop, got tracking" in error
 
 
 @pytest.mark.slow
-def test_tracking_on_virtual_robots(hardware_run, tmp_path):
+def test_tracking_on_virtual_robots(evaluation, tmp_path):
     """Much nearer than an untrained policy, which stays near the start pose."""
     rows = {}
     for controller in ("tracking", "policy"):
-        report = evaluate(hardware_run, tmp_path / controller, controller=controller, robot_world="nominal")
+        report = evaluation(tmp_path / controller, controller=controller, robot_world="nominal")
         rows[controller], lead = report["cases"]["all ranges"], report.get("lead_ticks")
         assert report["controller"] == controller and (lead is not None) == (controller == "tracking")
     assert rows["tracking"]["completed"] == 4
@@ -244,7 +257,6 @@ def test_what_does_not_fit_is_rejected(reason, hardware_run, tmp_path):
     cases = [
         (["robot=panda"], "robot: expected one of virtual_panda, virtual_robot, got 'panda'"),
         (["edges=true"], "robot_world, robot_loop, edges: expected only with robot="),
-        (["robot_loop=ruckig"], "robot_world, robot_loop, edges: expected only with robot="),
         (["robot=virtual_panda", "robot_loop=mars"], "robot_loop: expected one of mimic, ruckig"),
         (["robot=virtual_panda", "robot_world=mars"], "robot_world: expected one of paper, nominal, hardware"),
         (["robot=virtual_panda", "controller=pd"], "controller: expected policy or tracking with robot=, got pd"),

@@ -19,7 +19,7 @@ def shown(monkeypatch, capsys, name, *arguments):
     monkeypatch.setattr(sys, "argv", [f"mimic.{name}", *arguments, "--help"])
     cli.run(lambda config: pytest.fail("the command ran"), name)
     text, keys = capsys.readouterr().out.split("All keys, with their current values:\n\n")
-    assert "usage: " in text
+    assert "usage: " in text and (name != "train" or ("panda4dof" in text and "resume=DIR" in text))
     return keys
 
 

@@ -13,6 +13,7 @@ import pytest
 import mimic
 from mimic.arms.arm import build_arm
 from mimic.arms.rendering import ArmScene
+from mimic.commands import render
 from mimic.commands.clips import prepare_clip
 from mimic.commands.config import RenderConfig
 from mimic.commands.render import _write_video, draw_frames, prepare_video
@@ -23,7 +24,7 @@ from mimic.motions.recording import record_demonstrations
 from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 
-STEPS = 4  # of a motion: 0.4 s, 13 frames
+STEPS = 2  # of a motion: 0.2 s, 7 frames
 EVERY = 3  # frames from one sample to the next, 0.1 s at 30 frames a second
 TINY = {"samples": 256, "batch_size": 64, "epochs": 4, "evaluations": 1, "hidden_layers": [16], "heads": 2}
 ROUNDING = 1e-5  # of distances of about 1 in float32
@@ -58,6 +59,13 @@ def files(tmp_path_factory):
     return {key: str(folder / f"{key}.npz") for key in arms} | {"learner": "planar4dof", "compilation_cache": ""}
 
 
+@pytest.fixture(scope="module")
+def plan(files):
+    """The video of retargeted motions, whose content is computed once."""
+    plan = prepare_clip(RenderConfig(**files, demonstration=1))
+    return plan._replace(compute=functools.cache(plan.compute))
+
+
 def curves(clip):
     return {curve.label: curve.values for curve in clip.curves}
 
@@ -80,23 +88,16 @@ def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
     assert shown["holding the start pose"][0] == pytest.approx(float(stretched), abs=ROUNDING)
 
 
-@pytest.mark.slow
-def test_retargeted_motions_are_shown_as_they_are(files):
-    clip = prepare_clip(RenderConfig(**files, demonstration=1)).compute()
-    env = env_config("planar4dof")
-    for shown, arm in zip(clip.poses, (env.expert, env.learner), strict=True):
-        motions = swings(build_arm(arm).embodiment)
+def test_retargeted_motions_are_shown_as_they_are(plan):
+    clip, env = plan.compute(), env_config("planar4dof")
+    arms = [build_arm(arm).embodiment for arm in (env.expert, env.learner)]
+    for shown, arm in zip(clip.poses, arms, strict=True):
         assert len(shown) == len(clip.time) == EVERY * STEPS + 1
-        np.testing.assert_allclose(shown[::EVERY], motions.qpos[1], atol=1e-12)
+        np.testing.assert_allclose(shown[::EVERY], swings(arm).qpos[1], atol=1e-12)
     shown = curves(clip)
     assert np.all(shown["optimal poses"] <= shown["retargeted"] + ROUNDING)
-    assert clip.bars.shape == (len(clip.time), 4) and np.all(np.isfinite(clip.bars))
-
-
-def test_each_frame_has_the_measures_of_similarity(files):
-    plan = prepare_clip(RenderConfig(**files))
-    clip = plan.compute()
-    arms = build_arm(plan.env.expert).embodiment, build_arm(plan.env.learner).embodiment
+    assert clip.bars.shape == (len(clip.time), 4)
+    np.testing.assert_allclose(clip.bars.sum(axis=1), shown["retargeted"], atol=ROUNDING)
     frame = 5
     lines = (centre_line(arm, poses[frame]) for arm, poses in zip(arms, clip.poses, strict=True))
     for name, expected in similarity(*lines).items():
@@ -104,8 +105,7 @@ def test_each_frame_has_the_measures_of_similarity(files):
         assert clip.similarity[name][frame] == pytest.approx(float(expected), rel=1e-4)  # degrees in float32
 
 
-def test_frames_show_both_arms_and_the_time(files):
-    plan = prepare_clip(RenderConfig(**files))
+def test_frames_show_both_arms_and_the_time(plan):
     clip = plan.compute()
     few = dataclasses.replace(clip, time=clip.time[:2], poses=tuple(poses[[0, -1]] for poses in clip.poses))
     with ArmScene([plan.env.expert, plan.env.learner], width=160, height=120) as scene:
@@ -116,12 +116,14 @@ def test_frames_show_both_arms_and_the_time(files):
     assert changed[:280, 760:].any() and changed[340:380, 760:].any()  # the line of the time; similarity
 
 
-def test_a_video_has_all_frames(files, tmp_path, capsys):
+def test_a_video_has_all_frames(plan, files, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(render, "prepare_clip", lambda config: plan)
+    monkeypatch.setattr(render, "_SCENE", (190, 137))  # pixels: a scene of full size takes a second a frame on a CPU
     out = tmp_path / "swing.mp4"
     prepare_video(RenderConfig(**files, out=str(out)))()
     lines = capsys.readouterr().out.splitlines()  # no terminal
     assert lines[0] == "computing the motion and its distances"
-    assert lines[1:6] == [f"rendering: {number} of 13 frames" for number in (3, 6, 8, 11, 13)]
+    assert lines[1:6] == [f"rendering: {number} of 7 frames" for number in (2, 3, 5, 6, 7)]
     assert imageio_ffmpeg.count_frames_and_secs(str(out))[0] == EVERY * STEPS + 1
     with pytest.raises(ValueError, match="exists; name a new file"):
         prepare_video(RenderConfig(**files, out=str(out)))
@@ -145,7 +147,6 @@ def test_a_video_that_lacks_frames_is_removed(tmp_path, monkeypatch, options):
         ({"out": "swing.gif"}, "expected a file that ends in .mp4"),
         ({"learner": ""}, "learner: expected with retargeted=FILE"),
         ({"retargeted": ""}, "retargeted: expected with retargeted=FILE"),
-        ({"demonstrations": ""}, "demonstrations: expected with retargeted=FILE"),
         ({"demonstrations": "none.npz"}, "no file at 'none.npz'"),
         ({"learner": "planar7dof"}, "demonstrations: expected motions of planar4 .* got planar7"),
         ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
@@ -163,7 +164,7 @@ def test_bad_files_are_rejected_in_one_line(files, changes, message):
 def test_motions_of_another_length_are_rejected(files, tmp_path):
     learner = build_arm(env_config("planar4dof").learner).embodiment
     swings(learner, count=1).save(tmp_path / "one.npz")
-    with pytest.raises(ValueError, match="expected 2 motions of 4 steps of 0.1 s, as in demonstrations, got 1 motions"):
+    with pytest.raises(ValueError, match="expected 2 motions of 2 steps of 0.1 s, as in demonstrations, got 1 motions"):
         prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
 
 

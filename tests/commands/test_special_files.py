@@ -45,10 +45,12 @@ def in_time():
 
 @pytest.mark.parametrize("case", KEYS, ids=lambda case: " ".join(case))
 @pytest.mark.usefixtures("unchecked")
-def test_a_pipe_for_a_key(rejected, tmp_path, case):
+def test_a_pipe_for_a_key(reason, tmp_path, case):
     command, key, suffix, *others = case
     os.mkfifo(tmp_path / f"pipe{suffix}")
-    error = rejected(command, f"{key}={tmp_path}/pipe{suffix}", *others, *([PLANAR] if command == "train" else []))
+    error = reason(
+        command, f"{key}={tmp_path}/pipe{suffix}", *others, *([PLANAR] if command in ("train", "retarget") else [])
+    )
     assert f"pipe{suffix}" in error
 
 

@@ -76,15 +76,13 @@ def positions(samples: int = 600) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     waves = angles(samples)
-    result = np.zeros((samples, len(JOINTS), 3))
-    for sample in range(samples):
-        frames: list[tuple[Rotation, np.ndarray]] = []
-        for index, (name, parent, offset) in enumerate(JOINTS):
-            turn = Rotation.from_euler("ZXY", waves[name][sample] if name in waves else [0, 0, 0], degrees=True)
-            rotation, place = frames[parent] if parent >= 0 else (Rotation.identity(), np.zeros(3))
-            place = place + rotation.apply(offset)
-            frames.append((rotation * turn, place))
-            result[sample, index] = place
+    frames: list[tuple[Rotation, np.ndarray]] = []
+    for name, parent, offset in JOINTS:
+        turn = Rotation.from_euler("ZXY", waves.get(name, np.zeros((samples, 3))), degrees=True)
+        at_base = Rotation.identity(samples), np.zeros((samples, 3))
+        rotation, place = frames[parent] if parent >= 0 else at_base
+        frames.append((rotation * turn, place + rotation.apply(offset)))
+    result = np.stack([place for _, place in frames], axis=1)
     return result[..., [2, 0, 1]]  # z x y: y up becomes z up
 
 

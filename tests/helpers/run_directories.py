@@ -1,13 +1,16 @@
 """Run directories as training leaves them, without training."""
 
 import csv
+import functools
 import json
+import re
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from mimic.base import distribution
 from mimic.envs import env_config
-from mimic.runs.files import METRICS, REPORT
+from mimic.runs.files import CONFIG, METRICS, REPORT
 from mimic.runs.provenance import versions
 from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
 from mimic.trainers.run_config import save_config
@@ -25,11 +28,10 @@ def write_run(
     **settings: Any,
 ) -> Path:
     """A run whose gap on training data was `gaps`, one for each evaluation, and twice that on held-out data."""
-    settings_of = {"ppo": lambda: PPOConfig(**settings).resolve("cpu"), "pose_mapper": PoseMapperConfig().resolve}
     metric, unit = {"ppo": ("optimality_gap", "env_steps"), "pose_mapper": ("quality", "training_poses")}[trainer]
-    config = TrainConfig(env=env_config(env), trainer=settings_of[trainer](), seed=seed, run_dir=str(run_dir))
     run_dir.mkdir(parents=True)
-    save_config(run_dir, config)
+    config = _config_text(env, trainer, tuple(settings.items()))
+    (run_dir / CONFIG).write_text(re.sub(r"^seed: .*", f"seed: {seed}", config, flags=re.MULTILINE))
     rows = [{"step": 1000 * (i + 1), **_by_split(f"quality/{metric}.", gap)} for i, gap in enumerate(gaps)]
     with (run_dir / METRICS).open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
@@ -40,6 +42,15 @@ def write_run(
         content = {"seed": seed, metric: _by_split("", gaps[-1]), unit: 1000 * len(gaps), "versions": package_versions}
         (run_dir / REPORT).write_text(json.dumps(content))
     return run_dir
+
+
+@functools.cache
+def _config_text(env: str, trainer: str, settings: tuple[tuple[str, Any], ...]) -> str:
+    """The config of a run; the config of an environment takes long to write."""
+    resolved = PPOConfig(**dict(settings)).resolve("cpu") if trainer == "ppo" else PoseMapperConfig().resolve()
+    with tempfile.TemporaryDirectory() as folder:
+        save_config(Path(folder), TrainConfig(env=env_config(env), trainer=resolved))
+        return (Path(folder) / CONFIG).read_text()
 
 
 def _by_split(prefix: str, gap: float | None) -> dict[str, float | None]:

@@ -7,11 +7,22 @@ import math
 import numpy as np
 import pytest
 
+from mimic.commands.collect import plot
 from mimic.commands.collect.collect import prepare_collection
 from mimic.commands.collect.seed_groups import mean_interval
 from mimic.commands.config import CollectConfig
 from mimic.runs.sweeps.sweeper import SWEEP
+from mimic.trainers import run_config
 from tests.helpers.run_directories import write_run
+
+PLOT = plot.plot_collected
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch, schemas):
+    """Without the plot, which takes half a second, and with the schemas of configs made once."""
+    monkeypatch.setattr(plot, "plot_collected", lambda *_: None)
+    monkeypatch.setattr(run_config, "schema", schemas)
 
 
 def collect(folder, **more):
@@ -61,7 +72,8 @@ def six(tmp_path):
     return tmp_path / "sweep"
 
 
-def test_runs_that_differ_in_seed_alone_are_one_group(six, capsys):
+def test_runs_that_differ_in_seed_alone_are_one_group(six, capsys, monkeypatch):
+    monkeypatch.setattr(plot, "plot_collected", PLOT)
     assert collect(six) == 0
     groups = {group["label"]: group for group in collected(six)["groups"]}
     assert {label: group["seeds"] for label, group in groups.items()} == {
@@ -159,7 +171,7 @@ def test_pose_mappers_are_collected_by_their_quality(tmp_path, capsys):
     assert "distance above the optimum" in shown and "1.00 ± 0.00 %" in shown and "training poses" in shown
 
 
-def test_bad_input(rejected, tmp_path):
+def test_bad_input(rejected):
     assert "expected a folder with runs in it" in rejected("collect")
 
 
@@ -167,17 +179,18 @@ def test_bad_input(rejected, tmp_path):
     ("arguments", "message"),
     [
         (["{}/missing"], "there is no such folder"),
-        (["{}"], "expected runs with a report.json, found none; 1 without: stopped: no report.json"),
+        (["{}/file"], "there is no such folder"),
+        (["{}/stopped"], "expected runs with a report.json, found none; 1 without: run: no report.json"),
         (["{}/both"], "the runs are of pose_mapper and ppo, which have no metric in common; choose with only="),
         (["{}/both", "out={}/file"], "is a file; expected a folder"),
         (["{}/both", "only=sac"], "only: expected one of ppo, pose_mapper, got 'sac'"),
     ],
 )
-def test_bad_folders(rejected, tmp_path, arguments, message):
+def test_bad_folders(reason, tmp_path, arguments, message):
     (tmp_path / "file").touch()
-    if arguments == ["{}"]:
-        write_run(tmp_path / "stopped", [0.5], report=False)
-    else:
+    if arguments == ["{}/stopped"]:
+        write_run(tmp_path / "stopped" / "run", [0.5], report=False)
+    if "both" in arguments[0]:
         write_run(tmp_path / "both" / "policy", [0.5])
         write_run(tmp_path / "both" / "mapper", [0.5], trainer="pose_mapper")
-    assert message in rejected("collect", *(argument.format(tmp_path) for argument in arguments))
+    assert message in reason("collect", *(argument.format(tmp_path) for argument in arguments))

@@ -7,9 +7,16 @@ import pytest
 from mimic.commands.collect.finished_runs import find_runs
 from mimic.runs.files import METRICS, REPORT
 from mimic.runs.sweeps.sweeper import SWEEP
+from mimic.trainers import run_config
 from tests.helpers.run_directories import write_run
 
 HEADER = "step,quality/optimality_gap.train,quality/optimality_gap.held_out\n"
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch, schemas):
+    """With the schemas of configs made once."""
+    monkeypatch.setattr(run_config, "schema", schemas)
 
 
 @pytest.mark.parametrize(
@@ -17,7 +24,6 @@ HEADER = "step,quality/optimality_gap.train,quality/optimality_gap.held_out\n"
     [
         (REPORT, "[1]", r"report.json cannot be read: expected an object, got [1]"),
         (REPORT, "[" * 100_000, "report.json cannot be read: expected values that are not nested as deeply"),
-        (REPORT, "1" * 5000, "report.json cannot be read: Exceeds the limit"),
         (REPORT, '{"versions": 3}', "has no number optimality_gap.train"),
         (REPORT, '{"optimality_gap": {"train": 1e400, "held_out": 1}}', "has no number optimality_gap.train"),
         (METRICS, f"{HEADER}1000,0.1,0.2,1000,0.1,0.2\n", "metrics.csv cannot be read: line 2 has 6 cells, expected 3"),
@@ -50,7 +56,7 @@ def test_half_a_last_row_is_ignored(tmp_path):
     assert finished.curves["train"] == {1000: 0.5, 2000: 0.2} and not left_out
 
 
-@pytest.mark.parametrize("text", ["[", "{}", '{"runs": [3]}', '{"runs": [[1]]}', "[" * 100_000, '{"runs": {"a": 1}}'])
+@pytest.mark.parametrize("text", ["[", "{}", '{"runs": [3]}', '{"runs": {"a": 1}}'])
 def test_a_damaged_plan_of_a_sweep_is_ignored(tmp_path, text):
     write_run(tmp_path / "run", [0.5, 0.2])
     (tmp_path / SWEEP).write_text(text)
