@@ -50,6 +50,7 @@ def built(tmp_path_factory):
         return sdist, set(archive.namelist()), wheel.name, metadata
 
 
+@pytest.mark.slow
 def test_the_source_distribution_has_the_repository(built):
     links = ("envs/", "trainers/", "xml/")  # into mimic
     unneeded = re.compile(r"\.(git|ci|pre-commit)|" + "|".join(links))
@@ -59,6 +60,7 @@ def test_the_source_distribution_has_the_repository(built):
     assert added == {"PKG-INFO", "setup.cfg"}
 
 
+@pytest.mark.slow
 def test_the_wheel_has_the_package_alone(built):
     _, wheel, name, metadata = built
     assert name == f"{distribution.NAME.replace('-', '_')}-{distribution.VERSION}-py3-none-any.whl"

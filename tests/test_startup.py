@@ -1,62 +1,87 @@
-"""Start-up: heavy packages are imported only when they are needed."""
+"""Start-up: heavy packages are imported only when they are needed, and nothing is printed meanwhile."""
 
+import json
 import pathlib
 import subprocess
 import sys
 
+import pytest
+
 from mimic.commands import cli
 
-HEAVY = ("brax", "mujoco.mjx", "orbax", "matplotlib", "tensorboardX", "mink", "optax", "scipy", "trimesh")
-REPORT = "\nfrom jax._src import xla_bridge\nassert not xla_bridge.backends_are_initialized()\nprint(*sys.modules)"
+HEAVY = {"brax", "mujoco.mjx", "orbax", "matplotlib", "tensorboardX", "mink", "optax", "scipy", "trimesh"}
+SHOWN = ("html", "live_session", "playback", "meshes", "tracking", "history", "captured")  # by the page of a view
+STEPS = {
+    "mimic": "import mimic",
+    "help": """
+from jax._src import xla_bridge
+mimic.make
+from mimic import train
+from mimic.commands import cli
+sys.argv = ["mimic.train", "--help"]
+with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+    cli.run(train.prepare, "train")
+assert not xla_bridge.backends_are_initialized()
+""",
+    "pose mapper": """
+from mimic.commands import retarget
+from mimic.evaluation import plots
+from mimic.trainers import run_training
+from mimic.trainers.pose_mapper import trainer
+""",
+    "training": "from mimic.trainers.ppo import trainer",
+    "meshes and contacts": """
+import jaxopt
+from mujoco.mjx._src import mesh
+assert mesh.trimesh.Trimesh and jaxopt.projection
+""",
+    "everything": """
+mimic.metric.distance, mimic.arms.arm, mimic.retargeting.pose, mimic.envs.config.EnvConfig, mimic.fit
+mimic.export_run, mimic.ImitationEnv
+import mimic.commands.view_any_arm
+"""
+    + "\n".join(f"import mimic.viewer.{name}" for name in SHOWN),
+}
 
 
-def test_heavy_packages_are_imported_late():
-    """Neither by the names of the library nor by `--help`."""
-    code = "import mimic, sys\nmimic.make\nfrom mimic import train\nfrom mimic.commands import cli\n"
-    code += "sys.argv = ['mimic.train', '--help']\ncli.run(train.prepare, 'train')"
-    result = subprocess.run([sys.executable, "-c", code + REPORT], capture_output=True, text=True, check=False)
+@pytest.fixture(scope="module")
+def imported():
+    """The modules of a process without viser after each of these steps; the process must print nothing else."""
+    code = "import contextlib, io, json, sys\nsys.modules['viser'] = None\nmodules = {}\n"
+    code += "".join(f"{step}\nmodules[{name!r}] = [*sys.modules]\n" for name, step in STEPS.items())
+    command = [sys.executable, "-c", code + "print(json.dumps(modules))"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr[-2000:]
-    imported = set(result.stdout.splitlines()[-1].split())
-    assert "mimic.envs.config" in imported
-    assert not imported.intersection(HEAVY)
+    (line,) = result.stdout.splitlines()  # MJX prints two lines about Warp, an optional backend
+    assert "warp" not in result.stderr.lower()
+    return {name: set(modules) for name, modules in json.loads(line).items()}
 
 
-def test_import_mimic_imports_no_other_package():
+def test_import_mimic_imports_no_other_package(imported):
     """Each public name imports what it needs at its first use; `mimic.deploy` runs where nothing else is installed."""
-    code = "import mimic, sys\nfor name in [*sys.modules]: print(name.partition('.')[0], end=' ')"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not set(result.stdout.split()).intersection({"jax", "mujoco", "brax", "flax", "numpy", "omegaconf"})
+    packages = {name.partition(".")[0] for name in imported["mimic"]}
+    assert not packages & {"jax", "mujoco", "brax", "flax", "numpy", "omegaconf"}
 
 
-def test_pose_mappers_need_no_simulator():
-    code = "import sys\nfrom mimic.commands import retarget\nfrom mimic.evaluation import plots"
-    code += "\nfrom mimic.trainers import run_training"
-    code += "\nfrom mimic.trainers.pose_mapper import trainer\nprint(*sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    imported = set(result.stdout.splitlines()[-1].split())
-    assert "mimic.trainers.pose_mapper.model" in imported and not imported.intersection({"brax", "mujoco.mjx"})
+def test_heavy_packages_are_imported_late(imported):
+    """Neither by the names of the library nor by `--help`."""
+    assert "mimic.envs.config" in imported["help"] and not imported["help"] & HEAVY
 
 
-def test_training_needs_no_meshes_and_no_contacts():
+def test_pose_mappers_need_no_simulator(imported):
+    assert "mimic.trainers.pose_mapper.model" in imported["pose mapper"]
+    assert not imported["pose mapper"] & {"brax", "mujoco.mjx"}
+
+
+def test_training_needs_no_meshes_and_no_contacts(imported):
     """Those of MJX and brax are imported late, when something uses them."""
-    code = "import sys\nfrom mimic.base import compat\ncompat.import_mjx()\nfrom mimic.trainers import run_training"
-    code += "\nfrom mimic.trainers.ppo import trainer"
-    code += "\nprint(*sys.modules)"
-    code += "\nimport jaxopt\nfrom mujoco.mjx._src import mesh\nassert mesh.trimesh.Trimesh and jaxopt.projection"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr[-2000:]
-    imported = set(result.stdout.splitlines()[-1].split())
-    assert "brax" in imported and not imported.intersection({"scipy.optimize", "scipy.spatial", "trimesh"})
+    assert "brax" in imported["training"]
+    assert not imported["training"] & {"scipy.optimize", "scipy.spatial", "trimesh"}
+    assert "trimesh" in imported["meshes and contacts"]
 
 
-def test_mjx_and_what_a_view_shows_are_imported_without_a_word_and_without_viser():
-    """MJX prints two lines about Warp, an optional backend, once in a process. Only the page of a view needs viser."""
-    shown = ("html", "live_session", "playback", "meshes", "tracking", "history", "captured")
-    code = "import sys\nsys.modules['viser'] = None\nimport mimic\nmimic.metric.distance, mimic.arms.arm\n"
-    code += "mimic.retargeting.pose, mimic.envs.config.EnvConfig, mimic.fit, mimic.export_run, mimic.ImitationEnv\n"
-    code += "import mimic.commands.view_any_arm\n" + "\n".join(f"import mimic.viewer.{name}" for name in shown)
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout == "" and "warp" not in result.stderr.lower()
+def test_what_a_view_shows_needs_no_viser(imported):
+    assert {f"mimic.viewer.{name}" for name in SHOWN} <= imported["everything"]
 
 
 def test_a_process_started_after_this_one(monkeypatch):

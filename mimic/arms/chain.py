@@ -188,7 +188,7 @@ def _free_joints(
         rotation, offset = placement[parent]
         axis, anchor = rotation @ joint.axis, rotation @ joint.anchor + offset
         if joint.name in locked:
-            joint_rotation = _axis_rotation(axis, locked[joint.name])
+            joint_rotation = axis_rotation(axis, locked[joint.name])
             rotation, offset = joint_rotation @ rotation, joint_rotation @ (offset - anchor) + anchor
         else:
             joints.append(dataclasses.replace(joint, axis=axis, anchor=anchor))
@@ -233,6 +233,7 @@ def _warn_merged(names: str) -> None:
     _log.warning("links of length zero merged into the next link: %s", names)
 
 
-def _axis_rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+def axis_rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    """The rotation about a unit axis by an angle [rad] (Rodrigues)."""
     skew = np.cross(np.eye(3), axis)
     return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mimic.arms.chain import axis_rotation
 from mimic.arms.embodiment import Embodiment
 
 # The palettes of Okabe and Ito and of Tol (indigo), which colour-blind people tell apart. Red is left to locked joints.
@@ -81,7 +82,12 @@ def colours_along_arm(count: int) -> Float[np.ndarray, "links 3"]:
 
 def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.ndarray, "links 2 3"]:
     """Start and end of each link in a pose [rad], in the base frame [m]; merged links are chords."""
-    transforms = joint_transforms(arm, qpos)
+    transforms = [np.eye(4)]  # from the zero pose, of what no joint moves, the first joint, ...
+    for joint, (parent, angle) in enumerate(zip(arm.joint_parent, qpos, strict=True)):
+        axis, anchor = np.asarray(arm.joint_axis)[joint], np.asarray(arm.joint_anchor)[joint]
+        rotation = axis_rotation(axis, float(angle))
+        motion = np.block([[rotation, (anchor - rotation @ anchor)[:, None]], [np.eye(4)[3:]]])
+        transforms.append(transforms[parent + 1] @ motion)
     ends = np.empty((arm.num_links, 2, 3))
     segment_link = np.asarray(arm.segment_link)
     for link, joint in enumerate(arm.link_joint):
@@ -90,24 +96,6 @@ def link_ends(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> Float[np.n
         transform = transforms[joint + 1]
         ends[link] = points @ transform[:3, :3].T + transform[:3, 3]
     return ends
-
-
-def joint_transforms(arm: Embodiment, qpos: Float[np.ndarray, " joints"]) -> list[Float[np.ndarray, "4 4"]]:
-    """Transforms of what is distal to no joint, to the first joint, … from the zero pose to a pose [rad]."""
-    transforms, (axes, anchors) = [np.eye(4)], map(np.asarray, (arm.joint_axis, arm.joint_anchor))
-    for parent, axis, anchor, angle in zip(arm.joint_parent, axes, anchors, qpos, strict=True):
-        transforms.append(transforms[parent + 1] @ _rotation_about(axis, anchor, float(angle)))
-    return transforms
-
-
-def _rotation_about(axis: np.ndarray, anchor: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation about an axis through a point, as a transform (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    transform = np.eye(4)
-    transform[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    transform[:3, 3] = anchor - transform[:3, :3] @ anchor
-    return transform
 
 
 def _by_name(arm: Embodiment, colours: Float[np.ndarray, "links 3"]) -> dict[str, Colour]:

@@ -80,7 +80,7 @@ def _prepare_live(
         from mimic.viewer.live_page import show_live
         from mimic.viewer.manual_controls import ManualControls
 
-        expert = ManualControls(session, env, page.expert)
+        expert = ManualControls(session, env)
         show_live(page, times, session, env, expert, LearnerControls(session, page.starts, presets))
 
     return lambda: serve(config, env, _title(config, env), show_session, None, session.finish, learners=learners)

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from mimic.arms.arm import build_arm, finite_velocity_limit
 from mimic.arms.embodiment import Embodiment
 from mimic.envs.config import EnvConfig
-from mimic.viewer.hand import pose_of_hand
 from mimic.viewer.tracking import (
     CompiledFunctions,
     FunctionCache,
@@ -146,15 +145,6 @@ class LiveSession:
         """Moves the learner to the best pose of many initial guesses before it tracks again; for motions that jump."""
         with self._lock:
             self._seeks = self.by_optimiser
-
-    def drag(self, position: Float[np.ndarray, "3"]) -> None:
-        """Moves the expert's hand to a position in its base frame [m], or near it, and stops any motion."""
-        if not np.all(np.isfinite(position)):
-            return
-        with self._lock:
-            self._motion = None
-            pose = pose_of_hand(self.expert, self._pose, np.asarray(position, float))
-            self._pose, self._rest_time, self._goal = pose.astype(np.float32), 0.0, None
 
     def glide(self, pose: Float[np.ndarray, " joints"]) -> None:
         """Moves the expert to a pose [rad] within a second."""

@@ -1,7 +1,6 @@
-"""The controls of an expert that the user moves: sliders, a handle at its hand, buttons and demonstrations."""
+"""The controls of an expert that the user moves: sliders, buttons and demonstrations."""
 
 import functools
-import time
 from typing import Any
 
 import numpy as np
@@ -11,14 +10,10 @@ from mimic.arms.arm import build_arm
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import Demonstrations
 from mimic.motions.recording import record_demonstrations
-from mimic.viewer.hand import hand_position
 from mimic.viewer.live_session import LiveSession
-from mimic.viewer.meshes import ArmShape
 
-HAND = "/expert/base/hand"  # name of the handle that drags the expert's hand
 _DEMONSTRATIONS = 8  # number to choose from; recorded when the first one is played
 _ANGLE_STEP = 0.01  # rad
-_DRAG_PAUSE = 0.3  # s after the last message of a drag, for which the handle stays where the user holds it
 
 
 class ManualControls:
@@ -27,19 +22,16 @@ class ManualControls:
     Args:
       session: session that the widgets control.
       env: environment that defines the expert.
-      expert: meshes of the expert, at whose hand a handle is drawn.
     """
 
-    def __init__(self, session: LiveSession, env: EnvConfig, expert: ArmShape):
-        self._session, self._env, self._expert = session, env, expert
+    def __init__(self, session: LiveSession, env: EnvConfig):
+        self._session, self._env = session, env
         self._random = np.random.default_rng()
         self._demonstrations: Demonstrations | None = None
-        self._handle_pose: np.ndarray | None = None  # of the expert, for which the handle was placed
         self._was_moving = False  # whether the expert moved by itself at the last update
 
     def add_widgets(self, server: viser.ViserServer) -> None:
         """Adds the widgets."""
-        self._add_hand(server)
         self._add_buttons(server)
         self._add_sliders(server)
 
@@ -51,31 +43,11 @@ class ManualControls:
 
         Otherwise the sliders are not set: a slider that the user drags is ahead of the session and would jump back.
         """
-        dragged, pose = time.perf_counter() - self._dragged < _DRAG_PAUSE, self._session.pose
-        moving = self._session.moves_by_itself or dragged
-        if dragged:  # the user holds the handle
-            self._handle_pose = None
-        elif self._handle_pose is None or not np.array_equal(pose, self._handle_pose):
-            self._hand.position, self._handle_pose = hand_position(self._session.expert, pose), pose
+        moving = self._session.moves_by_itself
         if moving or self._was_moving:
-            for slider, angle in zip(self._sliders, pose, strict=True):
+            for slider, angle in zip(self._sliders, self._session.pose, strict=True):
                 slider.value = round(float(np.clip(angle, slider.min, slider.max)), 2)
         self._was_moving = moving
-
-    def _add_hand(self, server: viser.ViserServer) -> None:
-        scene, session, expert = server.scene, self._session, self._expert
-        position, wxyz = expert.base_pose()
-        scene.add_frame(HAND.rpartition("/")[0], show_axes=False, position=position, wxyz=wxyz)
-        start = hand_position(session.expert, session.pose)
-        self._dragged = -_DRAG_PAUSE
-        self._hand = scene.add_transform_controls(
-            HAND, scale=0.15 * expert.reach, disable_rotations=True, depth_test=False, position=start
-        )
-
-        @self._hand.on_update
-        def _(event: Any) -> None:
-            self._dragged = time.perf_counter()
-            session.drag(np.asarray(event.target.position, float))
 
     def _add_buttons(self, server: viser.ViserServer) -> None:
         gui, session = server.gui, self._session

@@ -4,6 +4,7 @@ import ast
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 
@@ -72,8 +73,10 @@ def test_examples_use_what_is_public(name):
     assert all(hasattr(mimic, attribute) for attribute in used - {"gymnasium"})
 
 
-@example("01_metric")
-def test_metric(said, tmp_path):
+def test_metric(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["01_metric.py", str(tmp_path)])
+    runpy.run_path(str(EXAMPLES / "01_metric.py"), run_name="__main__")
+    said = capsys.readouterr().out
     pattern = r"holding the start pose: (\S+)   copied angles: (\S+)   kinematic bound: (\S+)"
     ((rest, copied, bound),) = re.findall(pattern, said)
     assert 0 < float(bound) < float(copied) < float(rest)

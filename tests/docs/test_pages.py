@@ -56,10 +56,12 @@ def test_the_examples_on_poses_run(monkeypatch, tmp_path):
     "any_arm.md",
     "datasets.md",
     "dynamic_imitation.md",
+    "hardware_world.md",
     "motion_capture.md",
     "other_tools.md",
     "own_arm.md",
     "own_demonstrations.md",
+    "real_arm.md",
     "scaling.md",
     "static_pose_imitation.md",
     "training.md1",
@@ -139,9 +141,7 @@ def test_links_resolve(page):
         assert not heading or heading in [text.lower().replace(" ", "-") for text in headings], link
 
 
-def test_contributing_names_files_that_exist():
-    text = (REPOSITORY / "CONTRIBUTING.md").read_text()
-    paths = [path for path in re.findall(r"`((?:mimic|tests|docs|benchmarks)/[\w/.]+)`", text) if "NAME" not in path]
-    assert len(paths) > 30
-    for path in paths:
-        assert (REPOSITORY / path).exists(), path
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_pages_name_files_that_exist(page):
+    for path in re.findall(r"`((?:mimic|tests|docs|benchmarks|examples)/[\w/.]+)`", page.read_text()):
+        assert "NAME" in path or (REPOSITORY / path).exists(), path

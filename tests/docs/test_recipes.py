@@ -29,10 +29,3 @@ def test_the_pure_jax_loop_learns():
     returns = np.asarray(scope["episode_returns"])
     assert len(returns) == 200
     assert returns[-20:].mean() > returns[:20].mean() + 0.1 * abs(returns[:20].mean())
-
-
-def test_an_own_arm_starts_in_its_keyframe(own_registry, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "reacher.xml").write_text(block_with('<mujoco model="reacher">'))
-    exec(block_with('"reacher.xml", "tip"'), {"mimic": mimic, "few": SMALL["demonstrations"]})  # noqa: S102
-    np.testing.assert_allclose(mimic.make("reacher").learner.home, [0.5, -1.0], atol=1e-6)

@@ -37,16 +37,18 @@ def test_every_kind_of_geom_has_triangles_of_its_size(tmp_path):
         "mesh": ('mesh="cube"', (0.2, 0.2, 0.2)),
     }
     corners = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1))
-    for kind, (attributes, extent) in geoms.items():
-        path = tmp_path / f"{kind}.xml"
-        path.write_text(
-            f'<mujoco><asset><mesh name="cube" vertex="{corners}"/></asset><worldbody><body name="b">'
-            '<joint name="a" axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-            f'<geom type="{kind}" {attributes} rgba="1 0 0 1"/><geom type="sphere" size="9" group="3"/>'
-            '<site name="tip" pos="0 0 .5"/></body></worldbody></mujoco>'
-        )
-        part = ArmShape(ArmConfig(model=str(path), tip="tip")).parts[0]
-        assert part.rgba == (1, 0, 0, 1)
+    shapes = "".join(
+        f'<geom type="{kind}" {attributes} rgba="1 {number / 10} 0 1"/>'
+        for number, (kind, (attributes, _)) in enumerate(geoms.items())
+    )
+    (tmp_path / "arm.xml").write_text(
+        f'<mujoco><asset><mesh name="cube" vertex="{corners}"/></asset><worldbody><body name="b">'
+        '<joint name="a" axis="0 1 0"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+        f'{shapes}<geom type="sphere" size="9" group="3"/><site name="tip" pos="0 0 .5"/></body></worldbody></mujoco>'
+    )
+    parts = ArmShape(ArmConfig(model=str(tmp_path / "arm.xml"), tip="tip")).parts[: len(geoms)]
+    for number, (part, (_, extent)) in enumerate(zip(parts, geoms.values(), strict=True)):
+        np.testing.assert_allclose(part.rgba, (1, number / 10, 0, 1), atol=1e-6)
         np.testing.assert_allclose(np.ptp(part.vertices, axis=0), extent, rtol=0.02)  # facets of round shapes
 
 

@@ -1,7 +1,6 @@
 """The session of the live view, without a browser: motion, values, and settings."""
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
@@ -11,13 +10,10 @@ from mimic.arms.arm import ArmConfig, build_arm, finite_velocity_limit
 from mimic.envs import env_config
 from mimic.trainers import run_training as train
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
-from mimic.viewer import html
 from mimic.viewer.live_session import LiveSession
-from mimic.viewer.meshes import ArmShape
 from mimic.viewer.tracking import Settings, initial_settings, learner_arm, step_towards
 
 TICK = 1 / 30
-ENOUGH = 20  # updates a second that feel live
 
 
 @pytest.fixture(scope="module")
@@ -52,18 +48,14 @@ def settle(session, seconds=6.0):
     raise AssertionError("the learner does not come to rest")
 
 
-@pytest.mark.slow_for("nan")
-@pytest.mark.parametrize("angle", [float("nan"), float("inf"), -float("inf")])
-def test_an_angle_that_is_no_number_is_dropped(live, angle):
+def test_what_is_no_number_changes_nothing(live):
     before = live.pose
-    live.move(1, angle)
-    assert np.array_equal(live.pose, before)
-
-
-@pytest.mark.parametrize("weight", [float("nan"), float("inf"), -0.1])
-def test_a_weight_that_is_no_weight_is_rejected(live, weight):
-    with pytest.raises(ValueError, match="rotation: expected a finite weight of at least 0"):
-        live.change(rotation=weight)
+    for angle in (float("nan"), float("inf")):
+        live.move(1, angle)
+        assert np.array_equal(live.pose, before)
+    for weight in (float("nan"), float("inf"), -0.1):
+        with pytest.raises(ValueError, match="rotation: expected a finite weight of at least 0"):
+            live.change(rotation=weight)
 
 
 def test_the_learner_tracks_and_rests_at_the_bound(live):
@@ -200,8 +192,9 @@ def test_locking_the_last_joint_is_rejected_and_undone():
     for joint in ("joint1", "joint2", "joint3", "joint4"):
         session.lock(joint, True)
     with pytest.raises(ValueError, match="all 4 joints are locked"):
-        while session.advance(TICK) is None:
-            time.sleep(0.01)
+        session.advance(TICK)
+        session.finish()
+        session.advance(TICK)
     assert session.settings == before
 
 
@@ -223,20 +216,3 @@ def test_a_joint_takes_the_shorter_way_around():
     np.testing.assert_allclose(pose, 3.15 - 2 * np.pi)
     assert is_there is False
     assert step_towards(arm, np.zeros(7), np.full(7, 0.01), np.full(7, 0.05))[1]
-
-
-def test_an_update_is_quick(live):
-    """The view needs 20 a second; two CPU cores take 2 ms for one, so that the limit holds on a busy machine too."""
-    shape, seconds = ArmShape(ArmConfig()), []
-    settle(live)
-    for step in range(60):
-        live.move(1, 0.01 * (step + 1))
-        began = time.perf_counter()
-        frame = live.advance(TICK)
-        assert frame is not None
-        for angles in (frame.expert, frame.learner):
-            shape.bodies(angles)
-        html.heat_maps(frame.matrix, frame.links, frame.expert_links, frame.learner_links)
-        seconds.append(time.perf_counter() - began)
-    print(f"update of the view: {1e3 * np.median(seconds):.1f} ms in the median")
-    assert np.median(seconds) < 1 / ENOUGH

@@ -18,7 +18,6 @@ from viser.infra import _infra
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from mimic.viewer.manual_controls import HAND
 from mimic.viewer.server import _LoopEvent, make_server
 
 PROTOCOL = f"viser-v{viser.__version__}"
@@ -41,15 +40,6 @@ def served():
     slider.on_update(lambda event: values.append(event.target.value) if event.client else None)
     yield server.get_port(), server, slider, values
     server.stop()
-
-
-@pytest.fixture(scope="module")
-def dragged(served):
-    """Positions of the handle at the hand that arrived."""
-    positions = []
-    hand = served[1].scene.add_transform_controls(HAND)
-    hand.on_update(lambda event: positions.append(tuple(map(float, event.target.position))))
-    return positions
 
 
 def page(port, **headers):
@@ -135,22 +125,6 @@ def test_a_client_cannot_make_the_view_public(served, monkeypatch):
     values.clear()
     asyncio.run(send())
     assert values == [0.75]
-
-
-@pytest.mark.parametrize("owner", [{}, {"owner": ""}])
-def test_a_drag_of_the_hand_arrives(served, dragged, owner):
-    port = served[0]
-    drag = {"type": "TransformControlsUpdateMessage", "name": HAND, "wxyz": [1.0, 0.0, 0.0, 0.0], **owner}
-
-    async def send():
-        async with page(port) as client:
-            await client.send(encode(CAMERA))
-            for height in (0.5, 0.6):
-                await client.send(encode({**drag, "position": [0.25, 0.0, height]}))
-            await until(lambda: dragged and dragged[-1] == (0.25, 0.0, 0.6))
-
-    dragged.clear()
-    asyncio.run(send())
 
 
 def test_twenty_clients_move_the_slider(served):

@@ -1,0 +1,188 @@
+"""The pages' tables of any arm, robots and motion capture: rows of cells, the header first."""
+
+import statistics
+from collections.abc import Sequence
+
+from benchmarks.common.cells import MEASURES, Cells, Results, one, percent, span, where
+
+# Any arm
+
+
+def any_arm_controller(cpu: Results, random: Results) -> list[Cells]:
+    rows: list[Cells] = [
+        (
+            "arms",
+            "gap [%], mean",
+            "median",
+            "maximum",
+            "second half",
+            "centre line: controller / bound's poses / holding",
+        )
+    ]
+    arms = {
+        "Pandas with one or two joints locked": cpu["locks"],
+        "real arms": cpu["real"],
+        "random arms": [*random["random"], *random["report"]],
+    }
+    for name, group in arms.items():
+        kept = [arm for arm in group if arm["span"] >= 0.25]
+        gaps = [100 * arm["gap"] for arm in kept]
+        late = 100 * statistics.fmean(arm["late"] for arm in kept)
+        lines = [statistics.fmean(arm[f"{who}centre_line_distance"] for arm in kept) for who in ("", "best_", "hold_")]
+        numbers = (statistics.fmean(gaps), statistics.median(gaps), max(gaps), late)
+        cells = [f"{number:.1f}" for number in numbers]
+        rows.append((f"{len(kept)} {name}", *cells, " / ".join(f"{line:.3f}" for line in lines)))
+    return rows
+
+
+def any_arm_specialists(specialists: Results) -> list[Cells]:
+    rows = specialists["rows"]
+    return [
+        ("held-out gap [%]", *(row["arm"] for row in rows)),
+        ("controller, no training", *(f"{100 * row['controller_gap']['held_out']:.1f}" for row in rows)),
+        ("PPO of this arm alone", *(f"{100 * row['gap']['held_out']:.1f}" for row in rows)),
+    ]
+
+
+GROUPS = {
+    "seen locks": "Pandas with no, one or two joints locked, as in training",
+    "unseen locks": "8 sets of locked joints that are not in the training",
+    "seven real arms": "7 real arms that are not in the training",
+    "random arms": "random arms that are not in the training",
+    "random to other random": "random arms to other random arms, neither in the training",
+}
+
+
+def any_arm_mapper(results: Results) -> list[Cells]:
+    rows: list[Cells] = [
+        ("mean / maximum [%]", "mapper", "16 random guesses", "proposals without Newton steps", "home")
+    ]
+    for group in list(GROUPS)[1:]:
+        seeds = [run["groups"][group] for run in results["mapper"]]
+
+        def column(key: str, form: str = ".2f", seeds: Sequence[Results] = seeds) -> str:
+            return span([seed[key] for seed in seeds], form)
+
+        random = f"{column('quality_random_guesses')} / {column('largest_random_guesses')}"
+        proposals, home = column("quality_proposed", ".0f"), column("quality_from_home", ".0f")
+        rows.append((GROUPS[group], f"{column('quality')} / {column('largest')}", random, proposals, home))
+    return rows
+
+
+def any_arm_policy(results: Results) -> list[Cells]:
+    rows: list[Cells] = [("arms", "controller, no training", "one policy, three seeds", "arms on which it is better")]
+    for group, entry in results["groups"].items():
+        better = [seed["better_than_the_controller"] for seed in entry["seeds"]]
+        gaps = span([seed["mean"] for seed in entry["seeds"]])
+        count = f"{span(better, 'd', 1)} of {entry['arms']}"
+        rows.append((GROUPS[group], percent(entry["controller"]["mean"]), f"{gaps} %", count))
+    return rows
+
+
+# Robots
+
+
+JOINTS = {"panda7dof": "7 joints", "panda4dof": "4 joints"}
+
+
+def hardware_policies(results: Results) -> list[Cells]:
+    header = (
+        "gap [%]",
+        "training's physics",
+        "MJX",
+        "virtual robot",
+        "worst range at its end",
+        "all ranges at their ends",
+    )
+    rows: list[Cells] = [header]
+    for env, joints in JOINTS.items():
+        runs = where(results["runs"], run=env)
+        gaps = [span([run[key] for run in runs]) for key in ("fused", "mjx", "virtual")]
+        edges = [span([run[key] for run in runs if key in run]) for key in ("edges_worst", "edges_together")]
+        rows.append((joints, *gaps, *edges))
+    return rows
+
+
+def hardware_tracking(results: Results) -> list[Cells]:
+    rows: list[Cells] = [
+        ("held-out gap [%]", "tracking", "tracking that knows the reference as late as a policy observes it", "PPO")
+    ]
+    for env, joints in JOINTS.items():
+        runs = where(results["runs"], run=env)
+        first = one(runs, seed=0)
+        rows.append(
+            (joints, f"{100 * first['tracking']:.2f}", f"{100 * first['late']:.2f}", span([r["fused"] for r in runs]))
+        )
+    return rows
+
+
+def robot_loops(results: Results) -> list[Cells]:
+    loops = ("mimic", "ruckig")
+    rows: list[Cells] = [("held-out gap", *(f"`robot_loop={loop}`" for loop in loops))]
+    for env, joints in JOINTS.items():
+        runs = [one(results["runs"], env=env, robot_loop=loop) for loop in loops]
+        rows.append((joints, *(percent(run["optimality_gap"]) for run in runs)))
+    return rows
+
+
+# Motion capture
+
+
+METHODS = {
+    "mimic": "`imitate_trajectory`",
+    "mimic_hand": "with the hand cost",
+    "pose_mapper": "pose mapper",
+    "align_segments": "aligning segments",
+    "frame_matching": "GMR's way",
+    "hand_ik": "IK of the hand",
+}
+
+
+def captured_similarity(results: Results) -> list[Cells]:
+    rows: list[Cells] = [("robot", *METHODS.values())]
+    for learner in ("panda", "panda -3,6,7", "UR5e", "IIWA"):
+        cells = [learner]
+        for method in METHODS:
+            arms = where(results["results"], learner=learner, method=method)
+            line, tangent, _, hand, _ = (statistics.fmean(arm[measure] for arm in arms) for measure in MEASURES)
+            cells.append(f"{line:.3f}; {tangent:.1f}; {hand:.3f}")
+        rows.append(cells)
+    return rows
+
+
+def captured_methods(results: Results) -> list[Cells]:
+    rows: list[Cells] = [("method", "speed [rad/s]", "jerk [rad/s<sup>3</sup>]")]
+    for method, name in METHODS.items():
+        entries = where(results["results"], method=method)
+        speed = max(entry["largest_speed"] for entry in entries)
+        jerk = statistics.median(entry["jerk_rms"] for entry in entries)
+        rows.append((name, f"{speed:.0f}", f"{jerk:,.0f}"))
+    return rows
+
+
+def two_arms(results: Results) -> list[Cells]:
+    numbers = {
+        "minimum distance of capsules of different arms [m]": ("between_arms_minimum_m", ".3f"),
+        "of the same arm [m]": ("within_arm_minimum_m", ".3f"),
+        "samples with arms closer than 2 cm to each other": ("between_arms_closer", ".1%"),
+        "samples with an arm closer than 2 cm to itself": ("within_arm_closer", ".1%"),
+        "distance of the centre lines [chain lengths]": ("centre_line_distance", ".3f"),
+        "angle of the tangents [deg]": ("tangent_angle_deg", ".0f"),
+    }
+    pair = [one(results["results"], cost=cost) for cost in ("without", "with")]
+    return [
+        ("", "without", "with"),
+        *((name, *(format(row[key], f) for row in pair)) for name, (key, f) in numbers.items()),
+    ]
+
+
+def captured_policies(results: Results) -> list[Cells]:
+    rows: list[Cells] = [("clip", "arm", "robot", "seeds", "training", "held out", "distance: bound, policy, holding")]
+    cases = dict.fromkeys((run["clip"], run["arm"], run["learner"]) for run in results["results"])
+    for clip, arm, learner in cases:
+        runs = where(results["results"], clip=clip, arm=arm, learner=learner)
+        gaps = [span([run["gap"][split] for run in runs], ".1f") for split in ("train", "held_out")]
+        keys = ("kinematic_bound", "mean_distance", "hold_distance")
+        distances = [span([run[key]["held_out"] for run in runs], ".3f", 1) for key in keys]
+        rows.append((clip, arm, learner, str(len(runs)), *gaps, ", ".join(distances)))
+    return rows

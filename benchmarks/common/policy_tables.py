@@ -1,0 +1,214 @@
+"""The pages' tables of poses and policies of one pair of arms: rows of cells, the header first."""
+
+import statistics
+from collections.abc import Iterable, Sequence
+
+from benchmarks.common.cells import (
+    ENVIRONMENTS,
+    MEASURES,
+    SIMILARITY_HEADER,
+    Cells,
+    Results,
+    large,
+    one,
+    percent,
+    split_pair,
+)
+
+# Poses
+
+
+def pose_methods(pose: Results) -> list[Cells]:
+    names = {
+        "newton": "`imitate_pose`",
+        "gradient_descent": "gradient descent, 13 initial guesses",
+        "gradient_descent, one start": "gradient descent, one initial guess (paper)",
+        "mink": "mink, on the CPU",
+    }
+    rows: list[Cells] = [("pair", "method", "above the best known", "global minimum", "poses/s")]
+    for result in sorted(pose["results"], key=lambda result: result["pair"], reverse=True):
+        for method, name in names.items():
+            row = result["methods"][method]
+            quality, fraction, rate = row["quality"], row["global_share"], row["poses_per_second"]
+            rows.append((result["pair"], name, percent(abs(quality)), percent(fraction, ".1f"), large(rate)))
+    return rows
+
+
+def mapper_times(mapper: Results) -> list[Cells]:
+    rows: list[Cells] = [("pair", "training", "unseen", "within 2 % of the optimiser after", "training", "poses/s")]
+    for env, pair in ENVIRONMENTS.items():
+        run = next(run for run in mapper["runs"] if run["report"]["env"] == env)
+        quality, seconds = run["report"]["quality"], run["report"]["wall_time_s"]["train"]
+        cells = percent(quality["train"]), percent(quality["held_out"]), f"{run['to_goal_s']:.1f} s", f"{seconds:.1f} s"
+        rows.append((f"Panda {pair}", *cells, large(run["poses_per_second"])))
+    return rows
+
+
+def mapper_presets(mapper: Results) -> list[Cells]:
+    pairs = {env: f"Panda {pair}" for env, pair in ENVIRONMENTS.items()}
+    pairs |= {"planar4dof": "planar 7 to 4", "planar7dof": "planar 4 to 7"}
+    rows: list[Cells] = [("pair", "`paper`, training", "`paper`, unseen", "`large`, unseen")]
+    reports = {(run["preset"], run["report"]["env"]): run["report"]["quality"] for run in mapper["runs"]}
+    for env, pair in pairs.items():
+        paper, wide = reports["paper", env], reports["large", env]
+        rows.append((pair, percent(paper["train"]), percent(paper["held_out"]), percent(wide["held_out"])))
+    return rows
+
+
+def costs(results: Results) -> list[Cells]:
+    columns = {
+        "centre line": ("centre_line_distance", ".3f"),
+        "hand position": ("hand_position_error", ".3f"),
+        "hand angle [deg]": ("hand_angle_deg", ".0f"),
+    }
+    effects = {
+        "home": ("from_home", "distance from home", ".2f"),
+        "limits": ("at_limits", "intrusion at limits", ".3f"),
+        "velocity": ("step_rms", "change in a step [rad]", ".3f"),
+        "acceleration": ("change_rms", "change of it [rad]", ".3f"),
+        "self_collision": ("self_collisions", "poses in self-collision", ".1%"),
+        "floor": ("below_floor", "poses below the floor", ".1%"),
+    }
+    kinds = tuple(dict.fromkeys(row["motions"] for row in results["rows"]))  # demonstrations, random motions
+
+    def both(cost: str, key: str, form: str) -> str:
+        pair = [one(results["rows"], cost=cost, motions=kind) for kind in kinds]
+        return " / ".join(format({**row, **row["similarity"]}[key], form) for row in pair)
+
+    rows: list[Cells] = [("cost", *columns, "what it is for: without -> with")]
+    for cost, weights in results["weights"].items():
+        name = f"`{cost}={weights[cost]:g}`" if cost in weights else "all of them" if weights else "none"
+        effect = ""
+        if cost in effects:
+            key, what, form = effects[cost]
+            effect = f"{what}: {both('none', key, form)} -> {both(cost, key, form)}"
+        rows.append((name, *(both(cost, key, form) for key, form in columns.values()), effect))
+    return rows
+
+
+# Dynamic imitation
+
+
+def preset_runs(preset: Results, env: str) -> list[Results]:
+    """The reports of the three seeds of an environment."""
+    return [run for name, run in preset["results"].items() if name.startswith(env)]
+
+
+def mean(reports: Iterable[Results], split: str) -> float:
+    return statistics.fmean(report["optimality_gap"][split] for report in reports)
+
+
+def simulations(study: Results, preset: Results) -> list[Cells]:
+    def gap(reports: Sequence[Results], split: str) -> str:
+        deviation = statistics.stdev(report["optimality_gap"][split] for report in reports)
+        return f"{100 * mean(reports, split):.2f} ± {100 * deviation:.2f}"
+
+    rows: list[Cells] = [("joints", "trained on", "training", "held out", "the paper's setting, one seed")]
+    cases = [("one_demonstration", "7 to 7", "1", study["results"]["one_demonstration"])]
+    cases += [(env, joints, "124", preset_runs(preset, env)) for env, joints in ENVIRONMENTS.items()]
+    for name, joints, count, reports in cases:
+        paper = study["results"][f"{name}-paper"][0]["optimality_gap"]
+        rows.append((joints, count, gap(reports, "train"), gap(reports, "held_out"), split_pair(paper)))
+    return rows
+
+
+def policy_similarity(preset: Results) -> list[Cells]:
+    forms = (".3f", ".1f", ".3f", ".3f", ".1f")
+    names = {
+        "policy": "**policy**",
+        "nearest_poses": "nearest poses",
+        "copy_joints": "copying shared joints",
+        "hand_ik": "IK of the scaled hand",
+    }
+    runs = preset_runs(preset, "panda4dof")
+    rows: list[Cells] = [("7 to 4", *SIMILARITY_HEADER)]
+    for name, label in names.items():
+        cells = [label]
+        for measure, form in zip(MEASURES, forms, strict=True):
+            values = [run["similarity"][name][measure] for run in runs]
+            means = {split: statistics.fmean(value[split] for value in values) for split in ("train", "held_out")}
+            cells.append(split_pair(means, form, 1))
+        rows.append(cells)
+    return rows
+
+
+def controllers(study: Results, preset: Results, any_arm: Results) -> list[Cells]:
+    def gaps(case: str) -> list[str]:
+        return [split_pair(study["results"][f"{env}--{case}"][0]["optimality_gap"], ".2f") for env in ENVIRONMENTS]
+
+    nearest = [f"- / {100 * one(any_arm['presets'], arm=env)['gap']:.2f}" for env in ENVIRONMENTS]
+    runs = [preset_runs(preset, env) for env in ENVIRONMENTS]
+    ppo = [split_pair({split: mean(reports, split) for split in ("train", "held_out")}) for reports in runs]
+    return [
+        ("gap, training / held out [%]", *ENVIRONMENTS.values()),
+        ("PD (frequency tuned)", *gaps("pd")),
+        ("computed torque, exact dynamics", *gaps("computed_torque")),
+        ("nearest pose, exact dynamics", *nearest),
+        ("PPO, mean of three seeds", *ppo),
+        ("searched torques, the whole motion known", *gaps("searched")),
+    ]
+
+
+def pretrained(reports: Results) -> list[Cells]:
+    policy, mapper = "policy: gap, training / held out", "mapper: gap"
+    rows: list[Cells] = [("environment", policy, "distance / bound / copying", mapper, "distance / optimum / copying")]
+    for env in ("panda3dof", "panda4dof", "panda7dof", "planar4dof", "planar7dof"):
+        cells = [f"`{env}`"]
+        for network, quality, best in (
+            ("policy", "optimality_gap", "lower_bound"),
+            ("pose_mapper", "quality", "optimal_distance"),
+        ):
+            report = reports[f"{env}-{network}"]
+            gap = (
+                split_pair(report[quality], ".1f")
+                if network == "policy"
+                else f"{100 * report[quality]['held_out']:.2f}"
+            )
+            distances = [report[key]["held_out"] for key in ("mean_distance", best, "copying_distance")]
+            cells += [f"{gap} %", " / ".join(f"{distance:.3f}" for distance in distances)]
+        rows.append(cells)
+    return rows
+
+
+# Similarity
+
+
+CANDIDATES = {
+    "hand_ik": "hand IK",
+    "align_segments": "align segments",
+    "kept arc_length 0": "links kept, arc length, 0",
+    "kept arc_length 1": "**links kept, arc length, 1**",
+    "kept arc_length 2": "links kept, arc length, 2",
+    "kept overlap 1": "links kept, overlap, 1",
+    "merged overlap 0": "links merged, overlap, 0",
+}
+
+
+def _candidates(summary: Results, baseline: str) -> list[Cells]:
+    rows: list[Cells] = [("", *SIMILARITY_HEADER)]
+    for name, label in CANDIDATES.items():
+        if name in summary and name != baseline:
+            entries = [summary[name][measure] for measure in MEASURES]
+            rows.append((label, *(f"{entry['ratio']:.2f} ({entry['lost']})" for entry in entries)))
+    return rows
+
+
+def metrics_by_locks(results: Results) -> list[Cells]:
+    return _candidates(results["summary"]["locks, demonstrations, to copy_joints"], "copy_joints")
+
+
+def metrics_by_arms(results: Results) -> list[Cells]:
+    return _candidates(results["summary"]["other arms, demonstrations, to hand_ik"], "hand_ik")
+
+
+def default_metric(results: Results) -> list[Cells]:
+    cases = {
+        "locks, demonstrations, to copy_joints": ("Panda with one or two joints locked", "copying joints"),
+        "other arms, demonstrations, to hand_ik": ("the Panda and six other arms, both ways", "IK of the hand"),
+    }
+    rows: list[Cells] = [("learner", "compared with", *SIMILARITY_HEADER)]
+    for case, (learner, baseline) in cases.items():
+        entry = results["summary"][case]["kept arc_length 1"]
+        ratios = [f"{entry[measure]['ratio']:.2f}" for measure in MEASURES]
+        rows.append((f"{learner}, {entry['cases']} cases", baseline, *ratios))
+    return rows
