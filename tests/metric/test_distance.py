@@ -168,25 +168,25 @@ def test_weights_of_zero_cost_nothing():
 # --- batches and dtypes -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("correspondence", CORRESPONDENCES)
+@pytest.mark.parametrize("correspondence", ["overlap", "hard"])
 def test_a_batch_is_a_vmap_is_a_loop(correspondence):
-    distance = functools.partial(
-        embodiment_distance, correspondence=CORRESPONDENCES[correspondence], weights=adaptive_weights
-    )
+    options = {"correspondence": CORRESPONDENCES[correspondence], "weights": adaptive_weights}
+    distance = jax.jit(functools.partial(embodiment_distance, **options))
     pairs = [(states(EXPERT, seed), states(LEARNER, seed + 9)) for seed in range(4)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *pairs)
     one_by_one = [distance(*pair) for pair in pairs]
-    np.testing.assert_allclose(jax.jit(jax.vmap(distance))(*stacked), one_by_one, rtol=1e-6)  # float32, another order
-    np.testing.assert_allclose(jax.jit(distance)(*stacked), one_by_one, rtol=1e-6)
-    per_expert = jax.jit(distance)(pairs[0][0], stacked[1])
+    np.testing.assert_allclose(jax.vmap(distance)(*stacked), one_by_one, rtol=1e-6)  # float32, another order
+    np.testing.assert_allclose(distance(*stacked), one_by_one, rtol=1e-6)
+    per_expert = distance(pairs[0][0], stacked[1])
     np.testing.assert_allclose(per_expert, [distance(pairs[0][0], pair[1]) for pair in pairs], rtol=1e-6)
 
 
-@pytest.mark.parametrize("weights", WEIGHTS)
-@pytest.mark.parametrize("correspondence", CORRESPONDENCES)
+@pytest.mark.parametrize(
+    ("correspondence", "weights"), [("overlap", "constant"), ("hard", "matrix"), ("soft", "adaptive")]
+)
 def test_float32_stays_float32_under_x64(x64, correspondence, weights):
     args = {"correspondence": CORRESPONDENCES[correspondence], "weights": WEIGHTS[weights]}
-    for dtype, reduction in ((np.float32, "mean"), (np.float32, "frobenius"), (np.float64, "mean")):
+    for dtype, reduction in ((np.float32, "mean"), (np.float32, "frobenius")):
         function = functools.partial(embodiment_distance, reduction=reduction, **args)
         pair = jax.tree.map(
             lambda x, dtype=dtype: jax.ShapeDtypeStruct(x.shape, dtype), (states(EXPERT), states(LEARNER))

@@ -54,62 +54,48 @@ def central_differences(function, point, step):
     return ((ahead - behind) / (2 * step)).T.reshape(-1, *point.shape)
 
 
-# Latin squares: every weight and every correspondence meets every measure and every reduction.
-FINITE_DIFFERENCES = [
+# Every correspondence, weight, measure and reduction once, and all correspondences with all weights.
+COVER = [
+    ("overlap", "constant", "cosine", "mean"),
+    ("hard", "adaptive", "angle", "mean"),
+    ("soft", "matrix", "angle", "frobenius"),
+    ("matrix", "adaptive", "cosine", "frobenius"),
+]
+ALL = [
     (c, w, MEASURES[(i + j) % 2], REDUCTIONS[(i + j // 2 + i // 2) % 2])
     for i, c in enumerate(CORRESPONDENCES)
     for j, w in enumerate(WEIGHTS)
 ]
+EACH = pytest.mark.parametrize("names", [COVER, pytest.param(ALL, marks=pytest.mark.slow)], ids=["cover", "all"])
 
 
-@pytest.mark.slow_for("overlap-constant-cosine-mean")
-@pytest.mark.parametrize("combination", FINITE_DIFFERENCES, ids="-".join)
-def test_gradients_equal_finite_differences(x64, combination):
-    correspondence, weights, *options = combination
-    function = distances_of([(CORRESPONDENCES[correspondence], WEIGHTS[weights], *options)])
+def metrics(names):
+    return [(CORRESPONDENCES[c], WEIGHTS[w], *options) for c, w, *options in names]
+
+
+@EACH
+def test_gradients_equal_finite_differences(x64, names):
+    function = distances_of(metrics(names))
     a, b = generic_states(np.float64)
-    of_both = lambda point: function(point[: a.size].reshape(a.shape), point[a.size :].reshape(b.shape))  # noqa: E731
+    of_both = jax.jit(lambda point: function(point[: a.size].reshape(a.shape), point[a.size :].reshape(b.shape)))
     point = jnp.concatenate([a.ravel(), b.ravel()])
-    gradient = jax.jacrev(of_both)(point)
+    gradient = jax.jit(jax.jacrev(of_both))(point)
     step = 1e-6  # balances the error of the difference, step^2, against that of rounding, 1e-16 / step
     expected = central_differences(of_both, point, step)
     np.testing.assert_allclose(gradient, expected, rtol=1e-6, atol=1e-8)  # 1e-10, times derivatives of up to 100
-    assert abs(gradient[0, a.size :]).max() > 1e-3  # and it is not 0
+    assert np.all(abs(gradient[:, a.size :]).max(axis=1) > 1e-3)  # and it is not 0
 
 
-@pytest.mark.slow_for("overlap-constant-vmap")
-# jit compiles each of the twelve for seconds; the derivatives are the same operations, fused
-@pytest.mark.parametrize("transform", [lambda f: f, pytest.param(jax.jit, marks=pytest.mark.slow)], ids=["vmap", "jit"])
-@pytest.mark.parametrize("weights", WEIGHTS)
-@pytest.mark.parametrize("correspondence", [*CORRESPONDENCES, "matching"])
-def test_gradients_are_finite_at_the_kinks(correspondence, weights, transform):
+@EACH
+def test_gradients_are_finite_at_the_kinks(names):
     matching = np.array([[2, 0], [0, 2], [0, 0]])  # the links that match in the first two pairs of states
-    pair = CORRESPONDENCES.get(correspondence, matching), WEIGHTS[weights]
-    function = distances_of([(*pair, *options) for options in itertools.product(MEASURES, REDUCTIONS)])
-    gradient = transform(jax.vmap(jax.jacrev(function, argnums=1)))(*singular_states(np.float32))
+    at_a_match = [(matching, WEIGHTS["constant"], *options) for options in itertools.product(MEASURES, REDUCTIONS)]
+    function = distances_of([*at_a_match, *metrics(names)])
+    gradient = jax.vmap(jax.jacrev(function, argnums=1))(*singular_states(np.float32))
     assert gradient.dtype == np.float32
     assert np.all(np.isfinite(gradient))
     assert abs(gradient).max() < 100  # a norm's slope is 1, weights are up to 3
-    if correspondence == "matching" and transform is not jax.jit:  # which may round the two sides differently
-        assert not gradient[:2].any()
-
-
-@pytest.mark.slow
-def test_gradients_under_jit_and_vmap():
-    """A cover of all correspondences, weights, measures and reductions, at the kinks and away from them."""
-    cover = [
-        ("overlap", "constant", "cosine", "mean"),
-        ("hard", "adaptive", "angle", "mean"),
-        ("soft", "matrix", "angle", "frobenius"),
-        ("matrix", "adaptive", "cosine", "frobenius"),
-    ]
-    distances = distances_of([(CORRESPONDENCES[c], WEIGHTS[w], m, r) for c, w, m, r in cover])
-    plain = jax.vmap(jax.jacrev(distances, argnums=1))
-    singular, generic = singular_states(np.float32), generic_states(np.float32)
-    pairs = [jnp.concatenate([many, one[None]]) for many, one in zip(singular, generic, strict=True)]
-    compiled = jax.jit(plain)(*pairs)
-    assert np.all(np.isfinite(compiled))
-    np.testing.assert_allclose(compiled[-1], plain(*pairs)[-1], rtol=1e-4, atol=1e-5)  # float32, fused and not
+    assert not gradient[:2, : len(at_a_match)].any()
 
 
 def test_gradients_of_the_joint_motion_equal_finite_differences(x64):
@@ -140,6 +126,6 @@ def test_panda_gradients_under_jit_and_vmap():
     motions = jnp.asarray(np.random.default_rng(0).uniform(-2, 2, (3, 2, 4)), jnp.float32).at[0].set(0)
     at_a_match = gradient(motions, motions)
     assert np.all(np.isfinite(at_a_match)) and not at_a_match[0].any()
-    alone = jax.grad(distance)(motions[1] + 0.1, motions[1])
+    alone = jax.jit(jax.grad(distance))(motions[1] + 0.1, motions[1])
     np.testing.assert_allclose(gradient(motions + 0.1, motions)[1], alone, rtol=1e-4, atol=1e-5)  # float32, fused
     assert abs(alone).max() > 0.01

@@ -78,6 +78,10 @@ def assert_moves_as_in_mujoco(arm, model, dtype, locked=None):
         np.testing.assert_allclose(twists[:, part], in_link_frame, err_msg=f"body twist, {field}", **close)
 
 
+@pytest.mark.slow_for(
+    *(f"{dtype}-{seed}" for seed in random_arms.SEEDS for dtype in ("float32", "float64") if seed > 7)
+)
+@pytest.mark.slow_for(*(f"float32-{seed}" for seed in range(7)))
 @pytest.mark.parametrize("seed", random_arms.SEEDS)
 def test_random_arms_move_as_in_mujoco(dtype, seed):
     model = random_arms.random_arm(seed)
@@ -87,7 +91,7 @@ def test_random_arms_move_as_in_mujoco(dtype, seed):
 
 
 @pytest.mark.parametrize("locked", [{}, {"joint1": 0.3, "joint7": -0.5}], ids=["free", "locked"])
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_long_arms_move_as_in_mujoco(x64, seed, locked):
     model = random_arms.random_arm(seed, joints=LONG + 8)
     arm = load_mjcf(model, locked=locked, links="kept")
@@ -106,6 +110,8 @@ def test_long_arms_take_both_precisions_in_one_process():
             assert {leaf.dtype for leaf in jax.tree.leaves(actual)} == {dtype}
 
 
+@pytest.mark.slow_for(*(f"float32-{locked}-{links}" for locked in PANDA_LOCKED for links in ("merged", "kept")))
+@pytest.mark.slow_for("float64-free-merged", "float64-3dof-kept", "float64-base-merged", "float64-tip only-kept")
 @pytest.mark.parametrize("links", ["merged", "kept"])
 @pytest.mark.parametrize("locked", PANDA_LOCKED.values(), ids=PANDA_LOCKED)
 def test_panda_moves_as_in_mujoco(dtype, locked, links):
@@ -114,6 +120,7 @@ def test_panda_moves_as_in_mujoco(dtype, locked, links):
     assert_moves_as_in_mujoco(arm, model, dtype, dict(locked) if isinstance(locked, dict) else None)
 
 
+@pytest.mark.slow_for("merged-6", "kept-6", "kept-4")
 @pytest.mark.parametrize("seed", [4, 6, 17])
 @pytest.mark.parametrize("links", ["merged", "kept"])
 def test_locked_random_arm_moves_as_in_mujoco(x64, seed, links):
@@ -138,7 +145,7 @@ def test_locked_random_arm_moves_as_in_mujoco(x64, seed, links):
 
 @pytest.mark.parametrize(
     "arm",
-    [panda(), panda(locked=(3, 6, 7)), planar_arm([0.3, 0.2, 0.4], frame_at=1.0), load_mjcf(random_arms.random_arm(7))],
+    [panda(locked=(3, 6, 7)), planar_arm([0.3, 0.2, 0.4], frame_at=1.0), load_mjcf(random_arms.random_arm(2))],
     ids=lambda arm: arm.name,
 )
 def test_body_twists_are_the_derivative_of_the_frames(x64, arm):
@@ -151,14 +158,15 @@ def test_body_twists_are_the_derivative_of_the_frames(x64, arm):
         return jnp.concatenate([upper, lower], axis=1)
 
     (qpos, *_), (qvel, *_) = motions(arm.num_joints)
-    T, dT = jax.jvp(matrix, (jnp.asarray(qpos),), (jnp.asarray(qvel),))
+    T, dT = jax.jit(lambda *motion: jax.jvp(matrix, motion[:1], motion[1:]))(jnp.asarray(qpos), jnp.asarray(qvel))
     V = jnp.linalg.inv(T) @ dT
     expected = jnp.stack([V[:, 2, 1], V[:, 0, 2], V[:, 1, 0], V[:, 0, 3], V[:, 1, 3], V[:, 2, 3]], axis=1)
     np.testing.assert_allclose(body_twists(arm, qpos, qvel), expected, atol=1e-12)  # rounding, 1e-15 a step
 
 
-@pytest.mark.parametrize("frame_at", [0.5, 1.0, 0.0])
-@pytest.mark.parametrize("lengths", [[0.7], [1.0, 0.5], [0.2, 0.1, 0.4, 0.3], np.linspace(0.1, 0.3, LONG + 2)], ids=len)
+@pytest.mark.parametrize(
+    ("lengths", "frame_at"), [([0.7], 0.5), ([0.2, 0.1, 0.4, 0.3], 1.0), (np.linspace(0.1, 0.3, LONG + 2), 0.0)]
+)
 def test_planar_arm_has_the_closed_form(x64, lengths, frame_at):
     arm = planar_arm(lengths, frame_at=frame_at)
     (qpos, *_), (qvel, *_) = motions(arm.num_joints)
@@ -272,9 +280,7 @@ def test_wrong_shapes_are_rejected(unchecked, shape):
 @pytest.mark.parametrize(
     "arm",
     [
-        panda(),
         panda(locked=(3, 6, 7)),
-        load_mjcf(random_arms.random_arm(0)),
         load_mjcf(mujoco.MjModel.from_xml_string(torso()), tip=TORSO_TIPS),
         load_mjcf(mujoco.MjModel.from_xml_string(hand()), tip=["*"]),
     ],
@@ -283,9 +289,9 @@ def test_wrong_shapes_are_rejected(unchecked, shape):
 def test_link_states_of_a_batch_at_rest_equal_link_states(arm):
     """1e-12: double precision."""
     qpos = np.random.default_rng(0).uniform(-3, 3, (3, arm.num_joints))
-    batch = resting_link_states(arm, jnp.asarray(qpos.T))
+    batch, single = jax.jit(lambda q: resting_link_states(arm, q))(qpos.T), jax.jit(lambda q: link_states(arm, q))
     for pose, angles in enumerate(qpos):
-        one = link_states(arm, angles)
+        one = single(angles)
         jax.tree.map(lambda a, b, p=pose: np.testing.assert_allclose(a[..., p], b, atol=1e-12), batch, one)
 
 
@@ -293,9 +299,7 @@ def test_the_table_of_link_states_equals_link_states():
     arm = mimic.panda(locked=[3])
     qpos, qvel = np.random.default_rng(0).normal(size=(2, 3, 4, arm.num_joints))
     table = link_state_table(arm, qpos, qvel)
-    one_by_one = jax.vmap(jax.vmap(lambda *motion: mimic.link_states(arm, *motion)))(
-        jnp.asarray(qpos), jnp.asarray(qvel)
-    )
+    one_by_one = jax.jit(lambda *motion: mimic.link_states(arm, *motion))(qpos, qvel)
     for name, values in vars(one_by_one).items():
         actual = getattr(table, name)
         assert isinstance(actual, np.ndarray) and actual.dtype == np.float32

@@ -78,7 +78,7 @@ def test_another_key_compiles_nothing():
     metric = MetricConfig().build(*arms()).arguments
 
     def call(seed):
-        return imitate_pose(*arms(), qpos(0), **metric, key=jax.random.key(seed))
+        return imitate_pose(*arms(), qpos(0), **metric, **FEW, key=jax.random.key(seed))
 
     for seed in (0, 1):
         call(seed)

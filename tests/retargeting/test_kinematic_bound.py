@@ -20,6 +20,7 @@ FEW = slice(5, 51, 15)  # some steps of a demonstration: time is not what is tes
 ARMS = {
     "panda 7->4": (panda(), panda(locked=(3, 6, 7))),
     "planar 7->4": (planar_arm([1 / 7] * 7), planar_arm([1 / 4] * 4)),
+    "planar 3->2": (planar_arm([1 / 3] * 3), planar_arm([0.6, 0.4])),
 }
 
 
@@ -63,7 +64,7 @@ def solved(name):
     return motion, correspondence, closest_motion(expert, learner, *motion, correspondence, PAPER_WEIGHTS)
 
 
-@pytest.mark.slow_for("panda 7->4")
+@pytest.mark.slow_for("panda 7->4", "planar 7->4")
 @pytest.mark.parametrize("name", ARMS)
 def test_no_sampled_motion_is_below_the_bound(name):
     expert, learner = ARMS[name]
@@ -78,9 +79,11 @@ def test_no_sampled_motion_is_below_the_bound(name):
         assert jnp.all(closest.distance <= tried.min(axis=1) + BELOW)
 
 
-def test_the_bound_is_the_distance_of_the_returned_motion():
-    expert, learner = ARMS["panda 7->4"]
-    motion, correspondence, closest = solved("panda 7->4")
+@pytest.mark.slow_for("panda 7->4", "planar 7->4")
+@pytest.mark.parametrize("name", ARMS)
+def test_the_bound_is_the_distance_of_the_returned_motion(name):
+    expert, learner = ARMS[name]
+    motion, correspondence, closest = solved(name)
     candidates = closest.qpos[:, None], closest.qvel[:, None]
     expected = distances(expert, learner, motion, candidates, correspondence, PAPER_WEIGHTS)[:, 0]
     np.testing.assert_allclose(closest.distance, expected, rtol=1e-4, atol=1e-6)  # float32; fused in another order

@@ -159,7 +159,7 @@ def test_solutions_within_the_joint_range_come_first():
 def test_subproblem_2_minimises_the_angle(reachable):
     """Against a grid over both angles."""
     rng = np.random.default_rng(1)
-    first, second, vector, goal = rng.normal(size=(4, 40, 3))
+    first, second, vector, goal = rng.normal(size=(4, 20, 3))
     first, second, vector, goal = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (first, second, vector, goal))
     if not reachable:
         second = first + 0.2 * second
@@ -168,7 +168,7 @@ def test_subproblem_2_minimises_the_angle(reachable):
     def turned(a, b):
         return rotated(first, a, rotated(second, b, vector))
 
-    grid = np.linspace(-np.pi, np.pi, 181)
+    grid = np.linspace(-np.pi, np.pi, 73)
     best = np.max([np.sum(turned(a, b) * goal, axis=1) for a in grid for b in grid], axis=0)
     for a, b in rotate_onto_by_two(first, second, vector, goal):
         reached = np.sum(turned(a[:, None], b[:, None]) * goal, axis=1)

@@ -125,6 +125,7 @@ def test_smoothing_changes_the_distance_by_less_than_its_own_size(dtype):
     closed = pose_objective(learner, Metric(matrix, DEFAULT))
     qpos = np.random.default_rng(2).uniform(-3, 3, (64, 7)).astype(dtype)
 
+    @jax.jit
     @jax.vmap
     def values(pose):
         states, own = link_states(expert, pose), link_states(learner, pose[:4])

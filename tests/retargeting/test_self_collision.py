@@ -14,7 +14,7 @@ from mimic.retargeting.self_collision import smallest_clearances, touching_line
 POSES = 400
 
 
-@pytest.mark.parametrize("locked", [(), (3, 6, 7)])
+@pytest.mark.parametrize("locked", [pytest.param((), marks=pytest.mark.slow), (3, 6, 7)])
 def test_clearances_are_the_distances_of_mujocos_contacts(locked):
     """Of the same capsules, whose contacts MuJoCo finds on its own; among the poses are many that touch."""
     config = ArmConfig(locked=list(locked))

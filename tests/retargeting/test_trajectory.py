@@ -52,3 +52,11 @@ def test_a_joint_swings_back_where_the_expert_passes_its_limit():
     np.testing.assert_allclose(motion.distance[:150], 0, atol=1e-5)
     np.testing.assert_allclose(motion.distance[200:], 0, atol=1e-5)
     assert np.all(np.asarray(motion.qpos)[200:] < -2) and not np.any(np.asarray(motion.converged)[175:190])
+
+
+def test_the_first_pose_lies_within_half_a_revolution():
+    """Later poses of joints without limits may pass pi, as the expert does."""
+    arm = planar_arm([1.0])
+    qpos = np.linspace(3.5, 4.5, 6)[:, None]
+    motion = imitate_trajectory(arm, arm, qpos, np.eye(1), DistanceWeights(rotation=1.0), starts=1)
+    np.testing.assert_allclose(motion.qpos, qpos - 2 * np.pi, atol=1e-3)  # float32, at a flat minimum

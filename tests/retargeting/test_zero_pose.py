@@ -24,13 +24,16 @@ def zero_states(arm):
     return link_state_table(arm, np.zeros(arm.num_joints), np.zeros(arm.num_joints))
 
 
-def test_there_are_127_locked_pandas():
-    assert len(LOCKS) == 127
-
-
-@pytest.mark.slow_for("directions")
-@pytest.mark.parametrize("metric", [METRIC, DIRECTIONS], ids=["default", "directions"])
-def test_the_distance_is_zero_at_the_zero_pose(metric):
+@pytest.mark.parametrize(
+    ("metric", "locks"),
+    [
+        (METRIC, LOCKS[::12]),
+        pytest.param(METRIC, LOCKS, marks=pytest.mark.slow),
+        pytest.param(DIRECTIONS, LOCKS, marks=pytest.mark.slow),
+    ],
+    ids=["some", "default", "directions"],
+)
+def test_the_distance_is_zero_at_the_zero_pose(metric, locks):
     """1e-6: float32 rounds positions to 1e-7 chain lengths."""
     expert = panda()
 
@@ -38,7 +41,7 @@ def test_the_distance_is_zero_at_the_zero_pose(metric):
     def distance(expert_states: LinkStates, learner_states: LinkStates, matrix):
         return embodiment_distance(expert_states, learner_states, matrix, metric.make_weights())
 
-    for joints in LOCKS:
+    for joints in locks:
         learner = panda(locked=joints)
         assert learner.num_joints == 7 - len(joints) and learner.num_links == 7
         matrix = np.asarray(metric.make_correspondence(expert, learner))
@@ -66,7 +69,7 @@ def stays(joints, **options):
     return solution.distance <= 1e-6 and solution.converged and np.allclose(*(x.position for x in states), atol=1e-5)
 
 
-@pytest.mark.slow_for("(3, 6, 7)", "(1, 2, 3, 4, 5, 6)")
+@pytest.mark.slow_for("(3, 6, 7)", "(2, 3, 6, 7)")
 @pytest.mark.parametrize("joints", HANDFUL, ids=str)
 def test_the_optimiser_stays_at_the_zero_pose(joints):
     assert stays(joints)
