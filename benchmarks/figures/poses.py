@@ -1,7 +1,7 @@
 """Figures of the metric and of pose retargeting (static pose imitation in the paper), all computed here."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from benchmarks.figures.planar_arms import add_match_legend, draw_match, fit, jo
 from mimic.arms.embodiment import planar_arm  # noqa: E402
 from mimic.arms.link_match import LinkMatch  # noqa: E402
 from mimic.arms.rendering import ArmScene  # noqa: E402
-from mimic.commands.pose_picture import PANDA_POSES, show_images  # noqa: E402
 from mimic.envs import env_config  # noqa: E402
 from mimic.metric.config import MetricConfig  # noqa: E402
 from mimic.metric.correspondence import hard_correspondence, overlap_correspondence  # noqa: E402
@@ -36,7 +35,15 @@ _TWO_LINKS = planar_arm([0.5, 0.5])
 _CONTOUR_POSE = np.array([1.5, -1.5])  # of the expert in Fig. 2 d-f of the paper
 _WEIGHTS_POSE = np.array([2.3, -2.0])
 _OTHER_TWO_LINKS = planar_arm([0.25, 0.75])  # identical arms would match for any weights
-_PANDA_POSES = PANDA_POSES[:3]
+# Joint positions of the Panda [rad] that show the whole arm and are within its joint ranges.
+_PANDA_POSES = np.array(
+    [
+        [0.6, 0.7, -0.5, -1.3, 0.5, 1.6, 0.4],
+        [-0.9, 0.5, 0.9, -1.8, -0.6, 1.2, 0.0],
+        [0.3, -0.6, 0.4, -1.5, 1.2, 2.2, 0.8],
+    ],
+    np.float32,
+)
 _PIXELS = 420
 _OPTIMUM: dict[str, Any] = {"color": "black", "lw": 0.7, "marker": "o", "ms": 1.5}
 
@@ -120,7 +127,7 @@ def draw_panda(load_mapper: LoadMapper) -> Any:
     colours = matches[names[0]].expert_colours
     with ArmScene([expert], width=_PIXELS, height=_PIXELS, colours=[colours]) as scene:
         scene.fit([_PANDA_POSES])
-        show_images(rows[0], [scene.image([pose]) for pose in _PANDA_POSES], "expert, 7 joints")
+        _show_images(rows[0], [scene.image([pose]) for pose in _PANDA_POSES], "expert, 7 joints")
     for name, row in zip(names, rows[1:], strict=True):
         mapper = mappers[name]
         mapped, _, excess = _mapped_and_optimal(mapper, _PANDA_POSES)
@@ -129,10 +136,19 @@ def draw_panda(load_mapper: LoadMapper) -> Any:
             scene.fit([mapped])
             pairs = zip(_PANDA_POSES, mapped, strict=True)
             images = [scene.image([pose], matches[name].ghost(expert_pose, pose)) for expert_pose, pose in pairs]
-            show_images(row, images, f"learner, {mapper.learner.num_joints} joints")
+            _show_images(row, images, f"learner, {mapper.learner.num_joints} joints")
         for axes, percent in zip(row, excess, strict=True):
             axes.set_xlabel(f"{percent:.2f} % above the optimum", fontsize="small")
     return figure
+
+
+def _show_images(row: Sequence[Any], images: Sequence[np.ndarray], label: str) -> None:
+    """Shows images in a row of axes, without ticks and frames, with a label at the first one."""
+    for axes, image in zip(row, images, strict=True):
+        axes.imshow(image)
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_visible(False)
+    row[0].set_ylabel(label)
 
 
 FIGURES: dict[str, Callable[[LoadMapper], Any]] = {

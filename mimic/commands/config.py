@@ -290,8 +290,7 @@ class InspectConfig:
       expert: arm that it should imitate.
       limits: see `EnvConfig`.
       bound: whether to compute the kinematic bound of the distance, which takes a minute.
-      out: new folder for a picture of both arms with their correspondence, a picture of expert poses with the
-        learner's nearest poses (only with `bound`), and a JSON file of all results.
+      out: new folder for a picture of both arms with their correspondence, and a JSON file of all results.
       clip: motion capture file to inspect instead of an arm.
       capture: how it is read.
     """

@@ -15,7 +15,7 @@ from mimic.arms.embodiment import Embodiment
 from mimic.base.config import new_file
 from mimic.commands.capture import MOTION_CAPTURE, prepare_capture
 from mimic.commands.config import RecordingConfig
-from mimic.commands.demonstrations_plot import peak, plot_demonstrations, with_fraction
+from mimic.commands.demonstrations_plot import plot_demonstrations
 from mimic.envs.config import EnvConfig
 from mimic.motions.demonstrations import Demonstrations, check_effort
 from mimic.motions.importing import import_demonstrations
@@ -153,16 +153,24 @@ def _table(demonstrations: Demonstrations, arm: Embodiment) -> Table:
     torque = np.full((1, 1, arm.num_joints), np.nan) if demonstrations.torque is None else demonstrations.torque
     lowest, highest = demonstrations.qpos.min(axis=(0, 1)), demonstrations.qpos.max(axis=(0, 1))
     range_fraction = (highest - lowest) / np.ptp(arm.joint_range, axis=1)
+    peak_velocity, peak_torque = (np.abs(values).max(axis=(0, 1)) for values in (demonstrations.qvel, torque))
     rms_torque = np.sqrt(np.mean(torque**2, axis=(0, 1)))
     for joint, name in enumerate(arm.joint_names):
         table.add_row(
             name,
             f"{lowest[joint]:.2f} to {highest[joint]:.2f} ({range_fraction[joint]:.0%})",
-            with_fraction(peak(demonstrations.qvel)[joint], arm.velocity_limit[joint]),
-            with_fraction(peak(torque)[joint], arm.torque_limit[joint]),
-            with_fraction(rms_torque[joint], arm.torque_limit[joint]),
+            _with_fraction(peak_velocity[joint], arm.velocity_limit[joint]),
+            _with_fraction(peak_torque[joint], arm.torque_limit[joint]),
+            _with_fraction(rms_torque[joint], arm.torque_limit[joint]),
         )
     return table
+
+
+def _with_fraction(value: float, limit: float) -> str:
+    """Text of a value and its fraction of a finite limit; a dash for NaN."""
+    if np.isnan(value):
+        return "-"
+    return f"{value:.2f} ({value / limit:.0%})" if np.isfinite(limit) else f"{value:.2f}"
 
 
 def _limits_line(arm: Embodiment) -> str:

@@ -21,14 +21,13 @@ from mimic.arms.simulation_model import effective_inertia  # noqa: E402
 from mimic.base.config import new_folder  # noqa: E402
 from mimic.commands import arm_checks  # noqa: E402
 from mimic.commands.config import InspectConfig  # noqa: E402
-from mimic.commands.pose_picture import nearest_poses, readable_poses, save_poses  # noqa: E402
 from mimic.commands.printed import train_command  # noqa: E402
 from mimic.envs.config import EnvConfig  # noqa: E402
 from mimic.evaluation.rollout_metrics import pose_similarity  # noqa: E402
 from mimic.motions.demonstrations import Demonstrations  # noqa: E402
 from mimic.trainers.progress import similarity_table  # noqa: E402
 
-_PICTURE, _POSES, _RESULTS = "arms.png", "poses.png", "inspection.json"
+_PICTURE, _RESULTS = "arms.png", "inspection.json"
 _SCENE = 800, 640  # pixels
 
 
@@ -82,7 +81,7 @@ def prepare_inspection(config: InspectConfig) -> Callable[[], None]:
                 scene.fit([pose[None] for pose in home])
                 image = scene.image(home)
             _save_picture(out / _PICTURE, image, expert, learner, env)
-            _write(out, inspection, expert, learner, env)
+            _write(out / _RESULTS, inspection, expert, learner)
             console.print(f"results: {out}", soft_wrap=True, highlight=False)
         console.print(f"train it: {inspection.command}", soft_wrap=True, highlight=False, markup=False)
 
@@ -124,13 +123,9 @@ def _print(console: Console, inspection: Inspection, expert: Arm, learner: Arm) 
         console.print(similarity_table(inspection.similarity))
 
 
-def _write(out: Path, inspection: Inspection, expert: Arm, learner: Arm, env: EnvConfig) -> None:
-    """Writes the results as JSON, and a picture of the nearest poses of some poses of the expert."""
-    pairs, reachable = None, inspection.reachable
-    if reachable is not None:
-        poses = readable_poses(env.expert, expert, reachable.expert_qpos[:, 0])
-        pairs = nearest_poses(expert, learner, env.metric, poses)
-        save_poses(out / _POSES, expert, learner, env, pairs)
+def _write(path: Path, inspection: Inspection, expert: Arm, learner: Arm) -> None:
+    """Writes the results as JSON."""
+    reachable = inspection.reachable
     results = {
         "arm": learner.embodiment.name,
         "expert": expert.embodiment.name,
@@ -142,10 +137,9 @@ def _write(out: Path, inspection: Inspection, expert: Arm, learner: Arm, env: En
         "bound": reachable and reachable.bound,
         "hold": reachable and reachable.hold,
         "similarity": inspection.similarity,
-        "poses": pairs and pairs.as_json(),
         "train": inspection.command,
     }
-    (out / _RESULTS).write_text(json.dumps(results, indent=2) + "\n")
+    path.write_text(json.dumps(results, indent=2) + "\n")
 
 
 def _joints(arm: Arm, config: ArmConfig, env: EnvConfig) -> list[dict[str, Any]]:

@@ -1,7 +1,6 @@
 """Links over time without joints or a model: an expert of the metric that was only seen."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -261,20 +260,3 @@ def low_pass(values: Float[np.ndarray, "time *axes"], rate: float, cutoff: float
 def _derivative(values: np.ndarray, rate: float) -> np.ndarray:
     order = 2 if len(values) > 2 else 1
     return np.gradient(values, 1 / rate, axis=0, edge_order=order)
-
-
-def resampled(motion: LinkMotion, times: Sequence[float] | np.ndarray) -> LinkMotion:
-    """The motion at other, equally spaced times [s] from its first sample; cubic between the samples.
-
-    Raises:
-      ValueError: fewer than 2 times, or times beyond the motion.
-    """
-    from scipy.interpolate import CubicSpline
-
-    times = np.asarray(times, float)
-    duration = (len(motion.start) - 1) / motion.rate
-    if len(times) < 2 or times.min() < -1e-9 or times.max() > duration + 1e-9:
-        raise ValueError(f"times: expected at least 2 from 0 to {duration:.4g} s")
-    known = np.arange(len(motion.start)) / motion.rate
-    start, end = (CubicSpline(known, points, axis=0)(times) for points in (motion.start, motion.end))
-    return dataclasses.replace(motion, start=start, end=end, rate=1 / float(times[1] - times[0]))

@@ -9,7 +9,7 @@ import mimic
 from mimic.metric.kinematics import link_state_table
 from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
 from mimic.motions.mocap.clips import relative_speeds, slow_down_for, turned, windows
-from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, low_pass, motion_states, resampled, rigid_error
+from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, low_pass, motion_states, rigid_error
 from mimic.motions.mocap.points import bridge_gaps, gaps, jumps
 from tests.helpers.bodies import RATE, person
 
@@ -184,12 +184,6 @@ def test_jumps_are_found(body):
     positions[200:, 6] += 0.5
     assert jumps(dataclasses.replace(body, positions=positions)).tolist() == [200]
     assert len(jumps(body)) == 0
-
-
-def test_resampling_keeps_the_motion(right_arm):
-    finer = resampled(right_arm, np.arange(0, 9, 0.005))
-    again = resampled(finer, np.arange(0, 500) / RATE)
-    np.testing.assert_allclose(again.end, right_arm.end[:500], atol=1e-5)
 
 
 def test_what_is_no_motion_is_rejected(right_arm):
