@@ -119,7 +119,6 @@ def own_registry(monkeypatch: pytest.MonkeyPatch):
     from mimic.base import registry
 
     monkeypatch.setattr(registry, "_registered", {kind: {} for kind in registry.KINDS})
-    monkeypatch.setattr(registry, "_allowed", set())
     monkeypatch.setattr(registry, "_is_loaded", True)
     monkeypatch.setenv(registry.VARIABLE, "")
     monkeypatch.setattr(sys, "path", [*sys.path])

@@ -6,12 +6,10 @@ import os
 from collections.abc import Sequence
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
@@ -80,15 +78,7 @@ class Embodiment:
     chain_names: tuple[str, ...] = struct.field(pytree_node=False)
 
     def __repr__(self) -> str:
-        limits = [
-            f"{name} {_extent(values, unit)}"
-            for name, values, unit in (
-                ("angles", self.joint_range, "rad"),
-                ("speeds", self.velocity_limit, "rad/s"),
-                ("torques", self.torque_limit, "N m"),
-            )
-        ]
-        return f"Embodiment({self.name}: {self.num_joints} joints, {self.num_links} links; {', '.join(limits)})"
+        return f"Embodiment({self.name}: {self.num_joints} joints, {self.num_links} links)"
 
     @property
     def num_joints(self) -> int:
@@ -112,17 +102,6 @@ class Embodiment:
     def is_serial(self) -> bool:
         """Whether each joint is the child of the one before it."""
         return self.joint_parent == tuple(range(-1, self.num_joints - 1))
-
-
-def _extent(values: Any, unit: str) -> str:
-    """The minimum and maximum of an arm's limits, for its `repr`."""
-    if isinstance(values, Tracer) or not isinstance(values, np.ndarray | jax.Array):
-        return "unknown"  # JAX also fills pytrees with placeholders
-    values = np.asarray(values)
-    if not np.any(np.isfinite(values)):
-        return "unlimited"
-    minimum, maximum = f"{values.min():.3g}", f"{values.max():.3g}"
-    return f"{minimum} {unit}" if minimum == maximum else f"{minimum} to {maximum} {unit}"
 
 
 def planar_arm(link_lengths: Sequence[float] | Float[ArrayLike, " n"], *, frame_at: float = 0.5) -> Embodiment:

@@ -19,19 +19,16 @@ ScalarFunction = Callable[..., Sequence[Sequence[Scalar]]]
 class LaunchConfig:
     """Launch configuration of a Pallas kernel. The defaults are the fastest measured on an H200.
 
-    With samples as the first axis, a thread reads adjacent numbers, and a warp reads whole cache lines. This is best
-    for few columns, which are all read together: transposing them would only move them through memory once more. Many
-    columns, read one after the other, would evict each other from the cache.
+    Samples are the first axis: a thread reads adjacent numbers, and a warp reads whole cache lines. Transposing the few
+    columns would only move them through memory once more.
 
     Attributes:
       block: samples in a block; a power of 2.
       warps: groups of 32 threads in a block.
-      sample_axis: sample axis of the arrays within the kernel; with 1, the arrays [samples, width] are transposed.
     """
 
     block: int = 128
     warps: int = 4
-    sample_axis: int = 0
 
 
 DEFAULT = LaunchConfig()
@@ -149,21 +146,18 @@ class Columns:
     Attributes:
       ref: reference to the block.
       mask: valid samples; the last block may be partial.
-      sample_axis: of the array.
     """
 
     ref: Any
     mask: Array
-    sample_axis: int
 
     @property
     def width(self) -> int:
         """Number of columns."""
-        return self.ref.shape[1 - self.sample_axis]
+        return self.ref.shape[1]
 
     def _at(self, column: Array) -> Any:
-        column = column.astype(int)  # the type of a slice's start, which interpret mode requires
-        return self.ref.at[column, :] if self.sample_axis else self.ref.at[:, column]
+        return self.ref.at[:, column.astype(int)]  # the type of a slice's start, which interpret mode requires
 
     def read(self, column: Array) -> Array:
         """Reads a column, [block]."""
@@ -186,11 +180,9 @@ def by_columns(
       widths: of the output arrays.
       launch: launch configuration of the kernel.
     """
-    block, sample_axis = launch.block, launch.sample_axis
+    block = launch.block
 
     def window(width: int) -> pl.BlockSpec:
-        if sample_axis:
-            return pl.BlockSpec((width, block), lambda i: (0, i))
         return pl.BlockSpec((block, width), lambda i: (i, 0))
 
     def batched(*rows: Array) -> tuple[Array, ...]:
@@ -199,17 +191,16 @@ def by_columns(
         def kernel(*refs: Any) -> None:
             mask = pl.program_id(0) * block + jnp.arange(block) < count
             groups = refs[: len(rows)], refs[len(rows) :]
-            body(*([Columns(ref, mask, sample_axis) for ref in group] for group in groups))
+            body(*([Columns(ref, mask) for ref in group] for group in groups))
 
-        shapes = [(width, count) if sample_axis else (count, width) for width in widths]
         outputs = pl.pallas_call(
             kernel,
-            out_shape=[jax.ShapeDtypeStruct(shape, dtype) for shape in shapes],
+            out_shape=[jax.ShapeDtypeStruct((count, width), dtype) for width in widths],
             grid=(pl.cdiv(count, block),),
             in_specs=[window(x.shape[1]) for x in rows],
             out_specs=[window(width) for width in widths],
             compiler_params=triton.CompilerParams(num_warps=launch.warps, num_stages=1),
-        )(*(x.T if sample_axis else x for x in rows))
-        return tuple(x.T if sample_axis else x for x in outputs)
+        )(*rows)
+        return tuple(outputs)
 
     return batched

@@ -1,8 +1,7 @@
 """What packages and notebooks add to mimic: things by kind and name, which configs then refer to.
 
 A package declares a function in the entry-point group `mimic.plugins`; the function calls `register`. Entry points are
-loaded when a name is looked up that mimic itself does not have. A config never imports code: a name with a colon
-(`MODULE:NAME`) is imported only after `allow`, which a command calls for its own arguments.
+loaded when a name is looked up that mimic itself does not have. A config never imports code.
 """
 
 import importlib
@@ -25,7 +24,6 @@ KINDS = {
     "trainer": "a subclass of Trainer with the attribute config_class",
 }
 _NAME = re.compile(r"[A-Za-z_][\w-]*")
-_IMPORT_PATH = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 
 class _Entry(NamedTuple):
@@ -35,7 +33,6 @@ class _Entry(NamedTuple):
 
 _registered: dict[str, dict[str, _Entry]] = {kind: {} for kind in KINDS}
 _built_in: dict[str, tuple[str, ...]] = dict.fromkeys(KINDS, ())
-_allowed: set[str] = set()
 _loading: list[str] = []  # the plugin that registers at present
 _is_loaded = False
 
@@ -92,11 +89,11 @@ def names(kind: str) -> tuple[str, ...]:
 
 def is_registered(kind: str, name: str) -> bool:
     """Whether `find` would return a thing."""
-    return name in _allowed or name in names(kind)
+    return name in names(kind)
 
 
 def find(kind: str, name: str, key: str) -> Any:
-    """The thing with a registered name, or what an allowed import path names.
+    """The thing with a registered name.
 
     Args:
       kind: see `register`.
@@ -104,25 +101,16 @@ def find(kind: str, name: str, key: str) -> Any:
       key: the config key that has the name, for messages.
 
     Raises:
-      ValueError: an unknown name, an import path that is not allowed, or one that cannot be imported.
+      ValueError: an unknown name.
     """
-    if name in _allowed:
-        thing = _imported(name, key)
-        if not callable(thing):
-            raise ValueError(f"{key}: {name!r}: expected {KINDS[kind]}, got {thing!r:.80}")
-        return thing
     check(kind, name, key)
     return _registered[kind][name].thing
 
 
 def check(kind: str, name: str, key: str) -> None:
-    """Raises a ValueError that lists the valid names unless a name is built in, registered or allowed."""
+    """Raises a ValueError that lists the valid names unless a name is built in or registered."""
     if name in _built_in[kind] or is_registered(kind, name):
         return
-    if _IMPORT_PATH.fullmatch(name):
-        raise ValueError(
-            f"{key}: {name!r} is code, which is imported only if the command line names it: add --plugin {name}"
-        )
     known = ", ".join((*_built_in[kind], *names(kind))) or "none"
     raise ValueError(
         f"{key}: expected one of {known}, got {name!r:.80}; others are registered by a package with the entry point "
@@ -131,29 +119,19 @@ def check(kind: str, name: str, key: str) -> None:
 
 
 def origin(kind: str, name: str) -> str:
-    """The plugin or module that a registered thing is from; an import path is its own."""
-    return name if name in _allowed else _registered[kind][name].origin
-
-
-def allow(import_path: str) -> None:
-    """Lets configs of this process name an import path, `MODULE:NAME`."""
-    if not _IMPORT_PATH.fullmatch(import_path):
-        raise ValueError(f"expected MODULE:NAME, got {import_path!r:.80}")
-    _allowed.add(import_path)
+    """The plugin or module that a registered thing is from."""
+    return _registered[kind][name].origin
 
 
 def load_plugin(plugin: str) -> None:
-    """Imports a module, which registers things, or allows an import path. Processes started later do the same.
+    """Imports a module, which registers things. Processes started later do the same.
 
     Raises:
       ValueError: the module cannot be imported.
     """
-    if ":" in plugin:
-        allow(plugin)
-    else:
-        if os.getcwd() not in sys.path and "" not in sys.path:
-            sys.path.append(os.getcwd())
-        _run(plugin, lambda: importlib.import_module(plugin), f"--plugin {plugin}")
+    if os.getcwd() not in sys.path and "" not in sys.path:
+        sys.path.append(os.getcwd())
+    _run(plugin, lambda: importlib.import_module(plugin), f"--plugin {plugin}")
     known = [name for name in os.environ.get(VARIABLE, "").split(",") if name]
     os.environ[VARIABLE] = ",".join(dict.fromkeys([*known, plugin]))
 
@@ -182,18 +160,6 @@ def _run(name: str, load: Callable[[], Any], label: str) -> None:
         raise ValueError(f"{label} failed: {' '.join(f'{type(error).__name__}: {error}'.split())}") from error
     finally:
         _loading.pop()
-
-
-def _imported(path: str, key: str) -> Any:
-    module, _, name = path.partition(":")
-    try:
-        thing: Any = importlib.import_module(module)
-        for part in name.split("."):
-            thing = getattr(thing, part)
-    except Exception as error:  # code of others
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"{key}: {path!r} cannot be imported: {reason}") from error
-    return thing
 
 
 def _check_kind(kind: str) -> None:

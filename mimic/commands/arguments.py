@@ -4,7 +4,6 @@ Hydra also composes what nobody means: an environment without a preset for `~env
 `env={}`.
 """
 
-import re
 from typing import Any, NoReturn
 
 from hydra._internal.utils import get_args_parser
@@ -14,18 +13,10 @@ from hydra.core.override_parser.types import Override
 from mimic.base import registry
 
 GROUPS = {"env": "panda4dof", "trainer": "ppo", "metric": "paper"}  # config groups, with the example of messages
-# Keys whose value may be an import path, MODULE:NAME, which the command line then allows.
-_NAMING_KEYS = (
-    "env.environment",
-    "env.metric.correspondence",
-    "env.metric.link_distance",
-    "env.demonstrations.source",
-    "env.observation.terms",
-)
 
 
 def load_plugins(arguments: list[str]) -> list[str]:
-    """Loads what `--plugin MODULE` names, allows the import paths that arguments name, and returns the other arguments.
+    """Loads what `--plugin MODULE` names, and returns the other arguments.
 
     Raises:
       ValueError: a plugin that cannot be imported, or the option without a module.
@@ -40,9 +31,6 @@ def load_plugins(arguments: list[str]) -> list[str]:
             registry.load_plugin(plugin)
         else:
             others.append(argument)
-            if option.lstrip("+") in _NAMING_KEYS:
-                for path in re.findall(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", plugin):
-                    registry.allow(path)
     return others
 
 

@@ -53,7 +53,9 @@ HARD_AXES = {
 }
 
 
-FORMS = [jax.jit(form) for form in (unrolled, looped)]  # of all cases, so that each is compiled once
+# Of all cases, so that each is compiled once.
+FORMS = [jax.jit(form) for form in (unrolled, looped)]
+TORQUE, STATES = jax.jit(torque_of_arm), jax.jit(link_states)
 
 
 @pytest.mark.slow_for("almost parallel, 1e-5 rad")
@@ -67,11 +69,11 @@ def test_hard_axes_move_as_in_mujoco(x64, name):
         expected = acceleration(HARD_AXES[name], qpos, qvel, torque)
         for form in FORMS:
             assert_near(np.asarray(form(arrays, *rows, padded(torque))), padded(expected), 1e-11)
-        assert_near(np.asarray(torque_of_arm(arrays, *rows, padded(qacc))), padded(torque), 1e-11)
+        assert_near(np.asarray(TORQUE(arrays, *rows, padded(qacc))), padded(torque), 1e-11)
         data = random_arms.posed(HARD_AXES[name], qpos, qvel)
         names = arm.embodiment.link_names
         reference = random_arms.links(HARD_AXES[name], data, names)
-        states, unit = link_states(arrays, *rows), arm.embodiment.chain_length
+        states, unit = STATES(arrays, *rows), arm.embodiment.chain_length
         scale = {"position": unit, "linear_velocity": unit}
         for field, values in reference.items():
             actual = np.asarray(getattr(states, field))[: len(names)] * scale.get(field, 1)
@@ -145,7 +147,7 @@ def test_locked_joints_of_a_config_keep_their_slots_and_angles():
     motion = np.array([0.3, -0.5, 0.7, -1.2, 0.4])
     with_slots = arrays.home.copy()
     with_slots[[0, 2, 3, 4, 6]] = motion
-    own, expected = link_states(arrays, with_slots), link_states(fewer, padded(motion))
+    own, expected = STATES(arrays, with_slots), STATES(fewer, padded(motion))
     assert own.direction is not None and expected.direction is not None
     np.testing.assert_allclose(own.position, expected.position, atol=1e-6)
     np.testing.assert_allclose(own.direction, expected.direction, atol=1e-6)

@@ -1,6 +1,6 @@
 """Capsules contain the geoms that they are fitted to, and move with their links as in C MuJoCo."""
 
-import jax.numpy as jnp
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -36,11 +36,12 @@ def test_distances_equal_those_of_mujoco(locked, x64):
     is_capsule = [model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CAPSULE for geom in range(model.ngeom)]
     pairs = [k for k, (i, j) in enumerate(capsules.pairs) if is_capsule[i] and is_capsule[j]]
     compared = 0
+    distances = jax.jit(lambda qpos: pair_distances(capsules, *capsule_axes(arm, capsules, qpos)))
     for qpos in np.random.default_rng(0).uniform(-2, 2, (10, arm.num_joints)):
         for name, angle in {**dict(zip(arm.joint_names, qpos, strict=True)), **locked}.items():
             data.joint(name).qpos[0] = angle
         mujoco.mj_kinematics(model, data)
-        ours = np.asarray(pair_distances(capsules, *capsule_axes(arm, capsules, jnp.asarray(qpos))))
+        ours = np.asarray(distances(qpos))
         for k in pairs:
             i, j = capsules.pairs[k]
             theirs = mujoco.mj_geomDistance(model, data, i, j, 10.0, None)

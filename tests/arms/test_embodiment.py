@@ -38,17 +38,7 @@ ENDS = [
 
 
 def test_an_arm_prints_as_a_line():
-    assert repr(panda(locked=["joint3"])) == (
-        "Embodiment(panda-joint3: 6 joints, 7 links; angles -3.14 to 3.14 rad, speeds 2.17 to 2.61 rad/s, "
-        "torques 12 to 87 N m)"
-    )
-    assert "speeds unlimited, torques unlimited" in repr(planar_arm([1.0]))
-
-
-def test_an_arm_prints_while_jax_traces_it():
-    texts = []
-    jax.eval_shape(lambda arm: texts.append(repr(arm)), planar_arm([1.0]))
-    assert "angles unknown" in texts[0]
+    assert repr(panda(locked=["joint3"])) == "Embodiment(panda-joint3: 6 joints, 7 links)"
 
 
 def test_panda_has_the_manufacturers_kinematics(x64):

@@ -1,6 +1,9 @@
 """Hostile MJCF and URDF files: each is rejected in one line, and nothing outside the model's folder is read."""
 
 import os
+import signal
+import subprocess
+from unittest.mock import Mock
 
 import mujoco
 import numpy as np
@@ -196,6 +199,7 @@ HARMFUL = {
 }
 
 
+@pytest.mark.slow_for("time")
 @pytest.mark.parametrize("case", HARMFUL)
 def test_a_model_that_does_harm_is_one_line(monkeypatch, capfd, case):
     monkeypatch.setattr(compile_check, "SECONDS", 1 if case == "time" else 10)
@@ -204,6 +208,14 @@ def test_a_model_that_does_harm_is_one_line(monkeypatch, capfd, case):
         check_in_process(text, {"x.xml": ATTACHES_ITSELF.encode()})
     assert str(error.value).splitlines() == [str(error.value)]
     assert capfd.readouterr() == ("", "")
+
+
+def test_the_end_of_a_process_by_its_limit_of_time_is_one_line(monkeypatch):
+    ended = subprocess.CompletedProcess((), -signal.SIGXCPU, b"", b"")
+    for end in (lambda *_, **__: ended, Mock(side_effect=subprocess.TimeoutExpired((), 50))):
+        monkeypatch.setattr(subprocess, "run", end)
+        with pytest.raises(ValueError, match="^the model takes mujoco more than 10 s to read$"):
+            check_in_process("<mujoco/>", {})
 
 
 def test_a_file_is_compiled_in_a_process_once_and_the_panda_never(folder, monkeypatch):

@@ -11,7 +11,7 @@ from mimic.arms.model_files import read_model, read_spec
 from mimic.arms.model_source import MAX_FILE_SIZE
 from tests.helpers import original_model
 
-POSES = 40
+POSES = 10
 # Arms that others wrote, in packages that need not be installed: their paths there, and where the last link ends.
 OTHERS = {
     "Panda": ("robosuite/models/assets/robots/panda/robot.xml", "right_hand"),
@@ -85,8 +85,7 @@ def test_the_arm_of_a_scene_is_its_longest_chain(x64):
     assert arm.joint_names == tuple(f"robot:panda0_joint{number}" for number in range(1, 8))
 
 
-@pytest.mark.parametrize("actuators", ["motor", "position", "none"])
-@pytest.mark.parametrize("tip", ["pinch", "palm", "wrist_3_link"])
+@pytest.mark.parametrize(("actuators", "tip"), [("motor", "pinch"), ("position", "palm"), ("none", "wrist_3_link")])
 def test_a_generated_arm_moves_as_in_its_model(x64, tmp_path, actuators, tip):
     file = tmp_path / "arm.xml"
     file.write_text(original_model.ur_like(actuators=actuators))

@@ -8,11 +8,11 @@ import pytest
 
 from mimic.arms import sampler
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.arrays import MAX_JOINTS, arm_arrays
+from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.metric.array_kinematics import link_states
 from mimic.physics.dynamics import inertia_matrix
 
-COUNT = 500
+COUNT = 200
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,8 @@ def test_perturbed_arms_have_the_same_shape_about_the_vertical(panda, perturbed)
     """Link states are relative to the chain length; only the base rotates."""
     np.testing.assert_allclose(perturbed.chain_length, 1.2 * panda.chain_length, rtol=1e-5)
     qpos = jnp.asarray([0.3, -0.5, 0.7, -1.2, 0.4, 1.1, -0.6, 0.0])
-    own, theirs = link_states(panda, qpos), jax.vmap(lambda arm: link_states(arm, qpos))(perturbed)
+    of_arms = jax.jit(jax.vmap(link_states, (0, None)))
+    own, theirs = jax.tree.map(lambda x: x[0], of_arms(stack_arms([panda]), qpos)), of_arms(perturbed, qpos)
     for part in ("position", "direction"):
         vectors, expected = np.asarray(getattr(theirs, part)), np.asarray(getattr(own, part))
         np.testing.assert_allclose(vectors[..., 2], np.tile(expected[:, 2], (40, 1)), atol=1e-5)
@@ -85,8 +86,9 @@ def test_perturbed_inertia_is_that_of_scaled_bodies(panda, perturbed):
     qpos = jnp.asarray([0.3, -0.5, 0.7, -1.2, 0.4, 1.1, -0.6, 0.0])
     whole = np.asarray(perturbed.is_free).sum(axis=1) == 7
     assert 0.5 < whole.mean() < 0.95 and np.asarray(perturbed.is_free).sum(axis=1).min() == 6
-    matrices = np.asarray(jax.vmap(lambda arm: inertia_matrix(arm, qpos))(perturbed))[whole][:, :7, :7]
-    own = np.asarray(inertia_matrix(panda, qpos))[:7, :7] - np.diag(panda.armature[:7])
+    of_arms = jax.jit(jax.vmap(inertia_matrix, (0, None)))
+    matrices = np.asarray(of_arms(perturbed, qpos))[whole][:, :7, :7]
+    own = np.asarray(of_arms(stack_arms([panda]), qpos))[0, :7, :7] - np.diag(panda.armature[:7])
     expected = 1.5 * 1.2**2 * own + np.diag(panda.armature[:7])
     np.testing.assert_allclose(matrices, np.tile(expected, (len(matrices), 1, 1)), rtol=1e-4, atol=1e-4)
 
@@ -95,7 +97,9 @@ def test_random_arms_are_chains_of_connected_links(arms):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(arms))
     assert set(np.asarray(arms.is_free.sum(axis=1))) == {4, 5, 6, 7, 8}
     qpos = jax.random.uniform(jax.random.PRNGKey(4), (COUNT, MAX_JOINTS), minval=-3, maxval=3) * arms.is_free
-    states, lengths = jax.vmap(link_states)(arms, qpos), arms.link_length / arms.chain_length[:, None]
+    arms = jax.tree.map(np.asarray, arms)
+    states = jax.tree.map(np.asarray, jax.jit(jax.vmap(link_states))(arms, qpos))
+    lengths = arms.link_length / arms.chain_length[:, None]
     assert states.direction is not None
     half = 0.5 * states.direction * lengths[..., None]
     jumps = np.linalg.norm((states.position + half)[:, :-1] - (states.position - half)[:, 1:], axis=-1)
@@ -107,7 +111,7 @@ def test_random_arms_are_chains_of_connected_links(arms):
 def test_random_arms_have_positive_inertia(arms):
     """At least that of the rotors in each direction."""
     qpos = jax.random.uniform(jax.random.PRNGKey(5), (COUNT, MAX_JOINTS), minval=-3, maxval=3)
-    matrices = np.asarray(jax.vmap(inertia_matrix)(arms, qpos), float)
+    matrices = np.asarray(jax.jit(jax.vmap(inertia_matrix))(arms, qpos), float)
     assert np.linalg.eigvalsh(matrices).min() > 0.9 * float(arms.armature.min())
 
 
@@ -117,7 +121,7 @@ def test_a_body_is_a_cylinder_with_a_sphere(x64):
     model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody><body><joint/>
       <geom type="cylinder" fromto="0 0 0 0 0 {length}" size="{radius}" density="{density}"/>
       <geom type="sphere" pos="0 0 {length}" size="{radius}" density="{sphere}"/></body></worldbody></mujoco>""")
-    moments = sampler._rod_with_sphere(jnp.array([0.0, 0.0, length]), *map(jnp.asarray, (radius, density, housing)))
+    moments = jax.jit(sampler._rod_with_sphere)(np.array([0.0, 0.0, length]), radius, density, housing)
     mass, centre = model.body_mass[1], model.body_ipos[1]
     assert moments[3, 3] == pytest.approx(mass)
     np.testing.assert_allclose(moments[:3, 3], mass * centre, rtol=1e-12)

@@ -25,7 +25,7 @@ def module(tmp_path, monkeypatch):
     text = (
         "import mimic, sys\nsys.modules['imports'].append(1)\nmimic.register('correspondence', 'own', lambda e, l: 0)\n"
     )
-    (tmp_path / "own_terms.py").write_text(text + "def matrix(expert, learner):\n    return 0\n")
+    (tmp_path / "own_terms.py").write_text(text)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(sys.modules, "imports", imports := [])  # type: ignore[arg-type]
@@ -85,24 +85,10 @@ def test_a_package_registers_by_its_entry_point(own_registry, monkeypatch, capsy
     assert capsys.readouterr().err == "warning: plugin 'broken' of broken_package failed: ImportError: no such thing\n"
 
 
-def test_a_config_imports_nothing_that_the_command_line_does_not_name(module):
-    with pytest.raises(ValueError, match="imported only if the command line names it: add --plugin own_terms:matrix"):
-        MetricConfig(correspondence="own_terms:matrix")
-    assert load_plugins(["run=own_terms:matrix", "+note=own_terms:matrix"]) == [
-        "run=own_terms:matrix",
-        "+note=own_terms:matrix",
-    ]
-    with pytest.raises(ValueError, match="imported only if"):
+def test_a_config_imports_nothing(module):
+    with pytest.raises(ValueError, match="correspondence: expected one of arc_length, .*, got 'own_terms:matrix'"):
         MetricConfig(correspondence="own_terms:matrix")
     assert module == []
-
-
-@pytest.mark.parametrize("arguments", [["env.metric.correspondence=own_terms:matrix"], ["--plugin=own_terms:matrix"]])
-def test_a_function_that_the_command_line_names_is_imported_when_it_is_used(module, own_registry, arguments):
-    load_plugins(arguments)
-    config = MetricConfig(correspondence="own_terms:matrix")
-    assert module == []
-    assert own_registry.find("correspondence", config.correspondence, "key")(None, None) == 0 and module == [1]
 
 
 def test_a_plugin_is_imported_and_named_for_other_processes(module, own_registry):
@@ -117,18 +103,26 @@ def test_a_plugin_is_imported_and_named_for_other_processes(module, own_registry
     [
         (["--plugin"], "--plugin: expected a module"),
         (["--plugin", "no_such_module"], "--plugin no_such_module failed: ModuleNotFoundError"),
-        (["env.metric.correspondence=no_such_module:f"], "'no_such_module:f' cannot be imported: ModuleNotFoundError"),
-        (["env.metric.correspondence=own"], "correspondence: expected one of"),
-        (["env.observation.terms=[x]"], "observation.terms: expected one of distance_gradient, got 'x'"),
-        (["env.reward.terms={x: 1}"], "reward.terms: expected one of self_collision, got 'x'"),
-        (["env.metric.link_distance=x"], "link_distance: expected one of none, got 'x'"),
-        (["env.demonstrations.source=x"], "demonstrations.source: expected one of none, got 'x'"),
         (["env=no_such_env"], "unknown env 'no_such_env'; valid are any_arm, bimanual, pair, panda3dof"),
         (["trainer=no_such_trainer"], "unknown trainer 'no_such_trainer'; valid are pose_mapper, ppo"),
     ],
 )
 def test_a_bad_name_is_one_line(rejected, arguments, message):
     assert re.search(message, rejected("train", *arguments))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"observation": {"terms": ["x"]}}, "observation.terms: expected one of distance_gradient, got 'x'"),
+        ({"reward": {"terms": {"x": 1}}}, "reward.terms: expected one of self_collision, got 'x'"),
+        ({"metric": {"link_distance": "x"}}, "link_distance: expected one of none, got 'x'"),
+        ({"demonstrations": {"source": "x"}}, "demonstrations.source: expected one of none, got 'x'"),
+    ],
+)
+def test_an_unknown_name_lists_the_valid_ones(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        mimic.make("planar4dof", **overrides)
 
 
 def test_a_registered_environment_is_a_preset():

@@ -16,7 +16,7 @@ from tests.helpers.array_cases import Batch, random_source
 
 TIMESTEP, SUBSTEPS = 0.005, 2
 COUNT = 40  # of arms: one full block of 32 and a partial one
-BY_ROWS, BY_COLUMNS = (LaunchConfig(block=32, warps=1, sample_axis=axis) for axis in (0, 1))
+LAUNCH = LaunchConfig(block=32, warps=1)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def batch():
 def test_the_kernel_equals_the_looped_form(x64, interpreted, batch):
     arms, qpos, qvel, torque, load = batch
     assert (np.asarray(arms.is_free).sum(axis=1) < MAX_JOINTS).any() and (arms.is_free[:, 0] == 0).any()
-    kernel = jax.jit(gpu_kernel(TIMESTEP, SUBSTEPS, launch=BY_COLUMNS))
+    kernel = jax.jit(gpu_kernel(TIMESTEP, SUBSTEPS, launch=LAUNCH))
     actual = kernel(jax.vmap(joint_numbers)(arms), *map(jnp.asarray, (qpos, qvel, torque)), np.stack(load, 1))
     expected = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(*batch)
     for values, reference in zip(actual, expected, strict=True):
@@ -53,7 +53,7 @@ def test_single_precision(interpreted, batch):
     with jax.enable_x64(True):
         expected = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(*batch)
     arms, qpos, qvel, torque, load = jax.tree.map(lambda x: np.asarray(x, np.float32), batch)
-    kernel = jax.jit(gpu_kernel(TIMESTEP, SUBSTEPS, launch=BY_ROWS))
+    kernel = jax.jit(gpu_kernel(TIMESTEP, SUBSTEPS, launch=LAUNCH))
     actual = kernel(jax.vmap(joint_numbers)(arms), qpos, qvel, torque, np.stack(load, 1))
     for values, reference in zip(actual, expected, strict=True):
         scale = 1 + np.abs(reference).max(axis=1, keepdims=True)

@@ -165,11 +165,9 @@ def test_in_double_precision_only_rounding_is_left(name, x64):
     np.testing.assert_allclose(state.qpos, expected[-1], rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow_for("panda7dof-joint_velocity-0")
-@pytest.mark.parametrize(
-    ("mode", "sample_axis"), [pytest.param("torque", 1, marks=pytest.mark.slow), ("joint_velocity", 0)]
-)
-def test_the_kernel_equals_the_arrays(arm_and_plant, mode, sample_axis, interpreted):
+@pytest.mark.slow_for("panda7dof-joint_velocity")
+@pytest.mark.parametrize("mode", [pytest.param("torque", marks=pytest.mark.slow), "joint_velocity"])
+def test_the_kernel_equals_the_arrays(arm_and_plant, mode, interpreted):
     """The GPU kernel, interpreted, on a batch with a partial block."""
     arm, plant = arm_and_plant
     count, joints, periods, rng = 40, arm.embodiment.num_joints, 3, np.random.default_rng(0)
@@ -180,7 +178,7 @@ def test_the_kernel_equals_the_arrays(arm_and_plant, mode, sample_axis, interpre
     state = LoopState(home + qpos, qvel, Reference(home + reference[0], *reference[1:]), torque)
     target = Target(*0.1 * rng.normal(size=(2, count, joints)) + np.array([0.0, 1.0])[:, None, None])
     arguments = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (jax.vmap(plant.episode)(batch), state, target))
-    kernel = gpu_kernel(mode, plant.constants, periods, LaunchConfig(block=32, warps=1, sample_axis=sample_axis))
+    kernel = gpu_kernel(mode, plant.constants, periods, LaunchConfig(block=32, warps=1))
     (actual,) = jax.jit(kernel)(*jax.vmap(flattened)(*arguments))
     expected = jax.jit(jax.vmap(make_inner_loop(mode, plant.constants, periods)))(*arguments)
     rows = np.moveaxis(np.asarray(actual).reshape(count, joints, 6), -1, 0)

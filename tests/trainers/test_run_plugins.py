@@ -74,7 +74,7 @@ def test_a_run_directory_imports_no_code(tmp_path, own_registry, monkeypatch):
     changed = text.replace("correspondence: arc_length", "correspondence: hostile:attack")
     assert changed != text
     (run_dir / "config.yaml").write_text(changed)
-    with pytest.raises(ValueError, match="add --plugin hostile:attack"):
+    with pytest.raises(ValueError, match="got 'hostile:attack'"):
         load_config(run_dir)
     (run_dir / PLUGINS).write_text('{"correspondence:attack": "hostile"}')
     with pytest.raises(ValueError, match="which is not loaded: install its package, or add --plugin hostile"):
