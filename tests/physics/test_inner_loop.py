@@ -133,6 +133,7 @@ def as_arrays(target: Target, dtype) -> Target:
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), target)
 
 
+@pytest.mark.slow_for(*(f"panda7dof-{mode}" for mode in MODES if mode != "joint_position"))
 @pytest.mark.parametrize("mode", MODES)
 def test_a_second_is_that_of_c_mujoco(arm_and_plant, mode):
     """With gravity, payload, friction, damping, PD control and errors of gain and angle; float32."""
@@ -153,6 +154,7 @@ def test_a_second_is_that_of_c_mujoco(arm_and_plant, mode):
     assert np.abs(np.stack(rows) - expected).max() < 1e-4  # rad, the target of the project
 
 
+@pytest.mark.slow_for("panda7dof")
 @pytest.mark.parametrize("name", NAMES)
 def test_in_double_precision_only_rounding_is_left(name, x64):
     arm, plant = make_arm_and_plant(name)
@@ -186,6 +188,7 @@ def test_the_kernel_equals_the_arrays(arm_and_plant, mode, interpreted):
         np.testing.assert_allclose(values, reference, rtol=2e-4, atol=2e-4)  # float32, sums in another order
 
 
+@pytest.mark.slow_for("panda7dof")
 def test_the_kernel_lowers_without_a_gpu(arm_and_plant):
     arm, plant = arm_and_plant
     home, episode = start_of(arm, np.float32), plant.episode(draw_for(arm.embodiment.num_joints))
@@ -194,6 +197,7 @@ def test_the_kernel_lowers_without_a_gpu(arm_and_plant):
     assert "triton" in gpu_program(jax.jit(jax.vmap(make_inner_loop("joint_velocity", plant.constants, 2))), *batch)
 
 
+@pytest.mark.slow_for("panda7dof")
 def test_stops_hold_an_arm_that_is_driven_into_them(arm_and_plant):
     """At the maximum torque; a stop is a spring, which gives way a little."""
     arm, plant = arm_and_plant

@@ -24,6 +24,9 @@ ARMS = {
 }
 
 
+ADVANCE = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))
+
+
 def random_states(joints, dtype: Any = np.float64):
     """Angles, velocities and torques of light motion: each [count, joints]."""
     rng = np.random.default_rng(joints)
@@ -43,7 +46,7 @@ def copies(arm, count=COUNT):
     return stack_arms([arm] * count)
 
 
-@pytest.mark.slow_for("panda-fused", "planar-mjx")
+@pytest.mark.slow_for("panda-fused", "panda5-fused", "planar-mjx")
 @pytest.mark.parametrize(
     ("name", "kind"), [("panda", "fused"), ("panda5", "fused"), ("planar", "fused"), ("planar", "mjx")]
 )
@@ -52,7 +55,7 @@ def test_steps_are_those_of_the_compiled_in_arm(x64, name, kind):
     arm = build_arm(ARMS[name])
     states = random_states(arm.model.nv)
     expected = jax.jit(jax.vmap(physics.make_advance(arm.model, TIMESTEP, SUBSTEPS, kind)))(*states, loads())
-    actual = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(copies(arm_arrays(arm)), *wide(states), loads())
+    actual = ADVANCE(copies(arm_arrays(arm)), *wide(states), loads())
     for values, reference in zip(actual, expected, strict=True):
         values, own = np.asarray(values), arm.model.nv
         assert_near(values[:, :own], np.asarray(reference), 1e-11)  # 1e-15 a step, amplified by the light wrist
@@ -71,8 +74,7 @@ def mixed():
 
 
 def test_a_batch_steps_as_each_of_its_arms(mixed):
-    advance = make_advance(TIMESTEP, 2)
-    together, alone = jax.jit(jax.vmap(advance))(*mixed), jax.jit(advance)
+    together, alone = ADVANCE(*mixed), jax.jit(make_advance(TIMESTEP, SUBSTEPS))
     for i in range(COUNT):
         for batched, single in zip(together, alone(*jax.tree.map(lambda x, i=i: x[i], mixed)), strict=True):
             np.testing.assert_allclose(batched[i], single, atol=1e-5)  # rounding of velocities up to 10 rad/s
@@ -80,7 +82,7 @@ def test_a_batch_steps_as_each_of_its_arms(mixed):
 
 def test_locked_joints_and_empty_slots_rest_at_their_angle(mixed):
     arms, start, *_ = mixed
-    qpos, qvel = jax.jit(jax.vmap(make_advance(TIMESTEP, SUBSTEPS)))(*mixed)
+    qpos, qvel = ADVANCE(*mixed)
     rests = np.asarray(arms.is_free) == 0
     assert rests.any() and np.all(np.isfinite(qpos)) and np.all(np.isfinite(qvel))
     np.testing.assert_array_equal(np.asarray(qpos)[rests], start[rests])
@@ -90,12 +92,10 @@ def test_locked_joints_and_empty_slots_rest_at_their_angle(mixed):
 
 def test_some_arguments_may_be_common_to_the_batch(mixed):
     arms, qpos, qvel, torque, _ = mixed
-    advance = make_advance(TIMESTEP, 2)
+    advance = make_advance(TIMESTEP, SUBSTEPS)
     arm, state = jax.tree.map(lambda x: x[0], arms), (qpos, qvel * arms.is_free[0])
     common = jax.jit(jax.vmap(advance, (None, 0, 0, None, None)))(arm, *state, torque[0], Load())
-    each = jax.jit(jax.vmap(advance))(
-        copies(arm), *state, np.tile(torque[:1], (COUNT, 1)), Load(*jnp.ones((2, COUNT), jnp.float32))
-    )
+    each = ADVANCE(copies(arm), *state, np.tile(torque[:1], (COUNT, 1)), Load(*jnp.ones((2, COUNT), jnp.float32)))
     for a, b in zip(common, each, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -144,6 +144,7 @@ def test_the_kernel_steps_as_the_plain_function_does(mixed, gpu_kernels):
             np.testing.assert_allclose(batched[i], single, atol=1e-5)  # rounding of velocities up to 10 rad/s
 
 
+@pytest.mark.slow  # the inner loop has the same kernel
 def test_the_kernel_lowers_without_a_gpu(mixed):
     batched = jax.jit(jax.vmap(make_advance(TIMESTEP, 2)))
     assert "triton" in gpu_program(batched, *mixed)
