@@ -145,3 +145,14 @@ def test_links_resolve(page):
 def test_pages_name_files_that_exist(page):
     for path in re.findall(r"`((?:mimic|tests|docs|benchmarks|examples)/[\w/.]+)`", page.read_text()):
         assert "NAME" in path or (REPOSITORY / path).exists(), path
+
+
+def test_pages_on_the_code_name_files_that_exist():
+    """Files of a row of CONTRIBUTING.md are in its folder, those of the architecture and the decisions in mimic/."""
+    rows = re.findall(r"^\| [^|]+ \| `(\S+/)` \| (.*) \|$", (REPOSITORY / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    assert len(rows) > 10
+    paths = [folder + name for folder, names in rows for name in re.findall(r"`([\w./]+)`", names)]
+    for page in ("architecture.md", "decisions.md"):
+        names = re.findall(r"`([a-z]\w*/[\w/]+\.\w+)`", (DOCS / "design" / page).read_text())
+        paths += [name if (REPOSITORY / name).exists() else f"mimic/{name}" for name in names]
+    assert not [path for path in paths if not (REPOSITORY / path).exists()]
