@@ -101,7 +101,7 @@ def test_the_nearest_head_is_taken(trained):
     qpos = jnp.asarray(poses(mapper, 5)[2])
     candidates = jax.jit(mapper.model.candidates)(mapper.params, qpos)
     distances = jax.jit(jax.vmap(mapper.model.distance, (None, 0)))(qpos, candidates)
-    np.testing.assert_allclose(mapper(qpos), candidates[int(np.argmin(distances))], atol=1e-6)
+    np.testing.assert_allclose(jax.jit(mapper)(qpos), candidates[int(np.argmin(distances))], atol=1e-6)
 
 
 @pytest.mark.slow

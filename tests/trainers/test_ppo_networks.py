@@ -23,8 +23,8 @@ def policy():
     statistics = running_statistics.init_state(specs.Array((SIZE,), jnp.dtype("float32")))
     params = jax.jit(networks.policy_network.init)(jax.random.PRNGKey(0))
     leaves, structure = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.PRNGKey(1), len(leaves))
-    noise = [0.3 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
+    rng = np.random.default_rng(1)
+    noise = [rng.normal(0, 0.3, leaf.shape).astype(np.float32) for leaf in leaves]
     apply = jax.jit(lambda params, observation: networks.policy_network.apply(statistics, params, observation))
     return apply, params, jax.tree.unflatten(structure, noise), networks
 

@@ -18,7 +18,6 @@ from mimic.trainers.pose_mapper.any_arm_trainer import AnyArmMapperTrainer
 from mimic.trainers.pose_mapper.trainer import PoseMapperTrainer
 from mimic.trainers.pretrained.files import PARAMETERS, read_params, write_network
 from mimic.trainers.pretrained.network import NETWORKS, TRAINERS, names_of_one_learner, pretrained_names, read_network
-from tests.helpers.repository import REPOSITORY
 
 MAX_BYTES = 3_000_000  # of all of them: the package stays small
 OBSERVATION = 12 * (7 + 7 + 4)  # of planar4dof: four vectors for each link; expert now and next, learner
@@ -195,38 +194,3 @@ def test_parameters_are_read_as_they_were_written(tmp_path, half):
     assert all(leaf.dtype == np.float32 for leaf in jax.tree.leaves(read))
     assert json.loads((tmp_path / REPORT).read_text())["source"] == {"gap": None}
     assert "runs/mine" not in (tmp_path / "config.yaml").read_text()
-
-
-def test_the_page_has_the_recorded_metrics():
-    lines = [f"| `{name}` | {policy_cells(mimic.load(name).report)} | {mapper_cells(name)} |" for name in POLICIES]
-    page = (REPOSITORY / "docs" / "pretrained.md").read_text()
-    for line in lines:
-        assert line in page, "docs/pretrained.md: expected the rows\n" + "\n".join(lines)
-
-
-def policy_cells(report):
-    gap, distances = report["optimality_gap"], ("mean_distance", "lower_bound", "copying_distance")
-    cells = " / ".join(f"{report[key]['held_out']:.3f}" for key in distances)
-    return f"{gap['train']:.1%} / {gap['held_out']:.1%} | {cells}"
-
-
-def mapper_cells(name):
-    report = mimic.load(name, "pose_mapper").report
-    distances = ("mean_distance", "optimal_distance", "copying_distance")
-    cells = " / ".join(f"{report[key]['held_out']:.3f}" for key in distances)
-    return f"{report['quality']['held_out']:.2%} | {cells}"
-
-
-def test_the_page_has_the_recorded_metrics_of_the_mapper_to_any_arm(any_arm):
-    page = (REPOSITORY / "docs" / "pretrained.md").read_text()
-    arms = any_arm.report["arms"]
-    groups = {}
-    for name, arm in arms.items():
-        group = "seen" if arm["seen"] else name.split()[0] if " " in name else "real"
-        groups.setdefault(group, []).append(arm)
-    assert [len(rows) for rows in groups.values()] == [21, 8, 7, 16]
-    for rows in groups.values():
-        quality = np.array([row["quality"] for row in rows])
-        guesses = np.array([row["quality_random_guesses"] for row in rows])
-        values = (f"{column.mean():.2%} / {column.max():.2%}" for column in (quality, guesses))
-        assert f"| {' | '.join(values)} |" in page
