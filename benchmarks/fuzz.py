@@ -45,7 +45,6 @@ from mimic.motions.formats.rosbag2 import read_rosbag2
 from mimic.motions.importing import import_demonstrations
 from mimic.motions.mocap.reading import read_motion
 from mimic.runs.checkpoints import load_training
-from mimic.trainers.memory import check_training_memory
 from mimic.trainers.run_config import load_config, new_run_dir
 from tests.helpers import episodes, valid_files
 from tests.helpers.valid_files import ARM, PARAMS
@@ -106,7 +105,7 @@ def read_command_lines(folder: Path, changed: Path) -> Any:
         configs.append(config)
         if command == "train":
             new_run_dir(config)
-            check_training_memory(config.resolve("cpu", 1))
+            config.resolve("cpu", 1)
         return lambda: 0
 
     code: Any = 0

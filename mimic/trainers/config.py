@@ -110,7 +110,6 @@ class PPOConfig(TrainerConfig):
 
     name: str = "ppo"
     preset: str = "auto"
-    # Sizes: `check_training_memory` rejects products that do not fit.
     num_timesteps: FromPreset[int] = number(None, at_least=1, at_most=10**12)  # a week on eight GPUs
     num_envs: FromPreset[int] = number(None, at_least=1, at_most=2**22)
     unroll_length: FromPreset[int] = number(None, at_least=1, at_most=10_000)
@@ -259,7 +258,6 @@ class PoseMapperConfig(TrainerConfig):
     preset: str = "auto"
     inputs: FromPreset[str] = _unset()
     outputs: FromPreset[str] = _unset()
-    # Sizes: `check_training_memory` rejects products that do not fit.
     heads: FromPreset[int] = number(None, at_least=1, at_most=1000)
     hidden_layers: FromPreset[list[int]] = number(None, at_least=1, at_most=2**16, entries=(1, 32))
     activation: FromPreset[str] = _unset()

@@ -11,7 +11,6 @@ from mimic.base import compat, registry
 from mimic.motions.demonstrations import Demonstrations
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.fine_tuning import with_one_learner
-from mimic.trainers.memory import check_training_memory
 from mimic.trainers.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -27,11 +26,10 @@ def make_trainer(config: TrainConfig, run_dir: Path | None) -> Trainer:
       run_dir: directory of an existing run, whose inputs are used; None for a new run.
 
     Raises:
-      ValueError: a config that cannot be trained, or not in the memory that there is.
+      ValueError: a config that cannot be trained.
     """
     name = config.trainer.name
     config = config.resolve(jax.default_backend(), jax.device_count())
-    check_training_memory(config)
     if name in _MAKERS:
         return _MAKERS[name](config, run_dir)
     compat.import_mjx()  # first, and quietly: the trainer may import brax
