@@ -1,8 +1,6 @@
 """Evaluates a policy of any arm: every arm of a report on the same held-out demonstrations, in one function."""
 
-import csv
 import functools
-import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +15,6 @@ from jaxtyping import Array, Float
 from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays, stack_arms
 from mimic.base.compilation import Background, compiled_quickly, on_host
-from mimic.base.files import write_atomically
 from mimic.envs.family import SEEN, UNSEEN
 from mimic.envs.many_arms import AnyArmEnv, any_arm_state
 from mimic.evaluation.evaluator import Controller
@@ -26,6 +23,7 @@ from mimic.metric.array_kinematics import link_states
 from mimic.metric.array_similarity import motion_similarity
 from mimic.metric.kinematics import LinkStates
 from mimic.retargeting.array_bound import closest_motion
+from mimic.runs.files import write_csv
 
 EVALUATED_DEMONSTRATIONS = 8  # of the held-out ones: with 29 arms, 232 rollouts and bounds
 _ROUNDING = 1e-5  # relative float32 error of a velocity at its limit
@@ -253,11 +251,7 @@ class ArmsEvaluator:
         """Writes the table as CSV, with the split and the name of each arm."""
         table = self.table(outcome)
         seen = ["seen"] * self._num_seen + ["unseen"] * (len(self.names) - self._num_seen)
-        text = io.StringIO(newline="")
-        writer = csv.writer(text)
-        writer.writerow(["arms", "arm", *table])
-        writer.writerows(zip(seen, self.names, *table.values(), strict=True))
-        write_atomically(out, text.getvalue())
+        write_csv(out, ["arms", "arm", *table], zip(seen, self.names, *table.values(), strict=True))
 
 
 def _total(values: np.ndarray, total: Callable[[np.ndarray], Any]) -> float:

@@ -1,11 +1,9 @@
 """Evaluates controllers: every demonstration once, relative to the kinematic bound and to holding the start pose."""
 
 import copy
-import csv
 import dataclasses
 import functools
-import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +16,6 @@ from jaxtyping import Array, Float
 
 from mimic.arms.pose_limits import pose_limits
 from mimic.base.compilation import Background, on_host
-from mimic.base.files import write_atomically
 from mimic.envs.imitation import ImitationEnv
 from mimic.evaluation.labels import SPLITS
 from mimic.evaluation.nearest_pose_controller import ControllerWithMemory
@@ -29,6 +26,7 @@ from mimic.motions.demonstrations import Demonstrations, concatenate
 from mimic.retargeting.kinematic_bound import closest_motion
 from mimic.retargeting.pose import shared_joints
 from mimic.retargeting.pose_baselines import baseline_poses
+from mimic.runs.files import write_csv
 
 Controller = Callable[[State], Array]  # (state of the environment) -> action
 Motions = Float[np.ndarray, "demonstrations time joints"]
@@ -219,22 +217,14 @@ class Evaluator:
             curves = distance[part].mean(axis=0), low, high, self.lower_bound[part].mean(axis=0)
             columns = *curves, self.hold_distance[part].mean(axis=0)
             rows += [(split, round(dt * (i + 1), 9), *values) for i, values in enumerate(zip(*columns, strict=True))]
-        _write_csv(out, ["split", "time", "mean", "low", "high", "bound", "hold"], rows)
+        write_csv(out, ["split", "time", "mean", "low", "high", "bound", "hold"], rows)
 
     def save_table(self, rollouts: Rollouts, out: Path) -> None:
         """Writes the table as CSV, with the split and the number of each demonstration."""
         table = {**self.table(rollouts), **self.similarity(np.asarray(rollouts.qpos))}
         numbers = [(split, i) for split, part in self.parts.items() for i in range(len(self.hold_distance[part]))]
         rows = [(*number, *row) for number, *row in zip(numbers, *table.values(), strict=True)]
-        _write_csv(out, ["split", "demonstration", *table], rows)
-
-
-def _write_csv(out: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(header)
-    writer.writerows(rows)
-    write_atomically(out, text.getvalue())
+        write_csv(out, ["split", "demonstration", *table], rows)
 
 
 class References(NamedTuple):

@@ -1,11 +1,13 @@
 """Files of a run directory: their names, and writing them atomically."""
 
 import contextlib
+import csv
+import io
 import json
 import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,15 @@ def written_atomically(folder: Path) -> Iterator[Path]:
 def write_report(run_dir: Path, report: Mapping[str, Any]) -> None:
     """Writes report.json; numbers that are not finite, as after a divergence, are null."""
     write_atomically(run_dir / REPORT, json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Writes a table."""
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(header)
+    writer.writerows(rows)
+    write_atomically(path, text.getvalue())
 
 
 def reported_steps(run_dir: Path, unit: str) -> int:

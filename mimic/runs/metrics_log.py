@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import io
 import os
 import socket
 import time
@@ -10,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mimic.base.files import read_text, write_atomically
-from mimic.runs.files import METRICS
+from mimic.base.files import read_text
+from mimic.runs.files import METRICS, write_csv
 
 
 class MetricsLog:
@@ -68,11 +67,7 @@ class MetricsLog:
         self._records.write(event.SerializeToString())
 
     def _rewrite(self, rows: list[dict[str, str]]) -> None:
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, self._columns)
-        writer.writeheader()
-        writer.writerows(rows)
-        write_atomically(self._path, text.getvalue())
+        write_csv(self._path, self._columns, ([row.get(name, "") for name in self._columns] for row in rows))
 
     def close(self) -> None:
         """Closes the file of events; what could not be written is dropped."""

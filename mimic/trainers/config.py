@@ -214,7 +214,7 @@ class PoseMapperConfig(TrainerConfig):
 
     If the environment draws its learner (`env.arms`), one network maps to all of these arms: see
     `mimic.trainers.pose_mapper.any_arm_model`. It has `width`, `layers`, `guesses` and `refinements`, and neither
-    `inputs`, `outputs`, `hidden_layers`, `activation` nor `dropout`. A training pose is then a pose of the expert and
+    `inputs`, `outputs`, `hidden_layers` nor `activation`. A training pose is then a pose of the expert and
     an arm, and with `env.arms.expert=drawn` the expert is another arm for each pose too.
 
     Attributes:
@@ -239,8 +239,6 @@ class PoseMapperConfig(TrainerConfig):
       learning_rate: Adam's learning rate after a warm-up.
       final_learning_rate: learning rate at the end as a fraction of learning_rate; the decay is a cosine. With 1 the
         rate is constant, without warm-up.
-      dropout: fraction of the hidden units of each layer that is dropped for a training pose, in [0, 1). The paper
-        mentions it against overfitting and does not use it; the presets do not either.
       weight_decay: AdamW's: each update subtracts the fraction learning_rate * weight_decay of every weight; biases do
         not decay. The presets for one learner do not use it.
       patience: training ends after this many evaluations without a smaller distance on the validation poses; 0 disables
@@ -272,7 +270,6 @@ class PoseMapperConfig(TrainerConfig):
     # Adam's steps are about as large as its rate, and the initial weights are below 1.
     learning_rate: FromPreset[float] = number(None, above=0.0, at_most=1.0)
     final_learning_rate: FromPreset[float] = number(None, at_least=0.0, at_most=1.0)
-    dropout: float = number(0.0, at_least=0.0, below=1.0)
     weight_decay: FromPreset[float] = number(None, at_least=0.0, at_most=1000.0)  # times the rate in an update
     patience: FromPreset[int] = number(None, at_least=0, at_most=1_000_000)
     target_quality: float = number(0.0, at_least=0.0, at_most=100.0)
@@ -298,8 +295,6 @@ class PoseMapperConfig(TrainerConfig):
         for field in _MAPPER_FIELDS_OF[other]:
             if getattr(self, field) is not None:
                 raise ValueError(f"trainer.{field}: expected none for a mapper {kind}, got {getattr(self, field)}")
-        if is_of_many and self.dropout:
-            raise ValueError(f"trainer.dropout: expected 0 for a mapper {kind}, got {self.dropout}")
         config = _filled_in(self, MAPPER_PRESETS[name], preset=name)
         config._check(is_of_many)
         return config

@@ -24,23 +24,45 @@ class TrainingProgress:
     """A bar with metrics, steps/s, elapsed and remaining time; without a terminal, one line for each evaluation."""
 
     def __init__(self, console: Console, total_steps: int, done_steps: int = 0):
-        self._display = _Display(console, "training", total_steps, done_steps)
+        self._console, self._total, self._done, self._status = console, total_steps, done_steps, "compiling"
+        self._began = self._updated = time.monotonic()
+        self._left: float | None = None
+        self._live: Live | None = None
 
     def __enter__(self) -> "TrainingProgress":
-        self._display.start()
+        if is_animated(self._console):
+            self._live = Live(get_renderable=self._lines, console=self._console, refresh_per_second=_REFRESHES)
+            self._live.start()
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self._display.stop()
+        if self._live is not None:
+            self._live.stop()
 
     def update(self, step: int, status: str, steps_per_second: float | None) -> None:
         """Shows the state after an evaluation at a step."""
-        display, left = self._display, None
+        self._left = None
         if steps_per_second:
             status += f"{_GAP}{steps_per_second:,.0f} steps/s"
-            left = max(display.total - step, 0) / steps_per_second
-        display.update(step, status, left)
-        display.print_line(f"step {step:>11,}")
+            self._left = max(self._total - step, 0) / steps_per_second
+        self._done, self._status, self._updated = min(step, self._total), status, time.monotonic()
+        if self._live is not None:
+            self._live.refresh()
+        else:
+            line = _GAP.join([f"step {step:>11,}", self._status, *self._times()])
+            self._console.print(line, soft_wrap=True, highlight=False)
+
+    def _times(self) -> list[str]:
+        now = time.monotonic()
+        left = [] if self._left is None else [f"left {_duration(self._left - (now - self._updated))}"]
+        return [f"elapsed {_duration(now - self._began)}", *left]
+
+    def _lines(self) -> Group:
+        bar = Table.grid()
+        fraction = self._done / max(self._total, 1)
+        bar.add_row(ProgressBar(total=1.0, completed=fraction, width=min(self._console.width, _LONGEST_BAR)))
+        texts = ["training", f"{self._done:,}/{self._total:,}", *self._times(), self._status]
+        return Group(bar, Text(_GAP.join(texts)))
 
 
 def is_animated(console: Console) -> bool:
@@ -50,53 +72,6 @@ def is_animated(console: Console) -> bool:
     """
     is_terminal = console.is_terminal and not console.is_dumb_terminal and console.file.isatty()
     return is_terminal and "JPY_PARENT_PID" not in os.environ
-
-
-class _Display:
-    """The state of a long computation, as a bar where `is_animated`."""
-
-    def __init__(self, console: Console, label: str, total: int, done: int = 0):
-        self.total = total
-        self._console, self._label, self._done, self._status = console, label, done, "compiling"
-        self._began = self._updated = time.monotonic()
-        self._left: float | None = None
-        self._live: Live | None = None
-
-    def start(self) -> None:
-        if self._live is None and is_animated(self._console):
-            self._live = Live(get_renderable=self._lines, console=self._console, refresh_per_second=_REFRESHES)
-            self._live.start()
-
-    def stop(self) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    @property
-    def elapsed(self) -> float:
-        """Seconds since the start."""
-        return time.monotonic() - self._began
-
-    def update(self, done: int, status: str, left: float | None) -> None:
-        self._done, self._status, self._left, self._updated = min(done, self.total), status, left, time.monotonic()
-        if self._live is not None:
-            self._live.refresh()
-
-    def print_line(self, start: str) -> None:
-        """Prints the state as one line that begins with `start`, where there is no bar."""
-        if self._live is None:
-            line = _GAP.join([start, self._status, *self._times()])
-            self._console.print(line, soft_wrap=True, highlight=False)
-
-    def _times(self) -> list[str]:
-        left = [] if self._left is None else [self._left - (time.monotonic() - self._updated)]
-        return [f"elapsed {_duration(self.elapsed)}", *(f"left {_duration(seconds)}" for seconds in left)]
-
-    def _lines(self) -> Group:
-        fraction = self._done / max(self.total, 1)
-        bar = Table.grid()
-        bar.add_row(ProgressBar(total=1.0, completed=fraction, width=min(self._console.width, _LONGEST_BAR)))
-        texts = [self._label, f"{self._done:,}/{self.total:,}", *self._times(), self._status]
-        return Group(bar, Text(_GAP.join(texts)))
 
 
 def _duration(seconds: float) -> str:

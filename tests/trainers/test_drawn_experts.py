@@ -115,7 +115,7 @@ def test_each_sample_has_an_expert_and_a_learner_of_its_own(runs, mapper):
         keys.clear()
         params = jax.eval_shape(model.init, jax.random.key(0))
         distances = any_arm_objective(model, sampler).distances
-        shape = jax.eval_shape(distances, params, jax.random.split(jax.random.key(1), 3), None).shape
+        shape = jax.eval_shape(distances, params, jax.random.split(jax.random.key(1), 3)).shape
         assert shape == (3, model.heads) and len(set(map(id, keys))) == count
 
 
@@ -202,5 +202,5 @@ def test_training_reduces_the_loss():
     run = jax.jit(training._training_epoch(objective, settings, optimiser, 1))
     params, keys = objective.init(jax.random.key(0)), objective.draw(jax.random.key(1), 256)
     (trained, _), _ = run((params, optimiser.init(params)), 0, 0, objective.draw(jax.random.key(2), 6400))
-    before, after = (float(jax.jit(objective.distances)(x, keys, None).min(axis=1).mean()) for x in (params, trained))
+    before, after = (float(jax.jit(objective.distances)(x, keys).min(axis=1).mean()) for x in (params, trained))
     assert after < 3 / 4 * before

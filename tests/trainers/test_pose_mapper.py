@@ -185,42 +185,9 @@ def test_weights_decay_and_biases_do_not():
         np.testing.assert_allclose(value, expected, rtol=1e-6)  # float32
 
 
-def test_dropout_is_for_training_only():
-    models = [
-        make_model(env_config("planar4dof", **SHORT_ARMS), PoseMapperConfig(**SMALL, dropout=dropout).resolve())
-        for dropout in (0.0, 0.5)
-    ]
-    whole, dropping = models
-    params, qpos = jax.jit(whole.init)(jax.random.key(0)), jnp.full(3, 0.3)
-    candidates = {model: jax.jit(model.candidates) for model in models}
-    np.testing.assert_array_equal(candidates[dropping](params, qpos), candidates[whole](params, qpos))  # evaluation
-    key, other = jax.random.split(jax.random.key(1))
-    trained = [np.asarray(candidates[dropping](params, qpos, dropout_key=k)) for k in (key, key, other)]
-    np.testing.assert_array_equal(trained[0], trained[1])
-    assert not np.allclose(trained[0], trained[2])
-    assert not np.allclose(trained[0], candidates[dropping](params, qpos))
-    np.testing.assert_allclose(  # none at 0
-        candidates[whole](params, qpos, dropout_key=key), candidates[whole](params, qpos), atol=1e-6
-    )
-
-
-@pytest.mark.slow
-def test_a_regularised_run_differs_in_training_and_repeats_its_report(tmp_path):
-    plain, regularised = (
-        train(tmp_path / name, **SHORT, **settings)
-        for name, settings in (("plain", {}), ("regularised", {"dropout": 0.3, "weight_decay": 0.1}))
-    )
-    assert plain["quality"] != regularised["quality"]
-    job = PoseMapperTrainer(run_config(tmp_path, dropout=0.3, **SHORT).resolve())
-    mapper = mimic.PoseMapper.load(tmp_path / "regularised")
-    assert job.metrics(job.evaluate(mapper.params))["quality"] == pytest.approx(regularised["quality"], rel=1e-5)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"dropout": 1.0}, r"trainer.dropout: expected a number of at least 0 and below 1, got 1.0"),
-        ({"dropout": float("nan")}, "trainer.dropout"),
         ({"weight_decay": -0.1}, "trainer.weight_decay: expected a number from 0 to 1000, got -0.1"),
         ({"weight_decay": float("inf")}, "trainer.weight_decay"),
     ],

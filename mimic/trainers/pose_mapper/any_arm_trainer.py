@@ -1,8 +1,6 @@
 """`trainer=pose_mapper` where the environment draws its learner: trains one mapper to any arm."""
 
-import csv
 import functools
-import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,9 +11,9 @@ from jaxtyping import Array
 
 from mimic.arms.arrays import ArmArrays, stack_arms
 from mimic.base.compilation import Background, compiling
-from mimic.base.files import write_atomically
 from mimic.envs.family import SEEN, UNSEEN, arm_sampler, report_arms
 from mimic.runs.checkpoints import Checkpoint
+from mimic.runs.files import write_csv
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig, TrainConfig
 from mimic.trainers.pose_mapper import training
@@ -294,12 +292,6 @@ def _row(metrics: Mapping[str, Any], label: str, key: str, form: str) -> Row:
 
 def _write_table(file: Path, table: Mapping[str, Mapping[str, Any]]) -> None:
     """Writes one row for each arm."""
-    rows = [
-        {"arms": SEEN if row["seen"] else UNSEEN, "arm": name, **{key: row[key] for key in row if key != "seen"}}
-        for name, row in table.items()
-    ]
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, rows[0])
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomically(file, text.getvalue())
+    keys = [key for key in next(iter(table.values())) if key != "seen"]
+    rows = [(SEEN if row["seen"] else UNSEEN, name, *(row[key] for key in keys)) for name, row in table.items()]
+    write_csv(file, ["arms", "arm", *keys], rows)

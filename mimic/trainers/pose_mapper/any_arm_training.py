@@ -21,9 +21,7 @@ def any_arm_objective(model: AnyArmMapperModel, sampler: Sampler) -> Objective:
     """
     draw_expert: Sampler = sampler if model.expert_is_drawn else lambda _: model.expert
 
-    def distances(params: Params, keys: Array, dropout_key: Array | None) -> Float[Array, "samples heads"]:
-        del dropout_key  # the network has none
-
+    def distances(params: Params, keys: Array) -> Float[Array, "samples heads"]:
         def of_sample(key: Array) -> Float[Array, " heads"]:
             key_learner, key_pose, key_expert = jax.random.split(key, 3)
             learner, expert_arm = sampler(key_learner), draw_expert(key_expert)

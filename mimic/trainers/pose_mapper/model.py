@@ -36,18 +36,16 @@ _LIMIT_TOLERANCE = 1e-4  # rad: rounding to float32 moves a pose over its limit 
 
 
 class _Network(nn.Module):
-    """A fully connected network, with dropout after each hidden layer."""
+    """A fully connected network."""
 
     hidden_layers: tuple[int, ...]
     outputs: int
     activation: str
-    dropout: float
 
     @nn.compact
-    def __call__(self, x: Array, *, training: bool = False) -> Array:
+    def __call__(self, x: Array) -> Array:
         for width in self.hidden_layers:
             x = _ACTIVATIONS[self.activation](nn.Dense(width)(x))
-            x = nn.Dropout(self.dropout, deterministic=not training)(x)
         return nn.Dense(self.outputs)(x)
 
 
@@ -71,7 +69,7 @@ class MapperModel:
     def _network(self) -> _Network:
         outputs = self.config.heads * self.learner.num_joints * 2
         hidden_layers, activation = tuple(self.config.hidden_layers), self.config.activation
-        return _Network(hidden_layers, outputs, activation, self.config.dropout)
+        return _Network(hidden_layers, outputs, activation)
 
     @functools.cached_property
     def built_metric(self) -> Metric:
@@ -95,20 +93,15 @@ class MapperModel:
         """Random parameters."""
         return self._network.init(key, self._inputs(jnp.zeros(self.expert.num_joints)))
 
-    def candidates(
-        self, params: Params, qpos: Float[Array, " joints"], *, dropout_key: Array | None = None
-    ) -> Float[Array, "heads learner_joints"]:
+    def candidates(self, params: Params, qpos: Float[Array, " joints"]) -> Float[Array, "heads learner_joints"]:
         """The poses that the heads propose.
 
         Args:
           params: parameters of the network.
           qpos: the expert's pose [rad].
-          dropout_key: random key of the dropout in training; no dropout where None.
         """
         config = self.config
-        training = dropout_key is not None
-        rngs = {"dropout": dropout_key} if training else None
-        outputs = self._network.apply(params, self._inputs(qpos), training=training, rngs=rngs)
+        outputs = self._network.apply(params, self._inputs(qpos))
         outputs = jnp.reshape(outputs, (config.heads, self.learner.num_joints, 2))  # type: ignore[arg-type] - flax annotates all that apply may return
         lower, upper = (jnp.asarray(bound, qpos.dtype) for bound in np.asarray(self.learner.joint_range).T)
         within = (lower + upper) / 2 + (upper - lower) / 2 * jnp.tanh(outputs[..., 0])

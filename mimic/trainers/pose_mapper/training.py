@@ -38,12 +38,12 @@ class Objective:
     Attributes:
       init: random key -> parameters.
       draw: (random key, count) -> samples.
-      distances: (parameters, samples, random key of the dropout or None) -> distances [samples, heads].
+      distances: (parameters, samples) -> distances [samples, heads].
     """
 
     init: Callable[[Array], Params]
     draw: Callable[[Array, int], Samples]
-    distances: Callable[[Params, Samples, Array | None], Float[Array, "samples heads"]]
+    distances: Callable[[Params, Samples], Float[Array, "samples heads"]]
 
     def samples_shape(self, count: int) -> Any:
         """Shapes of `count` samples."""
@@ -161,7 +161,7 @@ def _compile(
         return params, schedules_from(optimiser.init(params), done_updates)
 
     def validation_distance(params: Params, samples: Samples) -> Array:
-        return objective.distances(params, samples, None).min(axis=1).mean()
+        return objective.distances(params, samples).min(axis=1).mean()
 
     state = jax.eval_shape(start, seed, initial, 0)
     training, validation = map(objective.samples_shape, (config.samples, config.validation_poses))
@@ -201,27 +201,25 @@ def _training_epoch(
     """
     count, batch_size = config.samples, config.batch_size
 
-    def loss(params: Params, samples: Samples, dropout_key: Array | None) -> Array:
-        distances = objective.distances(params, samples, dropout_key)
+    def loss(params: Params, samples: Samples) -> Array:
+        distances = objective.distances(params, samples)
         nearest = distances.min(axis=1).mean()
         return (1 - _ALL_HEADS) * nearest + _ALL_HEADS * distances.mean()
 
-    def update(carry: Any, batch: tuple[Samples, Array]) -> tuple[Any, Array]:
+    def update(carry: Any, samples: Samples) -> tuple[Any, Array]:
         params, state = carry
-        samples, key = batch
-        value, gradient = jax.value_and_grad(loss)(params, samples, key if config.dropout else None)
+        value, gradient = jax.value_and_grad(loss)(params, samples)
         change, state = optimiser.update(gradient, state, params)
         return (optax.apply_updates(params, change), state), value
 
     def run(carry: Any, seed: Any, done: Any, training: Samples) -> tuple[Any, Array]:
-        _, key_epochs, key_dropout = _keys(seed)
+        key_epochs = _keys(seed)[1]
 
         def epoch(carry: Any, number: Array) -> tuple[Any, Array]:
             key = jax.random.fold_in(key_epochs, number)
             samples = objective.draw(key, count) if config.fresh else _shuffled(key, training, count)
             batches = jax.tree.map(lambda x: x.reshape(-1, batch_size, *x.shape[1:]), samples)
-            keys = jax.random.split(jax.random.fold_in(key_dropout, number), count // batch_size)
-            carry, losses = jax.lax.scan(update, carry, (batches, keys))
+            carry, losses = jax.lax.scan(update, carry, batches)
             return carry, losses.mean()
 
         carry, losses = jax.lax.scan(epoch, carry, done + jnp.arange(epochs))
@@ -236,7 +234,7 @@ def _shuffled(key: Array, samples: Samples, count: int) -> Samples:
 
 
 def _keys(seed: Any) -> Array:
-    """Random keys of the network, of the epochs, and of dropout."""
+    """Random keys of the network and of the epochs; a third one is unused, so that the numbers stay those of before."""
     return jax.random.split(jax.random.key(seed), 3)
 
 
@@ -256,14 +254,11 @@ def poses_shape(model: MapperModel, count: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((count, model.expert.num_joints), jnp.float32)
 
 
-def _distances(
-    model: MapperModel, params: Params, poses: Poses, dropout_key: Array | None = None
-) -> Float[Array, "poses heads"]:
-    """Distances of the poses that the heads propose; with a key, dropout is independent for each pose."""
+def _distances(model: MapperModel, params: Params, poses: Poses) -> Float[Array, "poses heads"]:
+    """Distances of the poses that the heads propose."""
 
-    def head_distances(qpos: Array, key: Array | None) -> Array:
-        candidates = model.candidates(params, qpos, dropout_key=key)
+    def head_distances(qpos: Array) -> Array:
+        candidates = model.candidates(params, qpos)
         return jax.vmap(lambda candidate: model.distance(qpos, candidate))(candidates)
 
-    keys = None if dropout_key is None else jax.random.split(dropout_key, len(poses))
-    return jax.vmap(head_distances, (0, None if keys is None else 0))(poses, keys)
+    return jax.vmap(head_distances)(poses)
