@@ -1,6 +1,6 @@
 """Writes the tables of the pages that stem from results files.
 
-    python -m benchmarks.tables            # rewrites the tables between their marks in docs/
+    python -m benchmarks.tables            # rewrites the tables between their marks in README.md and docs/
     python -m benchmarks.tables --check    # changes nothing; exit code 1 where a page and its files differ
 
 A table stands between two marks: `<!-- table NAME: FILE.json ... -->` and `<!-- end -->`. NAME is a
@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="exit code 1 where a page and its files differ")
     check = parser.parse_args().check
     differing = []
-    for page in sorted((ROOT / "docs").rglob("*.md")):
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
         text = page.read_text()
         if (made := with_tables(text)) != text:
             differing.append(str(page.relative_to(ROOT)))

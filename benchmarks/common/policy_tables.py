@@ -112,6 +112,20 @@ def simulations(study: Results, preset: Results) -> list[Cells]:
     return rows
 
 
+def overview(study: Results, preset: Results, pose: Results) -> list[Cells]:
+    """The table of the README."""
+    runs = [preset_runs(preset, env) for env in ENVIRONMENTS]
+    ppo = [split_pair({split: mean(reports, split) for split in ("train", "held_out")}) for reports in runs]
+    exact = [split_pair(study["results"][f"{env}--computed_torque"][0]["optimality_gap"]) for env in ENVIRONMENTS]
+    rates = {result["pair"]: large(result["methods"]["newton"]["poses_per_second"]) for result in pose["results"]}
+    return [
+        ("", "7 joints", "4 joints", "3 joints"),
+        ("gap of PPO on training / held-out demonstrations [%], three seeds", *ppo),
+        ("the same for computed torque, with the exact model and the whole motion known", *exact),
+        ("poses at their optimum per second", rates["panda 7->7"], rates["panda 7->4"], ""),
+    ]
+
+
 def policy_similarity(preset: Results) -> list[Cells]:
     forms = (".3f", ".1f", ".3f", ".3f", ".1f")
     names = {
