@@ -27,6 +27,7 @@ from benchmarks.common.cut_links import cut_alike
 from benchmarks.common.parser import make_parser
 from benchmarks.common.record import Row, print_table, write_results
 from benchmarks.peers.frame_matching import match_frames
+from benchmarks.peers.segment_alignment import Landmarks, align_segments
 from benchmarks.similarity import other_arms
 from mimic.arms.arm import ArmConfig
 from mimic.commands.capture import fixed_fraction, read_arm
@@ -38,7 +39,6 @@ from mimic.motions.mocap.arms import SIDES
 from mimic.motions.mocap.ball_chain import ball_chain_motion, ball_chain_xml, zero_frames
 from mimic.motions.mocap.link_motion import TRUNK, LinkMotion
 from mimic.retargeting.pose_baselines import hand_ik, hold_home
-from mimic.retargeting.segment_alignment import Landmarks, align_segments
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.pose_mapper.model import MapperModel

@@ -11,9 +11,9 @@ from typing import Any
 import mink
 import numpy as np
 
+from benchmarks.peers.segment_alignment import Landmarks, landmarks, part_directions
 from mimic.arms.embodiment import Embodiment
-from mimic.retargeting.pose_baselines import kinematic_model, smallest_rotation
-from mimic.retargeting.segment_alignment import Landmarks, Poses, landmarks, part_directions
+from mimic.retargeting.pose_baselines import Poses, kinematic_model, smallest_rotation
 
 _FRAMES = ("elbow", "wrist", "hand")
 # Costs (position, orientation) of each frame in each stage, per chain length and rad: of orientations of 0.03, 0.1, 0.3

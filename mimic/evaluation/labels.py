@@ -16,7 +16,6 @@ SIMILARITY_NAMES = {  # display names that differ from their keys
     "nearest_poses": "nearest poses (metric)",
     "copy_joints": "copying shared joints",
     "hand_ik": "IK of the scaled hand",
-    "align_segments": "aligning segments",
     "hold_home": "holding start pose",
     "controller": "without learning",
 }

@@ -8,12 +8,14 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.arms.pose_limits import pose_limits
 from mimic.metric.similarity import centre_line_table
 from mimic.retargeting.pose import checked_poses, shared_joints
-from mimic.retargeting.segment_alignment import Poses, align_segments
+
+Poses = Float[np.ndarray, "*batch time joints"]
 
 IK_EVERY = 5  # inverse kinematics solves every fifth sample of a motion; a solve takes 0.1 ms
 _TRACKING_STEPS = 6  # from the solution of the previous solved sample
@@ -96,7 +98,6 @@ def hand_ik(expert: Embodiment, learner: Embodiment, qpos: Poses, *, every: int 
 BASELINES: dict[str, Callable[[Embodiment, Embodiment, Poses], Poses | None]] = {
     "copy_joints": copy_joints,
     "hand_ik": hand_ik,
-    "align_segments": align_segments,
     "hold_home": hold_home,
 }
 

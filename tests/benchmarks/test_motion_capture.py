@@ -3,8 +3,8 @@
 import numpy as np
 
 from benchmarks.peers.frame_matching import match_frames
+from benchmarks.peers.segment_alignment import landmarks, part_directions
 from mimic.arms.embodiment import panda
-from mimic.retargeting.segment_alignment import landmarks, part_directions
 
 
 def test_matched_frames_have_the_directions_of_the_parts():

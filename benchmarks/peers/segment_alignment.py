@@ -11,11 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mimic.arms.embodiment import Embodiment
-from mimic.arms.pose_limits import pose_limits
-from mimic.metric.kinematics import joint_frames
-from mimic.retargeting.pose import checked_poses, wrap_angles
-from mimic.retargeting.subproblems import (
+from benchmarks.peers.subproblems import (
     PARALLEL,
     bend_to_angle,
     dot,
@@ -25,8 +21,11 @@ from mimic.retargeting.subproblems import (
     rotated,
     unit,
 )
-
-Poses = Float[np.ndarray, "*batch time joints"]
+from mimic.arms.embodiment import Embodiment
+from mimic.arms.pose_limits import pose_limits
+from mimic.metric.kinematics import joint_frames
+from mimic.retargeting.pose import checked_poses, wrap_angles
+from mimic.retargeting.pose_baselines import BASELINES, Poses
 
 _PARTS = 3  # upper arm, forearm, hand
 _SWEEPS = 3  # more than one for joints whose axis does not pass through the start of their part
@@ -312,3 +311,6 @@ def _are_parallel(placement: Placement, joint: int, other: int) -> bool:
 def _wrap(arm: Embodiment, angles: np.ndarray, joints: list[int]) -> np.ndarray:
     """Angles within pi of the middle of each joint's range."""
     return wrap_angles(angles, centre=np.asarray(arm.joint_range, float)[joints].mean(axis=1))
+
+
+ALL_BASELINES = {**BASELINES, "align_segments": align_segments}
