@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, masked_arrays, stack_arms
+from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, masked_arrays
 from mimic.metric.array_kinematics import link_states
 from mimic.physics.dynamics import torque_of_arm
 from tests.helpers import random_arms
@@ -101,24 +101,11 @@ def test_planar_arms_have_no_offsets_but_their_lengths():
     np.testing.assert_allclose(arrays.second_moment[:, 3:], 0, atol=1e-15)
 
 
-def test_stacked_arms_keep_their_numbers():
-    arms = [arm_arrays(build_arm(ArmConfig(model="planar", link_lengths=[length]))) for length in (0.1, 0.2)]
-    stacked = stack_arms(arms)
-    assert all(x.shape[0] == 2 for x in jax.tree.leaves(stacked))
-    np.testing.assert_array_equal(stacked.chain_length, [0.1, 0.2])
-    jax.tree.map(np.testing.assert_array_equal, jax.tree.map(lambda x: x[1], stacked), arms[1])
-
-
 def test_locking_keeps_the_joints_that_are_locked():
     arm = arm_arrays(build_arm(ArmConfig()), free=[True] * 6 + [False])
     locked = lock_joints(arm, np.arange(MAX_JOINTS) == 2)
     assert locked.is_free.tolist() == [1, 1, 0, 1, 1, 1, 0, 0]
     assert arm.is_free.tolist() == [1, 1, 1, 1, 1, 1, 0, 0]  # not changed in place
-
-
-def test_astype_keeps_integers():
-    arm = arm_arrays(build_arm(ArmConfig())).astype(np.float32)
-    assert {x.dtype for x in jax.tree.leaves(arm)} == {np.dtype(np.float32), np.dtype(np.int32)}
 
 
 def test_a_tree_is_rejected():
@@ -130,10 +117,6 @@ def test_too_many_joints_are_rejected():
     arm = build_arm(ArmConfig(model="planar", link_lengths=[0.1] * 9))
     with pytest.raises(ValueError, match=r"^planar9: expected at most 8 joints and 12 links, got 9 and 9$"):
         arm_arrays(arm)
-
-
-def test_as_many_joints_as_slots_are_accepted():
-    assert arm_arrays(build_arm(ArmConfig(model="planar", link_lengths=[0.1] * MAX_JOINTS))).is_free.all()
 
 
 def test_locked_joints_of_a_config_keep_their_slots_and_angles():

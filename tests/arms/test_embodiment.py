@@ -129,11 +129,6 @@ def test_segments_follow_a_joint_that_is_locked_at_an_angle():
         np.testing.assert_allclose(actual.points, expected.points, atol=1e-6)  # float32
 
 
-def test_an_unknown_option_for_links_is_rejected(unchecked):
-    with pytest.raises(ValueError, match="links: expected one of kept, merged, got 'none'"):
-        panda(locked=3, links="none")  # pyright: ignore[reportArgumentType]
-
-
 def test_locking_the_first_joint_leaves_a_link_on_the_base():
     arm = panda(locked="joint1")
     assert arm.link_joint == (-1, 0, 1, 2, 3, 4, 5)
@@ -202,18 +197,12 @@ def test_planar_arm_rejects_a_frame_off_the_link(frame_at):
 LOCKED = [
     (["joint8"], "locked: unknown joint 'joint8'; valid are joint1, .*, joint7 or 1 to 7"),
     ([0], "locked: unknown joint 0; valid are "),
-    ([8], "locked: unknown joint 8; valid are "),
-    ([-1], "locked: unknown joint -1; valid are "),
     ([2.5], "locked: unknown joint 2.5; valid are "),
-    ([True], "locked: unknown joint True; valid are "),
-    ([None], "locked: unknown joint None; valid are "),
     ("Joint3", "locked: unknown joint 'Joint3'; valid are "),
     (["joint3", "joint3"], "locked: joint 'joint3' is named twice"),
-    (["joint3", 3], "locked: joint 'joint3' is named twice"),
     ({"joint3": 0.1, 3: 0.1}, "locked: joint 'joint3' is named twice"),
     ({"joint3": np.nan}, "locked: expected a finite angle .* for joint 'joint3', got nan"),
     ({"joint3": "bent"}, "locked: expected a finite angle .* for joint 'joint3', got 'bent'"),
-    ({"joint3": None}, "locked: expected a finite angle .* for joint 'joint3', got None"),
     (range(1, 8), "locked: all 7 joints are locked; at least one must stay free"),
 ]
 
@@ -223,8 +212,3 @@ def test_bad_locked_joints_are_rejected(locked, message):
     with pytest.raises(ValueError, match=f"^{message}") as error:
         load_mjcf(panda_path(), locked=locked)
     assert "\n" not in str(error.value)
-
-
-def test_unknown_limits_are_rejected():
-    with pytest.raises(ValueError, match="^limits: expected one of none, hardware, got 'soft'$"):
-        panda(limits="soft")  # pyright: ignore[reportArgumentType]

@@ -6,12 +6,11 @@ import subprocess
 from unittest.mock import Mock
 
 import mujoco
-import numpy as np
 import pytest
 
 import mimic
 from mimic.arms import compile_check, model_files
-from mimic.arms.compile_check import MAX_VELOCITY, check_in_process, check_magnitudes
+from mimic.arms.compile_check import MAX_VELOCITY, check_in_process
 from mimic.arms.model_files import read_model
 from mimic.arms.model_source import MAX_ELEMENTS, read_source
 from tests.helpers import original_model
@@ -105,26 +104,18 @@ def mesh(name):
 MODEL = '<asset><model name="z" file="{}"/></asset>'
 PARTS = {
     "a mesh outside": (mesh("../../secret.obj"), "needs '../../secret.obj', .* outside"),
-    "an entity": (mesh("..&#47;../secret.obj"), "needs '../../secret.obj', .* outside"),
-    "an absolute mesh": (mesh("/etc/hosts"), "needs '/etc/hosts', .* outside"),
     "a link": (mesh("link.obj"), "needs 'link.obj', .* outside"),
     "a texture": ('<asset><texture type="2d" file="/etc/hosts"/></asset>', "needs '/etc/hosts', .* outside"),
-    "a cube": ('<asset><texture type="cube" fileback="/etc/hosts"/></asset>', "needs '/etc/hosts', .* outside"),
-    "a height field": ('<asset><hfield file="../../secret.obj"/></asset>', "needs '../../secret.obj', .* outside"),
     "a mesh folder": (f'<compiler meshdir="../../x"/>{mesh("a.obj")}', "needs 'a.obj', .* outside"),
     "a mesh that is a pipe": (mesh("pipe"), "'pipe', which cannot be read: expected a regular file, got a named pipe"),
     "an include that is a pipe": (PLAIN.replace("{}", "pipe"), "'pipe', .* got a named pipe"),
-    "a folder": (PLAIN.replace("{}", "."), "'.', .* got a folder"),
     "a loop of links": (PLAIN.replace("{}", "loop.xml"), "needs 'loop.xml', which cannot be read"),
-    "a long name": (PLAIN.replace("{}", "x" * 5000), "which (is outside|does not exist|cannot be read)"),
     "an include of itself": (PLAIN.replace("{}", "arm.xml"), "includes 'arm.xml' twice"),
     "a model that attaches itself": (MODEL.replace("{}", "arm.xml"), "attaches 'arm.xml', which contains it"),
     "a model outside": (MODEL.replace("{}", "../beside.xml"), "needs '../beside.xml', .* outside"),
     "an include of an attached model": (MODEL.replace("{}", "other.xml"), "needs '../beside.xml', .* outside"),
     "levels": ("<body>" * 20_000 + "</body>" * 20_000, "too many levels"),
     "elements": ("<a/>" * (MAX_ELEMENTS + 1), "too many XML elements"),
-    "includes": ("<include " * 40_000, "not well-formed"),
-    "comments": ("<!--" * 100_000, "MuJoCo can read: "),
 }
 
 
@@ -167,14 +158,6 @@ def test_implausible_magnitudes_are_rejected(case):
     assert old in text
     with pytest.raises(ValueError, match=message):
         mimic.load_mjcf(mujoco.MjModel.from_xml_string(text.replace(old, new, 1)))
-
-
-def test_values_of_a_compiled_model_are_checked():
-    model = mujoco.MjModel.from_xml_string(original_model.ur_like())
-    check_magnitudes(model)
-    model.body_inertia[3, 0] = np.inf
-    with pytest.raises(ValueError, match=r"inertia \[kg m\^2\] of inf"):
-        check_magnitudes(model)
 
 
 @pytest.mark.parametrize("speed", ["nan", "fast"])

@@ -25,11 +25,6 @@ def test_a_link_has_the_mean_colour_of_the_links_that_it_corresponds_to():
         assert equal.learner_colours[link] == pytest.approx(colour)
 
 
-def test_where_the_correspondence_depends_on_the_state_colours_are_by_arc_length():
-    hard = MetricConfig(correspondence="hard").match_links(EXPERT, LEARNER)
-    np.testing.assert_array_equal(hard.fractions, MATCH.fractions)
-
-
 @pytest.mark.parametrize("links", ["kept", "merged"])
 def test_ends_of_links_are_those_of_the_kinematics(links):
     arm = mimic.panda(locked=(3, 6), links=links)

@@ -149,13 +149,6 @@ def test_arms_without_a_base_segment(arm, options, names):
     assert load_mjcf(arm, **options).link_names == names
 
 
-def test_a_first_joint_at_the_base_needs_no_message(caplog):
-    chain._warn_merged.cache_clear()
-    with caplog.at_level(logging.WARNING):
-        load_mjcf(on_a_base("0 0 0"))
-    assert not caplog.text
-
-
 def test_links_that_the_model_marks_are_all_its_links():
     site = '<site name="link1" type="capsule" size="0.01" fromto="0 0 0 0.5 0 0"/>'
     marked = model(f'<body name="plate">{revolute("a", pos="0 0 0.3", inner=site)}</body>')
@@ -235,21 +228,10 @@ BETWEEN = (
 STATIC = '<body name="hand" pos="0.5 0 0"><geom size="0.01"/><site name="palm"/></body>'
 MODELS = {
     "no joint": (lambda: model('<geom size="1"/>'), {}, "the model has no revolute joint$"),
-    "slides only": (
-        lambda: model('<body><joint type="slide"/><geom size="1"/></body>'),
-        {},
-        "the model has no revolute",
-    ),
-    "none behind base": (lambda: toy(TIP), {"base": "B"}, "the model has no revolute joint between base and tip"),
     "branch": (
         lambda: model(BRANCH),
         {},
         "the model branches: bodies 'B' and 'C' lead to 1 revolute joints each; name one end with tip=",
-    ),
-    "two arms": (
-        lambda: model(revolute("a", body="A") + revolute("b", body="B")),
-        {},
-        "the model branches: bodies 'A' and 'B'",
     ),
     "slide": (
         lambda: model(revolute("a", body="A", inner=BETWEEN)),
@@ -263,11 +245,6 @@ MODELS = {
     ),
     "connect behind the last joint": (
         lambda: toy(STATIC, '<equality><connect body1="hand" body2="A" anchor="0 0 0"/></equality>'),
-        {},
-        "expected a chain or a tree; .* number 1$",
-    ),
-    "connect to the world": (
-        lambda: toy(TIP, '<equality><connect body1="B" anchor="0 0 0"/></equality>'),
         {},
         "expected a chain or a tree; .* number 1$",
     ),
@@ -313,10 +290,7 @@ def test_an_active_loop_between_sites_is_rejected(active):
 
 FILES = {
     "missing": (None, "no MJCF or URDF file at '.*arm.xml'$"),
-    "empty": ("", "'.*arm.xml' is not an MJCF or URDF model that MuJoCo can read: "),
     "not xml": ("joint1 = 3", "'.*arm.xml' is not an MJCF or URDF model that MuJoCo can read: "),
-    "not mjcf": ("<html><body/></html>", "'.*arm.xml' is not an MJCF or URDF model that MuJoCo can read: "),
-    "broken": ("<mujoco><worldbody><body>", "'.*arm.xml' is not an MJCF or URDF model that MuJoCo can read: "),
     "misspelt": ("<mujoco><worldbody><boby/></worldbody></mujoco>", "'.*arm.xml' is not an MJCF or URDF model .*boby"),
 }
 
@@ -330,8 +304,3 @@ def test_bad_files_are_rejected(tmp_path, case):
     with pytest.raises(ValueError, match=f"^{message}") as error:
         load_mjcf(path)
     assert "\n" not in str(error.value)
-
-
-def test_a_directory_is_rejected(tmp_path):
-    with pytest.raises(ValueError, match="^no MJCF or URDF file at "):
-        load_mjcf(tmp_path)

@@ -6,8 +6,6 @@ import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.named_arms import MENAGERIE, named_arms
 from mimic.commands.config import ViewConfig
-from mimic.commands.printed import train_command
-from mimic.envs.config import EnvConfig
 from tests.arms.test_start_pose import ARM
 
 
@@ -67,12 +65,6 @@ def test_our_own_arms_keep_their_names(places):
     assert ArmConfig(model="panda").model == "panda" and not named_arms()
 
 
-def test_the_training_command_has_the_name(places):
-    places("menagerie", "toy7")
-    command = train_command(EnvConfig("pair", learner=ArmConfig(model="toy7", home="bent")))
-    assert "env.learner.model=toy7 env.learner.home=bent" in command
-
-
 def test_an_arm_that_is_not_here_names_the_three_ways(places, reason):
     message = reason("inspect", "toy8")
     for way in ("the package robosuite", "robot_descriptions", "MUJOCO_MENAGERIE", "here are none"):
@@ -80,9 +72,3 @@ def test_an_arm_that_is_not_here_names_the_three_ways(places, reason):
     places("robosuite", "toy7")
     with pytest.raises(ValueError, match=r"got 'toy8'; .* here are toy7; did you mean toy7\?"):
         ArmConfig(model="toy8")
-
-
-@pytest.mark.parametrize("model", ["toy7.xml", "folder/toy7", "../toy7"])
-def test_paths_are_no_names(model, places):
-    places("robosuite", "toy7")
-    assert ArmConfig(model=model).model.endswith(model.removeprefix(".."))

@@ -16,7 +16,16 @@ from mimic.arms.rendering import ArmScene
 PLANAR = ArmConfig(model="planar", link_lengths=[0.5, 0.5])
 
 
-@pytest.mark.slow_for("ctypes.ArgumentError('no glGetError')")
+def test_a_missing_graphics_library_is_one_line(monkeypatch):
+    def choose():
+        raise AttributeError("no\neglQueryString")
+
+    monkeypatch.setattr(rendering, "_choose_window_system", choose)
+    with pytest.raises(ValueError, match="^rendering: no OpenGL library works; expected EGL .*: no eglQueryString$"):
+        ArmScene([PLANAR])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("error", ["AttributeError('no eglQueryString')", "ctypes.ArgumentError('no glGetError')"])
 def test_a_missing_graphics_library_is_reported_when_something_is_drawn(error, tmp_path):
     """PyOpenGL fails in these ways where there is no libEGL, and no libGL."""
@@ -59,6 +68,7 @@ def test_points_as_the_camera_sees_them():
     assert abs(ahead[0]) < 0.3 and ahead[1] < 0  # x comes towards it, and down as it looks from above
 
 
+@pytest.mark.slow_for("False")
 @pytest.mark.parametrize("is_software", [True, False])
 def test_videos_are_plain_where_the_cpu_renders(monkeypatch, is_software):
     monkeypatch.setattr(rendering, "is_software_renderer", lambda: is_software)

@@ -77,7 +77,3 @@ def test_own_arms_and_environments_take_a_start_pose():
 def test_bad_start_poses(home, limits, message, file):
     with pytest.raises(ValueError, match=message):
         build_arm(ArmConfig(model=file, home=home), limits)
-
-
-def test_a_start_pose_on_the_command_line(rejected):
-    assert "home: unknown keyframe 'redy'; valid are ready" in rejected("train", "env.learner.home=redy")

@@ -1,7 +1,6 @@
 """Workarounds for the packages that mimic uses."""
 
 import copy
-import os
 import sys
 
 import jax
@@ -41,11 +40,6 @@ def test_hydra_shares_the_config_store_and_copies_loaded_configs(monkeypatch):
 @pytest.mark.parametrize(("version", "needed"), [("0.10.2", True), ("0.11.0", False), ("0.12.0.1", False)])
 def test_the_cpu_flag_is_for_old_jax_alone(version, needed):
     assert compat.needs_cpu_flag(version) is needed
-
-
-def test_the_cpu_flag_is_set_before_jax_starts():
-    """By `conftest.py`, as by `import mimic`."""
-    assert ("--xla_cpu_use_fusion_emitters=false" in os.environ["XLA_FLAGS"].split()) == compat.needs_cpu_flag()
 
 
 @pytest.mark.parametrize("count", [2, 3])

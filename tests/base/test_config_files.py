@@ -16,7 +16,7 @@ BOMB = "a: &a [1, 1]\nb: [*a, *a]\n"
     [
         (BOMB, r"expected no aliases, got \*a"),
         ("a: &a [*a]", r"expected no aliases, got \*a"),
-        ("[" * 5000, "not nested as deeply"),
+        ("[" * 1500, "not nested as deeply"),
         ("a: " + "x" * 60_000, "expected at most 50,000 bytes, got 60,003"),
         ("a: 1\na: 2", "found duplicate key a"),
         ("a: !!python/object/apply:os.getcwd []", "could not determine a constructor"),
@@ -58,12 +58,9 @@ def test_references_to_keys_are_accepted_up_to_a_number():
     ("text", "message"),
     [
         ("trainer: {name: ppo}\nrun_dir: ${oc.env:SECRET_TOKEN}", "run_dir: expected no"),
-        ("trainer: {name: '${oc.env:SECRET_TOKEN}'}", "trainer.name: expected no"),
         ("trainer: {name: ppo}\nenv: {metric: '${oc.env:SECRET_TOKEN}'}", "env.metric: expected no"),
         (BOMB, "aliases"),
         ("trainer: {name: ppo}\nenv: null", "env: expected keys and values, got None"),
-        ("trainer: {name: ppo}\nenv: []", r"env: expected keys and values, got \[\]"),
-        ("trainer: null", "trainer: expected keys and values, got None"),
         ("trainer: {name: ppo, entropy_cost: .nan}", "trainer.entropy_cost: expected a number from 0 to 1000, got nan"),
         ("trainer: {name: ppo}\nenv: {substeps: 1000000000}", "env.substeps: expected a whole number from 1 to 1,000"),
     ],

@@ -55,10 +55,6 @@ def test_every_number_of_every_config_has_a_finite_range(config_class):
     assert all(math.isfinite(limits.minimum) and math.isfinite(limits.maximum) for limits in declared.values())
 
 
-def test_numbers_are_found():
-    assert {"seed", "env.horizon", "env.randomization.mass", "env.learner.link_lengths"} <= set(numbers_of(TrainConfig))
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

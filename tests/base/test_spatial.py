@@ -10,11 +10,11 @@ AXES = [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.6, 0.0, -0.8), (2
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("angle", [0.0, 1e-9, -0.7, 3.0])
-def test_axis_rotation_is_the_matrix_exponential(x64, axis, angle):
-    skew = jnp.cross(jnp.eye(3), jnp.asarray(axis))
-    actual = spatial.stack(spatial.axis_rotation(axis, jnp.asarray(angle)), jnp.float64)
+def test_axis_rotation_is_the_matrix_exponential(axis, angle):
+    skew = np.cross(np.eye(3), np.asarray(axis))
+    actual = np.array(spatial.axis_rotation(axis, np.asarray(angle)), float)
     # a Taylor series of 30 terms is exact to rounding for angles up to pi
-    expected, term = jnp.eye(3), jnp.eye(3)
+    expected, term = np.eye(3), np.eye(3)
     for order in range(1, 30):
         term = term @ skew * angle / order
         expected = expected + term

@@ -147,28 +147,6 @@ def test_a_slider_moves_and_the_learner_tracks_it(page, serve, tmp_path):
     assert not complaints
 
 
-def test_a_window_of_800_pixels_shows_both_arms_and_the_panel(page, serve, tmp_path):
-    page, complaints = page
-    page.set_viewport_size({"width": 800, "height": 800})
-    page.goto(serve("env=panda4dof"))
-    wait_for_bound(page)
-    page.locator(".mantine-Notification-closeButton").first.click()  # of viser's warning that there is no GPU
-    time.sleep(3.0)  # the camera steps back
-    page.screenshot(path=tmp_path / "narrow.png")
-    print(f"screenshot: {tmp_path}/narrow.png")
-    names = ["distance", "chart", "correspondence", "links"]
-    boxes = [page.locator(f"#mimic-{name}").bounding_box() for name in names]
-    left = min(box["x"] for box in boxes)
-    assert left > 400 and max(box["x"] + box["width"] for box in boxes) <= 800
-    assert max(box["y"] + box["height"] for box in boxes) <= 800  # without scrolling
-    colours = np.ptp(pixels(page)[:, : int(left) - 16], axis=-1) > 60  # links; the ground is grey
-    columns = np.flatnonzero(colours.any(axis=0))
-    assert columns.min() > 16 and columns.max() < left - 32  # no arm is cut off
-    middle = columns.mean()
-    assert min(colours[:, : int(middle)].sum(), colours[:, int(middle) :].sum()) > 1000  # there are two
-    assert not complaints
-
-
 def test_the_learner_is_chosen_and_locked_on_the_page(page, serve, tmp_path):
     page, complaints = page
     page.goto(serve("mapper=any_arm", "learners=[panda,panda3dof,planar4dof]"))

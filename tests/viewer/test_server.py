@@ -127,21 +127,6 @@ def test_a_client_cannot_make_the_view_public(served, monkeypatch):
     assert values == [0.75]
 
 
-def test_twenty_clients_move_the_slider(served):
-    port, _, slider, values = served
-
-    async def send():
-        clients = [await page(port) for _ in range(20)]
-        for number, client in enumerate(clients):
-            await client.send(encode(CAMERA))
-            await client.send(move(slider, number / 100 + 0.01))
-            await until(lambda number=number: number / 100 + 0.01 in values)
-        await asyncio.gather(*(client.close() for client in clients))
-
-    values.clear()
-    asyncio.run(send())
-
-
 def test_an_update_in_a_thread_wakes_connections_in_the_loop_alone(served):
     message = GuiUpdateMessage(served[2]._impl.uuid, {"value": 0.5})
 
