@@ -12,6 +12,7 @@ from benchmarks.common.cells import (
     large,
     one,
     percent,
+    span,
     split_pair,
 )
 
@@ -123,6 +124,57 @@ def overview(study: Results, preset: Results, pose: Results) -> list[Cells]:
         ("gap of PPO on training / held-out demonstrations [%], three seeds", *ppo),
         ("the same for computed torque, with the exact model and the whole motion known", *exact),
         ("poses at their optimum per second", rates["panda 7->7"], rates["panda 7->4"], ""),
+    ]
+
+
+def main_results(
+    study: Results, preset: Results, pose: Results, mapper: Results, any_arm: Results, loops: Results
+) -> list[Cells]:
+    def held_out(reports: Sequence[Results]) -> str:
+        return f"{100 * mean(reports, 'held_out'):.2f}"
+
+    def centre_line(name: str) -> str:
+        runs = preset_runs(preset, "panda4dof")
+        return f"{statistics.fmean(run['similarity'][name][MEASURES[0]]['held_out'] for run in runs):.3f}"
+
+    ppo = ", ".join(held_out(preset_runs(preset, env)) for env in ENVIRONMENTS)
+    searched = ", ".join(held_out(study["results"][f"{env}--searched"]) for env in ENVIRONMENTS)
+    newton = one(pose["results"], pair="panda 7->4")["methods"]["newton"]
+    network = next(run for run in mapper["runs"] if run["report"]["env"] == "panda4dof")
+    quality = percent(network["report"]["quality"]["held_out"], ".1f")
+    gaps = [
+        statistics.fmean(arm["gap"] for arm in any_arm[group] if arm["span"] >= 0.25) for group in ("locks", "real")
+    ]
+    robots = [run["optimality_gap"] for run in loops["runs"]]
+    aborts = sum(run["episodes"] - run["completed"] for run in loops["runs"])
+    return [
+        ("result", "page"),
+        (
+            f"PPO has held-out gaps of {ppo} % with 7, 4, 3 joints; 0 is the kinematic bound, 100 % holding the start "
+            f"pose. Searched torques reach {searched} %.",
+            "[dynamic motions](dynamic_imitation.md#the-three-simulations)",
+        ),
+        (
+            f"Its centre line is {centre_line('policy')} chain lengths from the expert's with 4 joints; copying shared "
+            f"joints has {centre_line('copy_joints')}.",
+            "[similarity](dynamic_imitation.md#similarity)",
+        ),
+        (
+            f"`imitate_pose` finds the global minimum of {percent(newton['global_share'], '.1f')} of poses, "
+            f"{large(newton['poses_per_second'])} a second on an H200. A pose mapper makes "
+            f"{large(network['poses_per_second'])}, {quality} above.",
+            "[static poses](static_pose_imitation.md#comparison-with-other-methods)",
+        ),
+        (
+            f"A controller without training has gaps of {percent(gaps[0], '.1f')} on locked Pandas, "
+            f"{percent(gaps[1], '.1f')} on real arms.",
+            "[any arm](any_arm.md#a-controller-without-training)",
+        ),
+        (
+            f"On virtual robots policies have gaps of {span(robots)} %, and {aborts} of "
+            f"{sum(run['episodes'] for run in loops['runs']):,} episodes were aborted. None was on hardware.",
+            "[a real arm](real_arm.md#what-was-measured)",
+        ),
     ]
 
 
