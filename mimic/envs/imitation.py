@@ -61,6 +61,7 @@ class ImitationEnv(Env):
       arm: the learner with its simulation model.
       metric: metric of the reward.
       demonstrations: motions to imitate.
+      held_out: the demonstrations of the config that are for evaluation; None where the motions were given.
       expert_states: link states of the demonstrations, [demonstrations, time, links, 3] each.
       start_poses: [demonstrations, joints] where the learner starts each demonstration, at rest [rad].
       reward_terms, observation_terms: the functions that the config adds to reward and observation.
@@ -83,8 +84,9 @@ class ImitationEnv(Env):
         self._home_states = link_state_table(self.learner, home, np.zeros_like(home))
         self.config = config
         self._set_physics(choose_physics(config.physics, self.arm.model))
+        self.held_out: Demonstrations | None = None
         if demonstrations is None:
-            demonstrations = training_and_held_out(config, arms.expert)[0]
+            demonstrations, self.held_out = training_and_held_out(config, arms.expert)
         self._set_demonstrations(demonstrations)
 
     def with_demonstrations(self, demonstrations: Demonstrations) -> "ImitationEnv":

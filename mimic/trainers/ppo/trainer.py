@@ -271,8 +271,8 @@ def _text(form: str, value: float) -> str:
 def run_environment(config: EnvConfig, run_dir: Path | None) -> tuple[ImitationEnv, Demonstrations]:
     """The environment with its training demonstrations, and the held-out ones; an existing run has its own."""
     config = with_saved_demonstrations(config, run_dir)
-    training, held_out = training_and_held_out(config)
-    return make_env(config, training), held_out
+    env = make_env(config)
+    return env, env.held_out or training_and_held_out(config)[1]  # none where a registered class has motions of its own
 
 
 def with_saved_demonstrations(config: EnvConfig, run_dir: Path | None) -> EnvConfig:
