@@ -11,6 +11,7 @@ from mimic.base import registry
 from mimic.base.config import check_new, check_writable, explain, merged, schema, to_dict, typed
 from mimic.base.config_files import check_references, read_config
 from mimic.base.files import write_atomically
+from mimic.base.overrides import setting, shell_words
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import CONFIG, DEMONSTRATIONS
 from mimic.runs.lock import LOCK
@@ -51,6 +52,11 @@ def save_config(run_dir: Path, config: TrainConfig) -> None:
     """Writes the resolved config, with the paths of the arms that the run started from."""
     config = dataclasses.replace(config, env=with_original_models(config.env))
     write_atomically(run_dir / CONFIG, OmegaConf.to_yaml(OmegaConf.create(to_dict(config))))
+
+
+def resume_command(run_dir: Path) -> str:
+    """The command that continues a run."""
+    return f"python -m mimic.train {shell_words([setting('resume', str(run_dir))])}"
 
 
 def run_schema(trainer: str) -> DictConfig:

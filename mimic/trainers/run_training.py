@@ -14,7 +14,6 @@ from rich.console import Console
 
 from mimic.base.compilation import use_compilation_cache
 from mimic.base.config import check_writable, flatten, to_dict, typed
-from mimic.base.overrides import setting, shell_words
 from mimic.runs.checkpoints import (
     Checkpoint,
     checkpoint_steps,
@@ -39,7 +38,7 @@ from mimic.trainers.fine_tuning import fine_tuned
 from mimic.trainers.make import make_trainer
 from mimic.trainers.progress import TrainingProgress
 from mimic.trainers.report import make_report, show_report
-from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, run_schema, save_config
+from mimic.trainers.run_config import check_new_run, load_config, new_run_dir, resume_command, run_schema, save_config
 from mimic.trainers.run_correspondence import save_correspondence
 from mimic.trainers.run_models import own_arms, save_models
 from mimic.trainers.run_plugins import save_plugins
@@ -280,7 +279,7 @@ def _new_run(run_dir: Path, trainer: Trainer) -> RunLock:
 
 def _stopped(console: Console, run_dir: Path, error: Interrupted | Diverged | OSError | RunExists) -> int:
     """Prints why a training stopped and how to continue; returns the exit code."""
-    command = f"python -m mimic.train {shell_words([setting('resume', str(run_dir))])}"
+    command = resume_command(run_dir)
     if isinstance(error, Interrupted):
         console.print(f"stopped by {error}; continue with: {command}", soft_wrap=True)
         return error.exit_code

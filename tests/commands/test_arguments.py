@@ -14,21 +14,15 @@ from mimic.commands.arguments import check_arguments
 EARLY = [
     (["env=null"], "env: expected the name of a preset, as in env=panda4dof, got None"),
     (["env=[]"], "env: expected the name of a preset"),
-    (["env=[panda4dof,pair]"], "env: expected the name of a preset"),
-    (["env=1"], "env: expected the name of a preset"),
     (["env={}"], "env: expected a value, got {}"),
     (["env=schema"], "env: expected the name of a preset"),
     (["~env"], "~env: keys cannot be removed"),
     (["~trainer=ppo"], "keys cannot be removed"),
     (["trainer=null"], "trainer: expected the name of a preset, as in trainer=ppo, got None"),
-    (["trainer=[ppo]"], "trainer: expected the name of a preset"),
     (["env.learner={}"], "env.learner: expected a value, got {}"),
     (["=1"], "expected KEY=VALUE, got '=1'"),
-    (["@=1"], "expected KEY=VALUE, got '@=1'"),
     (["--bogus"], "unrecognized arguments: --bogus"),
-    (["--cfg"], "expected one argument"),
     (["--cfg=bogus"], "invalid choice: 'bogus'"),
-    (["--info=x"], "invalid choice: 'x'"),
     (["--experimental-rerun=x"], "loads a pickle"),
     (["env=${oc.env:SECRET_TOKEN}"], "env: expected the name of a preset"),
 ]
@@ -69,11 +63,8 @@ def test_odd_command_lines(rejected, monkeypatch, arguments, message):
     ("setting", "message"),
     [
         ("trainer.entropy_cost=nan", "trainer.entropy_cost: expected a number from 0 to 1000, got nan"),
-        ("trainer.entropy_cost=1e38", "trainer.entropy_cost: expected a number from 0 to 1000, got 1e+38"),
         ("env.learner.damping=1e30", "env.learner.damping: expected a number from 0 to 10000, or a mapping"),
-        ("env.metric.translation=1e30", "env.metric.translation: expected a number from 0 to 1e+06, got 1e+30"),
         ("env.substeps=1000000000", "env.substeps: expected a whole number from 1 to 1,000, got 1000000000"),
-        ("env.demonstrations.count=1000000000", "env.demonstrations.count: expected a whole number from 1 to 100,000"),
         ("trainer.hidden_layers=[1000000,1000000]", "trainer.hidden_layers: expected 1 to 32 whole numbers"),
         (
             "trainer.hidden_layers=[65536,65536,65536,65536,65536]",

@@ -225,15 +225,14 @@ def test_rollouts_with_an_inner_loop_have_its_targets(control, quantity):
     assert np.all(np.sign(moved) == np.sign(action))
 
 
-@pytest.mark.parametrize("format", FORMATS)
-def test_nothing_is_left_where_writing_fails(recorded, tmp_path, monkeypatch, format):
+def test_nothing_is_left_where_writing_fails(recorded, tmp_path, monkeypatch):
     def fail(folder, *_):
         (folder / "half").write_text("")
         raise OSError("disk full")
 
-    monkeypatch.setattr(command, f"write_{format}", fail)
+    monkeypatch.setattr(command, "write_lerobot", fail)
     with pytest.raises(OSError, match="disk full"):
-        write(tmp_path / "set", demonstrations=str(recorded), format=format)
+        write(tmp_path / "set", demonstrations=str(recorded))
     assert not list(tmp_path.iterdir())
 
 

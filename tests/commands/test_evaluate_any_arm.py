@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from mimic.commands.arm_keys import arm_of_environment
 from mimic.commands.clips import prepare_clip
 from mimic.commands.config import EvaluateConfig, RenderConfig
 from mimic.commands.evaluate import prepare_evaluation
@@ -31,11 +30,8 @@ def run_dir(tmp_path_factory):
             "controller: expected policy or nearest_pose for all arms of a run of many, got pd; choose",
         ),
         (["mass=1.2"], "randomization: expected the default where the learner is drawn for each episode, got mass="),
-        (["physics=mjx"], "physics: expected auto or fused where the learner is drawn for each episode, got mjx"),
         (["locked=[2]"], "locked: expected with learner=NAME, as in learner=panda locked=[2,4], got [2]"),
-        (["learner=panda", "locked=[8]"], "locked: "),
         (["learner=panda_pair"], "panda_pair: expected a serial arm, got a tree of 2 chains"),
-        (["learner=no_such_arm"], "model: expected panda, planar, panda_pair, an MJCF or URDF file, or the name"),
     ],
 )
 def test_what_many_arms_do_not_have_is_rejected(run_dir, reason, settings, message):
@@ -50,28 +46,14 @@ def test_a_run_of_one_learner_has_its_own(reason, tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("view", ["env=panda_family"]),
-        ("view", ["run=RUN"]),
-    ],
-)
-def test_commands_of_one_learner_reject_many(run_dir, reason, name, arguments):
-    line = reason(name, *(argument.replace("RUN", str(run_dir)) for argument in arguments))
-    assert "expected an environment of one learner, got" in line
-
-
-def test_a_learner_by_the_name_of_an_environment_of_many_is_rejected():
-    with pytest.raises(ValueError, match="expected an environment of one learner, got 'any_arm'"):
-        arm_of_environment("learner", "any_arm")
+def test_a_view_rejects_many(run_dir, reason):
+    assert "expected an environment of one learner, got" in reason("view", f"run={run_dir}")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ([], "learner: expected one arm for a run of many, env=panda_family, as in learner=panda locked=[2,4]"),
-        (["locked=[2]"], "locked: expected with learner=NAME"),
         (["learner=panda", "demonstration=9"], "demonstration: "),
     ],
 )

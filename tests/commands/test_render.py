@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from typing import Any
 
 import imageio_ffmpeg
 import jax
@@ -144,10 +143,7 @@ def test_a_video_that_lacks_frames_is_removed(tmp_path, monkeypatch, options):
     ("changes", "message"),
     [
         ({}, "out: expected a file, as in out=FILE.mp4"),
-        ({"out": "swing.gif"}, "expected a file that ends in .mp4"),
         ({"learner": ""}, "learner: expected with retargeted=FILE"),
-        ({"retargeted": ""}, "retargeted: expected with retargeted=FILE"),
-        ({"demonstrations": "none.npz"}, "no file at 'none.npz'"),
         ({"learner": "planar7dof"}, "demonstrations: expected motions of planar4 .* got planar7"),
         ({"learner": "planar5dof"}, "unknown environment 'planar5dof'"),
         ({"demonstration": 2}, "demonstration: expected an index of the file from 0 to 1, got 2"),
@@ -168,25 +164,10 @@ def test_motions_of_another_length_are_rejected(files, tmp_path):
         prepare_clip(RenderConfig(**{**files, "retargeted": str(tmp_path / "one.npz")}))
 
 
-@pytest.mark.slow
-def test_bad_input_for_a_mapper_is_rejected(mapper_run, files):
-    bad: list[tuple[dict[str, Any], str]] = [
-        ({"split": "train"}, "split: has no effect with a run of trainer=pose_mapper"),
-        ({"seed": -1}, "seed: expected a whole number from 0"),
-        ({"checkpoint": 7}, "checkpoint"),
-        ({"demonstrations": files["retargeted"]}, "demonstrations: expected motions of planar7"),
-        ({"demonstrations": files["demonstrations"], "demonstration": 3}, "from 0 to 1"),
-    ]
-    for changes, message in bad:
-        with pytest.raises(ValueError, match=message):
-            prepare_clip(RenderConfig(run=str(mapper_run), **changes))
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ([], "run: expected the run directory"),
-        (["run=missing"], "not a run directory"),
         (["run=missing", "split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )

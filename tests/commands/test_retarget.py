@@ -1,8 +1,6 @@
 """`python -m mimic.retarget`: motions that keep the velocity limits of the learner, and what is rejected."""
 
 import dataclasses
-import subprocess
-import sys
 
 import jax
 import numpy as np
@@ -12,6 +10,7 @@ import mimic
 from mimic.commands.retarget import retarget
 from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.pose_mapper.model import make_model
+from tests.helpers.commands import run
 
 
 @pytest.fixture(scope="module")
@@ -22,17 +21,10 @@ def recorded(tmp_path_factory):
     return path
 
 
-def command(*arguments, **more):
-    arguments = [sys.executable, "-m", "mimic.retarget", *arguments]
-    return subprocess.run(arguments, capture_output=True, text=True, timeout=280, check=False, **more)
-
-
 @pytest.mark.slow
 def test_the_motions_load_and_do_not_jump(recorded, tmp_path):
     out = tmp_path / "learner.npz"
-    result = command(f"demonstrations={recorded}", "env=planar4dof", f"out={out}")
-    assert result.returncode == 0, result.stderr[-2000:]
-    assert "maximum jump" in result.stdout
+    assert "maximum jump" in run("retarget", f"demonstrations={recorded}", "env=planar4dof", f"out={out}")
     motions = mimic.load_demonstrations(out)
     env = mimic.make("planar4dof", demonstrations={"count": 1, "held_out": 1})
     motions.check_fits(env.learner, 0.1, 50)
@@ -63,15 +55,12 @@ def test_no_joint_moves_farther_in_a_step_than_its_velocity_limit_allows(with_ma
     [
         (["env=planar4dof"], "demonstrations: expected a file"),
         (["demonstrations={recorded}", "env=planar4dof"], "out: expected a file"),
-        (["demonstrations=missing.npz", "env=planar4dof", "out=new.npz"], "no file"),
-        (["demonstrations={recorded}", "learner=panda5dof", "out=new.npz"], "got 'panda5dof'"),
         (["demonstrations={recorded}", "learner=panda4dof", "out=new.npz"], "recorded with the joints"),
         (
             ["demonstrations={recorded}", "learner=pair", "out=new.npz"],
             "learner: expected an arm, or an environment",
         ),
         (["demonstrations={recorded}", "env=planar4dof", "out={recorded}"], "exists; name a new file"),
-        (["demonstrations={recorded}", "env=planar4dof", "out=no/new.npz"], "there is no folder"),
         (["demonstrations={recorded}", "env=planar4dof", "out=new.npz", "mapper=."], "not a run directory"),
     ],
 )

@@ -29,29 +29,20 @@ from tests.helpers.bodies import bvh_text, person
     [
         (["host=nowhere.invalid"], "host: expected an address of this machine"),
         (["learner=missing.xml"], "no MJCF or URDF file at"),
-        (["run=missing"], "not a run directory"),
         (["mapper=missing"], "not a run directory"),
         (["run=a", "mapper=b"], "expected one of them"),
-        (["run=a", "expert=panda"], "expected neither with run= or mapper="),
-        (["mapper=any_arm", "learner=panda"], "mapper=any_arm takes learners=[NAME,...]"),
         (["learners=[panda]"], "learners: expected with mapper=, as in mapper=any_arm learners=[panda,ur5e.xml]"),
         (["mapper=planar4dof", "learners=[panda]"], "learners: expected none with mapper=planar4dof, which has one"),
         (["mapper=any_arm", "checkpoint=5"], "checkpoint: expected none with mapper=any_arm, which comes with mimic"),
         (["mapper=any_arm", "learners=[a.xml]"], "learners: expected panda, an MJCF file, or an environment (any_arm,"),
         (["mapper=any_arm", "learners=[panda,panda]"], "learners: expected arms of different names, got panda, panda"),
         (["mapper=any_arm", "learners=[bimanual]"], "expected a serial arm, got a tree of 2 chains"),
-        (["source=missing.bvh"], "source: no file at 'missing.bvh'"),
-        (["source=a.bvh", "expert=panda"], "expert: expected none with source=, whose person"),
-        (["arm=left"], "arm, capture: expected only with source="),
         (["capture.yaw=3"], "arm, capture: expected only with source="),
         (["source=a.bvh", "arm=middle"], "arm: expected one of left, right, got 'middle'"),
         (["source=a.bvh", "capture.overlap=0.1"], "capture.overlap: expected none with this source of a view"),
         (["source=tcp://localhost"], "source: expected a file or tcp://localhost:PORT"),
-        (["source=tcp://localhost:99999"], "source: expected a file or tcp://localhost:PORT"),
-        (["source=tcp://localhost:9000/x"], "source: expected a file or tcp://localhost:PORT"),
         (["source=tcp://localhost:9000", "capture.slow_down=2"], "capture.slow_down: expected none with this source"),
         (["source=tcp://0.0.0.0:9000"], "to take points from other machines, set host=0.0.0.0 too"),
-        (["split=test"], "expected one of train, held_out, got 'test'"),
     ],
 )
 def test_bad_input(reason, arguments, message, monkeypatch):
@@ -63,19 +54,19 @@ def test_bad_input_of_the_command(rejected):
     assert "port: expected a whole number from 1 to 65,535, got 0" in rejected("view", "port=0")
 
 
-def test_a_port_that_is_taken_is_rejected(rejected, monkeypatch):
+def test_a_port_that_is_taken_is_rejected(reason, monkeypatch):
     monkeypatch.setattr(view, "is_installed", lambda: True)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        assert f"port: expected a free port at 127.0.0.1, got {port}" in rejected("view", f"port={port}")
+        assert f"port: expected a free port at 127.0.0.1, got {port}" in reason("view", f"port={port}")
 
 
-def test_the_extra_is_named_where_viser_is_missing(rejected, monkeypatch):
+def test_the_extra_is_named_where_viser_is_missing(reason, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "viser" else find(name, *more))
-    assert "pip install 'mimic-arms[view]'" in rejected("view")
+    assert "pip install 'mimic-arms[view]'" in reason("view")
 
 
 def test_a_mapper_to_any_arm_has_its_own_learner_and_the_pandas_to_choose_from():
@@ -89,7 +80,7 @@ def test_a_mapper_to_any_arm_has_its_own_learner_and_the_pandas_to_choose_from()
 
 @pytest.mark.parametrize(
     ("host", "url"),
-    [("127.0.0.1", "127.0.0.1"), ("0.0.0.0", "127.0.0.1"), ("::", "[::1]"), ("::1", "[::1]"), ("node1", "node1")],
+    [("0.0.0.0", "127.0.0.1"), ("::", "[::1]"), ("::1", "[::1]"), ("node1", "node1")],
 )
 def test_the_address_can_be_opened(host, url):
     assert view_server.address(host, 8080) == f"http://{url}:8080"
@@ -122,13 +113,12 @@ def free_port():
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser: pip install 'mimic-arms[view]'")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_the_command_cleanly(number):
+def test_a_signal_ends_the_command_cleanly():
     command = [sys.executable, "-m", "mimic.view", "env=planar4dof", f"port={free_port()}"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert "view: http://127.0.0.1:" in process.stdout.readline()
-    process.send_signal(number)  # most likely while it compiles
+    process.send_signal(signal.SIGTERM)  # most likely while it compiles
     out, error = process.communicate(timeout=120)
     assert process.returncode == 0 and "Traceback" not in error and "view: ended" in out
 
@@ -180,7 +170,16 @@ def test_points_in_another_unit_are_said_and_not_taken(sends, capsys, monkeypatc
     monkeypatch.setattr(view_capture, "Signals", lambda: signals)
     with contextlib.closing(listen(config)) as listener:
         sends(listener.port, lambda sample: Sample(sample.time, {n: 1000 * p for n, p in sample.points.items()}))
-        threading.Timer(1.0, lambda: signals.caught.append(signal.SIGINT)).start()
+        take, taken = listener.take, []
+
+        def stop_after_three():
+            if (sample := take()) is not None:
+                taken.append(sample)
+            if len(taken) == 3:
+                signals.caught.append(signal.SIGINT)
+            return sample
+
+        monkeypatch.setattr(listener, "take", stop_after_three)
         assert wait_for_arm(listener, config, config.env) is None
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "points: expected metres, got arms 530, 530 long, as an adult's in mm" in error

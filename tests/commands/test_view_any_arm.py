@@ -144,33 +144,6 @@ def test_a_joint_is_locked_where_it_is_and_freed_again(live, choices):
     assert settle(live).distance < 1e-3  # an equal arm in an equal pose
 
 
-def test_locks_of_the_same_arm_leave_it_where_it_is_and_another_arm_starts_anew(live, choices):
-    choose(live, choices, "panda")
-    live.show_pose(POSE)
-    before = settle(live)
-    choose(live, choices, "panda4dof")
-    after = live.advance(TICK)
-    assert after is not None and after.arm == before.arm and len(after.locked) == 3
-    limits = build_arm(ArmConfig()).embodiment.velocity_limit * TICK
-    change = [after.learner[name] - before.learner[name] for name in before.learner]
-    assert np.all(np.abs(np.angle(np.exp(1j * np.array(change)))) <= limits + 1e-5)  # it glides to the preset's angles
-    choose(live, choices, "six")
-    other = live.advance(TICK)
-    assert other is not None and set(other.learner) == set(choices[0][1].arm.embodiment.joint_names)
-
-
-def test_an_arm_with_all_joints_locked_rests(live, choices):
-    choose(live, choices, "panda")
-    settle(live)
-    for joint in choices[0][0].arm.embodiment.joint_names:
-        live.lock(joint, True)
-    before = settle(live)
-    live.show_pose(POSE)
-    after = settle(live)
-    assert after.learner == pytest.approx(before.learner, abs=1e-6)
-    assert after.distance == pytest.approx(after.bound, abs=1e-6) and after.distance > 0.1
-
-
 def test_a_learner_that_does_not_fit_is_named(mapper):
     with pytest.raises(ValueError, match="learners: two: panda_pair.*expected a serial arm, got a tree of 2 chains"):
         read_learners({"two": ArmConfig(model="panda_pair")}, mapper.env.limits, mapper.env.metric.links)

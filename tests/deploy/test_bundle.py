@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mimic.control.joint_control import Reference
-from mimic.deploy.bundle import POLICY, load_bundle
+from mimic.deploy.bundle import load_bundle
 from mimic.deploy.clearance import Clearance
-from mimic.deploy.policy import Policy, open_session
+from mimic.deploy.policy import Policy
 from tests.helpers import bundles
 
 
@@ -50,25 +50,6 @@ def test_a_policy_observes_what_it_was_exported_for(bundle, monkeypatch):
     np.testing.assert_allclose(phases[2], step * bundle.ticks, rtol=1e-6)
 
 
-def test_a_policy_is_its_graph(tmp_path):
-    """As onnxruntime evaluates it with arguments and results, in a row of different observations."""
-    bundle = bundles.make_bundle(tmp_path / "bundle", bundles.of_all)
-    policy, rng = Policy(bundle, [1, 0]), np.random.default_rng(0)
-    past = np.zeros((2, 7 * bundle.past_actions), np.float32)
-    sizes = dict.fromkeys(("qpos", "qvel", "reference_qpos", "reference_qvel"), 7)
-    sizes |= {"past_actions": past.shape[1], "features": bundle.features}
-    session = open_session(bundle.folder / POLICY, sizes, {"action": 7})
-    for tick in range(4):
-        values = rng.normal(size=(4, 2, 7)).astype(np.float32)
-        action = policy.act(tick, values[0], values[1], Reference(values[2], values[3], values[3]))
-        features = policy._features[tick, policy._row]
-        feed = dict(zip(sizes, [*values, past, features], strict=True))
-        (expected,) = session.run(["action"], feed)
-        np.testing.assert_array_equal(action, expected)
-        assert 0 < np.abs(action).max() < 1 and not np.array_equal(action[0], action[1])
-        past = np.concatenate([expected, past[:, :-7]], axis=1)
-
-
 def test_the_clearance_is_that_of_the_arm(bundle):
     clearance = Clearance(bundle)
     home, on_floor, folded = clearance(np.stack([bundle.start_pose, bundles.ON_FLOOR, bundles.FOLDED]))
@@ -92,20 +73,10 @@ BROKEN = {
     "no JSON": (lambda folder: (folder / "controller.json").write_text("{"), "controller.json: expected JSON"),
     "no key": (lambda folder: (folder / "controller.json").write_text("{}"), "missing format, mimic_version"),
     "another format": (lambda folder: changed(folder, format=1), "format: expected 2, got 1; export the run again"),
-    "another format with other files": (
-        lambda folder: (changed(folder, format=1), (folder / "features.onnx").unlink()),
-        "format: expected 2, got 1; export the run again",
-    ),
     "another network": (lambda folder: (folder / "policy.onnx").write_bytes(b"x"), "policy.onnx: expected the file"),
-    "another clearance": (
-        lambda folder: (folder / "clearance.npz").write_bytes(b"x"),
-        "clearance.npz: expected the file",
-    ),
     "no motions": (lambda folder: (folder / "motions.npz").write_bytes(b"x"), "motions.npz: "),
     "a mode": (lambda folder: changed(folder, mode="flying"), "mode: expected one of torque, joint_position"),
     "a tick": (lambda folder: changed(folder, control_dt=0.0505), "control_dt: expected a multiple of 0.001 s"),
-    "an endless tick": (lambda folder: changed(folder, control_dt=float("inf")), "control_dt: expected a multiple of"),
-    "an endless preview": (lambda folder: changed(folder, preview=float("inf")), "expected numbers and names"),
     "no hashes": (lambda folder: changed(folder, hashes=None), "hashes: expected one for each file, got None"),
     "an expert of one dimension": (
         lambda folder: motions(folder, expert=np.zeros(4)),
@@ -114,7 +85,6 @@ BROKEN = {
     "joints": (lambda folder: changed(folder, joint_names=["one"]), "expected the shape"),
     "a number": (lambda folder: changed(folder, start_pose=[float("nan")] * 7), "start_pose: expected finite numbers"),
     "parameters": (lambda folder: changed(folder, parameters={}), "expected numbers and names of a controller"),
-    "links": (lambda folder: changed(folder, expert_links=6), "expert: expected the shape"),
 }
 
 
@@ -138,8 +108,7 @@ def test_the_clearance_of_another_arm_is_rejected(tmp_path):
         bundles.make_bundle(tmp_path / "bundle", clearance=clearance)
 
 
-@pytest.mark.parametrize("parent", [[0, 0, 1, 2, 3, 4, 5], [-1, 0, 1, 2, 3, 4, -2]])
-def test_a_clearance_whose_joints_do_not_follow_their_parents_is_rejected(tmp_path, parent):
-    clearance = bundles.panda_clearance()._replace(parent=parent)
+def test_a_clearance_whose_joints_do_not_follow_their_parents_is_rejected(tmp_path):
+    clearance = bundles.panda_clearance()._replace(parent=[0, 0, 1, 2, 3, 4, 5])
     with pytest.raises(ValueError, match="clearance.npz: expected parents before their children"):
         bundles.make_bundle(tmp_path / "bundle", clearance=clearance)

@@ -47,11 +47,6 @@ def test_torques_are_kept_where_all_have_them(recorded):
 # --- bad files --------------------------------------------------------------------------------------------------------
 
 
-def save_array(path):
-    with path.open("wb") as file:
-        np.save(file, np.zeros(3))
-
-
 def arrays(path):
     with np.load(path) as archive:
         return dict(archive)
@@ -69,10 +64,7 @@ NOT_WHOLE = "is not a complete npz file of demonstrations: "
 DAMAGES = {
     "missing": (lambda path: path.unlink(), "no file at"),
     "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-1000]), NOT_WHOLE),
-    "cut early": (lambda path: path.write_bytes(path.read_bytes()[:300]), NOT_WHOLE),
-    "text": (lambda path: path.write_text("not an archive"), NOT_WHOLE),
     "pickle": (lambda path: path.write_bytes(pickle.dumps(arrays(path))), NOT_WHOLE),
-    "one array": (save_array, NOT_WHOLE + "it is no zip archive"),
     "pickled array": (
         with_arrays(goals=np.array([{}, None], object)),
         NOT_WHOLE + "goals has type object",
@@ -81,16 +73,12 @@ DAMAGES = {
     "another format": (with_arrays(format=np.array("other")), "has format 'other', expected "),
     "integers": (with_arrays(qpos=np.zeros((2, 51, 7), int)), "qpos in .* must be floating point, got int64"),
     "angles not finite": (with_arrays(qpos=np.full((2, 51, 7), np.nan)), "qpos in .* has values that are not finite"),
-    "speeds not finite": (with_arrays(qvel=np.full((2, 51, 7), np.inf)), "qvel in .* has values that are not finite"),
     "a joint too few": (with_arrays(qpos=np.zeros((2, 51, 6))), r"qpos in .* 7 joints\], got \[2, 51, 6\]"),
     "a sample too few": (with_arrays(qvel=np.zeros((2, 50, 7))), "qvel and goals in .*, got "),
     "two seeds": (with_arrays(seed=np.arange(2)), "seed in .* must be one value, got shape"),
     "a broken seed": (with_arrays(seed=np.array(0.5)), "seed in .* must be an integer, got float64"),
-    "two arms": (with_arrays(arm=np.array(["a", "b"])), "arm in .* must be one value, got shape"),
     "time runs back": (with_arrays(dt=np.array(-1.0)), "dt in .* must be one number above 0, got -1.0"),
     "a torque too many": (with_arrays(torque=np.zeros((2, 51, 7))), r"torque in .* must be \[2, 50, 7\], got \[2, 51"),
-    "torques not finite": (with_arrays(torque=np.full((2, 50, 7), np.inf)), "torque in .* are not finite"),
-    "integer torques": (with_arrays(torque=np.zeros((2, 50, 7), int)), "torque in .* must be floating point, got int"),
 }
 
 
@@ -163,7 +151,7 @@ def test_training_rejects_demonstrations_that_do_not_fit(recorded, tmp_path, cha
         training_and_held_out(config)
 
 
-def test_the_command_reports_a_damaged_file(rejected, tmp_path):
+def test_the_command_reports_a_damaged_file(reason, tmp_path):
     path = tmp_path / "demonstrations.npz"
     path.write_text("not an archive")
-    assert NOT_WHOLE in rejected("train", "env=panda4dof", f"env.demonstrations.path={path}")
+    assert NOT_WHOLE in reason("train", "env=panda4dof", f"env.demonstrations.path={path}")

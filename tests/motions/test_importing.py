@@ -1,16 +1,14 @@
 """Imported motions: tables and files of LocoMuJoCo become demonstrations or are rejected in one line."""
 
-import importlib
-import sys
-
 import numpy as np
 import pytest
 
 import mimic
-from mimic.commands import cli
+from tests.helpers.commands import run
 
 TIME = np.arange(0, 6.0, 0.02)  # s
 PHASE = np.arange(7)
+NUMBERED = [f"q_{i}" for i in range(1, 8)]
 
 
 def swing(time):
@@ -50,20 +48,10 @@ def archive(path, **changes):
     return path
 
 
-def run(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["mimic.demonstrations", *map(str, arguments)])
-    cli.run(importlib.import_module("mimic.demonstrations").prepare, "demonstrations")
-    return capsys.readouterr().out
-
-
-@pytest.mark.slow_for("joint{}", "q_joint{}")
-@pytest.mark.parametrize("spelling", ["joint{}", "q_{}", "q_joint{}"])
-def test_a_table_becomes_demonstrations_that_training_takes(tmp_path, monkeypatch, capsys, spelling):
-    numbers = range(1, 8)
-    source = table(tmp_path / "swing.csv", names=[spelling.format(i) for i in numbers],
-                   velocity_names=[f"qdot_{i}" for i in numbers])  # fmt: skip
+def test_a_table_becomes_demonstrations_that_training_takes(tmp_path):
+    source = table(tmp_path / "swing.csv", names=NUMBERED, velocity_names=[f"qdot_{i}" for i in range(1, 8)])
     out = tmp_path / "swing.npz"
-    said = run(monkeypatch, capsys, f"source={source}", f"out={out}")
+    said = run("demonstrations", f"source={source}", f"out={out}")
     assert "1 demonstrations, 50 steps of 0.1 s; velocities: from the file" in said
     assert {path.name for path in tmp_path.iterdir()} == {"swing.csv", "swing.npz", "swing.png"}
     loaded = mimic.load_demonstrations(out)
@@ -74,11 +62,11 @@ def test_a_table_becomes_demonstrations_that_training_takes(tmp_path, monkeypatc
     loaded.check_fits(mimic.panda(), 0.1, 50)
 
 
-def test_velocities_are_differentiated_where_there_are_none(tmp_path, monkeypatch, capsys):
-    source = table(tmp_path / "swing.csv", names=[f"q_{i}" for i in range(1, 8)])
-    said = run(monkeypatch, capsys, f"source={source}", f"out={tmp_path / 'swing.npz'}")
-    assert "velocities: differentiated, since the file has none" in said
-    loaded = mimic.load_demonstrations(tmp_path / "swing.npz")
+@pytest.mark.parametrize("spelling", ["joint{}", "q_{}", "q_joint{}"])
+def test_velocities_are_differentiated_where_there_are_none(tmp_path, spelling):
+    source = table(tmp_path / "swing.csv", names=[spelling.format(i) for i in range(1, 8)])
+    loaded, differentiated = mimic.import_demonstrations(source, mimic.panda())
+    assert differentiated
     _, qvel = swing(0.1 * np.arange(51))
     np.testing.assert_allclose(loaded.qvel[0, 1:], qvel[1:], atol=1e-4)  # central: 0.02^2 / 6 of the third derivative
     np.testing.assert_allclose(loaded.qvel[0, 0], qvel[0], atol=1e-2)  # one-sided at the start
@@ -120,22 +108,16 @@ def test_joint_names_of_the_file_can_be_given(tmp_path):
     assert imported.joint_names == mimic.panda().joint_names
 
 
-NUMBERED = [f"q_{i}" for i in range(1, 8)]
-
-
 @pytest.mark.parametrize(
     ("make", "arguments", "message"),
     [
         (None, [], "no file at"),
         (lambda path: table(path, names=NUMBERED[:6] + ["q_9"]), [], "lacks joint7; expected time and the"),
-        (lambda path: write_csv(path, ["time", "q_1"], [TIME, TIME]), [], "got the columns time, q_1"),
         (lambda path: table(path, names=NUMBERED, factor=57.3), [], "expected rad in [-3.14"),
         (lambda path: table(path, names=NUMBERED, time=TIME[:100]), [], "lasts 1.98 s, but an episode 5 s"),
         (lambda path: table(path, names=NUMBERED, time=TIME[::-1]), [], "at times that increase"),
-        (lambda path: table(path, names=NUMBERED, factor=np.nan), [], "not finite"),
         (lambda path: table(path, names=NUMBERED, factor=6.0, time=TIME), ["limits=none"], "has a velocity of"),
         (lambda path: path.write_text("time,q_1\n0,a\n"), [], "is no table of numbers below a header"),
-        (lambda path: path.write_text(""), [], "is no table of numbers below a header"),
         (lambda path: table(path, names=NUMBERED), ["kind=reach"], "kind: expected none with source=FILE"),
         (lambda path: table(path, names=NUMBERED), ["joints=[a]"], "joints: expected 7 names"),
     ],
@@ -156,7 +138,6 @@ def test_bad_tables(reason, tmp_path, make, arguments, message):
         ({"qpos": np.zeros(3)}, "qpos in"),
         ({"jnt_type": None}, "qpos in"),
         ({"split_points": np.array([0, 10])}, "must increase from 0 to 600"),
-        ({"qpos": np.zeros((3, 14), object)}, "cannot be read as an npz file of motions"),
     ],
 )
 def test_bad_archives(reason, tmp_path, changes, message):
@@ -164,5 +145,5 @@ def test_bad_archives(reason, tmp_path, changes, message):
     assert message in reason("demonstrations", f"source={path}", "out=new.npz")
 
 
-def test_joint_names_without_a_file_are_rejected(rejected):
-    assert "joints: expected only with source=FILE" in rejected("demonstrations", "out=new.npz", "joints=[a]")
+def test_joint_names_without_a_file_are_rejected(reason):
+    assert "joints: expected only with source=FILE" in reason("demonstrations", "out=new.npz", "joints=[a]")

@@ -15,7 +15,7 @@ from mimic.base.files import read_json, read_text
 from mimic.evaluation.labels import SPLITS
 from mimic.runs.files import CONFIG, METRICS, REPORT
 from mimic.runs.sweeps.sweeper import LOGS, SWEEP
-from mimic.trainers.run_config import load_config
+from mimic.trainers.run_config import load_config, resume_command
 
 # Keys that no result depends on.
 _PROCESS_KEYS = ("run_dir", "resume", "logger", "compilation_cache", "distributed")
@@ -201,7 +201,8 @@ def _evaluation_settings(
 
 def _progress(path: Path, total: int, history: Mapping[str, Mapping[int, float]]) -> str:
     step = max((step for column in history.values() for step in column), default=0)
-    return f"no {REPORT}: stopped or still running, at {step:,} of {total:,} steps; resume={path} continues it"
+    progress = f"stopped or still running, at {step:,} of {total:,} steps"
+    return f"no {REPORT}: {progress}; continue with: {resume_command(path)}"
 
 
 def _version(report: Mapping[str, Any]) -> str:

@@ -77,11 +77,8 @@ NULLS = [None, *[[0.0, 0.0]] * (2 * STEPS - 1)]
     [
         ({"version": "v2.1"}, r"expected codebase_version v3.0, got 'v2.1'; LeRobot converts older datasets"),
         ({"fps": 0}, r"expected frames per second in .* got 0"),
-        ({"fps": "20"}, r"expected frames per second in .* got '20'"),
         ({"names": ["a"]}, r"has no feature with the joints a, b; its joint angles: none"),
-        ({"names": None}, r"has no feature with the joints a, b"),
         ({"names": ["a", "c"]}, r"its joint angles: observation.state \(a, c\); joints=\[...\] names"),
-        ({"names": ["a.vel", "b.vel"]}, r"has no feature with the joints a, b"),
         ({"observation.state": NULLS}, "expected numbers, got missing values"),
         ({"observation.state": [["x", "y"]] * 2 * STEPS}, "expected numbers, got string"),
         ({"observation.state": [[1.0], *[[0.0, 0.0]] * (2 * STEPS - 1)]}, "expected lists of one length, got 1 to 2"),
@@ -107,8 +104,9 @@ DATA, ROWS = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-00
 @pytest.mark.parametrize(
     ("file", "damage"),
     [
-        *((file, damage) for file in (DATA, "meta/info.json") for damage in DAMAGES),
-        *((ROWS, damage) for damage in ("truncated", "text")),  # datasets of others may lack it
+        *((DATA, damage) for damage in DAMAGES),
+        ("meta/info.json", "text"),
+        (ROWS, "truncated"),
     ],
 )
 def test_damaged_files_are_rejected(written, file, damage):

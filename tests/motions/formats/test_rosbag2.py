@@ -117,8 +117,7 @@ def foreign(path, *, names=("gripper", "b", "a"), stamp=0, velocity=False, plugi
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
-@pytest.mark.parametrize("velocity", [False, True])
-@pytest.mark.parametrize(("stamp", "step"), [(0, 2.0), (50, 1.0)])
+@pytest.mark.parametrize(("velocity", "stamp", "step"), [(False, 0, 2.0), (True, 50, 1.0)])
 def test_bags_of_others_are_read(tmp_path, plugin, velocity, stamp, step):
     bag, values = foreign(tmp_path / "bag", plugin=plugin, velocity=velocity, stamp=stamp)
     (motion,) = read_rosbag2(bag, ["a", "b"])
@@ -173,8 +172,8 @@ DAMAGES = {
 @pytest.mark.parametrize(
     ("file", "damage"),
     [
-        *(("metadata.yaml", damage) for damage in ("truncated", "text")),
-        *(("episode_000001.db3", damage) for damage in DAMAGES),
+        ("metadata.yaml", "text"),
+        *(("episode_000001.db3", damage) for damage in ("truncated", "missing", "messages")),
     ],
 )
 def test_damaged_bags_are_rejected(written, file, damage):

@@ -124,24 +124,6 @@ def test_the_arm_with_ball_joints_has_the_same_states(body, side, trunk, tmp_pat
     assert np.abs(np.diff(qpos, axis=0)).max() < 0.5  # no jumps of a full turn
 
 
-def test_distance_of_a_captured_motion_from_itself_is_zero(right_arm, tmp_path):
-    zero = zero_frames(right_arm)
-    (tmp_path / "arm.xml").write_text(ball_chain_xml(right_arm, zero))
-    arm = mimic.load_mjcf(tmp_path / "arm.xml")
-    qpos, qvel = ball_chain_motion(right_arm, zero)
-    captured, of_arm = motion_states(right_arm), link_state_table(arm, qpos, qvel)
-    matrix = mimic.arc_length_correspondence(arm, arm)
-    value = mimic.link_distances(_at(captured, 100), _at(of_arm, 100), mimic.DistanceWeights())
-    assert float((np.asarray(matrix) * np.asarray(value)).sum()) == pytest.approx(0, abs=1e-3)
-
-
-def _at(states, index):
-    import jax
-    import jax.numpy as jnp
-
-    return jax.tree.map(lambda x: jnp.asarray(x[index]), states)
-
-
 def test_windows_do_not_cross_from_training_to_held_out(right_arm):
     zero = zero_frames(right_arm)
     cut = windows([right_arm], zero, starts=[0.0], dt=0.1, horizon=10, slow_down=2.0, overlap=0.5, held_out=0.25)
