@@ -1,10 +1,12 @@
-"""Commands that run in the process of the tests: starting Python and importing JAX takes seconds."""
+"""Commands, in the process of the tests, as starting Python and importing JAX takes seconds; or in their own."""
 
 import contextlib
 import functools
 import importlib
 import io
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,27 @@ def run(name: str, *arguments: Any, folder: Path | None = None) -> str:
             patch.chdir(folder)
         cli.run(importlib.import_module(f"mimic.{name}").prepare, name)
     return printed.getvalue()
+
+
+def command(name: str, *arguments: Any, **more: Any) -> subprocess.CompletedProcess[str]:
+    """Runs a command in a process of its own."""
+    words = [sys.executable, "-m", f"mimic.{name}", *map(str, arguments)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=800, check=False, **more)
+
+
+def start(name: str, *arguments: Any, **more: Any) -> subprocess.Popen[str]:
+    """Starts a command in a process of its own."""
+    words = [sys.executable, "-m", f"mimic.{name}", *map(str, arguments)]
+    return subprocess.Popen(words, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **more})
+
+
+def wait_for(folder: Path, pattern: str, *processes: subprocess.Popen[str], count: int = 1) -> None:
+    """Waits until files of running processes exist."""
+    until = time.monotonic() + 200
+    while time.monotonic() < until and len(list(folder.glob(pattern))) < count:
+        for process in processes:
+            assert process.poll() is None, process.communicate()
+        time.sleep(0.2)
 
 
 def compose(name: str, *arguments: str) -> Any:

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import json
-import shutil
 from typing import Any
 
 import jax
@@ -76,28 +75,6 @@ def test_guesses_are_constant_poses_beside_the_proposals(mapper, guesses):
         np.testing.assert_array_equal(poses_of_expert[:, 2], learner.home[2])
     np.testing.assert_array_equal(initial[0][2:], initial[1][2:])
     assert len(np.unique(initial[0][2:], axis=0)) == guesses
-
-
-@pytest.mark.slow
-def test_more_guesses_are_never_worse(mapper):
-    """By the nearest of all poses; with the same Newton steps."""
-    learner, expert = mapper.arrays("panda4dof"), expert_pose(mapper.model.expert, jnp.full(MAX_JOINTS, 0.3))
-    few, many = (
-        float(dataclasses.replace(mapper.model, guesses=count).refined(mapper.params, expert, learner)[1].min())
-        for count in (1, 9)
-    )
-    assert many <= few
-
-
-@pytest.mark.slow
-def test_an_older_run_has_no_guesses(trained, tmp_path):
-    run_dir = tmp_path / "run"
-    shutil.copytree(trained[0], run_dir)
-    config = run_dir / "config.yaml"
-    text = config.read_text()
-    assert "  guesses: 1\n" in text
-    config.write_text(text.replace("  guesses: 1\n", ""))
-    assert AnyArmMapper.load(run_dir).model.guesses == 0
 
 
 @pytest.mark.slow
@@ -335,19 +312,3 @@ def test_runs_of_the_other_kind_are_rejected(trained, tmp_path):
     (tmp_path / "config.yaml").write_text("trainer: {name: pose_mapper}\nenv: {name: panda4dof}\n")
     with pytest.raises(ValueError, match="got one of trainer=pose_mapper env=panda4dof"):
         AnyArmMapper.load(tmp_path)
-
-
-@pytest.mark.slow
-def test_two_minutes_of_training_are_better_than_random_guesses(tmp_path):
-    """On arms seen in training; 130,000 samples, an eighth of the preset's width."""
-    settings = {
-        "width": 32,
-        "layers": 2,
-        "heads": 8,
-        "guesses": 0,
-        "refinements": 4,
-        "samples": 8192,
-        "batch_size": 256,
-    }
-    report = train(tmp_path / "run", **settings, epochs=16, held_out_poses=16)
-    assert report["quality"]["train"] < report["quality_random_guesses"]["train"]

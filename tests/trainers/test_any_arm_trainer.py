@@ -3,8 +3,6 @@
 import copy
 import dataclasses
 import json
-import subprocess
-import sys
 
 import pytest
 
@@ -17,6 +15,7 @@ from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.make import make_trainer
 from mimic.trainers.ppo.any_arm_trainer import AnyArmPPOTrainer
 from mimic.trainers.run_config import load_config
+from tests.helpers.commands import command
 from tests.helpers.untrained_family import ARMS, COUNT, HELD_OUT, family
 
 TINY = [
@@ -40,12 +39,6 @@ METRICS = {
     "speed_violations",
 }  # fmt: skip
 ROW = {"seen", "joints", "gap", "controller_gap", "mean_distance", "lower_bound", "hold_distance", "span"}
-
-
-def command(module, *arguments):
-    return subprocess.run(
-        [sys.executable, "-m", f"mimic.{module}", *arguments], capture_output=True, text=True, timeout=500, check=False
-    )
 
 
 @pytest.fixture(scope="module")

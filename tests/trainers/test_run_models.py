@@ -4,8 +4,6 @@ import dataclasses
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +19,7 @@ from mimic.trainers.config import TrainConfig
 from mimic.trainers.run_config import load_config, new_run_dir, save_config
 from mimic.trainers.run_models import MODELS, RECORD, save_models, with_original_models
 from tests.helpers import original_model
+from tests.helpers.commands import command
 from tests.helpers.run_directories import write_run
 from tests.helpers.tiny import TINY
 from tests.helpers.untrained_run import untrained_run
@@ -188,31 +187,22 @@ def test_commands_use_the_arm_of_a_moved_run(tmp_path):
     file = tmp_path / "arm.xml"
     file.write_text(TWO_JOINTS)
     arguments = [f"env.learner.model={file}", *TINY, f"run_dir={tmp_path / 'first'}", "compilation_cache="]
-    command("train", *arguments)
+    assert not command("train", *arguments).returncode
     report = json.loads((tmp_path / "first" / "report.json").read_text())
     file.write_text(TWO_JOINTS.replace('mass="0.5"', 'mass="5"'))
     run_dir = (tmp_path / "first").rename(tmp_path / "run")
-    command("evaluate", f"run={run_dir}", f"out={tmp_path / 'out'}")
+    assert not command("evaluate", f"run={run_dir}", f"out={tmp_path / 'out'}").returncode
     again = json.loads((tmp_path / "out" / "report.json").read_text())
     assert again["mean_distance"] == pytest.approx(report["mean_distance"], rel=1e-5)  # float32, in another process
     file.unlink()
-    command("export", f"run={run_dir}", f"out={tmp_path / 'policy.onnx'}")
-    command("render", f"run={run_dir}", f"out={tmp_path / 'video.mp4'}")
-    command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1")
+    assert not command("export", f"run={run_dir}", f"out={tmp_path / 'policy.onnx'}").returncode
+    assert not command("render", f"run={run_dir}", f"out={tmp_path / 'video.mp4'}").returncode
+    assert not command("train", f"resume={run_dir}", "trainer.num_timesteps=8000", "trainer.evaluations=1").returncode
     assert load_config(run_dir, saved_models=False).env.learner.model == str(file)
     append(run_dir / MODELS / "learner" / "arm.xml")
     for name in ("evaluate", "export", "render"):
-        error = command(name, f"run={run_dir}", f"out={tmp_path / name}", code=2)
+        error = command(name, f"run={run_dir}", f"out={tmp_path / name}").stderr
         assert error.startswith("error: ") and error.count("\n") == 1 and "was changed since" in error
-
-
-def command(name, *arguments, code=0):
-    """Runs a command, whose exit code must be this; returns its error output."""
-    result = subprocess.run(
-        [sys.executable, "-m", f"mimic.{name}", *arguments], capture_output=True, text=True, timeout=280, check=False
-    )
-    assert result.returncode == code, result.stderr[-2000:]
-    return result.stderr
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import contextlib
 import csv
 import dataclasses
-import io
 import json
 import logging
 import os
@@ -11,8 +10,6 @@ import re
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import time
 
 import imageio_ffmpeg
@@ -21,14 +18,13 @@ import numpy as np
 import pytest
 
 from benchmarks.interruptions import differences
-from mimic import train
-from mimic.commands import cli
 from mimic.runs.checkpoints import checkpoint_steps, delete_checkpoint, load_checkpoint, save_checkpoint
 from mimic.runs.lock import RunLock
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.run_config import load_config, new_run_dir
 from mimic.trainers.run_training import prepare_training
+from tests.helpers.commands import command, run, start, wait_for
 from tests.helpers.tiny import TINY
 
 BY_SPLIT = {
@@ -37,17 +33,6 @@ BY_SPLIT = {
     "worst_demonstrations",
 }  # fmt: skip
 REPORT_KEYS = {"env", "trainer", "seed", "wall_time_s", "env_steps", "steps_per_second", "hardware", "versions"}
-
-
-def command(module, *arguments, **more):
-    return subprocess.run(
-        [sys.executable, "-m", f"mimic.{module}", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-        **more,
-    )
 
 
 def rows_of(run_dir):
@@ -59,19 +44,16 @@ def rows_of(run_dir):
 def finished(tmp_path_factory):
     """One tiny run, what it prints, and what it compiles."""
     run_dir = tmp_path_factory.mktemp("runs") / "tiny"
-    compiled, printed = [], io.StringIO()
-    handler = logging.Handler()
+    compiled, handler = [], logging.Handler()
     handler.emit = lambda record: compiled.append(record.getMessage())
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
-        patch.setattr(sys, "argv", ["mimic.train", *TINY, f"run_dir={run_dir}", "compilation_cache="])
-        logging.getLogger("jax").addHandler(handler)
-        jax.config.update("jax_log_compiles", True)  # in all threads
-        try:
-            cli.run(train.prepare, "train")
-        finally:
-            jax.config.update("jax_log_compiles", False)
-            logging.getLogger("jax").removeHandler(handler)
-    return run_dir, printed.getvalue(), "\n".join(compiled)
+    logging.getLogger("jax").addHandler(handler)
+    jax.config.update("jax_log_compiles", True)  # in all threads
+    try:
+        printed = run("train", *TINY, f"run_dir={run_dir}", "compilation_cache=")
+    finally:
+        jax.config.update("jax_log_compiles", False)
+        logging.getLogger("jax").removeHandler(handler)
+    return run_dir, printed, "\n".join(compiled)
 
 
 def test_a_run_directory_holds_everything(finished):
@@ -313,25 +295,16 @@ def test_training_ends_at_the_target_gap(tmp_path):
     assert json.loads((run_dir / "report.json").read_text())["env_steps"] < 5000
 
 
-SLOW_SIGNALS = signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2
+ENDLESS = "trainer.num_timesteps=100000000", "trainer.evaluations=20000"
 
 
-@pytest.mark.slow_for("15")
-@pytest.mark.parametrize(
-    "number", [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in SLOW_SIGNALS)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2])
 def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
     run_dir = tmp_path / "stopped"
-    arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mimic.train", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    process = start("train", *TINY, f"run_dir={run_dir}", *ENDLESS)
     # SIGINT as soon as there is something to lose, SIGTERM in the midst of training.
-    awaited = "config.yaml" if number == signal.SIGINT else "checkpoints/0*[1-9]*"
-    until = time.monotonic() + 200
-    while time.monotonic() < until and not list(run_dir.glob(awaited)):
-        assert process.poll() is None, process.communicate()[1][-2000:]
-        time.sleep(0.2)
+    wait_for(run_dir, "config.yaml" if number == signal.SIGINT else "checkpoints/0*[1-9]*", process)
     process.send_signal(number)
     out, error = process.communicate(timeout=120)
     assert process.returncode == 128 + number, error[-2000:]
@@ -343,14 +316,8 @@ def test_a_signal_leaves_a_checkpoint_and_says_how_to_resume(number, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_second_signal_leaves_no_partial_checkpoint(number, tmp_path):
     run_dir = tmp_path / "stopped"
-    arguments = [*TINY, f"run_dir={run_dir}", "trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mimic.train", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    until = time.monotonic() + 200
-    while time.monotonic() < until and not list(run_dir.glob("config.yaml")):
-        assert process.poll() is None, process.communicate()[1][-2000:]
-        time.sleep(0.2)
+    process = start("train", *TINY, f"run_dir={run_dir}", *ENDLESS)
+    wait_for(run_dir, "config.yaml", process)
     for pause in (0.4, 0.0):
         process.send_signal(number)
         time.sleep(pause)

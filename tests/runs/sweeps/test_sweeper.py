@@ -6,7 +6,6 @@ import os
 import pathlib
 import signal
 import stat
-import subprocess
 import sys
 import threading
 import time
@@ -21,6 +20,7 @@ from mimic.commands import cli
 from mimic.runs.sweeps.launchers import gpus_of
 from mimic.runs.sweeps.run_command import RunCommand
 from mimic.runs.sweeps.sweeper import Outcome, Sweeper, path_of
+from tests.helpers.commands import command, schemas, start, wait_for
 from tests.helpers.run_directories import write_run
 from tests.helpers.tiny import TINY
 
@@ -40,18 +40,6 @@ while [[ $1 == -* ]]; do [[ $1 == --output || $1 == --error ]] && shift; shift; 
 exec "$@"
 """
 SACCT = "#!/bin/bash\necho 'JobID|State|NodeList'\necho '7_0|RUNNING|here'\n"
-
-
-def command(module, *arguments, folder, **more):
-    return subprocess.run(
-        [sys.executable, "-m", f"mimic.{module}", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=800,
-        check=False,
-        cwd=folder,
-        **more,
-    )
 
 
 @pytest.fixture
@@ -75,7 +63,7 @@ def test_a_failed_run_is_named_and_the_rest_is_kept(launcher, tmp_path, slurm):
         pytest.importorskip("ray")
     write_run(tmp_path / "there", [0.5])
     choice = [f"hydra/launcher={launcher}", "hydra.sweep.dir=sweep"]
-    result = command("collect", "-m", "folder=missing,there", *choice, folder=tmp_path, env=slurm)
+    result = command("collect", "-m", "folder=missing,there", *choice, cwd=tmp_path, env=slurm)
     assert result.returncode == 1, result.stderr[-2000:]
     assert "sweep: 1 of 2 runs done; results: sweep" in result.stdout
     failures = [line for line in result.stderr.splitlines() if line.startswith("failed: ")]
@@ -140,6 +128,7 @@ def test_the_same_sweep_continues(tmp_path, monkeypatch, capsys):
         cli.run(train.prepare, "train")
 
     monkeypatch.setattr(Sweeper, "setup", setup)
+    monkeypatch.setattr(cli, "schema", schemas)
     sweep("0,1,2,3")
     write_run(tmp_path / "0", [0.5], seed=0)
     write_run(tmp_path / "1", [0.5], seed=1, report=False)
@@ -258,6 +247,7 @@ def test_each_slot_has_gpus_of_its_own():
 def sweep(tmp_path, monkeypatch):
     """A function that sweeps a command over folders and returns the exit code; `work` takes a folder's name."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "schema", schemas)
 
     def run(work, *folders):
         arguments = ["-m", f"folder={','.join(folders)}", "hydra.sweep.dir=sweep"]
@@ -294,10 +284,10 @@ SHORT = [*TINY, "trainer.num_timesteps=2000", "trainer.evaluations=1"]
 def test_a_sweep_is_collected(tmp_path):
     choice = ["hydra/launcher=submitit_local", "hydra.launcher.parallel=2", "hydra.sweep.dir=runs/mine"]
     swept = ["env=planar4dof,planar7dof", "seed=0,1"]
-    result = command("train", "-m", *SHORT[1:], *swept, *choice, folder=tmp_path)
+    result = command("train", "-m", *SHORT[1:], *swept, *choice, cwd=tmp_path)
     assert result.returncode == 0, result.stderr[-2000:]
     assert "python -m mimic.collect folder=runs/mine" in result.stdout
-    result = command("collect", "runs/mine", folder=tmp_path)
+    result = command("collect", "runs/mine", cwd=tmp_path)
     assert result.returncode == 0, result.stderr[-2000:]
     collected = json.loads((tmp_path / "runs" / "mine" / "collected.json").read_text())
     assert [(group["label"], group["seeds"]) for group in collected["groups"]] == [
@@ -318,24 +308,14 @@ def test_a_sweep_is_collected(tmp_path):
 def test_ctrl_c_ends_a_sweep_at_the_next_checkpoint(launcher, tmp_path):
     endless = ["trainer.num_timesteps=100000000", "trainer.evaluations=20000"]
     arguments = ["-m", *SHORT, *endless, "seed=0,1", f"hydra/launcher={launcher}", "hydra.sweep.dir=sweep"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mimic.train", *arguments],
-        cwd=tmp_path,
-        start_new_session=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    until = time.monotonic() + 200
-    while time.monotonic() < until and not list(tmp_path.glob("sweep/0-*/checkpoints/0*[1-9]*")):
-        assert process.poll() is None, process.communicate()[1][-2000:]
-        time.sleep(0.2)
+    process = start("train", *arguments, cwd=tmp_path, start_new_session=True)
+    wait_for(tmp_path, "sweep/0-*/checkpoints/0*[1-9]*", process)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     _, error = process.communicate(timeout=120)
     assert process.returncode == 130, error[-2000:]
     assert "the sweep was stopped" in error
     assert not list(tmp_path.glob("sweep/1-*"))
-    result = command("collect", "sweep", folder=tmp_path)
+    result = command("collect", "sweep", cwd=tmp_path)
     assert result.returncode == 2 and "expected runs with a report.json, found none" in result.stderr
 
 
@@ -353,18 +333,8 @@ def running(text):
 def test_ctrl_c_twice_ends_a_sweep_and_its_runs_immediately(tmp_path):
     endless = ["trainer.num_timesteps=100000000", "trainer.evaluations=1"]  # no checkpoint for a long time
     arguments = ["-m", *SHORT, *endless, "seed=0,1", "hydra/launcher=submitit_local", "hydra.launcher.parallel=2"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mimic.train", *arguments, f"hydra.sweep.dir={tmp_path}/sweep"],
-        cwd=tmp_path,
-        start_new_session=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    until = time.monotonic() + 200
-    while time.monotonic() < until and len(list(tmp_path.glob("sweep/*/config.yaml"))) < 2:
-        assert process.poll() is None, process.communicate()[1][-2000:]
-        time.sleep(0.2)
+    process = start("train", *arguments, f"hydra.sweep.dir={tmp_path}/sweep", cwd=tmp_path, start_new_session=True)
+    wait_for(tmp_path, "sweep/*/config.yaml", process, count=2)
     for pause in (1.0, 0.0):
         os.killpg(process.pid, signal.SIGINT)
         time.sleep(pause)
