@@ -54,10 +54,16 @@ def poses(mapper, count, seed=0):
     return np.random.default_rng(seed).uniform(lower, upper, (count, len(lower))).astype(np.float32)
 
 
-@pytest.mark.slow
-def test_it_learns(tmp_path):
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
     """A small network and a third of a million poses; the preset gets below 0.1 %."""
-    report = train(tmp_path / "run")
+    run_dir = tmp_path_factory.mktemp("learned") / "run"
+    return run_dir, train(run_dir)
+
+
+@pytest.mark.slow
+def test_it_learns(learned):
+    report = learned[1]
     assert report["quality"]["held_out"] < 0.05
     learned_by_heart = report["quality"]["held_out"] - report["quality"]["train"]
     assert abs(learned_by_heart) < 0.02  # fresh poses cannot be
@@ -105,12 +111,12 @@ def test_the_nearest_head_is_taken(trained):
 
 
 @pytest.mark.slow
-def test_retargeted_motions_do_not_jump(trained, tmp_path):
-    mapper = mimic.PoseMapper.load(trained[0])
-    env = mimic.make("planar4dof", **SHORT_ARMS, demonstrations={"count": 3, "held_out": 1})
+def test_retargeted_motions_do_not_jump(learned, tmp_path):
+    mapper = mimic.PoseMapper.load(learned[0])
+    env = mimic.make("planar4dof", demonstrations={"count": 3, "held_out": 1})
     out = tmp_path / "learner.npz"
     env.demonstrations.save(tmp_path / "expert.npz")
-    config = RetargetConfig(str(tmp_path / "expert.npz"), env.config, str(trained[0]), out=str(out))
+    config = RetargetConfig(str(tmp_path / "expert.npz"), env.config, str(learned[0]), out=str(out))
     retarget.prepare_retargeting(config)()
     motions = mimic.load_demonstrations(out)
     motions.check_fits(env.learner, 0.1, 50)
