@@ -16,10 +16,9 @@ from jaxtyping import Array
 
 from mimic.arms.arrays import MAX_JOINTS
 from mimic.base import fused_kernel
-from mimic.base.spatial import ZERO, Scalar, Vector, add, minus, plus, times
+from mimic.base.spatial import Scalar, Vector, minus, plus, times
 from mimic.physics import dynamics
-from mimic.physics.chain_dynamics import acceleration_field
-from mimic.physics.dynamics import PLANE, JointNumbers, Motion
+from mimic.physics.dynamics import JointNumbers
 from mimic.physics.step import runge_kutta
 from mimic.physics.trigonometry import cosine_and_sine
 
@@ -129,44 +128,12 @@ def acceleration(
     turns = [(1.0, 0.0)] if base is None else []
     for joint, angle in list(zip(joints, qpos, strict=True))[len(turns) :]:
         turns.append(cosine_and_sine(angle + joint.reference))
-    wrenches = _wrenches(joints, turns, qvel, base)
-    rows = _inertia_and_bias(joints, turns, wrenches)
+    wrenches = dynamics.inertial_wrenches(joints, turns, qvel, base)
+    rows = dynamics.rows_of_inertia(joints, turns, wrenches)
     elimination = _Elimination(len(joints))
     for k, (row, bias) in zip(reversed(range(len(joints))), rows, strict=True):
         elimination.add(k, row, joints[k].armature, torque[k] - joints[k].damping * qvel[k] - bias)
     return elimination.solution()
-
-
-def _wrenches(
-    joints: Sequence[JointNumbers], turns: Sequence[PLANE], qvel: Sequence[Scalar], base: Vector | None
-) -> list[tuple[Vector, Vector]]:
-    """Force and moment that accelerate each body at zero joint acceleration."""
-    motion: Motion = (ZERO, ZERO, ZERO if base is None else base)
-    field = ZERO, ZERO, ZERO
-    wrenches = []
-    for joint, turn, speed in zip(joints, turns, qvel, strict=True):
-        motion = dynamics.child_motion(joint, turn, speed, motion, field)
-        field = acceleration_field(motion[0], motion[1])
-        wrenches.append(dynamics.inertial_wrench(joint, motion[2], field))
-    return wrenches
-
-
-def _inertia_and_bias(joints: Sequence[JointNumbers], turns: Sequence[PLANE], wrenches: Any) -> Any:
-    """Yields rows of the inertia's lower triangle, and the bias torque, of each joint from the last to the first."""
-    masses: Any = (ZERO, (ZERO, ZERO, ZERO))
-    total = ZERO, ZERO  # wrench of the distal bodies
-    for i in reversed(range(len(joints))):
-        masses = dynamics.composite(joints[i], *masses)
-        unit = dynamics.unit_wrench(*masses)
-        total = add(total[0], wrenches[i][0]), add(total[1], wrenches[i][1])
-        row, bias = [unit[1][2]], total[1][2]
-        for j in reversed(range(1, i + 1)):  # to the frames of the joints before it
-            unit = dynamics.wrench_to_parent(joints[j], turns[j], *unit)
-            row.insert(0, unit[1][2])
-        yield row, bias
-        if i > 0:
-            total = dynamics.wrench_to_parent(joints[i], turns[i], *total)
-            masses = dynamics.moments_to_parent(joints[i], turns[i], *masses)
 
 
 class _Elimination:

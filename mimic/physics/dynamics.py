@@ -4,7 +4,7 @@ A transform between two frames is two rotations in a plane, see mimic/arms/array
 operations as a general rotation. That matters twice: the compile time of a GPU kernel grows with their square.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from mimic.base.spatial import ZERO, Rotation, Scalar, Vector, add, cross, minus
 from mimic.physics.chain_dynamics import acceleration_field, moment_of_field
 
 PLANE = tuple[Scalar, Scalar]  # cosine and sine
+Wrench = tuple[Vector, Vector]  # force and moment
 Motion = tuple[Vector, Vector, Vector]  # angular velocity and acceleration, and linear acceleration of the origin
 
 
@@ -58,7 +59,8 @@ def joint_of(numbers: Any) -> JointNumbers:
 def inertia_matrix(arm: ArmArrays, qpos: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
     """Joint-space inertia with the armature [kg m^2]; locked joints have the rows of the identity."""
     joints = unpacked(joint_numbers(arm))
-    return _full_inertia(arm, mass_matrix(joints, _turns(joints, list(qpos))))
+    at_rest = [(ZERO, ZERO)] * len(joints)
+    return _full_inertia(arm, [row for row, _ in rows_of_inertia(joints, _turns(joints, list(qpos)), at_rest)])
 
 
 def inertia_and_bias(
@@ -67,11 +69,13 @@ def inertia_and_bias(
     """`inertia_matrix`, and the joint torques [N m] for zero acceleration: Coriolis and centrifugal forces, damping."""
     joints = unpacked(joint_numbers(arm))
     turns = _turns(joints, list(qpos))
-    bias = jnp.stack(bias_forces(joints, turns, list(qvel)))
-    return _full_inertia(arm, mass_matrix(joints, turns)), arm.is_free * (bias + arm.damping * qvel)
+    rows, torques = zip(*rows_of_inertia(joints, turns, inertial_wrenches(joints, turns, list(qvel))), strict=True)
+    bias = jnp.stack(torques[::-1])
+    return _full_inertia(arm, rows), arm.is_free * (bias + arm.damping * qvel)
 
 
-def _full_inertia(arm: ArmArrays, lower: Sequence[Sequence[Scalar]]) -> Float[Array, "joints joints"]:
+def _full_inertia(arm: ArmArrays, last_first: Sequence[Sequence[Scalar]]) -> Float[Array, "joints joints"]:
+    lower = last_first[::-1]
     rows = [jnp.stack([lower[max(i, j)][min(i, j)] for j in range(MAX_JOINTS)]) for i in range(MAX_JOINTS)]
     both_free = arm.is_free[:, None] * arm.is_free
     return both_free * jnp.stack(rows) + jnp.diag(arm.is_free * arm.armature + (1 - arm.is_free))
@@ -83,49 +87,53 @@ def _turns(joints: Sequence[JointNumbers], qpos: Sequence[Scalar]) -> list[PLANE
     return [(jnp.cos(angle), jnp.sin(angle)) for angle in angles]
 
 
-def mass_matrix(joints: Sequence[JointNumbers], turns: Sequence[PLANE]) -> list[list[Scalar]]:
-    """Lower triangle of the joint-space inertia, without armature, by the composite rigid body algorithm.
-
-    Args:
-      joints: from `unpacked`.
-      turns: cosine and sine of each joint's rotation.
-    """
-    matrix: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(len(joints))]
-    of_child: tuple[Vector, Rotation] = (ZERO, (ZERO, ZERO, ZERO))
-    for i in reversed(range(len(joints))):
-        first, second = composite(joints[i], *of_child)
-        force, moment = unit_wrench(first, second)
-        matrix[i][i] = moment[2]
-        for j in reversed(range(1, i + 1)):  # to the frames of the joints before it
-            force, moment = wrench_to_parent(joints[j], turns[j], force, moment)
-            matrix[i][j - 1] = moment[2]
-        if i > 0:
-            of_child = moments_to_parent(joints[i], turns[i], first, second)
-    return matrix
-
-
-def bias_forces(joints: Sequence[JointNumbers], turns: Sequence[PLANE], qvel: Sequence[Scalar]) -> list[Scalar]:
-    """Joint torques [N m] for zero joint acceleration: Coriolis and centrifugal forces.
+def inertial_wrenches(
+    joints: Sequence[JointNumbers], turns: Sequence[PLANE], qvel: Sequence[Scalar], base: Vector | None = None
+) -> list[Wrench]:
+    """Force and moment that accelerate each body at zero joint acceleration.
 
     Args:
       joints: from `unpacked`.
       turns: cosine and sine of each joint's rotation.
       qvel: joint velocities [rad/s].
+      base: acceleration of the base, in the frame of the first joint at angle 0 [m/s^2]; 0 where None.
     """
-    motion, field = (ZERO, ZERO, ZERO), (ZERO, ZERO, ZERO)
-    wrenches: list[tuple[Vector, Vector]] = []
+    motion: Motion = (ZERO, ZERO, ZERO if base is None else base)
+    field = ZERO, ZERO, ZERO
+    wrenches = []
     for joint, turn, speed in zip(joints, turns, qvel, strict=True):
         motion = child_motion(joint, turn, speed, motion, field)
         field = acceleration_field(motion[0], motion[1])
         wrenches.append(inertial_wrench(joint, motion[2], field))
-    torques: list[Scalar] = [0.0] * len(joints)
-    force, moment = ZERO, ZERO
+    return wrenches
+
+
+def rows_of_inertia(
+    joints: Sequence[JointNumbers], turns: Sequence[PLANE], wrenches: Sequence[Wrench]
+) -> Iterator[tuple[list[Scalar], Scalar]]:
+    """Yields a row of the joint-space inertia's lower triangle and the bias torque [N m], from the last joint on.
+
+    By the composite rigid body algorithm, without armature.
+
+    Args:
+      joints: from `unpacked`.
+      turns: cosine and sine of each joint's rotation.
+      wrenches: from `inertial_wrenches`.
+    """
+    masses: Any = (ZERO, (ZERO, ZERO, ZERO))
+    total = ZERO, ZERO  # wrench of the distal bodies
     for i in reversed(range(len(joints))):
-        force, moment = add(force, wrenches[i][0]), add(moment, wrenches[i][1])
-        torques[i] = moment[2]
+        masses = composite(joints[i], *masses)
+        unit = unit_wrench(*masses)
+        total = add(total[0], wrenches[i][0]), add(total[1], wrenches[i][1])
+        row, bias = [unit[1][2]], total[1][2]
+        for j in reversed(range(1, i + 1)):  # to the frames of the joints before it
+            unit = wrench_to_parent(joints[j], turns[j], *unit)
+            row.insert(0, unit[1][2])
+        yield row, bias
         if i > 0:
-            force, moment = wrench_to_parent(joints[i], turns[i], force, moment)
-    return torques
+            total = wrench_to_parent(joints[i], turns[i], *total)
+            masses = moments_to_parent(joints[i], turns[i], *masses)
 
 
 def child_motion(joint: JointNumbers, turn: PLANE, speed: Scalar, parent: Motion, field: Rotation) -> Motion:

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from mujoco import mjx
 
 from mimic.control import joint_control
@@ -13,6 +12,7 @@ from mimic.control.joint_control import Target
 from mimic.physics.inner_loop import LoopState, control
 from mimic.physics.mujoco_world import MujocoWorld, loaded_fields
 from mimic.physics.plant import Draw, Plant
+from mimic.physics.step import constant
 
 MjxLoop = Callable[[Draw, LoopState, Target], LoopState]
 
@@ -34,7 +34,7 @@ def make_mjx_loop(mode: str, plant: Plant, world: MujocoWorld, periods: int) -> 
     parts = jax.device_get((mjx.put_model(world.model, device=device), mjx.make_data(world.model, device=device)))
 
     def loop(draw: Draw, state: LoopState, target: Target) -> LoopState:
-        model, data = jax.tree.map(_constant, parts)
+        model, data = jax.tree.map(constant, parts)
         model = _with_draw(model, world, draw)
         by_row = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), constants)
         drive = draw.gain, draw.friction * jnp.asarray(plant.friction, jnp.float32), draw.bias
@@ -62,8 +62,3 @@ def _with_draw(model: mjx.Model, world: MujocoWorld, draw: Draw) -> mjx.Model:
         body_ipos=fields.body_ipos,
         dof_damping=draw.load.damping * model.dof_damping,
     )
-
-
-def _constant(value: Array) -> Array:
-    """A constant array. Empty ones are computed: jaxlib 0.11.2 crashes on empty literals with several devices."""
-    return jnp.asarray(value) if value.size else jnp.zeros(value.shape, value.dtype)

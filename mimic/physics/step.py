@@ -78,7 +78,7 @@ def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advan
     constants = jax.device_get((mjx.put_model(model, device=device), mjx.make_data(model, device=device)))
 
     def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
-        mjx_model, blank = jax.tree.map(_constant, constants)
+        mjx_model, blank = jax.tree.map(constant, constants)
         loaded = mjx_model.replace(
             body_mass=load.mass * mjx_model.body_mass,
             body_inertia=load.mass * mjx_model.body_inertia,
@@ -95,7 +95,7 @@ def _mjx_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advan
     return advance
 
 
-def _constant(value: Any) -> Array:
+def constant(value: Any) -> Array:
     """A constant array. Empty ones are computed: jaxlib 0.11.2 crashes on empty literals with several devices."""
     return jnp.asarray(value) if value.size else jnp.zeros(value.shape, value.dtype)
 

@@ -1,10 +1,8 @@
 """Optional costs of retargeting, which are added to the embodiment distance."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,7 +16,7 @@ from mimic.metric.capsule_distances import capsule_axes, intrusion, pair_distanc
 from mimic.metric.kinematics import LinkStates, forward_kinematics, joint_frames
 from mimic.retargeting.closed_form import SMOOTHING, Smoothing
 from mimic.retargeting.optimizers import Derivatives, Scalars, Store, call
-from mimic.retargeting.pose_objective import PoseObjective, Target
+from mimic.retargeting.pose_objective import PoseObjective, Target, automatic_derivatives
 
 _NEAR_LIMIT = 0.1  # fraction of a joint's range at each end where `limits` counts
 _FULL_TURN = 2 * np.pi - 1e-4  # rad; a joint with such a range has no limits, as for `continuous_joints`
@@ -175,17 +173,6 @@ def with_costs(
         return sum_of(base, cost)
 
     return dataclasses.replace(objective, target=target, value=value, derivatives=total, is_elementwise=False)
-
-
-def automatic_derivatives(function: Callable[[Array], Array], qpos: Scalars) -> Derivatives:
-    """Derivatives of a function of joint angles, by automatic differentiation."""
-
-    def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
-        value, gradient = jax.value_and_grad(function)(qpos)
-        return gradient, (value, gradient)
-
-    hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
-    return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
 
 
 def smoothness_derivatives(costs: Costs, qpos: Scalars, previous: Array, earlier: Array) -> Derivatives:

@@ -76,14 +76,20 @@ def pose_objective(learner: Embodiment, metric: Metric) -> PoseObjective:
 
 def _differentiated(learner: Embodiment, metric: Metric) -> PoseObjective:
     def derivatives(target: LinkStates, qpos: Scalars, store: Store = call, smoothing: Any = None) -> Derivatives:
-        def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
-            value, gradient = jax.value_and_grad(lambda q: metric(target, link_states(learner, q)))(qpos)
-            return gradient, (value, gradient)
-
-        hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
-        return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
+        return automatic_derivatives(lambda q: metric(target, link_states(learner, q)), qpos)
 
     return PoseObjective(metric, lambda states, _=None: states, metric, derivatives)
+
+
+def automatic_derivatives(function: Callable[[Array], Array], qpos: Scalars) -> Derivatives:
+    """Derivatives of a function of joint angles, by automatic differentiation."""
+
+    def gradient_and_value(qpos: Array) -> tuple[Array, tuple[Array, Array]]:
+        value, gradient = jax.value_and_grad(function)(qpos)
+        return gradient, (value, gradient)
+
+    hessian, (value, gradient) = jax.jacfwd(gradient_and_value, has_aux=True)(jnp.stack(qpos))
+    return Derivatives(value, tuple(gradient), tuple(map(tuple, hessian)))
 
 
 class StaticTarget(NamedTuple):

@@ -16,7 +16,6 @@ from mimic.metric.capsule_distances import capsule_axes, pair_distances, segment
 from mimic.metric.config import MetricConfig
 from mimic.retargeting.costs import (
     Costs,
-    automatic_derivatives,
     hand_cost,
     home_cost,
     limit_cost,
@@ -24,6 +23,7 @@ from mimic.retargeting.costs import (
     smoothness_derivatives,
 )
 from mimic.retargeting.pose import imitate_pose
+from mimic.retargeting.pose_objective import automatic_derivatives
 from mimic.retargeting.trajectory import imitate_trajectory
 
 EXPERT, LEARNER = planar_arm([0.4, 0.35, 0.25]), planar_arm([0.6, 0.4])
