@@ -156,15 +156,6 @@ def test_candidate_points_are_compared_by_place_and_velocity():
     np.testing.assert_allclose(traced, link_distances(a, b, weights), rtol=1e-6)  # float32
 
 
-def test_weights_of_zero_cost_nothing():
-    a, b = states(EXPERT), states(LEARNER, 1)
-    program = jax.make_jaxpr(functools.partial(link_distances, weights=DistanceWeights(rotation=1.0)))(a, b)
-    used = jax.jit(functools.partial(link_distances, weights=DistanceWeights(rotation=1.0))).lower(a, b).as_text()
-    assert "sqrt" in str(program)  # the distances are written down, and
-    assert "sqrt" not in used  # XLA drops those that are unused
-    assert not link_distances(a, b, DistanceWeights(rotation=0.0)).any()
-
-
 # --- batches and dtypes -----------------------------------------------------------------------------------------------
 
 
@@ -202,7 +193,7 @@ def test_float32_stays_float32_under_x64(x64, correspondence, weights):
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     "matrix",
-    [np.ones((2, 3)), np.ones((3, 3)), np.ones(6), np.ones((1, 3, 2)), 1.0, lambda distances: distances.T],
+    [np.ones((2, 3)), np.ones((1, 3, 2)), 1.0, lambda distances: distances.T],
     ids=lambda matrix: str(np.shape(matrix)),
 )
 def test_a_correspondence_of_another_shape_is_rejected(matrix):

@@ -12,6 +12,7 @@ from mimic.arms.capsules import fit_capsules
 from mimic.physics.mujoco_world import disabled, loaded_fields, mujoco_world
 from mimic.physics.world import WorldConfig
 from mimic.retargeting.clearance import make_clearance
+from tests.helpers.array_cases import acceleration
 from tests.physics.test_inner_loop import NAMES, draw_for, make_arm_and_plant, mujoco_model
 
 TILTED = """<mujoco><worldbody><body name="base" pos="1 2 3" quat="0.9 0.3 0.1 0.2">
@@ -32,13 +33,6 @@ def loaded(world, draw) -> mujoco.MjModel:
     return model
 
 
-def acceleration(model, qpos, qvel):
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = qpos, qvel
-    mujoco.mj_forward(model, data)
-    return data.qacc
-
-
 @pytest.mark.slow_for("panda7dof")
 @pytest.mark.parametrize("name", NAMES)
 def test_a_load_is_that_of_a_payload_within_the_last_body(name):
@@ -47,8 +41,8 @@ def test_a_load_is_that_of_a_payload_within_the_last_body(name):
     draw, rng = draw_for(arm.embodiment.num_joints), np.random.default_rng(0)
     ours = loaded(mujoco_world(arm, WorldConfig(gravity=True)), draw)
     qpos, qvel = rng.normal(size=(2, arm.embodiment.num_joints))
-    expected = acceleration(mujoco_model(arm, draw), qpos, qvel)
-    np.testing.assert_allclose(acceleration(ours, qpos, qvel), expected, rtol=1e-9, atol=1e-9)
+    expected = acceleration(mujoco_model(arm, draw), qpos, qvel, 0)
+    np.testing.assert_allclose(acceleration(ours, qpos, qvel, 0), expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("floor_height", [-0.3])
@@ -60,7 +54,7 @@ def test_gravity_is_vertical_and_the_floor_is_that_of_the_base(tmp_path, floor_h
     model = mujoco_world(arm, WorldConfig(gravity=True, contacts=True, floor_height=floor_height), capsules).model
     plain = copy.copy(arm.model)
     plain.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-    np.testing.assert_allclose(acceleration(model, qpos, 0), acceleration(plain, qpos, 0), rtol=1e-9)
+    np.testing.assert_allclose(acceleration(model, qpos, 0, 0), acceleration(plain, qpos, 0, 0), rtol=1e-9)
     model.pair_margin[:] = 10.0  # reports distances, too
     data = mujoco.MjData(model)
     data.qpos[:] = qpos

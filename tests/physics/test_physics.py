@@ -132,18 +132,6 @@ def test_gradients_are_finite_and_those_of_finite_differences(x64, mixed):
     np.testing.assert_allclose(actual, expected, rtol=1e-6)  # 1e-16 / 1e-6, times a hundred, and the step squared
 
 
-@pytest.mark.slow
-def test_the_kernel_steps_as_the_plain_function_does(mixed, gpu_kernels):
-    """The GPU kernel, interpreted on the CPU, for a batch that is no multiple of its block."""
-    advance = make_advance(TIMESTEP, 1)
-    batch = jax.vmap(advance)(*mixed)
-    assert len(gpu_kernels) == 1
-    alone = jax.jit(advance)
-    for i in range(COUNT):
-        for batched, single in zip(batch, alone(*jax.tree.map(lambda x, i=i: x[i], mixed)), strict=True):
-            np.testing.assert_allclose(batched[i], single, atol=1e-5)  # rounding of velocities up to 10 rad/s
-
-
 @pytest.mark.slow  # the inner loop has the same kernel
 def test_the_kernel_lowers_without_a_gpu(mixed):
     batched = jax.jit(jax.vmap(make_advance(TIMESTEP, 2)))
