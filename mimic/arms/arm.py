@@ -140,21 +140,11 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
     Raises:
       ValueError: what `panda`, `planar_arm` and `load_mjcf` reject.
     """
-    if config.model == "planar":
-        embodiment = planar_arm(config.link_lengths)
-        source = _planar_spec(embodiment).compile()
-        embodiment, source, angles = load_arm(
-            source,
-            name=embodiment.name,
-            locked=config.locked or (),
-            links=cast(Links, links),
-            limits=cast(Limits, limits),
-            home=config.home,
-        )
-        return with_minimum_armature(_arm(embodiment, source, angles, base_pose(source)), config)
+    is_planar = config.model == "planar"
+    path = config.model if config.is_file else panda_path(config.model)
     embodiment, source, angles = load_arm(
-        config.model if config.is_file else panda_path(config.model),
-        name=None if config.is_file else config.model,
+        _planar_spec(planar_arm(config.link_lengths)).compile() if is_planar else path,
+        name=None if is_planar or config.is_file else config.model,
         locked=config.locked or (),
         base=config.base,
         tip=config.tip,
@@ -163,18 +153,9 @@ def build_arm(config: ArmConfig, limits: str = "none", links: str = "kept") -> A
         home=config.home,
     )
     notes = () if not config.is_file else ignored_elements(source, config.base, config.tip)
-    pose = base_pose(source, config.base, config.tip)
-    return with_minimum_armature(_arm(embodiment, source, angles, pose, notes), config)
-
-
-def _arm(
-    embodiment: Embodiment,
-    source: mujoco.MjModel,
-    angles: Mapping[str, float],
-    pose: np.ndarray,
-    notes: tuple[str, ...] = (),
-) -> Arm:
-    return Arm(embodiment, simulation_model(source, embodiment.joint_names, angles), angles, pose, notes)
+    model = simulation_model(source, embodiment.joint_names, angles)
+    arm = Arm(embodiment, model, angles, base_pose(source, config.base, config.tip), notes)
+    return with_minimum_armature(arm, config)
 
 
 def with_minimum_armature(arm: Arm, config: ArmConfig) -> Arm:

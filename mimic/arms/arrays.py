@@ -140,9 +140,19 @@ def body_moments(
     arm: Arm,
 ) -> tuple[Float[np.ndarray, "joints 4 4"], Float[np.ndarray, "joints 3 3"], Float[np.ndarray, "joints 3"]]:
     """Moments of mass of each joint's body in its frame, see `pseudo_inertia`; and the frames, see `joint_frames`."""
-    embodiment = arm.embodiment
+    embodiment, model, to_world = arm.embodiment, arm.model, arm.T_world_base
     rotations, origins = joint_frames(np.asarray(embodiment.joint_axis), np.asarray(embodiment.joint_anchor))
-    return _masses(arm, rotations, origins), rotations, origins
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.0
+    mujoco.mj_kinematics(model, data)
+    last_joint = {int(body): joint for joint, body in enumerate(model.jnt_bodyid)}
+    masses = np.zeros((len(rotations), 4, 4))
+    for joint, (rotation, origin) in enumerate(zip(rotations, origins, strict=True)):
+        body = int(model.jnt_bodyid[joint])
+        if last_joint[body] == joint:  # if a body has several joints, the others move no mass of their own
+            frame = to_world[:3, :3] @ rotation
+            masses[joint] = pseudo_inertia(model, data, body, frame, to_world[:3, :3] @ origin + to_world[:3, 3])
+    return masses, rotations, origins
 
 
 def moments_of_joints(
@@ -272,23 +282,3 @@ def without_mass_on_axes(
             placement = numpy.concatenate([upper, numpy.array([[0.0, 0.0, 0.0, 1.0]])])
             of_child = placement @ (mass * on_axis) @ placement.T
     return numpy.stack(result[::-1])
-
-
-def _masses(
-    arm: Arm,
-    rotations: Float[np.ndarray, "joints 3 3"],
-    origins: Float[np.ndarray, "joints 3"],
-) -> Float[np.ndarray, "joints 4 4"]:
-    """Moments of mass of the body of each joint in its frame."""
-    model, to_world = arm.model, arm.T_world_base
-    data = mujoco.MjData(model)
-    data.qpos[:] = 0.0
-    mujoco.mj_kinematics(model, data)
-    last_joint = {int(body): joint for joint, body in enumerate(model.jnt_bodyid)}
-    masses = np.zeros((len(rotations), 4, 4))
-    for joint, (rotation, origin) in enumerate(zip(rotations, origins, strict=True)):
-        body = int(model.jnt_bodyid[joint])
-        if last_joint[body] == joint:  # if a body has several joints, the others move no mass of their own
-            frame = to_world[:3, :3] @ rotation
-            masses[joint] = pseudo_inertia(model, data, body, frame, to_world[:3, :3] @ origin + to_world[:3, 3])
-    return masses

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from mimic.arms.arm import ArmConfig, arm_spec, build_arm
 from mimic.arms.kinematic_tree import ChainIds, ancestors, find_chain
-from mimic.arms.mujoco_chain import zero_pose
+from mimic.arms.mujoco_chain import data_at_zero
 
 _SPHERE, _CAPSULE, _CYLINDER, _MESH, _PLANE = (
     int(kind)
@@ -86,8 +86,7 @@ def fit_capsules(config: ArmConfig, limits: str = "none") -> Capsules:
     arm = build_arm(config, limits)
     model = arm_spec(config).compile()
     chain = find_chain(model, config.base, config.tip)
-    data = mujoco.MjData(model)
-    data.qpos[:] = zero_pose(model)
+    data = data_at_zero(model)
     for name, angle in arm.locked.items():
         data.qpos[model.joint(name).qposadr[0]] = angle
     mujoco.mj_kinematics(model, data)

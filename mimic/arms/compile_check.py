@@ -51,7 +51,7 @@ def check_magnitudes(model: Any) -> None:
     for name in ("body_mass", "body_inertia", "dof_armature", "dof_damping"):
         if np.any(np.asarray(getattr(model, name)) < 0):
             raise ValueError(f"the model has a negative {name}; expected at least 0")
-    for limit in _velocity_limits(model):
+    for limit in velocity_limits(model):
         if not (0 < limit <= MAX_VELOCITY or limit == math.inf):
             raise ValueError(
                 f"the model has a velocity limit of {limit:g} rad/s; expected a number above 0 and of at most "
@@ -59,7 +59,8 @@ def check_magnitudes(model: Any) -> None:
             )
 
 
-def _velocity_limits(model: Any) -> list[float]:
+def velocity_limits(model: Any) -> list[float]:
+    """The velocity limit of each joint of a model [rad/s]; empty where it states none."""
     import mujoco
 
     numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, VELOCITY_LIMIT)

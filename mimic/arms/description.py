@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ _DYNAMICS: dict[str, tuple[int, ...]] = {
     "velocity_limit": (MAX_JOINTS,),
     "torque_limit": (MAX_JOINTS,),
 }
-SUFFIXES = (".json", ".npz")
+SUFFIX = ".json"
 
 
 def description_layout(*, has_dynamics: bool = False) -> list[dict[str, Any]]:
@@ -80,7 +79,7 @@ def described_arm(vector: Float[Array, " numbers"]) -> ArmArrays:
 def save_description(
     file: Path, arm: ArmArrays, name: str, joints: tuple[str, ...], *, has_dynamics: bool = False
 ) -> None:
-    """Writes the vector of an arm, its layout and the names of its joints to a .json or .npz file.
+    """Writes the vector of an arm, its layout and the names of its joints to a .json file.
 
     The file gets its name when it is complete.
 
@@ -94,15 +93,9 @@ def save_description(
     Raises:
       ValueError: another suffix.
     """
-    if file.suffix not in SUFFIXES:
-        raise ValueError(f"{str(file)!r}: expected a file {' or '.join(SUFFIXES)} for the description of an arm")
+    if file.suffix != SUFFIX:
+        raise ValueError(f"{str(file)!r}: expected a file {SUFFIX} for the description of an arm")
     vector = description(arm, has_dynamics=has_dynamics)
     layout = description_layout(has_dynamics=has_dynamics)
-    if file.suffix == ".npz":
-        partial = file.with_name(file.name + ".partial")
-        with partial.open("wb") as opened:
-            np.savez(opened, learner=vector, name=name, joints=np.array(joints), layout=json.dumps(layout))
-        os.replace(partial, file)
-        return
     content = {"name": name, "joints": list(joints), "learner": [float(x) for x in vector], "layout": layout}
     write_atomically(file, json.dumps(content, indent=2) + "\n")

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mimic.arms.chain import SHORTEST_LINK, Chain, Joint, Link, drop_zero_length
-from mimic.arms.compile_check import VELOCITY_LIMIT
+from mimic.arms.compile_check import velocity_limits
 from mimic.arms.kinematic_tree import Tip, ancestors, find_chain, is_revolute, tip_body
 
 START_POSES = "ready", "home"  # keyframes with the start pose of a model, in order of preference
@@ -36,10 +36,7 @@ def read_chain(model: mujoco.MjModel, base: str | None = None, tip: Tip = None, 
     Raises:
       ValueError: no revolute joint, a joint of another kind, a branch, a loop, or a name that the model lacks.
     """
-    chain_ids = find_chain(model, base, tip)
-    data = mujoco.MjData(model)
-    data.qpos[:] = zero_pose(model)
-    mujoco.mj_kinematics(model, data)
+    chain_ids, data = find_chain(model, base, tip), data_at_zero(model)
     origin, R_base_world = data.xpos[chain_ids.base], data.xmat[chain_ids.base].reshape(3, 3).T
 
     def in_base(point: np.ndarray) -> np.ndarray:
@@ -95,7 +92,7 @@ def _joint(model: mujoco.MjModel, joint_id: int, axis: np.ndarray, anchor: np.nd
         anchor=anchor,
         range=(low, high),
         torque_limit=_torque_limit(model, joint_id),
-        velocity_limit=_velocity_limits(model).get(joint_id, np.inf),
+        velocity_limit=dict(enumerate(velocity_limits(model))).get(joint_id, np.inf),
         home=float(np.clip(start, low, high)) if limited else start,
     )
 
@@ -199,20 +196,18 @@ def _geom_ends(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) ->
 
 def base_pose(model: mujoco.MjModel, base: str | None = None, tip: Tip = None) -> Float[np.ndarray, "4 4"]:
     """Pose of the base frame of an arm in the world of its model, in the zero pose; see `find_chain`."""
-    body, data = find_chain(model, base, tip).base, mujoco.MjData(model)
-    data.qpos[:] = zero_pose(model)
-    mujoco.mj_kinematics(model, data)
+    body, data = find_chain(model, base, tip).base, data_at_zero(model)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
     return pose
 
 
-def zero_pose(model: mujoco.MjModel) -> np.ndarray:
-    """The model's pose [nq] with revolute joints at 0, and joints of other kinds as in `qpos0`."""
-    qpos = np.array(model.qpos0)
-    revolute = [joint for joint in range(model.njnt) if is_revolute(model, joint)]
-    qpos[model.jnt_qposadr[revolute]] = 0
-    return qpos
+def data_at_zero(model: mujoco.MjModel) -> mujoco.MjData:
+    """The model's bodies with revolute joints at 0, and joints of other kinds as in `qpos0`."""
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[[joint for joint in range(model.njnt) if is_revolute(model, joint)]]] = 0
+    mujoco.mj_kinematics(model, data)
+    return data
 
 
 def _start_keyframe(model: mujoco.MjModel) -> int:
@@ -235,9 +230,3 @@ def _torque_limit(model: mujoco.MjModel, joint_id: int) -> float:
                 gain = abs(model.actuator_gainprm[actuator, 0])
                 limits.append(gear * gain * np.abs(model.actuator_ctrlrange[actuator]).max())
     return float(min(limits, default=np.inf))
-
-
-def _velocity_limits(model: mujoco.MjModel) -> dict[int, float]:
-    """Velocity limits [rad/s] by joint id, from the model's custom numeric of that name."""
-    numeric = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, VELOCITY_LIMIT)
-    return dict(enumerate(map(float, model.numeric(numeric).data))) if numeric >= 0 else {}

@@ -12,7 +12,7 @@ from mimic.arms.arm import ArmConfig, arm_spec, build_arm
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.kinematic_tree import ChainIds, ancestors, find_chain
 from mimic.arms.link_match import Colour
-from mimic.arms.mujoco_chain import zero_pose
+from mimic.arms.mujoco_chain import base_pose, data_at_zero
 
 _THICKNESS, _COLOUR = 0.03, (0.55, 0.62, 0.70, 1.0)  # of links without geoms; fraction of the chain length
 _DARK = 0.4  # maximum channel of a dark colour
@@ -37,23 +37,17 @@ def visual_spec(
         body.name = body.name or f"unnamed body {number}"
     model = spec.compile()
     chain_ids = find_chain(model, config.base, config.tip)
-    data = mujoco.MjData(model)
-    data.qpos[:] = zero_pose(model)
-    mujoco.mj_kinematics(model, data)
     if config.is_file:
         _remove_scene(spec, model, chain_ids)
     if not any(bool(body.geoms) for body in spec.bodies[1:]):
-        _draw_links(model, data, spec, chain_ids)
+        _draw_links(model, data_at_zero(model), spec, chain_ids)
     if colours:
         links = body_links(model, config, limits)
         by_body = {model.body(body).name: colours[link] for body, link in links.items() if link in colours}
         for body in spec.bodies[1:]:
             if body.name in by_body:
                 _colour_geoms(spec, body, by_body[body.name])
-    base = chain_ids.base
-    T_world_base = np.eye(4)
-    T_world_base[:3, :3], T_world_base[:3, 3] = data.xmat[base].reshape(3, 3), data.xpos[base]
-    return spec, T_world_base
+    return spec, base_pose(model, config.base, config.tip)
 
 
 def body_links(model: mujoco.MjModel, config: ArmConfig, limits: str) -> dict[int, str]:

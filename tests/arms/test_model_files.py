@@ -9,7 +9,7 @@ import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.model_files import read_model, read_spec
 from mimic.arms.model_source import MAX_FILE_SIZE
-from tests.helpers import original_model
+from tests.helpers import original_model, random_arms
 
 POSES = 10
 # Arms that others wrote, in packages that need not be installed: their paths there, and where the last link ends.
@@ -48,9 +48,9 @@ def largest_errors(file, original, tip, base=None):
         data.qpos[:] = original_model.at_rest(original)
         data.qpos[qpos_at], data.qvel[qvel_at] = qpos, qvel
         mujoco.mj_forward(original, data)
-        names = embodiment.joint_names, embodiment.link_names
         found = states(qpos, qvel)
-        for key, value in original_model.link_motion(original, data, *names, tip).items():
+        names = embodiment.link_names, embodiment.joint_names
+        for key, value in random_arms.links(original, data, *names, tip).items():
             kinematic = max(kinematic, float(np.abs(np.asarray(getattr(found, key)) - value).max()))
         simulated.qpos[:], simulated.qvel[:] = qpos, qvel
         mujoco.mj_forward(arm.model, simulated)

@@ -1,4 +1,4 @@
-"""Link states of an original model by C MuJoCo, and generated models to load."""
+"""Generated models to load, and models of other packages."""
 
 import os
 import pathlib
@@ -75,37 +75,6 @@ def addresses(model: mujoco.MjModel, joint_names: tuple[str, ...]) -> tuple[list
     """Indices of joints in qpos and in qvel."""
     joints = [model.joint(name) for name in joint_names]
     return [int(joint.qposadr[0]) for joint in joints], [int(joint.dofadr[0]) for joint in joints]
-
-
-def link_motion(
-    model: mujoco.MjModel, data: mujoco.MjData, joint_names: tuple[str, ...], link_names: tuple[str, ...], tip: str
-) -> dict[str, np.ndarray]:
-    """The expected unnormalized `link_states`, from the positions and velocities of MuJoCo's bodies.
-
-    Link number i runs from the anchor of joint i to that of the next, the last one to the tip, a site or a body. The
-    link "base" runs from the body that carries the arm to the first joint, and rotates with a joint whose axis is along
-    it.
-    """
-    joints = [model.joint(name).id for name in joint_names]
-    base = int(model.body_parentid[model.jnt_bodyid[joints[0]]])
-    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip)
-    end = data.site_xpos[site] if site >= 0 else data.body(tip).xpos
-    points = [data.xpos[base], *(data.xanchor[joint] for joint in joints), end]
-    is_off_axis = np.linalg.norm(np.cross(data.xaxis[joints[0]], points[1] - points[0])) > 1e-3
-    bodies = [base if is_off_axis else model.jnt_bodyid[joints[0]], *(model.jnt_bodyid[joint] for joint in joints)]
-    R_base_world = data.xmat[base].reshape(3, 3).T
-    rows = []
-    for index in (0 if name == "base" else int(name.removeprefix("link")) for name in link_names):
-        body = int(bodies[index])
-        velocity = np.zeros(6)  # [omega, v] at the body's origin, in the axes of the world
-        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
-        start, stop = points[index], points[index + 1]
-        centre, along = (start + stop) / 2, stop - start
-        linear = velocity[3:] + np.cross(velocity[:3], centre - data.xpos[body])
-        vectors = centre - data.xpos[base], along / np.linalg.norm(along), linear, velocity[:3]
-        rows.append([R_base_world @ vector for vector in vectors])
-    names = "position", "direction", "linear_velocity", "angular_velocity"
-    return dict(zip(names, map(np.stack, zip(*rows, strict=True)), strict=True))
 
 
 def package_file(path: str) -> pathlib.Path:

@@ -55,17 +55,31 @@ def posed(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray | None = Non
     return data
 
 
-def links(model: mujoco.MjModel, data: mujoco.MjData, link_names: tuple[str, ...]) -> dict[str, np.ndarray]:
+def links(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    link_names: tuple[str, ...],
+    joint_names: tuple[str, ...] = (),
+    tip: str = "tip",
+) -> dict[str, np.ndarray]:
     """The expected unnormalized `link_states`, from MuJoCo's positions and velocities.
 
     Links are found by name: "link2", or "link2+link3" for links that a locked joint merges.
+
+    Args:
+      model: of the arm.
+      data: its state.
+      link_names: of the arm.
+      joint_names: of the arm; default: all joints of the model.
+      tip: the site or body where the last link ends.
     """
-    base = int(model.body_parentid[model.jnt_bodyid[0]])
+    joints = [model.joint(name).id for name in joint_names] or list(range(model.njnt))
+    base = int(model.body_parentid[model.jnt_bodyid[joints[0]]])
     R_base_world, origin = data.xmat[base].reshape(3, 3).T, data.xpos[base]
     rows = []
     for name in link_names:
         first, last = name.split("+")[0], name.split("+")[-1]
-        (start, _, _), (_, end, body) = _segment(model, data, first), _segment(model, data, last)
+        start, end, body = _segment(model, data, first, joints, tip)[0], *_segment(model, data, last, joints, tip)[1:]
         velocity = np.zeros(6)  # [omega, v] at the body's origin, in the axes of the world
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
         centre = (start + end) / 2
@@ -84,25 +98,31 @@ def links(model: mujoco.MjModel, data: mujoco.MjData, link_names: tuple[str, ...
 def link_rotations(model: mujoco.MjModel, data: mujoco.MjData, link_names: tuple[str, ...]) -> np.ndarray:
     """Rotations [n, 3, 3] of the bodies that carry the links, in the base frame."""
     base = int(model.body_parentid[model.jnt_bodyid[0]])
-    bodies = [_segment(model, data, name.split("+")[-1])[2] for name in link_names]
+    bodies = [_segment(model, data, name.split("+")[-1], list(range(model.njnt)), "tip")[2] for name in link_names]
     return np.stack([data.xmat[base].reshape(3, 3).T @ data.xmat[body].reshape(3, 3) for body in bodies])
 
 
-def _segment(model: mujoco.MjModel, data: mujoco.MjData, link: str) -> tuple[np.ndarray, np.ndarray, int]:
+def _segment(
+    model: mujoco.MjModel, data: mujoco.MjData, link: str, joints: list[int], tip: str
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Start, end and body of one link: its site, else from its joint's anchor to the next one's, or to the tip.
 
-    The link "base" runs from the body that carries the arm to the first anchor; the joint's axis is not along it.
+    The link "base" runs from the body that carries the arm to the first anchor. It rotates with the first joint if that
+    joint's axis is along it.
     """
     site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, link)
     if site >= 0:
         half = data.site_xmat[site].reshape(3, 3)[:, 2] * model.site_size[site, 1]  # z points from end to start
         return data.site_xpos[site] + half, data.site_xpos[site] - half, int(model.site_bodyid[site])
     if link == "base":
-        base = int(model.body_parentid[model.jnt_bodyid[0]])
-        return data.xpos[base], data.xanchor[0], base
-    joint = int(link.removeprefix("link")) - 1
-    end = data.xanchor[joint + 1] if joint + 1 < model.njnt else data.site("tip").xpos
-    return data.xanchor[joint], end, int(model.jnt_bodyid[joint])
+        body, anchor = int(model.jnt_bodyid[joints[0]]), data.xanchor[joints[0]]
+        base = int(model.body_parentid[body])
+        is_off_axis = np.linalg.norm(np.cross(data.xaxis[joints[0]], anchor - data.xpos[base])) > 1e-3
+        return data.xpos[base], anchor, base if is_off_axis else body
+    joint, is_site = int(link.removeprefix("link")) - 1, mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tip) >= 0
+    end = data.site(tip).xpos if is_site else data.body(tip).xpos
+    end = data.xanchor[joints[joint + 1]] if joint + 1 < len(joints) else end
+    return data.xanchor[joints[joint]], end, int(model.jnt_bodyid[joints[joint]])
 
 
 def _pose(rng: np.random.Generator) -> str:

@@ -5,7 +5,7 @@ import numpy as np
 
 from mimic.arms.embodiment import Embodiment
 from mimic.arms.kinematic_tree import find_chain
-from mimic.arms.mujoco_chain import zero_pose
+from mimic.arms.mujoco_chain import data_at_zero
 
 TORSO_TIPS = ["left_hand", "right_hand"]
 
@@ -69,7 +69,7 @@ def largest_error(model: mujoco.MjModel, arm: Embodiment, tips: list[str], locke
     dofs = [int(model.joint(name).dofadr[0]) for name in arm.joint_names]
 
     def pose(qpos: np.ndarray, qvel: np.ndarray) -> None:
-        data.qpos[:], data.qvel[:] = zero_pose(model), 0
+        data.qpos[:], data.qvel[:] = data_at_zero(model).qpos, 0
         for name, angle in [*locked.items(), *zip(arm.joint_names, qpos, strict=True)]:
             data.qpos[model.joint(name).qposadr[0]] = angle
         data.qvel[dofs] = qvel

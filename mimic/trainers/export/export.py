@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from mimic.arms.arm import ArmConfig
-from mimic.arms.description import SUFFIXES, save_description
+from mimic.arms.description import SUFFIX, save_description
 from mimic.arms.embodiment import Embodiment
 from mimic.base.config import check_choice, new_file, new_folder
 from mimic.base.distribution import install_command
@@ -67,7 +67,7 @@ def export_run(
       format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json";
         or "controller", a folder for `mimic.deploy`, see `export_controller`.
       learner: name of the environment that the run's arms must equal. Default "": not checked. Of a run whose learner
-        is any arm, an arm (see `ArmConfig.model`) whose description is written to `out`, a .json or .npz file, instead
+        is any arm, an arm (see `ArmConfig.model`) whose description is written to `out`, a .json file, instead
         of the network.
       locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
@@ -193,12 +193,12 @@ def _write_description(trained: TrainConfig, learner: str, locked: Sequence[Any]
       out: file to write.
 
     Raises:
-      ValueError: another suffix than those of descriptions, no such arm, or one that the run's function does not take.
+      ValueError: another suffix than that of descriptions, no such arm, or one that the run's function does not take.
     """
     file = new_file("out", out)
-    if file.suffix not in SUFFIXES:
+    if file.suffix != SUFFIX:
         raise ValueError(
-            f"out: expected a file {' or '.join(SUFFIXES)} for the description of learner={learner}, got {out!r}; "
+            f"out: expected a file {SUFFIX} for the description of learner={learner}, got {out!r}; "
             "export the network, which takes any arm, without learner="
         )
     is_policy = trained.trainer.name == "ppo"

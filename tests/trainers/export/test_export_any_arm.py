@@ -72,7 +72,7 @@ def with_locks(arm, joints):
             ["out=new.onnx", "locked=[2]"],
             "locked: expected with learner=NAME, as in learner=panda locked=[2,4], got [2]",
         ),
-        (["out=new.onnx", "learner=panda"], "out: expected a file .json or .npz for the description of learner=panda"),
+        (["out=new.onnx", "learner=panda"], "out: expected a file .json for the description of learner=panda"),
         (["out=new.json", "learner=no_such_arm"], "model: expected panda, planar, panda_pair, an MJCF or URDF file"),
         (["out=new.json", "learner=panda", "checkpoint=6"], "has no checkpoint 6; it has "),
     ],
