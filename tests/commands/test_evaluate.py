@@ -121,10 +121,8 @@ def test_crossovers_are_trained_on_and_not_evaluated(monkeypatch, tmp_path):
         ),
         (["physics=bullet"], "physics: expected one of mjx, fused, got 'bullet'"),
         (["checkpoint=7"], "has no checkpoint 7; it has 0"),
-        (["out=."], "exists; name a new folder"),
         (["mass=0"], "mass: expected a number from 0.001 to 1000, got 0.0"),
         (["torque_noise=-1"], "torque_noise: expected a number from 0 to 10, got -1"),
-        (["demonstrations=missing.npz"], "no file at 'missing.npz'"),
     ],
 )
 def test_bad_evaluations(reason, run_dir, arguments, message):
@@ -135,35 +133,16 @@ def test_bad_evaluations(reason, run_dir, arguments, message):
     ("override", "message"),
     [
         ("mass=[0,1]", "randomization.mass: expected 2 numbers, each from 0.001 to 1000, got [0.0, 1.0]"),
-        ("damping=[2,1]", "randomization.damping: expected [minimum, maximum], got [2.0, 1.0]"),
-        ("torque_noise=nan", "randomization.torque_noise: expected a number from 0 to 10, got nan"),
     ],
 )
 def test_bad_randomization(reason, override, message):
     assert message in reason("train", "env=planar4dof", f"env.randomization.{override}")
 
 
-def too_fast(demonstrations):
-    qvel = demonstrations.qvel.copy()
-    qvel[1, 4, 2] = 100.0
-    return dataclasses.replace(demonstrations, qvel=qvel)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda overrides: dataclasses.replace(overrides, arm="panda"),
-            "recorded with the joints joint1, joint2, joint3 of",
-        ),
-        (too_fast, "joint3 of demonstration 1 has a velocity of 100 rad/s at 0.4 s, but its velocity limit is"),
-    ],
-)
-def test_unfit_demonstrations(reason, run_dir, unseen, tmp_path, change, message):
-    path = tmp_path / "unfit.npz"
-    change(unseen).save(path)
-    arguments = [f"run={run_dir}", f"demonstrations={path}", "compilation_cache="]
-    assert message in reason("evaluate", *arguments)
+def test_unfit_demonstrations(reason, run_dir, unseen, tmp_path):
+    dataclasses.replace(unseen, arm="panda").save(tmp_path / "unfit.npz")
+    arguments = [f"run={run_dir}", f"demonstrations={tmp_path}/unfit.npz", "compilation_cache="]
+    assert "recorded with the joints joint1, joint2, joint3 of" in reason("evaluate", *arguments)
 
 
 def test_a_checkpoint_of_another_environment(reason, run_dir, tmp_path):
@@ -173,14 +152,6 @@ def test_a_checkpoint_of_another_environment(reason, run_dir, tmp_path):
     error = reason("evaluate", f"run={other}", "compilation_cache=")
     # 12 numbers for each link seen: 3 of the learner and twice 3 of the expert, where the other learner has 2.
     assert "does not fit the config of its run" in error and "expected shape (108,), got shape (96,)" in error
-
-
-def test_a_damaged_checkpoint(reason, run_dir, tmp_path):
-    damaged = tmp_path / "damaged"
-    shutil.copytree(run_dir, damaged)
-    (checkpoint,) = (damaged / "checkpoints").glob("0*")
-    (checkpoint / "params.npz").write_text("not JSON")
-    assert "is damaged: params.npz was changed" in reason("evaluate", f"run={damaged}", "compilation_cache=")
 
 
 def test_a_mapper_has_no_controllers(reason, tmp_path):

@@ -167,14 +167,14 @@ def test_an_exported_policy_is_the_policy(hardware_run, tmp_path):
     bundle, motions = load_bundle(tmp_path / "controller"), [1, 0, 1]
     policy = Policy(bundle, motions)
     controller = make_controller(settings, env.observation_size, env.action_size)(params)
+    observe = jax.vmap(functools.partial(control_observation, env))
+    act = jax.jit(lambda *parts: controller(SimpleNamespace(obs=observe(*parts))))
     past, table = np.zeros((3, SENT_ACTIONS * env.action_size), np.float32), expert_table(env)
     for tick in range(HORIZON + 2):
         measured = rng.uniform(-1, 1, (4, 3, env.learner.num_joints)).astype(np.float32)
         steps = np.minimum(np.arange(tick, tick + env.config.preview + 1), HORIZON)
         expert = table[motions][:, steps].reshape(3, -1)
-        parts = map(jnp.asarray, (np.concatenate(measured, axis=1), past, expert))
-        observation = jax.vmap(functools.partial(control_observation, env))(*parts)
-        expected = np.asarray(controller(SimpleNamespace(obs=observation)))
+        expected = np.asarray(act(np.concatenate(measured, axis=1), past, expert))
         qpos, qvel, *reference = measured
         observed = tick, qpos, qvel, Reference(reference[0], reference[1], reference[1])
         action = policy.act(*observed)
@@ -193,7 +193,6 @@ def test_a_run_without_an_inner_loop_has_no_controller(reason, paper_run):
     [
         ({"control": "torque"}, "got torque"),
         ({"control_dt": 0.02}, "got 0.02 s"),  # as long as the latency
-        ({"control_dt": 0.025}, "got 0.025 s"),
     ],
 )
 def test_what_the_safety_layer_cannot_run_is_rejected(tmp_path, settings, message):
@@ -225,18 +224,6 @@ def test_controllers_whose_commands_the_run_does_not_have(settings, controller, 
 def test_tracking_needs_an_inner_loop(reason, paper_run):
     error = reason("evaluate", f"run={paper_run}", "controller=tracking", "robot=virtual_panda")
     assert "for a run with no inner loop, got tracking" in error
-
-
-@pytest.mark.slow
-def test_tracking_on_virtual_robots(evaluation, tmp_path):
-    """Much nearer than an untrained policy, which stays near the start pose."""
-    rows = {}
-    for controller in ("tracking", "policy"):
-        report = evaluation(tmp_path / controller, controller=controller, robot_world="nominal")
-        rows[controller], lead = report["cases"]["all ranges"], report.get("lead_ticks")
-        assert report["controller"] == controller and (lead is not None) == (controller == "tracking")
-    assert rows["tracking"]["completed"] == 4
-    assert rows["tracking"]["optimality_gap"] < 0.5 * rows["policy"]["optimality_gap"]
 
 
 @pytest.mark.slow
@@ -276,8 +263,7 @@ def test_a_mapper_has_no_robot(reason, tmp_path):
     assert "robot: expected a run of trainer=ppo with one learner" in error
 
 
-@pytest.mark.parametrize("package", ["jax2onnx", "onnxruntime"])
-def test_missing_packages_are_named(reason, monkeypatch, package):
-    monkeypatch.setitem(sys.modules, package, None)
+def test_missing_packages_are_named(reason, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
     error = reason("evaluate", "run=runs/NAME", "robot=virtual_panda")
     assert "robot: needs the packages jax2onnx and onnxruntime: pip install 'mimic-arms[deploy,export]'" in error

@@ -7,9 +7,8 @@ import sys
 import pytest
 
 from mimic.__main__ import commands
-from mimic.base.config import schema
 from mimic.commands import cli
-from mimic.commands.key_help import explanations, key_lines
+from mimic.commands.key_help import explanations
 from mimic.trainers.config import BUILT_IN_TRAINERS
 from mimic.trainers.presets import MAPPER_PRESETS, PPO_PRESETS
 
@@ -51,21 +50,3 @@ def test_presets_are_shown_in_place_of_null(monkeypatch, capsys):
     assert value(keys, "samples") == str(MAPPER_PRESETS["paper"]["samples"])
     keys = shown(monkeypatch, capsys, "train", "env=panda3dof")
     assert "[2, 3, 6, 7]" in keys
-
-
-def test_lines_fit_and_explanations_end_at_a_word():
-    @dataclasses.dataclass(frozen=True)
-    class Config:
-        """A config.
-
-        Attributes:
-          first, second: long words that no line of a terminal would have enough space for, since there are too many of
-            them. A second sentence.
-        """
-
-        first: str = "value"
-        second: str = "x" * 100
-
-    first, second = key_lines(schema(Config))
-    assert first.startswith("first: value  ") and first.endswith(" for, since ...")
-    assert len(first) <= 120 and "A second" not in second
