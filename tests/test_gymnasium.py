@@ -92,6 +92,7 @@ def test_a_seed_repeats_everything(vector):
     assert len(np.unique(play(4)[0], axis=0)) > 1  # arms do not all imitate the same demonstration
 
 
+@pytest.mark.slow
 def test_pictures(imitation):
     """The image of an arm is that of the first of many arms in the same state."""
     env, many = Env(imitation, render_mode="rgb_array"), VectorEnv(imitation, num_envs=1, render_mode="rgb_array")

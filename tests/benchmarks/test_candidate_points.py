@@ -5,7 +5,6 @@ import pytest
 
 from benchmarks.figures import candidate_points
 from benchmarks.figures.planar_arms import joint_points
-from mimic.arms.embodiment import planar_arm
 
 
 def test_candidate_points_and_frames_have_different_optima():
@@ -19,12 +18,3 @@ def test_candidate_points_and_frames_have_different_optima():
     assert same_directions["frames"] < rounding and same_directions["points"] > 0.3  # chain lengths
     tips = [joint_points(posed.arm, posed.qpos)[-1] for posed in (expert, parallel)]
     assert same_directions["points"] == pytest.approx(np.linalg.norm(tips[0] - tips[1]), abs=rounding)
-
-
-def test_a_planar_arm_is_drawn_through_its_joints_wherever_its_frames_sit():
-    pose = np.array([0.5, -1.2])
-    first = np.array([np.cos(0.5), np.sin(0.5)])
-    drawn = np.stack([np.zeros(2), 0.25 * first, 0.25 * first + 0.75 * np.array([np.cos(-0.7), np.sin(-0.7)])])
-    for frame_at in (0.0, 0.5, 1.0):
-        points = joint_points(planar_arm([0.5, 1.5], frame_at=frame_at), pose)
-        np.testing.assert_allclose(points, drawn, atol=1e-6)  # float32

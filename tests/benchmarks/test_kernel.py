@@ -1,6 +1,5 @@
 """`python -m benchmarks.kernel`: all that can run without a GPU, on few pairs."""
 
-import numpy as np
 import pytest
 
 from benchmarks import kernel
@@ -34,9 +33,3 @@ def test_a_method_that_fails_says_why_and_the_others_go_on(monkeypatch):
     failed = [row for row in measured if "failed" in row]
     assert [row["failed"] for row in failed] == ["MemoryError: no room"] * 3  # one size of each quantity
     assert sum(row["method"] == "matrices" for row in measured) == 4
-
-
-def test_the_reference_is_in_double_precision():
-    arms = kernel.planar_pair(3)
-    value = kernel.reference(arms, kernel.random_motions(arms, 2), "value")
-    assert value.dtype == np.float64

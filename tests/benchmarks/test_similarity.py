@@ -71,11 +71,6 @@ def test_ratios_and_cases_lost():
     assert second["centre_line_distance"] == {"ratio": 0.5, "lost": 1}  # where copying is exact
 
 
-def test_the_front_leaves_out_what_another_beats():
-    compared = summary.compare(LOCKS, "copy_joints", ("pd",))
-    assert summary.pareto_front(compared) == ["kept overlap 1"]
-
-
 def test_tables(capsys):
     summary.print_tables([])
     summary.print_tables(ROWS)

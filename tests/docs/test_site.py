@@ -60,6 +60,7 @@ def test_files_that_pages_use_are_in_the_site(site):
             assert ((out / name).parent / result).is_file(), (name, result)
 
 
+@pytest.mark.slow
 def test_a_broken_link_stops_the_build(tmp_path):
     (tmp_path / "docs").mkdir()
     (tmp_path / "docs" / "index.md").write_text("[lost](lost.md)")

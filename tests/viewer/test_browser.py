@@ -82,11 +82,6 @@ def learner_pixels(page):
     return pixels(page)[top:bottom, left:right]
 
 
-def angles(page):
-    """Angles of the expert's joints that the sliders show [rad]."""
-    return [float(slider.get_attribute("aria-valuenow")) for slider in page.get_by_role("slider").all()]
-
-
 def wait_for_bound(page):
     page.wait_for_selector("#mimic-bound", timeout=LATEST)
     page.wait_for_function("!document.querySelector('#mimic-bound').innerText.includes('…')", timeout=LATEST)
@@ -144,34 +139,6 @@ def test_a_slider_moves_and_the_learner_tracks_it(page, serve, tmp_path):
     rate = updates_per_second(page, 5.0)
     print(f"updates in the browser while a demonstration plays: {rate:.1f} a second; screenshots: {tmp_path}")
     assert rate > 0  # drawing by the processor is slow, and may be as slow as it likes
-    assert not complaints
-
-
-def test_the_learner_is_chosen_and_locked_on_the_page(page, serve, tmp_path):
-    page, complaints = page
-    page.goto(serve("mapper=any_arm", "learners=[panda,panda3dof,planar4dof]"))
-    wait_for_bound(page)
-    page.get_by_text("random pose", exact=True).click()
-    page.get_by_role("tab", name="Learner").click()
-    settled(page)
-    assert number(page, "distance") < 1e-3  # an equal arm
-    page.get_by_text("lock joint2", exact=True).click()
-    page.get_by_text("Locked: joint2 at").wait_for()
-    page.get_by_role("tab", name="Expert").click()
-    page.get_by_text("home pose", exact=True).click()
-    page.get_by_role("tab", name="Learner").click()
-    assert float(settled(page)) >= number(page, "bound") > 0.01
-    page.screenshot(path=tmp_path / "locked.png")
-    for name, boxes in (("panda3dof", 7), ("planar4dof", 4)):
-        page.get_by_role("textbox", name="learner").or_(page.get_by_role("combobox")).first.click()
-        page.get_by_role("option", name=name, exact=True).click()
-        page.wait_for_function(
-            "n => [...document.querySelectorAll('label')].filter(x => /^lock /.test(x.innerText)).length == n",
-            arg=boxes, timeout=LATEST,
-        )  # fmt: skip
-        settled(page)
-        page.screenshot(path=tmp_path / f"{name}.png")
-    print(f"screenshots: {tmp_path}")
     assert not complaints
 
 
