@@ -49,6 +49,7 @@ def test_links_are_those_of_mujoco(batch, states):
             np.testing.assert_allclose(scale * actual, values, rtol=0, atol=ATOL)
 
 
+@pytest.mark.slow
 def test_links_are_those_of_the_embodiment(x64, batch, states):
     """Of one arm of each number of joints, for the time that each takes to trace."""
     for i in range(MAX_JOINTS):

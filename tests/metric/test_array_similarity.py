@@ -13,7 +13,7 @@ from mimic.metric.similarity import MEASURES, centre_line_table
 from tests.helpers.array_cases import padded
 
 TIMES = 20
-LOCKS = [(), (2,), (3, 6, 7), (2, 3, 6, 7)]
+LOCKS = [(), (3, 6, 7), (2, 3, 6, 7)]
 # Of lengths [chain lengths] and angles [rad]: float32, 6e-8 of each of about 20 steps from base to tip, amplified by
 # angles from differences of unit vectors.
 ATOL = 1e-5

@@ -94,7 +94,11 @@ def test_rotation_measures():
 
 @pytest.mark.parametrize("rotation", MEASURES)
 @pytest.mark.parametrize("weights", [ALL_WEIGHTS, PAPER_WEIGHTS, adaptive_weights])
-@pytest.mark.parametrize("arm", [panda(), planar_arm([0.5, 0.2, 0.3])], ids=lambda arm: arm.name)
+@pytest.mark.parametrize(
+    "arm",
+    [pytest.param(panda(), marks=pytest.mark.slow), planar_arm([0.5, 0.2, 0.3])],
+    ids=lambda arm: arm.name,
+)
 def test_zero_exactly_at_a_match_and_only_there(arm, weights, rotation):
     here, elsewhere = states(arm), states(arm, seed=1)
     itself = link_distances(here, here, weights, rotation=rotation)

@@ -1,5 +1,3 @@
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,7 +87,7 @@ def test_gradients_equal_finite_differences(x64, names):
 @EACH
 def test_gradients_are_finite_at_the_kinks(names):
     matching = np.array([[2, 0], [0, 2], [0, 0]])  # the links that match in the first two pairs of states
-    at_a_match = [(matching, WEIGHTS["constant"], *options) for options in itertools.product(MEASURES, REDUCTIONS)]
+    at_a_match = [(matching, WEIGHTS["constant"], *options) for options in zip(MEASURES, REDUCTIONS, strict=True)]
     function = distances_of([*at_a_match, *metrics(names)])
     gradient = jax.vmap(jax.jacrev(function, argnums=1))(*singular_states(np.float32))
     assert gradient.dtype == np.float32
@@ -114,6 +112,7 @@ def test_gradients_of_the_joint_motion_equal_finite_differences(x64):
     assert abs(expected).max() > 0.1
 
 
+@pytest.mark.slow
 def test_panda_gradients_under_jit_and_vmap():
     arm = panda(locked=(3, 6, 7))
     overlap = overlap_correspondence(arm, arm)

@@ -145,7 +145,11 @@ def test_locked_random_arm_moves_as_in_mujoco(x64, seed, links):
 
 @pytest.mark.parametrize(
     "arm",
-    [panda(locked=(3, 6, 7)), planar_arm([0.3, 0.2, 0.4], frame_at=1.0), load_mjcf(random_arms.random_arm(2))],
+    [
+        pytest.param(panda(locked=(3, 6, 7)), marks=pytest.mark.slow),
+        planar_arm([0.3, 0.2, 0.4], frame_at=1.0),
+        load_mjcf(random_arms.random_arm(2)),
+    ],
     ids=lambda arm: arm.name,
 )
 def test_body_twists_are_the_derivative_of_the_frames(x64, arm):
@@ -282,7 +286,7 @@ def test_wrong_shapes_are_rejected(unchecked, shape):
     [
         panda(locked=(3, 6, 7)),
         load_mjcf(mujoco.MjModel.from_xml_string(torso()), tip=TORSO_TIPS),
-        load_mjcf(mujoco.MjModel.from_xml_string(hand()), tip=["*"]),
+        pytest.param(load_mjcf(mujoco.MjModel.from_xml_string(hand()), tip=["*"]), marks=pytest.mark.slow),
     ],
     ids=lambda arm: arm.name,
 )

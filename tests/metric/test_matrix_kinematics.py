@@ -23,7 +23,7 @@ def states(arm, count=200, seed=0):
     return jnp.asarray(qpos, jnp.float32), jnp.asarray(rng.normal(size=qpos.shape), jnp.float32)
 
 
-@pytest.mark.slow_for("panda")
+@pytest.mark.slow_for("panda", "locked")
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 def test_they_are_the_link_states(config):
     arm = build_arm(config, "hardware").embodiment

@@ -158,6 +158,7 @@ def test_smoothness_derivatives_equal_automatic_ones(x64):
         np.testing.assert_allclose(row, theirs.hessian[i][: i + 1], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_without_weights_the_result_is_the_same_to_the_bit():
     plain = imitate_pose(EXPERT, LEARNER, QPOS, **METRIC, **FEW)
     jax.tree.map(

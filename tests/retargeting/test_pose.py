@@ -151,6 +151,7 @@ def test_newton_beats_gradient_descent():
     assert np.mean(plain.distance - newton.distance) < 1e-2  # the paper's way gets near
 
 
+@pytest.mark.slow
 def test_dropped_initial_guesses_are_not_missed():
     expert, learner = PAIRS["planar 3->2"]
     arguments = expert, learner, poses(expert, 64), overlap_correspondence(expert, learner), DIRECTIONS
