@@ -86,8 +86,10 @@ def read_captures(folder: Path, changed: Path) -> Any:
 def read_runs(folder: Path, changed: Path) -> Any:
     find_runs(folder)
     config = load_config(folder / "run")
-    with contextlib.redirect_stderr(io.StringIO()):
+    with contextlib.redirect_stderr(io.StringIO()) as error:
         checkpoint = load_training(folder / "run", PARAMS)
+    if error.getvalue():  # a damaged checkpoint is named and the one before it loaded
+        raise ValueError(error.getvalue().strip())
     return vars(config) if "checkpoints" not in changed.parts else checkpoint._asdict()
 
 

@@ -180,6 +180,10 @@ def load_training(run_dir: Path, template: Any) -> Checkpoint:
                 file=sys.stderr,
             )
     if not (path / _STATE).is_file():
+        print(
+            f"warning: checkpoint {str(path)!r} has no {_STATE}: training continues from its parameters alone",
+            file=sys.stderr,
+        )
         return Checkpoint(step, params, None, metrics)
     names = [f"arr_{i}" for i in range(_MAX_ARRAYS)]  # as NumPy names them
     try:

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import fuzz
 
-COUNTS = {"motions": 34, "models": 17, "captures": 34, "runs": 17, "command_lines": 17}  # each change once or twice
+COUNTS = {"motions": 34, "models": 34, "captures": 34, "runs": 17, "command_lines": 17}  # each change once or twice
 
 
 @pytest.fixture(autouse=True)

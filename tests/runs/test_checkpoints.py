@@ -189,6 +189,13 @@ def test_another_device_is_said(run_dir, monkeypatch, capsys):
     )
 
 
+def test_a_missing_training_state_is_one_line(run_dir, capsys):
+    (run_dir / "checkpoints" / "000000000020" / "training.npz").unlink()
+    restored, warning = load_training(run_dir, PARAMS), capsys.readouterr().err
+    assert (restored.step, restored.state) == (20, None)
+    assert warning.count("\n") == 1 and "000000000020' has no training.npz: training continues" in warning
+
+
 def test_old_checkpoints_are_thinned(run_dir):
     save_checkpoint(run_dir, 30, PARAMS, STATE)
     thin_checkpoints(run_dir, keep=3, best=0)
