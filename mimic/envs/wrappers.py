@@ -1,26 +1,13 @@
 """Training wrappers: brax's own, with a new random demonstration for every episode."""
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 
-from mimic.envs.arm_state import ArmState
-from mimic.envs.config import EnvConfig
 from mimic.envs.imitation import FIRST_STEP, ImitationEnv, arm_state
-
-
-@runtime_checkable
-class RestartableEnv(Protocol):
-    """An environment whose episodes start anew within a batch: `ImitationEnv`, and `AnyArmEnv` of many arms."""
-
-    config: EnvConfig
-
-    def at_step(self, state: Any, step: Any) -> ArmState: ...  # noqa: D102
-    def observe_start(self, state: Any) -> jax.Array: ...  # noqa: D102
-    def restart_done(self, states: State) -> State: ...  # noqa: D102
 
 
 class FreshEpisodeWrapper(Wrapper):
@@ -31,7 +18,7 @@ class FreshEpisodeWrapper(Wrapper):
     synchronous, each batch would contain only one part of the motion.
     """
 
-    def __init__(self, env: Wrapper, imitation: RestartableEnv):
+    def __init__(self, env: Wrapper, imitation: Any):  # an `ImitationEnv`, or an `AnyArmEnv` of many arms
         super().__init__(env)
         self._imitation = imitation
 
@@ -70,7 +57,7 @@ def wrap_for_training(env: Env, episode_length: int, action_repeat: int = 1, ran
       ValueError: a `randomization_fn`; see `RandomizationConfig` for randomization.
     """
     imitation = env.unwrapped
-    if not isinstance(imitation, RestartableEnv):
+    if not hasattr(imitation, "restart_done"):
         raise TypeError(f"expected an ImitationEnv or AnyArmEnv, got {type(imitation).__name__}")
     if randomization_fn is not None:
         raise ValueError("randomization_fn is not supported")

@@ -37,9 +37,9 @@ class Trainer(abc.ABC):
     unit: str
     columns: tuple[str, str] = ("training", "held out")
 
-    @abc.abstractmethod
     def save_inputs(self, run_dir: Path) -> None:
-        """Writes the inputs that reproduce the run, in addition to its config."""
+        """Writes the inputs that reproduce the run, in addition to its config; none by default."""
+        del run_dir
 
     @abc.abstractmethod
     def params_template(self) -> Params:

@@ -15,11 +15,9 @@ from rich.console import Console
 
 from mimic.arms.arm import ArmConfig
 from mimic.arms.description import SUFFIX, save_description
-from mimic.arms.embodiment import Embodiment
 from mimic.base.config import check_choice, new_file, new_folder
 from mimic.base.distribution import install_command
 from mimic.base.files import write_atomically
-from mimic.envs import env_config
 from mimic.envs.many_arms_control import torque_scale
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.trainers.config import TrainConfig
@@ -66,9 +64,8 @@ def export_run(
       out: exported file; must not exist.
       format: "onnx", or "jax" for `jax.export.deserialize`, with the metadata in a second file named `out` + ".json";
         or "controller", a folder for `mimic.deploy`, see `export_controller`.
-      learner: name of the environment that the run's arms must equal. Default "": not checked. Of a run whose learner
-        is any arm, an arm (see `ArmConfig.model`) whose description is written to `out`, a .json file, instead
-        of the network.
+      learner: of a run whose learner is any arm, an arm (see `ArmConfig.model`) whose description is written to `out`,
+        a .json file, instead of the network.
       locked: numbers or names of the joints of this arm that are locked.
       checkpoint: steps of the checkpoint. Default None: the last checkpoint.
 
@@ -76,8 +73,8 @@ def export_run(
       Path of the file.
 
     Raises:
-      ValueError: the run or the checkpoint does not exist, the run has other arms, the file cannot be written, the
-        format is unknown, or a package that it needs is not installed.
+      ValueError: the run or the checkpoint does not exist, the file cannot be written, the format is unknown, or a
+        package that it needs is not installed.
     """
     config = ExportConfig(os.fspath(run), os.fspath(out), format, learner, list(locked), checkpoint)
     if export := _folder_writer(config) or _description_writer(config):
@@ -116,9 +113,8 @@ def _folder_writer(config: ExportConfig) -> Callable[[], None] | None:
         return None
     _check_package(config.format)
     out, run_dir = new_folder("out", config.out), _run_dir(config)
-    if config.learner:
-        _check_arms(config, *load_config(run_dir).env.build_arms().embodiments)
     write = prepare_controller(run_dir, config.checkpoint)
+    _check_no_learner(config)
 
     def run() -> None:
         write(out)
@@ -166,8 +162,7 @@ def exported_function(config: ExportConfig) -> ExportedFunction:
     if trained.env.kind == "inner_loop" and trained.trainer.name == "ppo":
         raise ValueError(f"format: expected {CONTROLLER} for a run with an inner loop, got {config.format}")
     steps = check_checkpoint(run_dir, config.checkpoint)
-    if config.learner:
-        _check_arms(config, *trained.env.build_arms().embodiments)
+    _check_no_learner(config)
     return make_function(trained, run_dir, steps)
 
 
@@ -221,18 +216,10 @@ def _write_description(trained: TrainConfig, learner: str, locked: Sequence[Any]
     return run
 
 
-def _check_arms(config: ExportConfig, expert: Embodiment, learner: Embodiment) -> None:
-    """Raises a `ValueError` unless the arms of a run are those of the environment `learner`."""
-    name = config.learner
-    if config.locked:
-        raise ValueError(f"locked: expected none for a run of one learner, got {config.locked}")
-    required_arms = env_config(name).build_arms().embodiments
-    for role, arm, required in zip(("expert", "learner"), (expert, learner), required_arms, strict=True):
-        if (arm.name, arm.joint_names) != (required.name, required.joint_names):
-            raise ValueError(
-                f"learner: {name} has the {role} {required.name} with joints {', '.join(required.joint_names)}, "
-                f"but the run's is {arm.name} with joints {', '.join(arm.joint_names)}"
-            )
+def _check_no_learner(config: ExportConfig) -> None:
+    """Raises a `ValueError` for an arm that a run of one learner does not take."""
+    if config.learner:
+        raise ValueError(f"learner: expected none for a run of one learner, got {config.learner!r}")
 
 
 def _write(exported: ExportedFunction, out: Path, format: str) -> None:

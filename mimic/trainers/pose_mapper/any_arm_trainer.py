@@ -115,9 +115,6 @@ class AnyArmMapperTrainer(Trainer):
         optimise = self._optimisation()
         return {part: jax.device_get(optimise(_key(_GUESSES), pairs)) for part, pairs in self._pairs.items()}
 
-    def save_inputs(self, run_dir: Path) -> None:
-        """Writes nothing, because arms and poses follow from the config and the seed."""
-
     def params_template(self) -> Params:
         """Shapes of the network's parameters."""
         return jax.eval_shape(lambda: self._model.init(jax.random.key(0)))

@@ -144,9 +144,6 @@ class PoseMapperTrainer(Trainer):
     def _reference(self) -> _Reference:
         return jax.device_get(self._optimisation()(self._evaluation_poses))
 
-    def save_inputs(self, run_dir: Path) -> None:
-        """Writes nothing, because the poses follow from the seed."""
-
     def params_template(self) -> Params:
         """Shapes of the network's parameters."""
         return jax.eval_shape(lambda: self._model.init(jax.random.key(0)))

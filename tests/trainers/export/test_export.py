@@ -229,8 +229,7 @@ def mapped(tmp_path_factory):
         ([f"out={__file__}"], "exists; name a new file"),
         (["out=no/new.onnx"], "there is no folder 'no'"),
         (["out=new.onnx", "format=tflite"], "expected one of onnx, jax, controller, got 'tflite'"),
-        (["out=new.onnx", "learner=panda3dof"], "but the run's is panda-joint3-joint6-joint7 with joints"),
-        (["out=new.onnx", "learner=panda9dof"], "unknown environment 'panda9dof'; valid are any_arm, bimanual, pair"),
+        (["out=new.onnx", "learner=panda"], "learner: expected none for a run of one learner, got 'panda'"),
     ],
 )
 def test_bad_input_is_rejected(mapped, reason, arguments, message):
