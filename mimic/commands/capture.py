@@ -9,10 +9,11 @@ import numpy as np
 from rich.console import Console
 
 from mimic.arms.arm import ArmConfig, build_arm
-from mimic.arms.embodiment import Embodiment
+from mimic.arms.embodiment import Embodiment, load_mjcf
 from mimic.arms.kinematic_tree import ALL_ENDS
 from mimic.base.overrides import setting, shell_words
 from mimic.commands.config import CaptureConfig, RecordingConfig
+from mimic.commands.demonstrations_plot import plot_demonstrations
 from mimic.commands.printed import train_command
 from mimic.envs.config import DemonstrationConfig, EnvConfig, ObservationConfig, RewardConfig
 from mimic.metric.kinematics import link_state_table
@@ -20,7 +21,7 @@ from mimic.motions.mocap.arms import SIDES, find_arms
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
 from mimic.motions.mocap.clips import Windows, relative_speeds, slow_down_for, turned, windows
 from mimic.motions.mocap.link_motion import BOTH, LinkMotion, arm_motion, rigid_error, sides
-from mimic.motions.mocap.picture import draw_skeleton, draw_windows
+from mimic.motions.mocap.picture import draw_skeleton
 from mimic.motions.mocap.points import PointMotion, bridge_gaps, gaps, jumps, segment_lengths
 from mimic.motions.mocap.reading import read_motion
 
@@ -130,8 +131,8 @@ def prepare_capture(config: RecordingConfig, env: EnvConfig, out: Path, plot: Pa
         model.write_text(xml)
         cut.demonstrations.save(out)
         length = env.horizon * env.control_dt / slow_down
-        spans = [(start, start + length, i >= cut.training) for i, start in enumerate(cut.start)]
-        draw_windows(parts, spans, plot, f"{source.name}, {parts[0].name}: {len(spans)} windows of {length:.2f} s")
+        title = f"{source.name}, {parts[0].name}: {len(cut.start)} windows of {length:.2f} s"
+        plot_demonstrations(cut.demonstrations, load_mjcf(model, tip=[ALL_ENDS]), plot, title=title)
         for line in [*body_lines(capture.body), *_capture_lines(capture, cut, env)]:
             console.print(line, soft_wrap=True, highlight=False, markup=False)
         console.print(f"plot: {plot}", soft_wrap=True, highlight=False)

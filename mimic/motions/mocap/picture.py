@@ -1,6 +1,5 @@
-"""Pictures of captured motions."""
+"""The picture of a captured motion."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -11,7 +10,6 @@ import numpy as np  # noqa: E402
 
 from mimic.motions.mocap.arms import find_arms  # noqa: E402
 from mimic.motions.mocap.conventions import mean_point  # noqa: E402
-from mimic.motions.mocap.link_motion import LinkMotion  # noqa: E402
 from mimic.motions.mocap.points import PointMotion  # noqa: E402
 
 _COLOURS = {"left": "tab:blue", "right": "tab:orange"}
@@ -48,36 +46,6 @@ def draw_skeleton(motion: PointMotion, path: Path, title: str) -> None:
     axes[1, 0].set_ylabel("z [m]")
     if arms:
         axes[0, 0].legend(fontsize=8, loc="upper left")
-    figure.suptitle(title)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
-def draw_windows(
-    motions: Sequence[LinkMotion], spans: Sequence[tuple[float, float, bool]], path: Path, title: str
-) -> None:
-    """Directions of the links over time, with the windows that were cut; spans are start, stop [s] and held out."""
-    links = motions[0].names
-    figure, axes = plt.subplots(len(links) + 1, 1, figsize=(9, 1.7 * len(links) + 1.6), sharex=True)
-    begin = 0.0
-    for motion in motions:
-        time = begin + np.arange(len(motion.start)) / motion.rate
-        span = motion.end - motion.start
-        direction = span / np.linalg.norm(span, axis=2, keepdims=True)
-        for link, axis in enumerate(axes[:-1]):
-            for component, colour in zip(range(3), ("tab:red", "tab:green", "tab:blue"), strict=True):
-                axis.plot(time, direction[:, link, component], color=colour, linewidth=0.8)
-        begin = time[-1] + 1 / motion.rate
-    for link, axis in zip(links, axes[:-1], strict=True):
-        axis.set_ylabel(f"{link}\ndirection")
-        axis.set_ylim(-1.05, 1.05)
-    axes[0].legend(("x forward", "y left", "z up"), fontsize=8, loc="upper right", ncols=3)
-    for index, (start, stop, is_held_out) in enumerate(spans):
-        colour = "tab:orange" if is_held_out else "tab:blue"
-        axes[-1].plot([start, stop], [index, index], color=colour, linewidth=2)
-    axes[-1].set_ylabel("window")
-    axes[-1].set_xlabel("time in the capture [s]; blue: training, orange: held out")
     figure.suptitle(title)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
