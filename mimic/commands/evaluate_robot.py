@@ -27,8 +27,7 @@ from mimic.evaluation.virtual_robot.draws import draw_world, edge_cases
 from mimic.evaluation.virtual_robot.episodes import Episodes, TorquePolicy, TrackingPolicy
 from mimic.evaluation.virtual_robot.robots import LIMIT_CAUSES, SELF_CONTACT
 from mimic.evaluation.virtual_robot.runs import Task, run_tasks
-from mimic.metric.kinematics import link_state_table
-from mimic.metric.matrix_kinematics import make_link_vector
+from mimic.metric.kinematics import link_state_table, link_states
 from mimic.physics.world import WorldConfig
 from mimic.runs.checkpoints import check_checkpoint
 from mimic.runs.files import write_report
@@ -177,10 +176,10 @@ def _torque_model(evaluator: Evaluator, run_dir: Path, steps: int) -> bytes:
 
     env = evaluator.env
     policy = exported_function(ExportConfig(str(run_dir), checkpoint=steps))
-    link_vector = make_link_vector(env.learner)
 
     def function(qpos: jax.Array, qvel: jax.Array, expert: jax.Array) -> dict[str, jax.Array]:
-        return {"torque": policy.function(jnp.concatenate([link_vector(qpos, qvel), expert]))["torque"]}
+        states = [leaf.ravel() for leaf in jax.tree.leaves(link_states(env.learner, qpos, qvel))]
+        return {"torque": policy.function(jnp.concatenate([*states, expert]))["torque"]}
 
     joints, experts = env.learner.num_joints, (env.config.preview + 1) * env.expert.num_links * 12
     return to_onnx(function, name="policy", inputs={"qpos": joints, "qvel": joints, "expert": experts})

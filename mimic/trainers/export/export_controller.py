@@ -18,8 +18,7 @@ from mimic.control.joint_control import JointParameters
 from mimic.deploy.bundle import write_bundle
 from mimic.deploy.safety import check_supported
 from mimic.envs.world_env import SENT_ACTIONS, HardwareEnv
-from mimic.metric.kinematics import LinkStates
-from mimic.metric.matrix_kinematics import make_link_vector
+from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.clearance import clearance_constants
 from mimic.runs.checkpoints import check_checkpoint, load_checkpoint
 from mimic.trainers.config import PPOConfig
@@ -100,7 +99,7 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
     expert_size = (env.config.preview + 1) * _NUMBERS * env.expert.num_links
     is_expert = np.zeros(env.observation_size, bool)
     is_expert[own_links : own_links + expert_size] = True
-    link_vector, mean = make_link_vector(env.learner), np.array(statistics.mean)
+    mean = np.array(statistics.mean)
     mean[own_links + expert_size :][:joints] += np.asarray(env.learner.home)  # the policy observes the difference
     first_kernel = np.asarray(layers[0]["kernel"]) / np.asarray(statistics.std)[:, None]
 
@@ -112,7 +111,8 @@ def _policy_graphs(env: HardwareEnv, params: Any) -> tuple[bytes, bytes]:
 
     def action(*values: jax.Array) -> dict[str, jax.Array]:
         qpos, qvel, reference_qpos, reference_qvel, past_actions, features = values
-        own = jnp.concatenate([link_vector(qpos, qvel), reference_qpos, reference_qvel, past_actions])
+        states = [leaf.ravel() for leaf in jax.tree.leaves(link_states(env.learner, qpos, qvel))]
+        own = jnp.concatenate([*states, reference_qpos, reference_qvel, past_actions])
         hidden = features + first_layer(~is_expert, own)
         for layer in layers[1:-1]:
             hidden = jax.nn.silu(hidden) @ layer["kernel"] + layer["bias"]
