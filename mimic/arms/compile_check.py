@@ -4,7 +4,6 @@ That process runs this file: it must import nothing of mimic at its start.
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 SECONDS = 10  # CPU time; a Panda with meshes needs 1 s
@@ -67,29 +66,27 @@ def velocity_limits(model: Any) -> list[float]:
     return list(map(float, model.numeric(numeric).data)) if numeric >= 0 else []
 
 
-def check_in_process(text: str, attached: Mapping[str, bytes]) -> None:
+def check_in_process(text: str) -> None:
     """Compiles a model in a process with limits, before this one does, and checks its magnitudes.
 
     Args:
       text: the model's XML, which names its files by absolute paths.
-      attached: the XML of the models that it attaches, by their names in it.
 
     Raises:
       ValueError: MuJoCo rejects the model, crashes, or exceeds a limit; or what `check_magnitudes` rejects.
     """
     from mimic.base.limited_process import call_limited
 
-    texts = {name: content.decode() for name, content in attached.items()}
-    call_limited(__file__, "compile_model", text, texts, library="mujoco", what="the model", seconds=SECONDS)
+    call_limited(__file__, "compile_model", text, library="mujoco", what="the model", seconds=SECONDS)
 
 
-def compile_model(text: str, attached: Mapping[str, str]) -> None:
+def compile_model(text: str) -> None:
     """What `check_in_process` runs there."""
     import mujoco
 
     warnings: list[str] = []
     mujoco.set_mju_user_warning(warnings.append)
-    spec = mujoco.MjSpec.from_string(text, include={name: content.encode() for name, content in attached.items()})
+    spec = mujoco.MjSpec.from_string(text)
     spec.compiler.usethread = False
     model = spec.compile()
     if any("NaN" in warning for warning in warnings):  # in whatever attribute it is

@@ -20,8 +20,7 @@ def copied_files(source: ModelSource, name: str) -> Mapping[str, bytes | Path]:
     # The names of the files stay, since MuJoCo names meshes by them.
     places = {str(file): f"{_ASSETS}/{number}/{file.name}" for number, file in enumerate(source.files)}
     files: dict[str, bytes | Path] = {place: Path(file) for file, place in places.items()}
-    for path, root in {name: source.root, **source.attached}.items():
-        files[path] = ElementTree.tostring(_with_paths(root, places))
+    files[name] = ElementTree.tostring(_with_paths(source.root, places))
     return files
 
 

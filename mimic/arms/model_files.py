@@ -55,7 +55,7 @@ def _read(path: str | os.PathLike[str]) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
             spec = mujoco.MjSpec.from_file(os.fspath(path))
         else:
             _check(source)
-            spec = mujoco.MjSpec.from_string(source.text, include=source.attached_texts)
+            spec = mujoco.MjSpec.from_string(source.text)
             if source.is_urdf:
                 _restore_urdf_data(spec, source)
         model = spec.compile()
@@ -77,7 +77,7 @@ def _is_bundled(file: Path) -> bool:
 
 @functools.cache  # a run reads a model several times
 def _check(source: ModelSource) -> None:
-    check_in_process(source.text, source.attached_texts)
+    check_in_process(source.text)
 
 
 def _reason(shown: str, message: str) -> str:

@@ -31,15 +31,13 @@ class ModelSource:
 
     Attributes:
       digest: checksum of the XML and of all files.
-      root: the XML, whose `file` attributes are absolute paths, or names in `attached`.
-      attached: other models that this one attaches, by the names that it has for them.
+      root: the XML, whose `file` attributes are absolute paths.
       files: the meshes, textures and height fields.
       missing: meshes of a URDF that were left out, since there is no such file.
     """
 
     digest: str
     root: ElementTree.Element = dataclasses.field(compare=False)
-    attached: dict[str, ElementTree.Element] = dataclasses.field(compare=False)
     files: tuple[Path, ...] = dataclasses.field(compare=False)
     missing: tuple[str, ...] = dataclasses.field(compare=False)
 
@@ -52,11 +50,6 @@ class ModelSource:
     def text(self) -> str:
         """The XML, with each element in the line that it has in its file, as far as there are no includes."""
         return ElementTree.tostring(self.root, "unicode")
-
-    @property
-    def attached_texts(self) -> dict[str, bytes]:
-        """The XML of the attached models."""
-        return {name: ElementTree.tostring(root) for name, root in self.attached.items()}
 
 
 def read_source(path: str | os.PathLike[str]) -> ModelSource:
@@ -74,20 +67,18 @@ def read_source(path: str | os.PathLike[str]) -> ModelSource:
     try:
         root = reader.read(file)
         files = tuple(dict.fromkeys(reader.files))
-        digest = hashlib.sha256()
-        for tree in (root, *reader.attached.values()):
-            digest.update(ElementTree.tostring(tree) + b"\0")
+        digest = hashlib.sha256(ElementTree.tostring(root))
     except RecursionError:
         raise ValueError(f"{shown} has too many levels of XML") from None
     if (size := sum(file.stat().st_size for file in files)) > MAX_ASSET_SIZE:
         raise ValueError(f"{shown} has files of {size:,} bytes; expected at most {MAX_ASSET_SIZE:,}")
     for asset in files:
         digest.update(file_digest(asset).encode())
-    return ModelSource(digest.hexdigest(), root, reader.attached, files, tuple(reader.missing))
+    return ModelSource(digest.hexdigest(), root, files, tuple(reader.missing))
 
 
 class _Reader:
-    """Reads a model, and those that it attaches.
+    """Reads a model.
 
     Args:
       shown: the model, for messages.
@@ -99,17 +90,11 @@ class _Reader:
         self._folder = folder
         is_top = folder.parent == folder.parent.parent  # everything would be next to it
         self._package = folder if is_top else folder.parent
-        self.attached: dict[str, ElementTree.Element] = {}
         self.files: list[Path] = []
         self.missing: list[str] = []
 
-    def read(self, file: Path, models: tuple[Path, ...] = ()) -> ElementTree.Element:
-        """The tree of a model with its includes, whose files are located.
-
-        Args:
-          file: the model.
-          models: those that attach it.
-        """
+    def read(self, file: Path) -> ElementTree.Element:
+        """The tree of a model with its includes, whose files are located."""
         root = self._with_includes(file)
         mesh_folder, texture_folder, strips_paths = _read_compilers(root)
         is_urdf = root.tag == "robot"
@@ -120,8 +105,7 @@ class _Reader:
                 if not (name := element.attrib[attribute]):
                     continue
                 if element.tag.lower() == "model":
-                    element.attrib[attribute] = self._attach(name, file, models)
-                    continue
+                    raise ValueError(f"{self._shown} attaches the model {name!r:.200}; expected includes, or one file")
                 name = re.split(r"[/\\]", name)[-1] if strips_paths and not is_urdf else name
                 folder = texture_folder if element.tag.lower() == "texture" else mesh_folder
                 asset = self._file(name, (file.parent / folder, file.parent), self._package)
@@ -155,16 +139,6 @@ class _Reader:
         for child in root.iter():
             child.text = child.tail = None  # lines of another file
         return root
-
-    def _attach(self, name: str, file: Path, models: tuple[Path, ...]) -> str:
-        """Reads a model that another one attaches; returns the name that MuJoCo finds it by."""
-        path, models = self._file(name, (file.parent,), self._folder), (*models, file)
-        if path in models:
-            raise ValueError(f"{self._shown} attaches {name!r:.200}, which contains it")
-        key = f"attached-{hashlib.sha256(str(path).encode()).hexdigest()[:16]}.xml"
-        if key not in self.attached:
-            self.attached[key] = self.read(path, models)
-        return key
 
     def _locate_urdf_meshes(self, root: ElementTree.Element, folders: tuple[Path, ...]) -> None:
         """Writes the paths of meshes into the model, and removes the shapes whose mesh does not exist."""

@@ -202,19 +202,6 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, float | int)
 
 
-def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
-    """Copies a pytree to all devices, along a new first axis.
-
-    JAX removed its function of this name in 0.10, and brax 0.14 still calls it. This one replicates through `jax.pmap`,
-    with brax's own name of the axis, so that the result has the sharding of what brax's training epoch returns: the
-    epoch is then compiled once instead of twice.
-    """
-    import jax
-
-    replicate = jax.pmap(lambda _, x: x, axis_name=_BRAX_AXIS_NAME, in_axes=(0, None), devices=list(devices))
-    return replicate(jax.numpy.arange(len(devices)), tree)
-
-
 def coordination_client() -> Any:
     """The key-value client of `jax.distributed`'s coordination service; JAX has no public name for it."""
     from jax._src import distributed
@@ -230,12 +217,21 @@ def process_number() -> int:
 
 
 def mend_brax() -> None:
-    """Restores `jax.device_put_replicated`, which brax's training loops call and JAX no longer has.
+    """Restores `jax.device_put_replicated`, which brax 0.14 calls in its training loops and JAX removed in 0.10.
 
     Called by each `ImitationEnv`, not by `import mimic`. brax looks the name up in `jax` itself. The name is added only
     where it is missing, with JAX's own arguments and result; nothing that exists is replaced.
     """
     import jax
 
+    def replicated(tree: Any, devices: Sequence[Any]) -> Any:
+        """Copies a pytree to all devices, along a new first axis.
+
+        By `jax.pmap` with brax's own name of the axis, so that the result has the sharding of what brax's training
+        epoch returns: the epoch is then compiled once instead of twice.
+        """
+        replicate = jax.pmap(lambda _, x: x, axis_name=_BRAX_AXIS_NAME, in_axes=(0, None), devices=list(devices))
+        return replicate(jax.numpy.arange(len(devices)), tree)
+
     if not hasattr(jax, "device_put_replicated"):
-        jax.device_put_replicated = device_put_replicated  # type: ignore[attr-defined]
+        jax.device_put_replicated = replicated  # type: ignore[attr-defined]

@@ -1,6 +1,5 @@
 """`python -m benchmarks.costs`: its motions, its weights, and the quantities of its rows."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,15 +7,6 @@ import numpy as np
 import mimic
 from benchmarks import costs as benchmark
 from mimic.metric.similarity import MEASURES
-from mimic.retargeting.costs import Costs
-
-
-def test_all_has_the_weight_of_each_row():
-    weights = {name: dataclasses.asdict(cost) for name, cost in benchmark.COSTS.items()}
-    total, plain = weights.pop("all"), weights.pop("none")
-    assert plain == dataclasses.asdict(Costs())
-    for name, weight in weights.items():
-        assert weight == plain | {name: total[name]} and weight[name] > 0
 
 
 def test_rows_say_what_the_learner_does(monkeypatch):

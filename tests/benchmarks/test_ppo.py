@@ -7,7 +7,6 @@ import pytest
 
 import mimic
 from benchmarks import ppo
-from benchmarks.common.record import print_table
 from benchmarks.peers import stock
 from mimic.trainers.config import PPOConfig
 
@@ -19,18 +18,6 @@ SMALL = PPOConfig(
 
 def test_the_first_epoch_is_not_counted():
     assert ppo.rates(100, [1.0, 8.0, 10.0, 12.0, 14.0]) == {"compile_s": 5.0, "steps_per_s": 50.0, "spread": 0.0}
-
-
-@pytest.mark.slow
-def test_what_cannot_run_says_why(monkeypatch, capsys):
-    def absent(*_):
-        raise ImportError("not here\nand more")
-
-    monkeypatch.setitem(ppo.CASES, "absent", absent)
-    rows = [ppo.run("planar4dof", SMALL, case, batches=1) for case in ("mimic, fused", "absent")]
-    assert rows[0]["steps_per_s"] > 0 and rows[1]["failed"] == "ImportError: not here"
-    print_table(rows, ppo.COLUMNS)
-    assert "ImportError: not here" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -10,8 +10,7 @@ from benchmarks import pretrained
 from mimic.base.files import read_json
 from mimic.envs import env_config
 from mimic.runs.files import REPORT
-from mimic.trainers import run_training as train
-from mimic.trainers.config import PoseMapperConfig, PPOConfig, TrainConfig
+from mimic.trainers.config import PPOConfig, TrainConfig
 from mimic.trainers.pretrained.network import NETWORKS, read_network
 from mimic.trainers.run_config import load_config
 from tests.helpers import pages
@@ -47,16 +46,3 @@ def test_a_policy_is_measured_as_it_is_stored(tmp_path, half):
     assert policy.source["commit"] == "c0ffee" and policy.source["matrices"] == ("float16" if half else "float32")
     assert policy.config.env == load_config(run_dir).env
     assert policy(np.zeros(policy.env.observation_size)).shape == (2,)
-
-
-@pytest.mark.slow
-def test_a_mapper_is_measured_as_it_is_stored(tmp_path):
-    settings = {"samples": 256, "batch_size": 128, "epochs": 1, "hidden_layers": [8], "held_out_poses": 32}
-    trainer = PoseMapperConfig(**settings, evaluations=1, validation_poses=32)
-    config = TrainConfig(env_config("planar4dof"), trainer, run_dir=str(tmp_path / "run"), compilation_cache="")
-    assert train.prepare_training(config, 0.0)() == 0
-    trained = json.loads((tmp_path / "run" / REPORT).read_text())
-    row = pretrained.make_network(tmp_path / "run", tmp_path / "out", "c0ffee", False)
-    mapper = read_network(tmp_path / "out" / "planar4dof-pose_mapper", "pose_mapper")
-    assert row["gap"] == mapper.report["quality"] == trained["quality"]
-    assert mapper.report["copying_distance"]["held_out"] > mapper.report["optimal_distance"]["held_out"]

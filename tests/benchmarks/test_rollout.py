@@ -34,7 +34,7 @@ def test_a_peer_that_cannot_run_says_why(monkeypatch):
         raise RuntimeError("no room\nand more")
 
     monkeypatch.setitem(rollout.CASES["physics"], "mjx.Data carried", out_of_memory)
-    (row,) = rollout.run(["panda4dof"], [16], ["mjx.Data carried"])
+    (row,) = rollout.run(["planar4dof"], [16], ["mjx.Data carried"])
     assert row["failed"] == "RuntimeError: no room"
 
 

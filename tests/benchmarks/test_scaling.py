@@ -1,8 +1,5 @@
 """`python -m benchmarks.scaling`."""
 
-import json
-import sys
-
 import pytest
 
 from benchmarks import scaling
@@ -48,23 +45,3 @@ def test_efficiency_is_relative_to_the_fewest_devices():
         ("weak", 2, 1, 1.0), ("weak", 4, 1, 0.75), ("weak", 4, 4, 0.9), ("strong", 2, 1, 1.0),
     ]  # fmt: skip
     assert rows[0]["gap"] == pytest.approx(0.01) and rows[0]["gap_deviation"] == pytest.approx(0.01)
-
-
-def test_a_run_that_fails_loses_none_of_those_before_it(tmp_path, monkeypatch):
-    def measure(kind, devices, processes, seed, common, of_one):
-        if devices == 4:
-            sys.exit("error: out of memory")
-        quality = {"optimality_gap": {"train": 0.01}}
-        of_run = {"scaling": kind, "devices": devices, "processes": processes, "seed": seed}
-        return of_run | {"steps_per_s": 100.0 * devices} | quality
-
-    out = tmp_path / "scaling.json"
-    monkeypatch.setattr(scaling, "measure", measure)
-    monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "true")  # and back, after the test
-    monkeypatch.setattr(sys, "argv", ["scaling", "--devices", "1", "2", "4", "--processes", "one", "--out", str(out)])
-    with pytest.raises(SystemExit, match="out of memory"):
-        scaling.main()
-    runs = json.loads(out.read_text())["runs"]
-    assert [(row["scaling"], row["devices"]) for row in runs] == [
-        ("weak", 1), ("strong", 1), ("weak", 2), ("strong", 2),
-    ]  # fmt: skip

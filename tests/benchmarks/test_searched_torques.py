@@ -102,18 +102,6 @@ def test_a_bounded_law_is_the_minimum_between_the_bounds():
 
 
 @pytest.mark.slow
-def test_runaways_give_no_nan():
-    """With a speed bound that the maximum torques exceed in one step and zero torques do not."""
-    slow = evaluator_of([0.5, 0.5], speed_bound=1.0)
-    descent, task = descent_and_task(slow)
-    greedy = jnp.ones_like(random_actions(slow)).at[0].set(0.0)
-    episodes = descent.improve(task, descent.start(task, greedy))
-    assert np.isfinite(np.asarray(episodes.objective)[0])
-    assert not np.isnan(np.asarray(episodes.objective)).any()
-    assert np.abs(np.asarray(episodes.qvel)[0]).max() < 1.0
-
-
-@pytest.mark.slow
 def test_the_best_of_all_starts_is_returned(tmp_path, monkeypatch, capsys):
     """Of an untrained policy. 1e-5: float32, means in another order."""
     run, out = untrained_run(tmp_path / "run"), tmp_path / "out.json"

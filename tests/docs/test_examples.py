@@ -73,6 +73,7 @@ def test_examples_use_what_is_public(name):
     assert all(hasattr(mimic, attribute) for attribute in used - {"gymnasium"})
 
 
+@pytest.mark.slow
 def test_metric(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["01_metric.py", str(tmp_path)])
     runpy.run_path(str(EXAMPLES / "01_metric.py"), run_name="__main__")
