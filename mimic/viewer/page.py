@@ -17,9 +17,7 @@ _GRID = 0.1, 0.5  # m, sizes of a cell and of a section
 _STANCE = np.array([2.5, -0.1, 0.75])  # camera position relative to its target, in arm lengths
 _FROM_ABOVE = np.array([0.55, -0.01, 2.9])
 _FIELD_OF_VIEW = 0.75  # rad, vertical
-_UNMOVED = 1e-3  # of the height of the view: a camera that moved less, moved by rounding
 _PANEL_WIDTH = 384.0  # pixels; the heat maps of two arms with seven joints fit
-_MIN_WIDTH, _MIN_FLAT_WIDTH = 1.9, 2.6  # arm lengths that a narrow window shows: both arms, with room for elbows
 
 
 class LearnerShape(NamedTuple):
@@ -65,8 +63,6 @@ class Page:
         largest = max((learner.shape for learner in learners), key=lambda shape: shape.reach)
         reach = max(self.expert.reach, largest.reach)
         _set_stage(server, reach, is_flat)
-        width = reach * (_MIN_FLAT_WIDTH if is_flat else _MIN_WIDTH)
-        server.on_client_connect(lambda client: _keep_in_view(client.camera, server.initial_camera, width))
         (left, right), label_at = places([self.expert, largest]), -0.3 if is_flat else 0.3
         self._expert = _DrawnArm(server, "/expert", self.expert, left, f"expert: {expert[0]}", label_at)
         self._learners = [
@@ -223,19 +219,3 @@ def _set_stage(server: viser.ViserServer, reach: float, is_flat: bool) -> None:
     camera.look_at = target
     camera.position = target + reach * (_FROM_ABOVE if is_flat else _STANCE)
     camera.fov = _FIELD_OF_VIEW
-
-
-def _keep_in_view(camera: viser.CameraHandle, start: viser.InitialCameraConfig, width: float) -> None:
-    """Moves a client's camera back until its window shows a width [m] at the target, unless the user moved it."""
-    target, stance = np.array(start.look_at), start.position - start.look_at
-    height = 2 * np.tan(_FIELD_OF_VIEW / 2) * np.linalg.norm(stance)  # of the view at the target
-    last = start.position
-
-    @camera.on_update
-    def _(_: Any) -> None:
-        nonlocal last
-        position = target + stance * max(1.0, width / (height * camera.aspect))
-        is_ours = np.linalg.norm(camera.position - last) < _UNMOVED * height
-        if is_ours and np.linalg.norm(position - last) > _UNMOVED * height:
-            camera.position = last = position
-            camera.look_at = target

@@ -119,21 +119,6 @@ def test_a_base_segment_that_is_not_along_the_first_axis_does_not_move():
     assert not np.any(states.linear_velocity[0]) and not np.any(states.angular_velocity[0])
 
 
-def test_an_arm_from_a_urdf_starts_at_its_base(tmp_path):
-    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-    links = "".join(f'<link name="{name}">{inertial}</link>' for name in ("plate", "upper", "fore", "tool"))
-    joint = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/><origin xyz="{}"/><axis xyz="0 0 1"/>'
-    joint += '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
-    joints = joint.format("a", "revolute", "plate", "upper", "0 0 0.3")
-    joints += joint.format("b", "revolute", "upper", "fore", "1 0 0")
-    joints += joint.format("end", "fixed", "fore", "tool", "0.5 0 0")
-    file = tmp_path / "toy.urdf"
-    file.write_text(f'<robot name="toy">{links}{joints}</robot>')
-    arm = load_mjcf(file)
-    assert (arm.link_names, arm.link_joint) == (("base", "link1", "link2"), (0, 0, 1))
-    np.testing.assert_allclose(arm.link_position, [[0, 0, 0.15], [0.5, 0, 0.3], [1.25, 0, 0.3]], atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("arm", "options", "names"),
     [

@@ -9,7 +9,6 @@ from mimic.physics.world import WorldConfig
 
 _INTERVALS = ("gravity_error", "payload", "payload_lever", "link_mass", "friction", "motor_gain")
 _DELAYS = ("observation_delay", "action_delay")
-_DEVIATIONS = ("position_bias", "start_noise")  # drawn from [-maximum, maximum]
 
 
 @dataclasses.dataclass(frozen=True)

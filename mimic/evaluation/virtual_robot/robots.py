@@ -16,9 +16,6 @@ from mimic.physics.mujoco_world import FLOOR, disabled, loaded_fields
 START_POSE, POSITION, VELOCITY = "start pose invalid", "joint position limit", "joint velocity limit"
 TORQUE, TORQUE_RATE, EXTERNAL_TORQUE = "torque limit", "torque rate", "external torque"
 SELF_CONTACT, FLOOR_CONTACT, COMMUNICATION = "self-contact", "floor contact", "communication"
-CAUSES = (
-    START_POSE, POSITION, VELOCITY, TORQUE, TORQUE_RATE, EXTERNAL_TORQUE, SELF_CONTACT, FLOOR_CONTACT, COMMUNICATION,
-)  # fmt: skip
 LIMIT_CAUSES = (POSITION, VELOCITY, TORQUE, TORQUE_RATE)
 MAX_MISSING = 20  # periods in a row without a command, as for a Panda
 _ROUNDING = 1e-6  # relative, of a torque at its limit
