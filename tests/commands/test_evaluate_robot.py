@@ -221,11 +221,6 @@ def test_controllers_whose_commands_the_run_does_not_have(settings, controller, 
         _check_commands(mimic.env_config("panda7dof", **settings), controller)
 
 
-def test_tracking_needs_an_inner_loop(reason, paper_run):
-    error = reason("evaluate", f"run={paper_run}", "controller=tracking", "robot=virtual_panda")
-    assert "for a run with no inner loop, got tracking" in error
-
-
 @pytest.mark.slow
 def test_tracking_is_the_same_on_a_virtual_robot_as_in_the_environment(tmp_path):
     """Of nominal worlds, where nothing is random."""
