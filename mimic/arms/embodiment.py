@@ -193,7 +193,6 @@ def load_arm(
     links: Links = "kept",
     limits: Limits = "hardware",
     home: Any = None,
-    base_segment: bool = True,
 ) -> tuple[Embodiment, mujoco.MjModel, dict[str, float]]:
     """An embodiment, its source model, and the angles [rad] of its locked joints by name.
 
@@ -201,7 +200,7 @@ def load_arm(
     """
     check_choice("limits", limits, LIMITS)
     model = _model(path_or_model)
-    chain = read_chain(model, base, tip, base_segment=base_segment and links == "kept")
+    chain = read_chain(model, base, tip, base_segment=links == "kept")
     if limits == "none":
         unlimited = (dataclasses.replace(joint, range=(-np.pi, np.pi), home=0.0) for joint in chain.joints)
         chain = dataclasses.replace(chain, joints=tuple(unlimited))

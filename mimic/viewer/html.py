@@ -33,7 +33,6 @@ def heat_map(
     title: str,
     *,
     name: str,
-    maximum: float | None = None,
     colour: tuple[int, int, int] = _BLUES,
 ) -> str:
     """Returns a matrix as a table of coloured cells.
@@ -44,10 +43,9 @@ def heat_map(
       columns: names of the learner's links.
       title: title above the table.
       name: id of the HTML element.
-      maximum: value of the full colour. Default None: the maximum of `values`.
       colour: full colour as red, green and blue from 0 to 255.
     """
-    scale = max(float(values.max()) if maximum is None else maximum, 1e-9)
+    scale = max(float(values.max()), 1e-9)
     head = "".join(f"<th>{html.escape(column)}</th>" for column in columns)
     width = f' style="width:{_LONG_NAME / 2}em"' if max(map(len, rows)) > _SHORT_NAME else ""
     body = "".join(
