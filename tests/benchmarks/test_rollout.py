@@ -33,6 +33,7 @@ def test_a_peer_that_cannot_run_says_why(monkeypatch):
     def out_of_memory(*_):
         raise RuntimeError("no room\nand more")
 
+    monkeypatch.setattr(mimic, "make", lambda *_, **__: None)
     monkeypatch.setitem(rollout.CASES["physics"], "mjx.Data carried", out_of_memory)
     (row,) = rollout.run(["planar4dof"], [16], ["mjx.Data carried"])
     assert row["failed"] == "RuntimeError: no room"
