@@ -7,6 +7,7 @@ from benchmarks.figures import candidate_points
 from benchmarks.figures.planar_arms import joint_points
 
 
+@pytest.mark.slow
 def test_candidate_points_and_frames_have_different_optima():
     expert, mirrored, parallel = candidate_points.poses().values()
     itself, same_hand, same_directions = (

@@ -3,12 +3,14 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 import mimic
 from benchmarks import costs as benchmark
 from mimic.metric.similarity import MEASURES
 
 
+@pytest.mark.slow
 def test_rows_say_what_the_learner_does(monkeypatch):
     """A learner that copies the free joints: its hand is off, and a step of its motion is that of the expert."""
     free = [0, 1, 3, 4]

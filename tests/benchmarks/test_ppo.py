@@ -37,6 +37,7 @@ def test_the_stock_environment_is_the_same_task():
     np.testing.assert_allclose(theirs.obs, theirs.info["first_obs"])
 
 
+@pytest.mark.slow
 def test_the_task_on_mujoco_is_the_same():
     mujoco_task = pytest.importorskip("benchmarks.peers.mujoco_task", exc_type=ImportError)  # gymnasium is an extra
     env = mimic.make("planar4dof", physics="fused", demonstrations={"count": 3, "held_out": 1})

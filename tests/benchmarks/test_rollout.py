@@ -29,6 +29,7 @@ def test_only_the_cases_asked_for_are_measured():
     assert rows[0]["bytes_per_arm"] > 0
 
 
+@pytest.mark.slow
 def test_a_peer_that_cannot_run_says_why(monkeypatch):
     def out_of_memory(*_):
         raise RuntimeError("no room\nand more")

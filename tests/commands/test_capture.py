@@ -34,6 +34,7 @@ def written(clip):
     return clip.parent, run("demonstrations", *arguments, folder=clip.parent)
 
 
+@pytest.mark.slow
 def test_demonstrations_fit_the_arm_that_is_written_with_them(written):
     folder, printed = written
     demonstrations = mimic.load_demonstrations(folder / "left.npz")

@@ -44,6 +44,7 @@ def evaluate(run_dir, out, **settings):
         return json.loads((out / "report.json").read_text()), list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_holding_the_start_pose_has_a_gap_of_one(run_dir, tmp_path, monkeypatch):
     """Whatever the bound. 1e-5: float32, once from rollouts and once from the home pose."""
     bound = np.zeros((COUNT + HELD_OUT, HORIZON)), np.zeros((COUNT + HELD_OUT, HORIZON, 2))

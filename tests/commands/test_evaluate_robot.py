@@ -107,6 +107,7 @@ def test_a_policy_of_the_hardware_world(evaluation, tmp_path, capsys, loop):
     assert "4 episodes on virtual_panda" in printed and "aborts of the robot" in printed
 
 
+@pytest.mark.slow
 def test_a_policy_of_the_papers_world_aborts(paper_run, tmp_path):
     """Torques that jump from one tick to the next: the robot's limit is 1000 N m/s."""
     report = evaluate(paper_run, tmp_path / "new", robot_world="hardware")

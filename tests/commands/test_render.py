@@ -87,6 +87,7 @@ def test_a_mapper_poses_the_learner_at_each_frame(mapper_run):
     assert shown["holding the start pose"][0] == pytest.approx(float(stretched), abs=ROUNDING)
 
 
+@pytest.mark.slow
 def test_retargeted_motions_are_shown_as_they_are(plan):
     clip, env = plan.compute(), env_config("planar4dof")
     arms = [build_arm(arm).embodiment for arm in (env.expert, env.learner)]

@@ -32,6 +32,7 @@ def evaluator():
     return Evaluator(ImitationEnv(config, moved(training, 0)), moved(held_out, 1))
 
 
+@pytest.mark.slow
 def test_each_episode_starts_at_rest_in_the_nearest_pose_of_its_demonstration(evaluator):
     env = evaluator.env
     start_of, begin, distance, observe = map(jax.jit, (env.start, env.begin, env.distance, env.observe))

@@ -76,6 +76,7 @@ def demonstrations_over_time(wrapped, env, steps=6, count=8):
     return np.asarray(rollout(jax.random.PRNGKey(0)))
 
 
+@pytest.mark.slow
 def test_an_environment_works_in_brax_trainers(short_env, monkeypatch):
     """Their training loops copy the state to all devices by a function that JAX removed."""
     monkeypatch.delattr(jax, "device_put_replicated", raising=False)

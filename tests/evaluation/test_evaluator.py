@@ -254,6 +254,7 @@ def test_the_bound_of_an_equal_arm_needs_no_search(monkeypatch):
     assert not evaluator.lower_bound.any() and evaluator.hold_distance[:, -1].min() > 0.01
 
 
+@pytest.mark.slow
 def test_no_rollout_goes_below_the_bound():
     """Random controllers on the planar arm. 1e-4: the tolerance of the search."""
     config = mimic.env_config("planar4dof", **SHORT_ARMS, demonstrations={"count": 3, "held_out": 2}, horizon=HORIZON)

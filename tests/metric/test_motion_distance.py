@@ -67,6 +67,7 @@ def test_value_and_gradient_equal_those_of_the_composition(x64, pair, weights):
     assert float(np.abs(expected[1][2]).max()) > 1e-2
 
 
+@pytest.mark.slow_for("hard-adaptive")
 @pytest.mark.parametrize(("correspondence", "weights"), [("overlap", "constant"), ("hard", "adaptive")])
 def test_other_metrics_equal_the_composition(x64, correspondence, weights):
     metric, arms = (CORRESPONDENCES[correspondence], WEIGHTS[weights]), (EXPERT, LEARNER)

@@ -48,6 +48,7 @@ def archive(path, **changes):
     return path
 
 
+@pytest.mark.slow
 def test_a_table_becomes_demonstrations_that_training_takes(tmp_path):
     source = table(tmp_path / "swing.csv", names=NUMBERED, velocity_names=[f"qdot_{i}" for i in range(1, 8)])
     out = tmp_path / "swing.npz"

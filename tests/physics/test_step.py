@@ -289,6 +289,7 @@ def test_the_kernel_lowers_without_a_gpu(planar):
     assert "triton" not in batched.lower(*states).as_text()
 
 
+@pytest.mark.slow
 def test_default_substeps_keep_the_tip_within_1_mm():
     """1 s of random torques against RK4 at 0.5 ms; 0.2 mm when written, a thousandth of the reach is 1 mm."""
     env = mimic.make("panda4dof", physics="fused", demonstrations={"count": 1, "held_out": 1})

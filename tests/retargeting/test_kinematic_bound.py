@@ -96,6 +96,7 @@ def test_the_bound_of_an_arm_and_itself_is_zero():
     np.testing.assert_allclose(bound, 0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_bound_of_two_links_is_that_of_a_grid_search():
     expert, learner = planar_arm([1 / 3] * 3), planar_arm([0.5, 0.5])
     correspondence, weights = overlap_correspondence(expert, learner), DistanceWeights(translation=1.0, rotation=0.5)

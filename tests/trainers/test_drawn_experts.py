@@ -103,6 +103,7 @@ def test_empty_slots_of_an_expert_change_nothing(mapper):
         jax.tree.map(np.testing.assert_array_equal, *results)
 
 
+@pytest.mark.slow
 def test_each_sample_has_an_expert_and_a_learner_of_its_own(runs, mapper):
     keys = []
 

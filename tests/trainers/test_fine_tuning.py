@@ -20,6 +20,7 @@ def requested(init, **fields):
     return TrainConfig(family(), PPOConfig(), init=str(init), learner="panda", **fields)
 
 
+@pytest.mark.slow
 def test_the_learner_is_the_only_arm(run_dir):
     overrides = [f"init={run_dir}", "learner=panda", "seed=3", "trainer.num_timesteps=1000"]
     config = fine_tuned(requested(run_dir, seed=3, run_dir="runs/new"), overrides)

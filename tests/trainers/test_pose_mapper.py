@@ -77,6 +77,7 @@ def test_a_run_reports_what_it_trained_with(trained):
     assert {"config.yaml", "report.json", "metrics.csv", "training.png"} <= {path.name for path in run_dir.iterdir()}
 
 
+@pytest.mark.slow
 def test_evaluate_repeats_the_report(trained, tmp_path):
     run_dir, report = trained
     out = tmp_path / "again"

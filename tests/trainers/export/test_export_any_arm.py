@@ -44,6 +44,7 @@ def part(vector, name):
     return vector[..., place["start"] : place["stop"]].reshape(*vector.shape[:-1], *place["shape"])
 
 
+@pytest.mark.slow
 def test_a_description_has_the_dynamics_and_the_maximum_torque(run_dir, tmp_path):
     env = load_config(run_dir).env
     vector = described(run_dir, tmp_path / "panda.json", learner="panda", locked=[2, "joint4"])
