@@ -132,6 +132,7 @@ def test_a_model_that_is_no_file_is_rejected(folder, name):
 
 MAGNITUDES = {
     "mass": ('mass="8.4"', 'mass="1e30"', r"mass \[kg\] of 1e\+30"),
+    "mass just above": ('mass="8.4"', 'mass="1.1e5"', r"mass \[kg\] of 110000"),
     "position": ('pos="0 0.14 0"', 'pos="0 1e30 0"', r"position \[m\] of 1e\+30"),
     "range": ('range="-6.2 6.2"', 'range="-1e30 6.2"', r"joint range .* of -1e\+30"),
     "rotor inertia": ('armature="0.1"', 'armature="1e30"', r"rotor inertia .* of 1e\+30"),

@@ -92,6 +92,8 @@ def test_a_urdf_arm_moves_as_in_its_model(x64, tmp_path):
     arm = mimic.load_mjcf(file)
     assert arm.name == "four" and arm.torque_limit.tolist() == [39, 38, 37, 36]
     assert arm.velocity_limit.tolist() == [0.5, 1, 1.5, 2]
+    file.write_text(original_model.urdf().replace('velocity="0.5"', 'velocity="0"'))
+    assert mimic.load_mjcf(file).velocity_limit.tolist() == [np.inf, 1, 1.5, 2]
     assert arm.link_lengths[-1] == pytest.approx(0.15)
 
 

@@ -93,6 +93,19 @@ def test_torque_changes_at_most_at_its_rate() -> None:
             torque = after
 
 
+def test_the_torque_is_critically_damped_control_of_the_reference() -> None:
+    unlimited = np.full(JOINTS, 1e9)
+    joints = parameters()._replace(torque=unlimited, torque_rate=unlimited)
+    np.testing.assert_allclose(joints.damping**2, 4 * joints.stiffness * joints.inertia)
+    reference = Reference(*(np.full(JOINTS, value) for value in (0.01, 0.2, 3.0)))
+    target, rest = joint_control.Target(np.zeros(JOINTS), np.full(JOINTS, 0.25)), np.zeros(JOINTS)
+    torque = joint_control.joint_torque("joint_impedance", rest, rest, reference, target, rest, joints, np)
+    expected = (
+        0.25 * joints.stiffness * 0.01 + 0.5 * joints.damping * 0.2 + joints.inertia * 3.0 + joints.friction * 0.2
+    )
+    np.testing.assert_allclose(torque, expected)
+
+
 def test_impedance_action_sets_the_stiffness() -> None:
     joints = parameters()
     action = np.concatenate([np.zeros(JOINTS), np.linspace(-1, 1, JOINTS)])
