@@ -1,7 +1,7 @@
 """Start-up: heavy packages are imported only when they are needed, and nothing is printed meanwhile."""
 
 import json
-import pathlib
+import os
 import subprocess
 import sys
 
@@ -84,10 +84,10 @@ def test_what_a_view_shows_needs_no_viser(imported):
     assert {f"mimic.viewer.{name}" for name in SHOWN} <= imported["everything"]
 
 
-def test_a_process_started_after_this_one(monkeypatch):
-    """Both by `time.perf_counter`."""
-    own = cli.process_started()
-    with subprocess.Popen(["cat"], stdin=subprocess.PIPE) as other:
-        monkeypatch.setattr(cli, "Path", lambda _: pathlib.Path(f"/proc/{other.pid}/stat"))
-        started = cli.process_started()
-    assert own < started  # how near to now depends on the clocks of a machine that was suspended
+def test_the_start_of_the_process_is_on_the_clock_of_perf_counter(monkeypatch):
+    """10 s before now, where the clock since boot says 1000 s and the process started at 990 s."""
+    ticks = 990 * os.sysconf("SC_CLK_TCK")
+    monkeypatch.setattr(cli, "read_text", lambda path: f"7 (a) name) {'0 ' * 19}{ticks} 0")
+    monkeypatch.setattr(cli.time, "clock_gettime", lambda clock: 1000.0)
+    monkeypatch.setattr(cli.time, "perf_counter", lambda: 50.0)
+    assert cli.process_started() == 40.0
