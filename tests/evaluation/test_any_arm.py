@@ -94,7 +94,6 @@ def test_details_tables_and_plots(evaluator, tmp_path):
     assert not (tmp_path / "none.png").exists()
 
 
-@pytest.mark.slow
 def test_similarity_of_the_home_pose_is_that_of_holding(evaluator):
     """All rollouts rest at home here, where the whole Panda's expert starts too; so they and holding agree."""
     similarity = evaluator.similarity_summary(OUTCOME, "policy")

@@ -1,5 +1,8 @@
 """Which checkpoint of PPO is the result: the last one, or that with the smallest score."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ from mimic.runs.checkpoints import Checkpoint, checkpoint_steps, load_checkpoint
 from mimic.runs.signals import Signals
 from mimic.trainers.config import PPOConfig
 from mimic.trainers.ppo import ppo
+from mimic.trainers.ppo.trainer import PPOTrainer
 
 
 def run(monkeypatch, run_dir, values, restored=None, score=lambda params: float(params["x"][0]), last=None, **settings):
@@ -81,3 +85,9 @@ def test_a_resumed_run_knows_the_checkpoints_before(monkeypatch, tmp_path):
     step, params = load_checkpoint(tmp_path, {"x": np.zeros(1)})
     restored = Checkpoint(step, params, None, {"loss": 0.0})
     assert step == 2 and run(monkeypatch, tmp_path, values, restored) == (1, 1.0, [2, 3])
+
+
+@pytest.mark.parametrize(("train", "held_out", "is_good"), [(0.1, 0.3, True), (0.2, 0.05, False)])
+def test_the_target_is_the_gap_of_the_training_demonstrations(train, held_out, is_good):
+    trainer: Any = SimpleNamespace(settings=PPOConfig(target_gap=0.1))
+    assert PPOTrainer.good_enough(trainer, {"optimality_gap": {"train": train, "held_out": held_out}}) == is_good

@@ -111,7 +111,6 @@ def test_a_folder_takes_one_sweep(rejected, tmp_path):
     assert "has a sweep already" in rejected("train", "-m", "seed=0,1", f"hydra.sweep.dir={tmp_path}")
 
 
-@pytest.mark.slow
 def test_the_same_sweep_continues(tmp_path, monkeypatch, capsys):
     launched = []
 
