@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -177,7 +177,8 @@ def _train(
         try:
             inputs = config, trainer, run_dir, console, stopwatch, signals
             end = (lambda: group.end(0)) if group else None
-            report = run_training(*inputs, lock=lock, restored=restored, on_trained=end)
+            with _memory_errors():
+                report = run_training(*inputs, lock=lock, restored=restored, on_trained=end)
         except (Interrupted, Diverged, OSError, RunExists) as error:
             exit_code = _stopped(console, run_dir, error)
             if group:
@@ -186,6 +187,18 @@ def _train(
     show_report(console, report, trainer)
     console.print(f"results: {run_dir}", soft_wrap=True, highlight=False)
     return 0
+
+
+@contextlib.contextmanager
+def _memory_errors() -> Iterator[None]:
+    """Raises an OSError of one line where XLA finds too little memory; other errors of XLA stay as they are."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        message = str(error).partition("\n")[0]
+        if not message.startswith("RESOURCE_EXHAUSTED"):
+            raise
+        raise OSError(f"too little memory for this training, which smaller batches need less of: {message}") from error
 
 
 # Above 40 lines because of its docstring.

@@ -23,7 +23,7 @@ from mimic.runs.lock import RunLock
 from mimic.trainers.config import TrainConfig
 from mimic.trainers.make import make_ppo_trainer
 from mimic.trainers.run_config import load_config, new_run_dir
-from mimic.trainers.run_training import prepare_training
+from mimic.trainers.run_training import _memory_errors, prepare_training
 from tests.helpers.commands import command, run, start, wait_for
 from tests.helpers.tiny import TINY
 
@@ -324,3 +324,11 @@ def test_a_second_signal_leaves_no_partial_checkpoint(number, tmp_path):
     _, error = process.communicate(timeout=120)
     assert process.returncode == 128 + number and error.splitlines()[1:] == [f"stopped by {number.name}"], error
     assert all(path.name.isdigit() for path in run_dir.glob("checkpoints/*"))
+
+
+def test_too_little_memory_is_one_line():
+    message = "RESOURCE_EXHAUSTED: Out of memory allocating 17592186044416 bytes."
+    with pytest.raises(OSError, match=f"smaller batches need less of: {message}$"), _memory_errors():
+        raise jax.errors.JaxRuntimeError(f"{message}\nbuffers of XLA, on many lines")
+    with pytest.raises(jax.errors.JaxRuntimeError), _memory_errors():
+        raise jax.errors.JaxRuntimeError("INTERNAL: a defect")
