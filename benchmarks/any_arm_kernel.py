@@ -28,7 +28,8 @@ from mimic.arms.sampler import random_arm
 from mimic.control.joint_control import JointParameters, Reference, Target, action_target
 from mimic.envs import env_config
 from mimic.envs.world_env import plant_of
-from mimic.physics import composite_kernel, dynamics, inner_loop, physics
+from mimic.physics import composite_kernel, inner_loop, physics
+from mimic.physics.joint_numbers import joint_numbers
 from mimic.physics.plant import draw_episode
 from mimic.physics.world import WorldConfig
 
@@ -62,7 +63,7 @@ def of_physics(substeps: int) -> Case:
     arms = jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(0), DRAWN))
     qpos, qvel, torque = rng.uniform(-1, 1, (3, DRAWN, MAX_JOINTS)) * np.array([3.0, 1.0, 1.0])[:, None, None]
     load = rng.uniform(0.8, 1.2, (DRAWN, 2))
-    inputs = [jax.vmap(dynamics.joint_numbers)(arms), qpos, qvel * np.asarray(arms.is_free), torque, load]
+    inputs = [jax.vmap(joint_numbers)(arms), qpos, qvel * np.asarray(arms.is_free), torque, load]
     return Case(
         composite_kernel.gpu_kernel(TIMESTEP, substeps),
         physics.array_step(TIMESTEP, substeps),

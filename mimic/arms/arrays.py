@@ -11,7 +11,7 @@ parallel.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
@@ -41,8 +41,8 @@ class ArmArrays:
       twist: [joints, 2] cosine and sine of the angle between a joint's axis and the axis before it.
       offset: [joints, 2] a and b above [m].
       reference: [joints] angle that is added to the joint's angle [rad].
-      first_moment: [joints, 2] x and y of the sum of m r over the points of the joint's body [kg m], as in `Inertia` of
-        mimic/physics/chain_dynamics.py: the mass on the axis is part of the parent body.
+      first_moment: [joints, 2] x and y of the sum of m r over the points of the joint's body [kg m], as in
+        mimic/physics/dynamics.py: the mass on the axis is part of the parent body.
       second_moment: [joints, 5] xx, yy, xy, xz and yz of the sum of m r r^T [kg m^2].
       armature: [joints] rotor inertia [kg m^2].
       damping: [joints] viscous damping [N m s/rad].
@@ -105,7 +105,7 @@ def arm_arrays(arm: Arm, free: Sequence[bool] | np.ndarray | None = None) -> Arm
             f"{embodiment.name}: expected at most {MAX_JOINTS} joints and {MAX_LINKS} links, got {joints} and {links}"
         )
     masses, rotations, origins = body_moments(arm)
-    twist, offset, reference = placements(rotations, origins)
+    twist, offset, reference, _ = placements(rotations, origins)
     first_moment, second_moment = moments_of_joints(masses, rotations, origins)
     is_free = np.ones(joints) if free is None else np.asarray(free, float)
     link_joint = np.array(embodiment.link_joint)
@@ -140,26 +140,40 @@ def body_moments(
     arm: Arm,
 ) -> tuple[Float[np.ndarray, "joints 4 4"], Float[np.ndarray, "joints 3 3"], Float[np.ndarray, "joints 3"]]:
     """Moments of mass of each joint's body in its frame, see `pseudo_inertia`; and the frames, see `joint_frames`."""
-    embodiment, model, to_world = arm.embodiment, arm.model, arm.T_world_base
+    embodiment, to_world = arm.embodiment, arm.T_world_base
     rotations, origins = joint_frames(np.asarray(embodiment.joint_axis), np.asarray(embodiment.joint_anchor))
+    in_world = to_world[:3, :3] @ rotations, origins @ to_world[:3, :3].T + to_world[:3, 3]
+    return moments_in_frames(arm.model, *in_world), rotations, origins
+
+
+def moments_in_frames(
+    model: mujoco.MjModel, rotations: Float[np.ndarray, "joints 3 3"], origins: Float[np.ndarray, "joints 3"]
+) -> Float[np.ndarray, "joints 4 4"]:
+    """Moments of mass of each joint's body in a frame, see `pseudo_inertia`.
+
+    Args:
+      model: from `simulation_model`.
+      rotations: of the frames in the world, at angles 0.
+      origins: of the frames [m].
+    """
     data = mujoco.MjData(model)
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(model, data)
     last_joint = {int(body): joint for joint, body in enumerate(model.jnt_bodyid)}
     masses = np.zeros((len(rotations), 4, 4))
-    for joint, (rotation, origin) in enumerate(zip(rotations, origins, strict=True)):
-        body = int(model.jnt_bodyid[joint])
-        if last_joint[body] == joint:  # if a body has several joints, the others move no mass of their own
-            frame = to_world[:3, :3] @ rotation
-            masses[joint] = pseudo_inertia(model, data, body, frame, to_world[:3, :3] @ origin + to_world[:3, 3])
-    return masses, rotations, origins
+    for body, joint in last_joint.items():  # if a body has several joints, the others move no mass of their own
+        masses[joint] = pseudo_inertia(model, data, body, rotations[joint], origins[joint])
+    return masses
 
 
 def moments_of_joints(
-    masses: Float[Any, "joints 4 4"], rotations: Float[Any, "joints 3 3"], origins: Float[Any, "joints 3"]
+    masses: Float[Any, "joints 4 4"],
+    rotations: Float[Any, "joints 3 3"],
+    origins: Float[Any, "joints 3"],
+    parents: Sequence[int] | None = None,
 ) -> tuple[Float[Any, "joints 2"], Float[Any, "joints 5"]]:
     """`first_moment` and `second_moment` of `ArmArrays`, which are linear in the moments of the bodies."""
-    masses = without_mass_on_axes(masses, rotations, origins)
+    masses = without_mass_on_axes(masses, rotations, origins, parents)
     return masses[:, :2, 3], masses[:, (0, 1, 0, 0, 1), (0, 1, 1, 2, 2)]
 
 
@@ -215,8 +229,26 @@ def _with_empty_slots(arrays: ArmArrays, joints: int, links: int) -> ArmArrays:
     return arrays
 
 
+class Placements(NamedTuple):
+    """Where each joint's frame is in that of its parent, see `ArmArrays`; that of a joint at the base is its own.
+
+    Attributes:
+      twist, offset, reference: of the joints.
+      branch: [joints, 2] cosine and sine of the angle about the parent's axis from its x-axis, which is normal to the
+        axis of its first child, to the normal to this joint's axis.
+    """
+
+    twist: Any
+    offset: Any
+    reference: Any
+    branch: Any
+
+
 def joint_frames(
-    axes: Float[Any, "joints 3"], anchors: Float[Any, "joints 3"], min_angle: float = _PARALLEL
+    axes: Float[Any, "joints 3"],
+    anchors: Float[Any, "joints 3"],
+    min_angle: float = _PARALLEL,
+    parents: Sequence[int] | None = None,
 ) -> tuple[Float[Any, "joints 3 3"], Float[Any, "joints 3"]]:
     """Rotations and origins of the joints' frames at angle 0; NumPy or JAX arrays.
 
@@ -224,61 +256,83 @@ def joint_frames(
       axes: unit axes of the joints.
       anchors: a point on each axis.
       min_angle: axes at a smaller angle are parallel [rad].
+      parents: index of each joint's parent, -1 at the base; those of a serial arm where None.
     """
-    numpy = array_library(axes)
-    origins = [anchors[0]]
-    for axis, anchor in zip(axes[1:], anchors[1:], strict=True):
-        origins.append(anchor + numpy.sum(axis * (origins[-1] - anchor)) * axis)
+    numpy, parents = array_library(axes), _parents(len(axes), parents)
+    origins: list[Any] = []
+    for axis, anchor, parent in zip(axes, anchors, parents, strict=True):
+        origins.append(anchor if parent < 0 else anchor + numpy.sum(axis * (origins[parent] - anchor)) * axis)
     rotations = []
-    for i, axis in enumerate(axes):
-        is_last = i + 1 == len(axes)
-        candidates = [] if is_last else [numpy.cross(axis, axes[i + 1]), origins[i + 1] - origins[i]]
-        x = _first_normal(axis, numpy.stack([*candidates, *numpy.eye(3, dtype=axes.dtype)]), min_angle)
+    for joint, axis in enumerate(axes):
+        first_child = parents.index(joint) if joint in parents else None
+        x = _normal_to_child(axes, origins, joint, first_child, min_angle)
         rotations.append(numpy.stack([x, numpy.cross(axis, x), axis], axis=1))
     return numpy.stack(rotations), numpy.stack(origins)
 
 
-def _first_normal(axis: Any, candidates: Any, min_length: float) -> Any:
-    """The unit vector normal to an axis along the first of the candidates that is long enough."""
-    numpy = array_library(axis)
+def _parents(count: int, parents: Sequence[int] | None) -> list[int]:
+    return list(range(-1, count - 1) if parents is None else parents)
+
+
+def _normal_to_child(axes: Any, origins: Any, joint: int, child: int | None, min_angle: float) -> Any:
+    """A unit vector normal to a joint's axis, and to that of a child if it has one."""
+    numpy, axis = array_library(axes), axes[joint]
+    candidates = [] if child is None else [numpy.cross(axis, axes[child]), origins[child] - origins[joint]]
+    candidates = numpy.stack([*candidates, *numpy.eye(3, dtype=axes.dtype)])
     normals = candidates - numpy.sum(candidates * axis, axis=1, keepdims=True) * axis
     lengths = numpy.sqrt(numpy.sum(normals * normals, axis=1))
-    first = numpy.argmax(lengths > min_length)
+    first = numpy.argmax(lengths > min_angle)
     normal = normals[first] / lengths[first]
     normal = normal - numpy.sum(normal * axis) * axis  # a short vector was not normal to rounding
     return normal / numpy.sqrt(numpy.sum(normal * normal))
 
 
-def placements(rotations: Float[Any, "joints 3 3"], origins: Float[Any, "joints 3"]) -> tuple[Any, Any, Any]:
-    """Twist, offset and reference of each joint, see `ArmArrays`; those of the first are 0."""
-    numpy = array_library(rotations)
-    twists, offsets, references = [numpy.array([1.0, 0.0])], [numpy.zeros(2)], [numpy.zeros(())]
-    for i in range(1, len(rotations)):
-        x, y, z = (rotations[i - 1][:, k] for k in range(3))
-        axis, step = rotations[i][:, 2], origins[i] - origins[i - 1]
+def placements(
+    rotations: Float[Any, "joints 3 3"], origins: Float[Any, "joints 3"], parents: Sequence[int] | None = None
+) -> Placements:
+    """The placements of frames from `joint_frames`."""
+    numpy, parents = array_library(rotations), _parents(len(rotations), parents)
+    no_rotation, axes = numpy.array([1.0, 0.0]), rotations[:, :, 2]
+    columns: list[tuple[Any, ...]] = []
+    for i, parent in enumerate(parents):
+        if parent < 0:
+            columns.append((no_rotation, numpy.zeros(2), numpy.zeros(()), no_rotation))
+            continue
+        x, y, z = (rotations[parent][:, k] for k in range(3))
+        branch = no_rotation
+        if parents.index(parent) != i:
+            normal = _normal_to_child(axes, origins, parent, i, _PARALLEL)
+            branch = numpy.stack([numpy.sum(x * normal), numpy.sum(y * normal)])
+            x, y = normal, numpy.cross(z, normal)
+        axis, step, next_x = axes[i], origins[i] - origins[parent], rotations[i][:, 0]
         cosine, sine = numpy.sum(z * axis), -numpy.sum(y * axis)
         twisted_y = cosine * y + sine * z
-        next_x = rotations[i][:, 0]
-        twists.append(numpy.stack([cosine, sine]))
-        offsets.append(numpy.stack([numpy.sum(x * step), numpy.sum(twisted_y * step)]))
-        references.append(numpy.arctan2(numpy.sum(twisted_y * next_x), numpy.sum(x * next_x)))
-    return numpy.stack(twists), numpy.stack(offsets), numpy.stack(references)
+        offset = numpy.stack([numpy.sum(x * step), numpy.sum(twisted_y * step)])
+        reference = numpy.arctan2(numpy.sum(twisted_y * next_x), numpy.sum(x * next_x))
+        columns.append((numpy.stack([cosine, sine]), offset, reference, branch))
+    return Placements(*(numpy.stack(column) for column in zip(*columns, strict=True)))
 
 
 def without_mass_on_axes(
-    masses: Float[Any, "joints 4 4"], rotations: Float[Any, "joints 3 3"], origins: Float[Any, "joints 3"]
+    masses: Float[Any, "joints 4 4"],
+    rotations: Float[Any, "joints 3 3"],
+    origins: Float[Any, "joints 3"],
+    parents: Sequence[int] | None = None,
 ) -> Float[Any, "joints 4 4"]:
-    """Moments of mass in the frames of the joints, where the mass on each axis is part of the parent, see `Inertia`."""
-    numpy = array_library(masses)
+    """Moments of mass in the frames of the joints, where the mass on each axis is part of the parent.
+
+    See mimic/physics/dynamics.py.
+    """
+    numpy, parents = array_library(masses), _parents(len(masses), parents)
     on_axis = np.zeros((4, 4))
     on_axis[2:, 2:] = 1.0
-    result, of_child = [], numpy.zeros((4, 4))
+    result = list(masses)
     for i in reversed(range(len(masses))):
-        mass = masses[i] + of_child
-        result.append(mass * (1 - on_axis))
-        if i > 0:
-            step = rotations[i - 1].T @ (origins[i] - origins[i - 1])
-            upper = numpy.concatenate([rotations[i - 1].T @ rotations[i], step[:, None]], axis=1)
+        mass, parent = result[i], parents[i]
+        result[i] = mass * (1 - on_axis)
+        if parent >= 0:
+            step = rotations[parent].T @ (origins[i] - origins[parent])
+            upper = numpy.concatenate([rotations[parent].T @ rotations[i], step[:, None]], axis=1)
             placement = numpy.concatenate([upper, numpy.array([[0.0, 0.0, 0.0, 1.0]])])
-            of_child = placement @ (mass * on_axis) @ placement.T
-    return numpy.stack(result[::-1])
+            result[parent] = result[parent] + placement @ (mass * on_axis) @ placement.T
+    return numpy.stack(result)

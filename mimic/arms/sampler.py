@@ -170,7 +170,7 @@ def random_arm(key: Array) -> ArmArrays:
     )
     masses = jax.vmap(_rod_with_sphere, (0, None, None, 0))(steps, radius, density, housings)
     rotations, origins = joint_frames(axes, anchors, _PARALLEL)
-    twist, offset, reference = placements(rotations, origins)
+    twist, offset, reference, _ = placements(rotations, origins)
     moments = without_mass_on_axes(
         _in_frames(exists[:, None, None] * masses, rotations, origins, anchors), rotations, origins
     )

@@ -17,7 +17,8 @@ from mimic.envs.world_env import HardwareEnv
 from mimic.envs.world_state import HardwareState
 from mimic.evaluation.evaluator import Controller, Evaluator, Motions, Rollouts
 from mimic.evaluation.nearest_pose_controller import nearest_pose_controller
-from mimic.physics import chain_dynamics as dynamics
+from mimic.physics import dynamics
+from mimic.physics.joint_numbers import joints_of_model
 from mimic.retargeting.motions import largest_jump, optimal_motions
 
 _FREQUENCIES = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0)  # candidates [rad/s]; a torque is constant for 0.1 s
@@ -146,9 +147,9 @@ def _joint_law(env: ImitationEnv) -> _Law:
 
 
 def _inverse_dynamics_law(env: ImitationEnv) -> _Law:
-    arm = dynamics.segments(env.arm.model)
+    joints = joints_of_model(env.arm.model)
 
     def law(acceleration: Array, qpos: Array, qvel: Array) -> Array:
-        return jnp.stack(dynamics.inverse(arm, list(qpos), list(qvel), list(acceleration)))
+        return jnp.stack(dynamics.inverse(joints, list(qpos), list(qvel), list(acceleration)))
 
     return law

@@ -1,66 +1,115 @@
-"""Dynamics of any arm: the equations of mimic/physics/chain_dynamics.py with the numbers of the arm as arguments.
+"""Dynamics of a chain or tree of joints on scalar components, for an arm that is constant and for an arm as data.
 
-A transform between two frames is two rotations in a plane, see mimic/arms/arrays.py, which takes half as many
-operations as a general rotation. That matters twice: the compile time of a GPU kernel grows with their square.
+The composite rigid body algorithm computes the mass matrix, the recursive Newton-Euler algorithm the Coriolis and
+centrifugal forces (Featherstone, "Rigid Body Dynamics Algorithms", 2008, chapters 6 and 5). There are no contacts or
+constraints. Numbers that are known while JAX traces are folded, see `mimic.base.spatial`; traced numbers make one
+compiled function for all arms of as many joints.
+
+The compile time of a GPU kernel grows with the square of the number of operations. So a transform between two frames is
+two rotations in a plane, see mimic/arms/arrays.py, half as many operations as a general rotation. And the mass
+distribution of a body is given by the sums of m r and m r r^T, which need fewer operations than a centre of mass and an
+inertia tensor. Mass on the axis of a joint moves in the same way as part of the body that the joint moves or of its
+parent. It is counted as part of the parent, for all joints up to the base. So a body has no total mass, and its moments
+z and zz are zero.
 """
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.base.spatial import ZERO, Rotation, Scalar, Vector, add, cross, minus, plus, rotate, times
-from mimic.physics.chain_dynamics import acceleration_field, moment_of_field
+from mimic.arms.arrays import ArmArrays
+from mimic.base.spatial import ZERO, Rotation, Scalar, Vector, add, cross, dot, minus, plus, rotate, times
+from mimic.physics.joint_numbers import PLANE, JointNumbers, joint_numbers, unpacked
 
-PLANE = tuple[Scalar, Scalar]  # cosine and sine
 Wrench = tuple[Vector, Vector]  # force and moment
 Motion = tuple[Vector, Vector, Vector]  # angular velocity and acceleration, and linear acceleration of the origin
+Moments = tuple[Vector, Rotation]  # sums of m r and of m r r^T
 
 
-class JointNumbers(NamedTuple):
-    """The numbers of a joint that its dynamics need; see `ArmArrays`."""
-
-    twist: tuple[Scalar, Scalar]
-    offset: tuple[Scalar, Scalar]
-    reference: Scalar
-    first: tuple[Scalar, Scalar]
-    second: tuple[Scalar, Scalar, Scalar, Scalar, Scalar]
-    armature: Scalar
-    damping: Scalar
-    is_free: Scalar
+def cosine_and_sine(angle: Scalar) -> PLANE:
+    """Those of JAX's library, which have derivatives."""
+    return jnp.cos(angle), jnp.sin(angle)
 
 
-NUMBERS = 15  # of a joint
+def acceleration(
+    joints: Sequence[JointNumbers],
+    qpos: Sequence[Scalar],
+    qvel: Sequence[Scalar],
+    torque: Sequence[Scalar],
+    base: Vector | None = None,
+    trigonometry: Callable[[Scalar], PLANE] = cosine_and_sine,
+) -> tuple[Scalar, ...]:
+    """Forward dynamics: joint accelerations [rad/s^2] under joint torques; 0 for locked joints.
+
+    Args:
+      joints: each after its parent, from `loaded`.
+      qpos: joint angles [rad].
+      qvel: joint velocities [rad/s]; those of locked joints are 0.
+      torque: joint torques over the factor on masses [N m].
+      base: acceleration of the base, in the frame of the first joint at angle 0 [m/s^2]: minus gravity. 0 where None.
+      trigonometry: cosine and sine of an angle.
+    """
+    turns = _turns(joints, qpos, base is None, trigonometry)
+    rows = rows_of_inertia(joints, turns, inertial_wrenches(joints, turns, qvel, base=base))
+    elimination = _Elimination(len(joints))
+    for k, (row, bias) in zip(reversed(range(len(joints))), rows, strict=True):
+        force = minus(torque[k], times(joints[k].damping, qvel[k]))
+        elimination.add(k, row, joints[k].armature, minus(force, bias))
+    return elimination.solution()
 
 
-def joint_numbers(arm: ArmArrays) -> Float[Array, " numbers"]:
-    """The numbers of all joints as one vector, for `unpacked`."""
-    # The diagonal entry of a locked joint has no effect, but forward dynamics divide by it: 1 keeps it away from 0.
-    armature = arm.armature + (1 - arm.is_free)
-    columns = [arm.twist, arm.offset, arm.reference[:, None], arm.first_moment, arm.second_moment]
-    columns += [armature[:, None], arm.damping[:, None], arm.is_free[:, None]]
-    return jnp.concatenate(columns, axis=1).ravel()
+def loaded(joints: Sequence[JointNumbers], mass: Scalar, damping: Scalar) -> list[JointNumbers]:
+    """The joints under a load, over the factor on masses: dividing these few numbers is cheaper than multiplying all.
+
+    The armature of a locked joint is infinite, so that its acceleration is 0.
+
+    Args:
+      joints: of the arm.
+      mass: factor on the masses and inertias of all bodies.
+      damping: factor on the damping of all joints.
+    """
+    inverse = 1.0 / mass
+
+    def armature(joint: JointNumbers) -> Scalar:
+        value = times(joint.armature, inverse)
+        return value if isinstance(joint.is_free, float) else jnp.where(joint.is_free > 0, value, math.inf)
+
+    return [
+        joint._replace(armature=armature(joint), damping=times(joint.damping, times(damping, inverse)))
+        for joint in joints
+    ]
 
 
-def unpacked(numbers: Any) -> list[JointNumbers]:
-    """The numbers of each joint, from the vector of `joint_numbers`."""
-    return [joint_of([numbers[NUMBERS * i + k] for k in range(NUMBERS)]) for i in range(MAX_JOINTS)]
+def inverse(
+    joints: Sequence[JointNumbers], qpos: Sequence[Scalar], qvel: Sequence[Scalar], qacc: Sequence[Scalar]
+) -> list[Scalar]:
+    """Inverse dynamics: joint torques [N m] for joint accelerations [rad/s^2]; see `acceleration` for the arguments."""
+    turns = _turns(joints, qpos, True, cosine_and_sine)
+    totals = list(inertial_wrenches(joints, turns, qvel, qacc))
+    torque: list[Scalar] = [0.0] * len(joints)
+    for i in reversed(range(len(joints))):
+        joint, parent = joints[i], joints[i].parent
+        of_joint = plus(times(joint.armature, qacc[i]), times(joint.damping, qvel[i]))
+        torque[i] = plus(totals[i][1][2], of_joint)
+        if parent >= 0:
+            totals[parent] = _sum(totals[parent], wrench_to_parent(joint, turns[i], *totals[i]))
+    return torque
 
 
-def joint_of(numbers: Any) -> JointNumbers:
-    """The numbers of one joint, from its part of the vector of `joint_numbers`."""
-    x = numbers
-    first, second = (x[5], x[6]), (x[7], x[8], x[9], x[10], x[11])
-    return JointNumbers((x[0], x[1]), (x[2], x[3]), x[4], first, second, x[12], x[13], x[14])
+def torque_of_arm(
+    arm: ArmArrays, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"], qacc: Float[Array, " joints"]
+) -> Float[Array, " joints"]:
+    """Inverse dynamics of an arm as data: `inverse`, with 0 for locked joints."""
+    joints = unpacked(joint_numbers(arm))
+    return arm.is_free * jnp.stack(inverse(joints, list(qpos), list(qvel), list(arm.is_free * qacc)))
 
 
 def inertia_matrix(arm: ArmArrays, qpos: Float[Array, " joints"]) -> Float[Array, "joints joints"]:
     """Joint-space inertia with the armature [kg m^2]; locked joints have the rows of the identity."""
-    joints = unpacked(joint_numbers(arm))
-    at_rest = [(ZERO, ZERO)] * len(joints)
-    return _full_inertia(arm, [row for row, _ in rows_of_inertia(joints, _turns(joints, list(qpos)), at_rest)])
+    return inertia_and_bias(arm, qpos, jnp.zeros_like(qpos))[0]
 
 
 def inertia_and_bias(
@@ -68,43 +117,70 @@ def inertia_and_bias(
 ) -> tuple[Float[Array, "joints joints"], Float[Array, " joints"]]:
     """`inertia_matrix`, and the joint torques [N m] for zero acceleration: Coriolis and centrifugal forces, damping."""
     joints = unpacked(joint_numbers(arm))
-    turns = _turns(joints, list(qpos))
+    turns = _turns(joints, list(qpos), True, cosine_and_sine)
     rows, torques = zip(*rows_of_inertia(joints, turns, inertial_wrenches(joints, turns, list(qvel))), strict=True)
-    bias = jnp.stack(torques[::-1])
-    return _full_inertia(arm, rows), arm.is_free * (bias + arm.damping * qvel)
-
-
-def _full_inertia(arm: ArmArrays, last_first: Sequence[Sequence[Scalar]]) -> Float[Array, "joints joints"]:
-    lower = last_first[::-1]
-    rows = [jnp.stack([lower[max(i, j)][min(i, j)] for j in range(MAX_JOINTS)]) for i in range(MAX_JOINTS)]
+    lower, size = rows[::-1], range(len(joints))
+    matrix = jnp.stack([jnp.stack([lower[max(i, j)][min(i, j)] for j in size]) for i in size])
     both_free = arm.is_free[:, None] * arm.is_free
-    return both_free * jnp.stack(rows) + jnp.diag(arm.is_free * arm.armature + (1 - arm.is_free))
+    matrix = both_free * matrix + jnp.diag(arm.is_free * arm.armature + (1 - arm.is_free))
+    return matrix, arm.is_free * (jnp.stack(torques[::-1]) + arm.damping * qvel)
 
 
-def _turns(joints: Sequence[JointNumbers], qpos: Sequence[Scalar]) -> list[PLANE]:
-    """Cosine and sine of the rotation of each joint about its axis."""
-    angles = [plus(angle, joint.reference) for joint, angle in zip(joints, qpos, strict=True)]
-    return [(jnp.cos(angle), jnp.sin(angle)) for angle in angles]
+def solve(matrix: Sequence[Sequence[Scalar]], values: Sequence[Scalar], is_free: Sequence[Scalar]) -> list[Scalar]:
+    """X of M x = b; only the lower triangle of M is read.
+
+    Args:
+      matrix: M, symmetric and positive definite.
+      values: b.
+      is_free: 1 for the rows and columns of a smaller system, 0 for those to leave out; x is 0 there.
+    """
+    elimination = _Elimination(len(values))
+    for k in reversed(range(len(values))):
+        elimination.add(k, matrix[k][: k + 1], jnp.where(is_free[k] > 0, 0.0, math.inf), values[k])
+    return list(elimination.solution())
+
+
+def _turns(
+    joints: Sequence[JointNumbers],
+    qpos: Sequence[Scalar],
+    base_rests: bool,
+    trigonometry: Callable[[Scalar], PLANE],
+) -> list[PLANE]:
+    """Cosine and sine of each joint's rotation; constants at a base at rest, where angles have no effect."""
+    return [
+        (1.0, 0.0) if base_rests and joint.parent < 0 else trigonometry(plus(angle, joint.reference))
+        for joint, angle in zip(joints, qpos, strict=True)
+    ]
 
 
 def inertial_wrenches(
-    joints: Sequence[JointNumbers], turns: Sequence[PLANE], qvel: Sequence[Scalar], base: Vector | None = None
+    joints: Sequence[JointNumbers],
+    turns: Sequence[PLANE],
+    qvel: Sequence[Scalar],
+    qacc: Sequence[Scalar] | None = None,
+    base: Vector | None = None,
 ) -> list[Wrench]:
-    """Force and moment that accelerate each body at zero joint acceleration.
+    """Force and moment that accelerate each body.
 
     Args:
-      joints: from `unpacked`.
+      joints: each after its parent.
       turns: cosine and sine of each joint's rotation.
       qvel: joint velocities [rad/s].
-      base: acceleration of the base, in the frame of the first joint at angle 0 [m/s^2]; 0 where None.
+      qacc: joint accelerations [rad/s^2]; 0 where None.
+      base: see `acceleration`.
     """
-    motion: Motion = (ZERO, ZERO, ZERO if base is None else base)
-    field = ZERO, ZERO, ZERO
-    wrenches = []
-    for joint, turn, speed in zip(joints, turns, qvel, strict=True):
-        motion = child_motion(joint, turn, speed, motion, field)
-        field = acceleration_field(motion[0], motion[1])
-        wrenches.append(inertial_wrench(joint, motion[2], field))
+    at_base: Motion = (ZERO, ZERO, ZERO if base is None else base)
+    motions, fields, wrenches = [], [], []
+    for i, (joint, turn, speed) in enumerate(zip(joints, turns, qvel, strict=True)):
+        is_first = joint.parent < 0
+        parent = at_base if is_first else motions[joint.parent]
+        field = (ZERO, ZERO, ZERO) if is_first else fields[joint.parent]
+        omega, alpha, linear = child_motion(joint, turn, speed, parent, field)
+        if qacc is not None:
+            alpha = alpha[0], alpha[1], plus(alpha[2], qacc[i])
+        motions.append((omega, alpha, linear))
+        fields.append(acceleration_field(omega, alpha))
+        wrenches.append(inertial_wrench(joint, linear, fields[i]))
     return wrenches
 
 
@@ -116,24 +192,26 @@ def rows_of_inertia(
     By the composite rigid body algorithm, without armature.
 
     Args:
-      joints: from `unpacked`.
+      joints: each after its parent.
       turns: cosine and sine of each joint's rotation.
       wrenches: from `inertial_wrenches`.
     """
-    masses: Any = (ZERO, (ZERO, ZERO, ZERO))
-    total = ZERO, ZERO  # wrench of the distal bodies
+    distal: list[Moments] = [(ZERO, (ZERO, ZERO, ZERO))] * len(joints)  # of the bodies distal to each joint's body
+    totals = list(wrenches)
     for i in reversed(range(len(joints))):
-        masses = composite(joints[i], *masses)
-        unit = unit_wrench(*masses)
-        total = add(total[0], wrenches[i][0]), add(total[1], wrenches[i][1])
-        row, bias = [unit[1][2]], total[1][2]
-        for j in reversed(range(1, i + 1)):  # to the frames of the joints before it
-            unit = wrench_to_parent(joints[j], turns[j], *unit)
-            row.insert(0, unit[1][2])
-        yield row, bias
-        if i > 0:
-            total = wrench_to_parent(joints[i], turns[i], *total)
-            masses = moments_to_parent(joints[i], turns[i], *masses)
+        masses = composite(joints[i], *distal[i])
+        unit, j = unit_wrench(*masses), i
+        row = [*[0.0] * i, unit[1][2]]
+        while joints[j].parent >= 0:  # to the frames of the proximal joints
+            unit, j = wrench_to_parent(joints[j], turns[j], *unit), joints[j].parent
+            row[j] = unit[1][2]
+        yield row, totals[i][1][2]
+        parent = joints[i].parent
+        if parent >= 0:
+            totals[parent] = _sum(totals[parent], wrench_to_parent(joints[i], turns[i], *totals[i]))
+            first, second = moments_to_parent(joints[i], turns[i], *masses)
+            others, (x, y, z) = distal[parent]
+            distal[parent] = add(others, first), (add(x, second[0]), add(y, second[1]), add(z, second[2]))
 
 
 def child_motion(joint: JointNumbers, turn: PLANE, speed: Scalar, parent: Motion, field: Rotation) -> Motion:
@@ -153,39 +231,55 @@ def child_motion(joint: JointNumbers, turn: PLANE, speed: Scalar, parent: Motion
     return (omega[0], omega[1], plus(omega[2], speed)), alpha, linear
 
 
-def inertial_wrench(joint: JointNumbers, linear: Vector, field: Rotation) -> tuple[Vector, Vector]:
-    """Force and moment that accelerate a joint's body, without the force on its total mass, see `Inertia`.
+def acceleration_field(omega: Vector, alpha: Vector) -> Rotation:
+    """The matrix of alpha x r + omega x (omega x r)."""
+    x, y, z = omega
+    xx, yy, zz = times(x, x), times(y, y), times(z, z)
+    xy, yz, zx = times(x, y), times(y, z), times(z, x)
+    less_xx, less_yy = times(-1.0, xx), times(-1.0, yy)
+    return (
+        (minus(less_yy, zz), minus(xy, alpha[2]), plus(zx, alpha[1])),
+        (plus(xy, alpha[2]), minus(less_xx, zz), minus(yz, alpha[0])),
+        (minus(zx, alpha[1]), plus(yz, alpha[0]), minus(less_xx, yy)),
+    )
+
+
+def inertial_wrench(joint: JointNumbers, linear: Vector, field: Rotation) -> Wrench:
+    """Force and moment that accelerate a joint's body, without the force on its total mass.
 
     Args:
       joint: the joint.
       linear: acceleration of the origin of its frame [m/s^2].
       field: `acceleration_field` of the body.
     """
-    first, second = (*joint.first, 0.0), symmetric(joint.second)
-    return rotate(field, first), add(moment_of_field(field, second), cross(first, linear))
+    xx, yy, xy, xz, yz = joint.second
+    first, second = (*joint.first, 0.0), ((xx, xy, xz), (xy, yy, yz), (xz, yz, 0.0))
+
+    def minor(i: int, j: int) -> Scalar:  # of the sum of m r x (field r)
+        return minus(dot(field[j], second[i]), dot(field[i], second[j]))
+
+    return rotate(field, first), add((minor(1, 2), minor(2, 0), minor(0, 1)), cross(first, linear))
 
 
-def composite(joint: JointNumbers, first: Vector, second: Rotation) -> tuple[Vector, Rotation]:
-    """Moments of a joint's body and of the bodies after it."""
+def composite(joint: JointNumbers, first: Vector, second: Rotation) -> Moments:
+    """Moments of a joint's body and of the bodies distal to it."""
     xx, yy, xy, xz, yz = joint.second
     xx, xy, xz = add((xx, xy, xz), second[0])
     yy, yz = plus(yy, second[1][1]), plus(yz, second[1][2])
     return add((*joint.first, 0.0), first), ((xx, xy, xz), (xy, yy, yz), (xz, yz, second[2][2]))
 
 
-def unit_wrench(first: Vector, second: Rotation) -> tuple[Vector, Vector]:
+def unit_wrench(first: Vector, second: Rotation) -> Wrench:
     """Force and moment of a unit acceleration about a joint's axis, from the moments of mass that it moves."""
     moment = times(-1.0, second[0][2]), times(-1.0, second[1][2]), plus(second[0][0], second[1][1])
     return (times(-1.0, first[1]), first[0], 0.0), moment
 
 
-def symmetric(second: tuple[Scalar, Scalar, Scalar, Scalar, Scalar]) -> Rotation:
-    """Rows of the second moment, whose zz is 0."""
-    xx, yy, xy, xz, yz = second
-    return (xx, xy, xz), (xy, yy, yz), (xz, yz, 0.0)
+def _sum(a: Wrench, b: Wrench) -> Wrench:
+    return add(a[0], b[0]), add(a[1], b[1])
 
 
-def turned(turn: PLANE, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
+def _turned(turn: PLANE, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
     """A rotation in the plane of two components."""
     cosine, sine = turn
     return minus(times(cosine, x), times(sine, y)), plus(times(sine, x), times(cosine, y))
@@ -198,58 +292,96 @@ def _turned_back(turn: PLANE, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
 
 def to_child(joint: JointNumbers, turn: PLANE, a: Vector) -> Vector:
     """A vector of the parent frame in the joint's frame."""
-    y, z = _turned_back(joint.twist, a[1], a[2])
-    x, y = _turned_back(turn, a[0], y)
-    return x, y, z
+    x, y = _turned_back(joint.branch, a[0], a[1])
+    y, z = _turned_back(joint.twist, y, a[2])
+    return *_turned_back(turn, x, y), z
 
 
 def offset_in_parent(joint: JointNumbers) -> Vector:
     """Origin of the joint's frame in the parent frame [m]."""
     (a, b), (cosine, sine) = joint.offset, joint.twist
-    return a, times(cosine, b), times(sine, b)
+    return *_turned(joint.branch, a, times(cosine, b)), times(sine, b)
 
 
-def wrench_to_parent(joint: JointNumbers, turn: PLANE, force: Vector, moment: Vector) -> tuple[Vector, Vector]:
+def wrench_to_parent(joint: JointNumbers, turn: PLANE, force: Vector, moment: Vector) -> Wrench:
     """A wrench of the joint's frame in the parent frame, about its origin."""
     (a, b), twist = joint.offset, joint.twist
-    fx, fy = turned(turn, force[0], force[1])
-    nx, ny = turned(turn, moment[0], moment[1])
+    fx, fy = _turned(turn, force[0], force[1])
+    nx, ny = _turned(turn, moment[0], moment[1])
     nx, ny = plus(nx, times(b, force[2])), minus(ny, times(a, force[2]))
     nz = plus(moment[2], minus(times(a, fy), times(b, fx)))
-    return (fx, *turned(twist, fy, force[2])), (nx, *turned(twist, ny, nz))
+    (fy, fz), (ny, nz) = _turned(twist, fy, force[2]), _turned(twist, ny, nz)
+    return (*_turned(joint.branch, fx, fy), fz), (*_turned(joint.branch, nx, ny), nz)
 
 
-def moments_to_parent(joint: JointNumbers, turn: PLANE, first: Vector, second: Rotation) -> tuple[Vector, Rotation]:
+def moments_to_parent(joint: JointNumbers, turn: PLANE, first: Vector, second: Rotation) -> Moments:
     """Moments of mass of the joint's frame in the parent frame, about its origin; there is no total mass."""
-    (a, b), twist = joint.offset, joint.twist
+    (a, b), twist, branch = joint.offset, joint.twist, joint.branch
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = second
-    x, y = turned(turn, first[0], first[1])
+    x, y = _turned(turn, first[0], first[1])
     z = first[2]
-    xx, yy, xy = turned_tensor(turn, xx, yy, xy)
-    xz, yz = turned(turn, xz, yz)
+    xx, yy, xy = _turned_tensor(turn, xx, yy, xy)
+    xz, yz = _turned(turn, xz, yz)
     xx, yy = plus(xx, times(2.0, times(a, x))), plus(yy, times(2.0, times(b, y)))
     xy = plus(xy, plus(times(a, y), times(b, x)))
     xz, yz = plus(xz, times(a, z)), plus(yz, times(b, z))
-    yy, zz, yz = turned_tensor(twist, yy, zz, yz)
-    xy, xz = turned(twist, xy, xz)
-    return (x, *turned(twist, y, z)), ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    yy, zz, yz = _turned_tensor(twist, yy, zz, yz)
+    (xy, xz), (y, z) = _turned(twist, xy, xz), _turned(twist, y, z)
+    xx, yy, xy = _turned_tensor(branch, xx, yy, xy)
+    (xz, yz), (x, y) = _turned(branch, xz, yz), _turned(branch, x, y)
+    return (x, y, z), ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
 
 
-def turned_tensor(turn: PLANE, xx: Scalar, yy: Scalar, xy: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+def _turned_tensor(turn: PLANE, xx: Scalar, yy: Scalar, xy: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """A symmetric 2 x 2 matrix after a rotation in its plane: xx, yy, xy."""
     cosine, sine = turn
+    if isinstance(sine, float) and sine == 0:  # by 0 or pi
+        return xx, yy, xy
+    if isinstance(cosine, float) and cosine == 0:  # by a quarter
+        return yy, xx, times(-1.0, xy)
     difference, double = minus(yy, xx), times(2.0, xy)
     change = times(sine, minus(times(sine, difference), times(cosine, double)))
     decrease = times(sine, plus(times(sine, double), times(cosine, difference)))
     return plus(xx, change), minus(yy, change), minus(xy, decrease)
 
 
-def torque_of_arm(
-    arm: ArmArrays,
-    qpos: Float[Array, " joints"],
-    qvel: Float[Array, " joints"],
-    qacc: Float[Array, " joints"],
-) -> Float[Array, " joints"]:
-    """Inverse dynamics: joint torques [N m] for joint accelerations [rad/s^2]; 0 for locked joints."""
-    inertia, bias = inertia_and_bias(arm, qpos, qvel)
-    return arm.is_free * jnp.sum(inertia * (arm.is_free * qacc), axis=1) + bias
+class _Elimination:
+    """Solves (M + armature) x = b by elimination from the last row to the first, when these become known.
+
+    A row with an infinite pivot has no effect on the others, and its x is 0.
+    """
+
+    def __init__(self, size: int) -> None:
+        """Makes the changes of an empty system."""
+        self._matrix: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(size)]  # decrease of each entry
+        self._values: list[Scalar] = [0.0] * size
+        self._factors: list[list[Scalar]] = [[] for _ in range(size)]
+        self._scaled: list[Scalar] = [0.0] * size
+
+    def add(self, k: int, row: Sequence[Scalar], armature: Scalar, value: Scalar) -> None:
+        """Eliminates x[k].
+
+        Args:
+          k: index of the row.
+          row: of M, up to the diagonal.
+          armature: added to the diagonal.
+          value: entry of b.
+        """
+        row = [minus(x, change) for x, change in zip(row, self._matrix[k], strict=True)]
+        value = minus(value, self._values[k])
+        inverse: Any = 1.0 / plus(row[k], armature)
+        self._factors[k] = [times(inverse, x) for x in row[:k]]
+        self._scaled[k] = times(inverse, value)
+        for i, factor in enumerate(self._factors[k]):
+            self._values[i] = plus(self._values[i], times(factor, value))
+            for j in range(i + 1):
+                self._matrix[i][j] = plus(self._matrix[i][j], times(factor, row[j]))
+
+    def solution(self) -> tuple[Scalar, ...]:
+        """The solution x; call it after all rows."""
+        solution: list[Scalar] = []
+        for value, factors in zip(self._scaled, self._factors, strict=True):
+            for factor, x in zip(factors, solution, strict=True):
+                value = minus(value, times(factor, x))
+            solution.append(value)
+        return tuple(solution)

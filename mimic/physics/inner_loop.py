@@ -15,8 +15,11 @@ from jaxtyping import Array, Float
 from mimic.base import fused_kernel
 from mimic.control import joint_control
 from mimic.control.joint_control import PERIOD, JointParameters, Reference, Target
-from mimic.physics import composite_kernel, dynamics, looped_dynamics
-from mimic.physics.composite_kernel import read_rows, write_rows
+from mimic.physics import composite_kernel, looped_dynamics
+from mimic.physics.composite_kernel import read_joints, read_rows, write_rows
+from mimic.physics.dynamics import acceleration, loaded
+from mimic.physics.joint_numbers import NUMBERS
+from mimic.physics.trigonometry import cosine_and_sine
 
 
 class JointConstants(NamedTuple):
@@ -152,7 +155,7 @@ def array_loop(mode: str, constants: JointConstants, periods: int) -> Callable[.
 
     def loop(numbers: Array, base: Array, drive: Array, motion: Array, target: Array) -> tuple[Array]:
         batch = numbers.shape[1:]
-        by_joint = numbers.reshape(-1, dynamics.NUMBERS, *batch)
+        by_joint = numbers.reshape(-1, NUMBERS, *batch)
         by_row = (jnp.moveaxis(x.reshape(joints, -1, *batch), 1, 0) for x in (drive, motion, target))
         drives, motions, targets = map(list, by_row)
         parameters = jax.tree.map(lambda x: jnp.asarray(x, motion.dtype).reshape(joints, *[1] * len(batch)), constants)
@@ -188,8 +191,7 @@ def gpu_kernel(
     def body(inputs: Sequence[fused_kernel.Columns], outputs: Sequence[fused_kernel.Columns]) -> None:
         numbers, base, *of_joints = inputs
         (base_acceleration,) = read_rows(base, 1)
-        joints = [dynamics.joint_of(row) for row in read_rows(numbers, count)]
-        joints = [composite_kernel.loaded(joint, 1.0, 1.0) for joint in joints]  # they have the masses of the episode
+        joints = loaded(read_joints(numbers, count), 1.0, 1.0)  # they have the masses of the episode
         drives, motions, targets = (read_rows(columns, count) for columns in of_joints)
 
         def period(_: Any, states: tuple[LoopState, ...]) -> tuple[LoopState, ...]:
@@ -198,7 +200,7 @@ def gpu_kernel(
                 controlled.append(control(mode, joint, state, Target(*target), drive))
             qpos, qvel, *_ = zip(*states, strict=True)
             acting = [torque for _, _, torque in controlled]
-            qacc = composite_kernel.acceleration(joints, qpos, qvel, acting, base_acceleration)
+            qacc = acceleration(joints, qpos, qvel, acting, base_acceleration, cosine_and_sine)
             after = []
             for state, (reference, torque, _), a in zip(states, controlled, qacc, strict=True):
                 speed = state.qvel + PERIOD * a

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from mimic.base.spatial import add, vector
 from mimic.physics import dynamics
-from mimic.physics.chain_dynamics import acceleration_field
+from mimic.physics.joint_numbers import joint_of
 
 Joints = Float[Array, "joints *batch"]
 _Turns = tuple[Joints, Joints]  # cosine and sine of the rotation of each joint
@@ -36,9 +36,9 @@ def acceleration(
       torque: joint torques [N m].
       mass: factor on the masses and inertias of all bodies.
       damping: factor on the damping of all joints.
-      base: three components of the base's acceleration, see mimic/physics/composite_kernel.py; 0 where None.
+      base: three components of the base's acceleration, see mimic/physics/dynamics.py; 0 where None.
     """
-    joints = dynamics.joint_of(jnp.moveaxis(numbers, 1, 0))
+    joints = joint_of(jnp.moveaxis(numbers, 1, 0))
     angles = qpos + joints.reference
     turns = jnp.cos(angles), jnp.sin(angles)
     matrix, bias = _mass_matrix_and_bias(numbers, turns, _wrenches(numbers, turns, qvel, base))
@@ -51,16 +51,16 @@ def _wrenches(numbers: Array, turns: _Turns, qvel: Joints, base: Any) -> Any:
 
     def outward(parent: Any, joint: Any) -> Any:
         row, turn, speed = joint
-        field = acceleration_field(parent[0], parent[1])
-        motion = dynamics.child_motion(dynamics.joint_of(row), turn, speed, parent, field)
+        field = dynamics.acceleration_field(parent[0], parent[1])
+        motion = dynamics.child_motion(joint_of(row), turn, speed, parent, field)
         return motion, motion
 
     zero = jnp.zeros_like(qvel[0])
     zeros = (zero,) * 3
     start = zeros, zeros, zeros if base is None else tuple(zero + x for x in base)
     _, (omega, alpha, linear) = jax.lax.scan(outward, start, (numbers, turns, qvel))
-    joints = dynamics.joint_of(jnp.moveaxis(numbers, 1, 0))
-    return dynamics.inertial_wrench(joints, linear, acceleration_field(omega, alpha))
+    joints = joint_of(jnp.moveaxis(numbers, 1, 0))
+    return dynamics.inertial_wrench(joints, linear, dynamics.acceleration_field(omega, alpha))
 
 
 def _mass_matrix_and_bias(
@@ -75,7 +75,7 @@ def _mass_matrix_and_bias(
         # Wrenches [joints, *batch] of unit accelerations about the distal joints, and the wrench of the bias forces.
         (force, moment), bias, distal_masses = carry
         row, turn, wrench, is_own = joint
-        numbers_of_joint = dynamics.joint_of(row)
+        numbers_of_joint = joint_of(row)
         masses = first, second = dynamics.composite(numbers_of_joint, *distal_masses)
         own_force, own_moment = dynamics.unit_wrench(first, second)
         force = vector([jnp.where(is_own, x, y) for x, y in zip(own_force, force, strict=True)])

@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.base import fused_kernel
-from mimic.physics import composite_kernel, dynamics, looped_dynamics
+from mimic.physics import composite_kernel, looped_dynamics
+from mimic.physics.joint_numbers import NUMBERS, joint_numbers
 from mimic.physics.step import Load, runge_kutta
 
 AdvanceAny = Callable[[ArmArrays, Array, Array, Array, Load], tuple[Array, Array]]
@@ -37,7 +38,7 @@ def make_advance(timestep: float, substeps: int) -> AdvanceAny:
         load: Load,
     ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
         factors = jnp.stack([jnp.asarray(x, qpos.dtype) for x in load])
-        numbers = dynamics.joint_numbers(arm).astype(qpos.dtype)
+        numbers = joint_numbers(arm).astype(qpos.dtype)
         qpos, qvel = step(numbers, qpos, qvel, torque, factors)
         return qpos, qvel
 
@@ -48,7 +49,7 @@ def array_step(timestep: float, substeps: int) -> Callable[..., tuple[Array, ...
     """The steps on arrays [size, *batch], for other devices and for derivatives."""
 
     def step(numbers: Array, qpos: Array, qvel: Array, torque: Array, load: Array) -> tuple[Array, ...]:
-        by_joint = numbers.reshape(MAX_JOINTS, dynamics.NUMBERS, *numbers.shape[1:])
+        by_joint = numbers.reshape(MAX_JOINTS, NUMBERS, *numbers.shape[1:])
 
         def acceleration(qpos: Array, qvel: Array) -> Array:
             return looped_dynamics.acceleration(by_joint, qpos, qvel, torque, *load)

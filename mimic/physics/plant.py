@@ -14,8 +14,8 @@ from mimic.arms.drives import drives_of
 from mimic.arms.simulation_model import joint_inertia
 from mimic.control.joint_control import PERIOD
 from mimic.control.limits import joint_parameters
-from mimic.physics.dynamics import NUMBERS, joint_numbers
 from mimic.physics.inner_loop import Episode, JointConstants
+from mimic.physics.joint_numbers import NUMBERS, joint_numbers
 from mimic.physics.step import Load
 from mimic.physics.world import RandomizationConfig, WorldConfig
 

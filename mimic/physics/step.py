@@ -1,6 +1,6 @@
 """Simulation of the learner, from torques to joint states: by MJX, or by mimic's own dynamics in a fused kernel."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +11,9 @@ from mujoco import mjx
 
 from mimic.arms.embodiment import LONG
 from mimic.base import fused_kernel
-from mimic.physics import chain_dynamics as dynamics
+from mimic.physics import dynamics
+from mimic.physics.joint_numbers import JointNumbers, joints_of_model, uncovered_elements
+from mimic.physics.trigonometry import cosine_and_sine
 from mimic.physics.world import AUTO
 
 _LAUNCH = fused_kernel.LaunchConfig(block=64, warps=2)  # the fastest by measurement
@@ -48,7 +50,7 @@ def choose_physics(physics: str, model: mujoco.MjModel) -> PhysicsChoice:
     """
     if physics != AUTO:
         return PhysicsChoice(physics, "as configured")
-    uncovered = dynamics.uncovered_elements(model)
+    uncovered = uncovered_elements(model)
     if uncovered:
         return PhysicsChoice("mjx", f"auto: the fused dynamics do not cover {', '.join(uncovered)}")
     if model.njnt > LONG:
@@ -101,17 +103,19 @@ def constant(value: Any) -> Array:
 
 
 def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Advance:
-    arm = dynamics.segments(model)
+    joints = joints_of_model(model)
 
     def plain(qpos: Array, qvel: Array, torque: Array, load: Array) -> tuple[Array, Array]:
+        of_arm, force = _loaded(joints, list(torque), *load)
+
         def acceleration(qpos: Array, qvel: Array) -> Array:
-            return jnp.stack(dynamics.acceleration(arm, list(qpos), list(qvel), list(torque), *load))
+            return jnp.stack(dynamics.acceleration(of_arm, list(qpos), list(qvel), force))
 
         return runge_kutta(acceleration, qpos, qvel, timestep, substeps)
 
     # For CPUs: a loop over a few arrays is twice as fast as a loop over an array for each joint.
-    widths = len(arm), len(arm)
-    step = fused_kernel.fused(_scalar_step(arm, timestep, substeps), widths, plain=plain, launch=_LAUNCH)
+    widths = len(joints), len(joints)
+    step = fused_kernel.fused(_scalar_step(joints, timestep, substeps), widths, plain=plain, launch=_LAUNCH)
 
     def advance(qpos: Array, qvel: Array, torque: Array, load: Load) -> tuple[Array, Array]:
         qpos, qvel = step(qpos, qvel, torque, jnp.stack([jnp.asarray(x, qpos.dtype) for x in load]))
@@ -120,12 +124,22 @@ def _fused_advance(model: mujoco.MjModel, timestep: float, substeps: int) -> Adv
     return advance
 
 
-def _scalar_step(arm: tuple[dynamics.Segment, ...], timestep: float, substeps: int) -> fused_kernel.ScalarFunction:
+def _loaded(
+    joints: tuple[JointNumbers, ...], torque: Sequence[Any], mass: Any, damping: Any
+) -> tuple[list[JointNumbers], list[Any]]:
+    """Joints and torques over the factor on masses."""
+    inverse = 1.0 / mass
+    return dynamics.loaded(joints, mass, damping), [inverse * x for x in torque]
+
+
+def _scalar_step(joints: tuple[JointNumbers, ...], timestep: float, substeps: int) -> fused_kernel.ScalarFunction:
     """The steps on scalar components, for the kernel."""
 
     def step(qpos: Any, qvel: Any, torque: Any, load: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        of_arm, force = _loaded(joints, torque, *load)
+
         def acceleration(qpos: Any, qvel: Any) -> tuple[Any, ...]:
-            return tuple(dynamics.acceleration(arm, qpos, qvel, torque, *load))
+            return dynamics.acceleration(of_arm, qpos, qvel, force, trigonometry=cosine_and_sine)
 
         return runge_kutta(acceleration, tuple(qpos), tuple(qvel), timestep, substeps)
 

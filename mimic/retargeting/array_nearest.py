@@ -16,7 +16,7 @@ from mimic.arms.arrays import ArmArrays
 from mimic.metric.array_kinematics import joint_states, link_jacobians, link_states_in_frames
 from mimic.metric.distance import DistanceWeights
 from mimic.metric.kinematics import LinkStates
-from mimic.physics.chain_dynamics import solve
+from mimic.physics.dynamics import solve
 
 _MIN_DISTANCE = 0.02  # chain lengths; the curvature of a pair's translation is not above the inverse of it
 _DAMPING = 1e-3  # of the Hessian, relative to the mean of its diagonal

@@ -11,7 +11,9 @@ from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
 from mimic.arms.embodiment import load_arm
 from mimic.arms.mujoco_chain import base_pose
 from mimic.arms.simulation_model import simulation_model
-from mimic.physics import composite_kernel, dynamics, looped_dynamics
+from mimic.physics import dynamics, looped_dynamics
+from mimic.physics.joint_numbers import NUMBERS, joint_numbers, unpacked
+from mimic.physics.trigonometry import cosine_and_sine
 from tests.helpers.random_arms import random_arm
 
 # Double precision leaves 1e-16 of each of a few thousand operations, and bodies much lighter than others amplify it.
@@ -62,14 +64,15 @@ def acceleration(model, qpos, qvel, torque):
 
 def looped(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: Any = None):
     """Accelerations of an arm by the equations for CPUs."""
-    numbers = dynamics.joint_numbers(arm).reshape(MAX_JOINTS, dynamics.NUMBERS)
+    numbers = joint_numbers(arm).reshape(MAX_JOINTS, NUMBERS)
     return looped_dynamics.acceleration(numbers, qpos, qvel, torque, jnp.asarray(mass), jnp.asarray(damping), base)
 
 
 def unrolled(arm, qpos, qvel, torque, mass: Any = 1.0, damping: Any = 1.0, base: Any = None):
     """Accelerations of an arm by the equations of the GPU kernel."""
-    joints = [composite_kernel.loaded(joint, mass, damping) for joint in dynamics.unpacked(dynamics.joint_numbers(arm))]
-    return jnp.stack(composite_kernel.acceleration(joints, tuple(qpos), tuple(qvel), tuple(torque / mass), base))
+    joints = dynamics.loaded(unpacked(joint_numbers(arm)), mass, damping)
+    state = tuple(qpos), tuple(qvel), tuple(torque / mass)
+    return jnp.stack(dynamics.acceleration(joints, *state, base, cosine_and_sine))
 
 
 def padded(values) -> Any:

@@ -11,7 +11,8 @@ from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.simulation_model import simulation_model
 from mimic.base import fused_kernel
 from mimic.envs.config import PHYSICS
-from mimic.physics import chain_dynamics as dynamics
+from mimic.physics import dynamics
+from mimic.physics.joint_numbers import joints_of_model
 from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
 from tests.helpers.array_cases import acceleration, assert_near
 from tests.helpers.lowering import gpu_program
@@ -57,10 +58,10 @@ def mujoco_acceleration(model, qpos, qvel, torque):
     return np.array([acceleration(model, *row) for row in zip(qpos, qvel, torque, strict=True)])
 
 
-def ours(function, model, *rows, **factors):
-    """A function of `dynamics` on arrays [count, joints]."""
+def ours(function, model, *rows, mass=1.0, damping=1.0):
+    """A function of `dynamics` on arrays [count, joints]; where a load is given, its torques are over the mass."""
     columns = ([jnp.asarray(column) for column in row.T] for row in rows)
-    return np.stack(function(dynamics.segments(model), *columns, **factors), axis=-1)
+    return np.stack(function(dynamics.loaded(joints_of_model(model), mass, damping), *columns), axis=-1)
 
 
 def loaded(model, load):
@@ -219,7 +220,8 @@ def test_load_scales_masses_inertias_and_damping(x64, name):
     model = build_arm(ARMS[name]).model
     state = random_states(model)
     expected = mujoco_acceleration(loaded(model, LOAD), *state)
-    assert_near(ours(dynamics.acceleration, model, *state, **LOAD._asdict()), expected)
+    qpos, qvel, torque = state
+    assert_near(ours(dynamics.acceleration, model, qpos, qvel, torque / LOAD.mass, **LOAD._asdict()), expected)
     plain = mujoco_acceleration(model, *state)
     assert np.abs(expected - plain).max() > 0.01 * np.abs(plain).max()  # or the load would not be tested
 
