@@ -61,11 +61,11 @@ with (out / "waves.csv").open("w", newline="") as file:
             table.writerow([number, f"{t:.2f}", *(amplitude * np.sin(frequency * tempo * t) ** 2)])
 
 # The import resamples to control steps and checks the expert's limits. The table has no velocities, so they are
-# differentiated, which the second result says. The torques are unknown.
+# computed from the angles; the second result has a line about this, and about all else that was assumed or left out.
+# The torques are unknown.
 
-waves, differentiated = mimic.import_demonstrations(out / "waves.csv", expert)
-print(f"\nwaves.csv: {waves.count} demonstrations, {waves.horizon} steps of {waves.dt} s; velocities differentiated: "
-      f"{differentiated}")  # fmt: skip
+waves, notes = mimic.import_demonstrations(out / "waves.csv", expert)
+print(f"\nwaves.csv: {waves.count} demonstrations, {waves.horizon} steps of {waves.dt} s", *notes, sep="\n")
 
 # The same as a command, which writes the file and a picture of it:
 
@@ -76,19 +76,20 @@ subprocess.run([sys.executable, "-m", "mimic.demonstrations", *arguments], check
 # ---- What is rejected ------------------------------------------------------------------------------------------------
 #
 # Most mistakes in such files are silent: degrees, a wrong column, another sample rate. A file must therefore be within
-# the arm's joint ranges and velocity limits. The first file below is in degrees, the second eight times too fast.
+# the arm's joint ranges, and within three times its velocity limits, since the files of many arms state too little. The
+# first file below is in degrees, the second twenty times too fast.
 
 lines = (out / "waves.csv").read_text().splitlines()
 rows = [line.split(",") for line in lines[1:]]
 wrong_tables = {
     "degrees.csv": [[*row[:2], *(str(np.degrees(float(x))) for x in row[2:])] for row in rows],
-    "clock.csv": [[row[0], str(float(row[1]) / 8), *row[2:]] for row in rows],
+    "clock.csv": [[row[0], str(float(row[1]) / 20), *row[2:]] for row in rows],
 }
 print()
 for name, table_rows in wrong_tables.items():
     (out / name).write_text("\n".join([lines[0], *map(",".join, table_rows)]))
     try:
-        mimic.import_demonstrations(out / name, expert, horizon=6)  # the second file has 0.6 s
+        mimic.import_demonstrations(out / name, expert, horizon=2)  # the second file has 0.25 s
     except ValueError as error:
         print(f"{name} is rejected: {error}")
 

@@ -248,6 +248,8 @@ class RecordingConfig:
       source: file or folder of motions to import instead of recording, see `import_demonstrations`.
       joints: names of the expert's joints in `source`, base to tip. Default []: the expert's own names.
       topic: topic or feature of `source` that has the joints, where several do; see `import_demonstrations`.
+      units: of the angles in `source`: rad, deg or percent. Default "": stated there or found, see
+        `import_demonstrations`.
       arm: "left" or "right" arm of the person in a motion capture file `source`, or "both". Default "": right.
       capture: how such a file is read and cut.
       out: .npz file of the demonstrations; must not exist.
@@ -262,6 +264,7 @@ class RecordingConfig:
     source: str = ""
     joints: list[str] = dataclasses.field(default_factory=list)
     topic: str = ""
+    units: str = ""
     arm: str = ""
     capture: CaptureConfig = dataclasses.field(default_factory=CaptureConfig)
     out: str = ""

@@ -37,15 +37,16 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
     out, plot = _files(config)
     env, console = config.resolve(), Console()
     if config.source and (config.arm or Path(config.source).suffix.lower() in MOTION_CAPTURE):
-        _check_unused(config, "kind", "count", "seed", "limits", "joints", "topic")
+        _check_unused(config, "kind", "count", "seed", "limits", "joints", "topic", "units")
         return prepare_capture(config, env, out, plot)
     arm = build_arm(env.expert, env.limits)
     if config.source:
         return _prepare_import(config, env, arm, out, plot)
     if config.joints:
         raise ValueError("joints: expected only with source=FILE, as the names of its joints")
-    if config.topic:
-        raise ValueError(f"topic: expected only with source=FOLDER, got {config.topic!r}")
+    for key in ("topic", "units"):
+        if getattr(config, key):
+            raise ValueError(f"{key}: expected only with source=, got {getattr(config, key)!r}")
     demonstrations, redrawn = _record(arm, env, console)
     check_effort(demonstrations, arm.embodiment)  # of the exact arrays to be written
 
@@ -68,8 +69,16 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
     """Imports motions; the returned function writes and plots them."""
     _check_unused(config, "kind", "count", "seed")
     source = Path(config.source).expanduser()
-    imported, differentiated = import_demonstrations(
-        source, arm.embodiment, dt=env.control_dt, horizon=env.horizon, joints=config.joints, topic=config.topic
+    model = arm if env.limits == "hardware" else build_arm(env.expert, "hardware")
+    imported, notes = import_demonstrations(
+        source,
+        arm.embodiment,
+        dt=env.control_dt,
+        horizon=env.horizon,
+        joints=config.joints,
+        topic=config.topic,
+        units=config.units,
+        joint_range=model.embodiment.joint_range,
     )
 
     def run() -> None:
@@ -77,17 +86,26 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
         imported.save(out)
         plot_demonstrations(imported, arm.embodiment, plot, title=f"{arm.embodiment.name}, {source.name}")
         console.print(_table(imported, arm.embodiment))
-        velocities = "differentiated, since the file has none" if differentiated else "from the file"
         length = f"{imported.horizon} steps of {imported.dt:g} s"
-        console.print(
-            f"{source.name}: {imported.count} demonstrations, {length}; velocities: {velocities}", soft_wrap=True
-        )
-        console.print(f"all stay within the velocity limits of {arm.embodiment.name}; torques are unknown")
+        for line in [f"{source.name}: {imported.count} demonstrations, {length}", *notes, *_gripper_lines(imported)]:
+            console.print(line, soft_wrap=True, highlight=False, markup=False)
         _print_clearance(console, env, arm, imported)
         console.print(f"plot: {plot}", soft_wrap=True, highlight=False)
         console.print(f"results: {out}", soft_wrap=True, highlight=False)
 
     return run
+
+
+def _gripper_lines(demonstrations: Demonstrations) -> list[str]:
+    """A line about the gripper, in the units of its source."""
+    if demonstrations.gripper is None:
+        return ["gripper: none"]
+    channels = np.moveaxis(demonstrations.gripper, -1, 0)
+    ranges = [
+        f"{name} from {values.min():.4g} to {values.max():.4g}"
+        for name, values in zip(demonstrations.gripper_names, channels, strict=True)
+    ]
+    return [f"gripper, as in the source: {', '.join(ranges)}"]
 
 
 def _print_clearance(console: Console, env: EnvConfig, arm: Arm, demonstrations: Demonstrations) -> None:

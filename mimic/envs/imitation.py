@@ -26,7 +26,7 @@ from mimic.envs.terms import Transition, observation_layout_of_terms, observatio
 from mimic.metric.capsule_distances import changing_pairs
 from mimic.metric.distance import LinkDistance
 from mimic.metric.kinematics import LinkStates, link_state_table, link_states
-from mimic.motions.demonstrations import Demonstrations, check_effort, load_demonstrations
+from mimic.motions.demonstrations import RECORDED_SPEED, Demonstrations, check_effort, load_demonstrations
 from mimic.motions.recording import record_demonstrations
 from mimic.physics.step import Load, PhysicsChoice, choose_physics, make_advance
 
@@ -401,7 +401,7 @@ def training_and_held_out(config: EnvConfig, expert: Arm | None = None) -> tuple
     if settings.path or settings.source:
         loaded, label = _demonstrations_of_others(config, expert)
         loaded.check_fits(expert.embodiment, config.control_dt, config.horizon)
-        check_effort(loaded, expert.embodiment)
+        check_effort(loaded, expert.embodiment, RECORDED_SPEED if loaded.torque is None else 1.0)
         if loaded.count < settings.count + settings.held_out:
             raise ValueError(
                 f"demonstrations: {label!r} has {loaded.count}, expected at least "

@@ -13,9 +13,10 @@ from mimic.base.npz import read_arrays
 
 FORMAT = "mimic-demonstrations-1"
 _ARRAYS = ("qpos", "qvel", "goals", "dt", "seed", "arm", "joint_names", "format")
-_OPTIONAL_ARRAYS = ("torque",)
+_OPTIONAL_ARRAYS = ("torque", "gripper", "gripper_names")
 MAX_VALUE = 1e6  # rad, rad/s, N m, s: no arm's motion has larger values
 _ROUNDING = 1e-6  # relative tolerance of a value above its limit: a file in float32 rounds by 6e-8
+RECORDED_SPEED = 3.0  # times the model's velocity limit, which a recorded joint may have: some state 1 rad/s for all
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +32,8 @@ class Demonstrations:
       joint_names: the expert's joints, base to tip.
       seed: random seed of the goals.
       torque: [N, T, n] torque between each sample and the next [N m], without gravity compensation; None if unknown.
+      gripper: [N, T+1, m] joints or opening of the gripper, in the units of their source; None if unknown.
+      gripper_names: its channels.
     """
 
     qpos: Float[np.ndarray, "demonstrations samples joints"]
@@ -41,6 +44,8 @@ class Demonstrations:
     joint_names: tuple[str, ...]
     seed: int = 0
     torque: Float[np.ndarray, "demonstrations steps joints"] | None = None
+    gripper: Float[np.ndarray, "demonstrations samples channels"] | None = None
+    gripper_names: tuple[str, ...] = ()
 
     @property
     def count(self) -> int:
@@ -54,9 +59,9 @@ class Demonstrations:
 
     def select(self, index: slice | Sequence[int]) -> "Demonstrations":
         """The demonstrations with these indices."""
-        torque = None if self.torque is None else self.torque[index]
+        torque, gripper = (None if values is None else values[index] for values in (self.torque, self.gripper))
         return dataclasses.replace(
-            self, qpos=self.qpos[index], qvel=self.qvel[index], goals=self.goals[index], torque=torque
+            self, qpos=self.qpos[index], qvel=self.qvel[index], goals=self.goals[index], torque=torque, gripper=gripper
         )
 
     def of_length(self, steps: int) -> "Demonstrations":
@@ -66,12 +71,17 @@ class Demonstrations:
         """
         sample = np.minimum(np.arange(steps + 1), self.horizon)
         torque = None if self.torque is None or steps > self.horizon else self.torque[:, :steps]
-        return dataclasses.replace(self, qpos=self.qpos[:, sample], qvel=self.qvel[:, sample], torque=torque)
+        gripper = None if self.gripper is None else self.gripper[:, sample]
+        return dataclasses.replace(
+            self, qpos=self.qpos[:, sample], qvel=self.qvel[:, sample], torque=torque, gripper=gripper
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes one `.npz` file; an existing file is replaced only when the new one is complete."""
         partial = f"{os.fspath(path)}.partial"
         optional: dict[str, Any] = {} if self.torque is None else {"torque": self.torque}
+        if self.gripper is not None:
+            optional |= {"gripper": self.gripper, "gripper_names": np.array(self.gripper_names)}
         with open(partial, "wb") as file:
             np.savez_compressed(
                 file,
@@ -105,23 +115,34 @@ class Demonstrations:
 
 
 def concatenate(first: Demonstrations, second: Demonstrations) -> Demonstrations:
-    """Joins two sets of demonstrations of one arm and time step. Torques are kept if both sets have them."""
+    """Joins two sets of demonstrations of one arm and time step. Torques and grippers are kept if both have them."""
     joined = {key: np.concatenate([getattr(first, key), getattr(second, key)]) for key in ("qpos", "qvel", "goals")}
     torques = [part.torque for part in (first, second) if part.torque is not None]
-    return dataclasses.replace(first, **joined, torque=np.concatenate(torques) if len(torques) == 2 else None)
+    torque = np.concatenate(torques) if len(torques) == 2 else None
+    grippers = [part.gripper for part in (first, second) if part.gripper is not None]
+    is_kept = len(grippers) == 2 and first.gripper_names == second.gripper_names
+    gripper = np.concatenate(grippers) if is_kept else None
+    return dataclasses.replace(
+        first, **joined, torque=torque, gripper=gripper, gripper_names=first.gripper_names if is_kept else ()
+    )
 
 
-def check_effort(demonstrations: Demonstrations, arm: Embodiment) -> None:
+def check_effort(demonstrations: Demonstrations, arm: Embodiment, speed: float = 1.0) -> None:
     """Raises a ValueError if a joint exceeds its velocity limit, or its torque limit where torques are known.
+
+    Args:
+      demonstrations: of the arm.
+      arm: whose limits are checked.
+      speed: how many times its velocity limit a joint may have.
 
     Raises:
       ValueError: names the first demonstration above a limit, with joint, time, value and limit.
     """
-    checks = [("velocity", demonstrations.qvel, "rad/s", arm.velocity_limit)]
+    checks = [("velocity", demonstrations.qvel, "rad/s", arm.velocity_limit, speed)]
     if demonstrations.torque is not None:
-        checks.append(("torque", demonstrations.torque, "N m", arm.torque_limit))
-    for quantity, values, unit, limit in checks:
-        above_limit = np.argwhere(np.abs(values) > np.asarray(limit) * (1 + _ROUNDING))
+        checks.append(("torque", demonstrations.torque, "N m", arm.torque_limit, 1.0))
+    for quantity, values, unit, limit, times in checks:
+        above_limit = np.argwhere(np.abs(values) > times * np.asarray(limit) * (1 + _ROUNDING))
         if len(above_limit):
             demonstration, sample, joint = above_limit[0]
             raise ValueError(
@@ -150,7 +171,7 @@ def crossovers(demonstrations: Demonstrations, count: int, seed: int) -> Demonst
         "qvel": demonstrations.qvel.swapaxes(1, 2)[parents, joints].swapaxes(1, 2),
         "goals": demonstrations.goals[parents, joints],
     }
-    return dataclasses.replace(demonstrations, torque=None, **mixed)
+    return dataclasses.replace(demonstrations, torque=None, gripper=None, gripper_names=(), **mixed)
 
 
 def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
@@ -194,13 +215,15 @@ def _validated(content: dict[str, np.ndarray], name: str) -> Demonstrations:
         joint_names=joint_names,
         seed=int(content["seed"]),
         torque=content.get("torque"),
+        gripper=content.get("gripper"),
+        gripper_names=tuple(map(str, np.atleast_1d(content.get("gripper_names", ())))),
     )
 
 
 def _check_trajectories(content: dict[str, np.ndarray], name: str, joints: int) -> None:
     """Checks type, values and shapes of the numeric arrays."""
     qpos, qvel, goals, torque = content["qpos"], content["qvel"], content["goals"], content.get("torque")
-    numeric = {key: content[key] for key in ("qpos", "qvel", "goals", "dt", "torque") if key in content}
+    numeric = {key: content[key] for key in ("qpos", "qvel", "goals", "dt", "torque", "gripper") if key in content}
     for key, array in numeric.items():
         if not np.issubdtype(array.dtype, np.floating):
             raise ValueError(f"demonstrations: {key} in {name!r} must be floating point, got {array.dtype}")
@@ -221,3 +244,8 @@ def _check_trajectories(content: dict[str, np.ndarray], name: str, joints: int) 
     steps = [qpos.shape[0], qpos.shape[1] - 1, qpos.shape[2]]
     if torque is not None and list(torque.shape) != steps:
         raise ValueError(f"demonstrations: torque in {name!r} must be {steps}, got {list(torque.shape)}")
+    channels = [*qpos.shape[:2], np.size(content.get("gripper_names", ()))]
+    if "gripper" in content and list(content["gripper"].shape) != channels:
+        raise ValueError(
+            f"demonstrations: gripper in {name!r} must be {channels}, got {list(content['gripper'].shape)}"
+        )

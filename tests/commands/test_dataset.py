@@ -138,7 +138,10 @@ def test_demonstrations_come_back_from_a_dataset(recorded, tmp_path, monkeypatch
     monkeypatch.setattr("mimic.commands.demonstrations.plot_demonstrations", lambda *_, **__: None)
     dataset = write(tmp_path / "set", demonstrations=str(recorded), format=format)
     text = run("demonstrations", f"source={dataset}", f"out={tmp_path / 'back.npz'}")
-    assert "set: 3 demonstrations, 50 steps of 0.1 s; velocities: from the file" in text
+    assert (
+        "set: 3 demonstrations, 50 steps of 0.1 s\n3 motions, 15 s, 10 samples a second; velocities: from the source"
+        in text
+    )
     before, after = mimic.load_demonstrations(recorded), mimic.load_demonstrations(tmp_path / "back.npz")
     tolerance = {"lerobot": 2e-7, "rosbag2": 1e-12}[format]  # rad: single precision of up to 3 rad; double
     np.testing.assert_allclose(after.qpos, before.qpos, rtol=0, atol=tolerance)
@@ -151,8 +154,8 @@ def test_a_policys_motions_become_demonstrations(run_dir, written, format, topic
     learner = mimic.build_arm(environment().learner).embodiment
     free = np.full(2, np.inf)  # an untrained policy keeps no limits
     learner = dataclasses.replace(learner, joint_range=np.stack([-free, free], axis=1), velocity_limit=free)
-    imported, differentiated = mimic.import_demonstrations(dataset, learner, dt=0.05, horizon=2 * HORIZON, topic=topic)
-    assert imported.count == COUNT + HELD_OUT and not differentiated  # twice the rate: resampled
+    imported, notes = mimic.import_demonstrations(dataset, learner, dt=0.05, horizon=2 * HORIZON, topic=topic)
+    assert imported.count == COUNT + HELD_OUT and "velocities: from the source" in notes[0]  # twice the rate: resampled
     same = mimic.import_demonstrations(dataset, learner, dt=0.1, horizon=HORIZON, topic=topic)[0]
     np.testing.assert_allclose(imported.qpos[:, ::2], same.qpos, rtol=0, atol=1e-6)  # rad
     expert = mimic.build_arm(environment().expert).embodiment
@@ -278,9 +281,9 @@ def test_a_time_step_that_lerobot_does_not_have(reason, recorded, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["source={folder}"], "expected a folder of a LeRobot dataset or of rosbag2"),
+        (["source={folder}"], "expected a folder of a LeRobot dataset, of rosbag2 or of tables"),
         (["source={csv}", "topic=/joint_states"], "topic: expected only for a LeRobot dataset or a rosbag2"),
-        (["topic=/joint_states"], "topic: expected only with source=FOLDER"),
+        (["topic=/joint_states"], "topic: expected only with source="),
     ],
 )
 def test_bad_sources_of_demonstrations(reason, tmp_path, arguments, message):

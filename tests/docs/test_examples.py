@@ -143,7 +143,7 @@ def test_demonstrations(said, tmp_path):
     for number_of_wave, tempo in enumerate((1.0, 0.5)):
         expected = 0.6 * np.sin(1.5 * tempo * times) ** 2
         np.testing.assert_allclose(waves.qpos[number_of_wave, :, 0], expected, atol=1e-3)  # splines of 0.02 s
-    assert "velocities differentiated: True" in said
+    assert "velocities: computed from the angles" in said
     assert re.search(r"degrees.csv is rejected: .* expected rad in", said)
     assert re.search(r"clock.csv is rejected: .* its velocity limit is", said)
     assert 0 < number(r"mean kinematic bound over the first wave: (\S+)", said) < 0.5

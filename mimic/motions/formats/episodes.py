@@ -31,11 +31,41 @@ ANGLE, VELOCITY, TORQUE = Quantity("pos", "rad"), Quantity("vel", "rad/s"), Quan
 
 
 class Motion(NamedTuple):
-    """One motion at the times of its file; `qvel` is None if the file has no velocities."""
+    """One motion, of any length, at the times of its source.
+
+    Attributes:
+      time: [samples] s.
+      qpos: [samples, joints] angles, in rad unless a `Recording` says otherwise.
+      qvel: [samples, joints] the same per second; None if the source has no velocities.
+      gripper: [samples, channels] joints or opening of the gripper, as the source has them; None without a gripper.
+    """
 
     time: Float[np.ndarray, " samples"]
     qpos: Float[np.ndarray, "samples joints"]
     qvel: Float[np.ndarray, "samples joints"] | None
+    gripper: Float[np.ndarray, "samples channels"] | None = None
+
+    def take(self, index: Any) -> "Motion":
+        """The samples with these indices."""
+        return Motion(*(None if values is None else values[index] for values in self))
+
+
+class Recording(NamedTuple):
+    """The motions of one arm in a source.
+
+    Attributes:
+      motions: by name, as messages call them.
+      gripper: names of the gripper's channels.
+      unit: of the angles: a value of `UNITS`; empty where the source does not state one.
+      robot: the robot's type, of a source that may be in any of these units; None where others than rad are unusual.
+      notes: lines about what was assumed, changed or left out.
+    """
+
+    motions: dict[str, Motion]
+    gripper: tuple[str, ...] = ()
+    unit: str = ""
+    robot: str | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,34 +126,3 @@ class Episodes:
 def package_error(what: str, package: str) -> ValueError:
     """The error of a format whose package is not installed."""
     return ValueError(f"{what} needs the package {package}: {install_command(EXTRA)}")
-
-
-def choose_entry(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str], entry: str, kind: str) -> str:
-    """The entry of a dataset to read: the one that is named, or the only one that has all joints.
-
-    Args:
-      path: of the dataset, for messages.
-      entries: names of the joints of each entry.
-      joints: names of the joints that are needed.
-      entry: name of the entry; empty for the only one.
-      kind: what an entry is called, for messages.
-
-    Raises:
-      ValueError: no entry has all joints, several have, or the named one has not.
-    """
-    listed = "; ".join(f"{name} ({', '.join(names)})" for name, names in entries.items()) or "none"
-    if entry and entry not in entries:
-        raise ValueError(f"topic: expected a {kind} of {path!r} with joint angles: {listed}; got {entry!r}")
-    considered = [entry] if entry else list(entries)
-    fitting = [name for name in considered if set(joints) <= set(entries[name])]
-    if not fitting:
-        raise ValueError(
-            f"source: {path!r} has no {kind} with the joints {', '.join(joints)}; its joint angles: {listed}; "
-            "joints=[...] names the arm's joints among these"
-        )
-    if len(fitting) > 1:
-        raise ValueError(
-            f"source: {path!r} has the joints {', '.join(joints)} in several {kind}s; "
-            f"expected one, as topic={' or topic='.join(fitting)}"
-        )
-    return fitting[0]

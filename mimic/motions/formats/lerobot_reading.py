@@ -1,17 +1,29 @@
-"""Reads joint motions from a LeRobot dataset, version 3."""
+"""Reads joint motions from a LeRobot dataset, version 2 or 3."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mimic.base.files import check_file, read_json
-from mimic.motions.formats.episodes import ANGLE, EXPERT, MAX_NUMBERS, VELOCITY, Motion, choose_entry, package_error
+from mimic.motions.formats.episodes import (
+    ANGLE,
+    EXPERT,
+    MAX_NUMBERS,
+    VELOCITY,
+    Motion,
+    Quantity,
+    Recording,
+    package_error,
+)
 from mimic.motions.formats.lerobot import DATA_FOLDER, EPISODES_FOLDER, FINAL, INFO
+from mimic.motions.formats.names import UNITS, parse_column, select
 
 _TIME_TOLERANCE = 1e-4  # s: LeRobot's own, between a timestamp and that of its frame
 _FLOATS = ("float32", "float64")
+_NO_JOINTS = ("timestamp", "next.")  # features of LeRobot's own: times, rewards
+_MAX_COLUMNS = 1000  # of a feature without names
 
 
 def is_lerobot(path: Path) -> bool:
@@ -19,7 +31,14 @@ def is_lerobot(path: Path) -> bool:
     return (path / INFO).is_file()
 
 
-def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> list[Motion]:
+class _Feature(NamedTuple):
+    """A feature that is a vector of numbers: its columns by joint, for angles and for velocities, and its unit."""
+
+    columns: dict[Quantity, dict[str, int]]
+    unit: str
+
+
+def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> Recording:
     """The motions of joints, one for each episode. Needs pyarrow.
 
     Joints are found by their names in info.json: NAME.pos or NAME for the angle, NAME.vel for the velocity. Where
@@ -28,7 +47,7 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> list[M
     Args:
       path: folder of the dataset.
       joints: names of the joints, base to tip.
-      feature: feature that has them; empty for the only one that does.
+      feature: feature that has them; empty for the only one that does, or for what was measured.
 
     Raises:
       ValueError: a folder that cannot be read, or that lacks the joints or has them in several features.
@@ -39,54 +58,70 @@ def read_lerobot(path: Path, joints: Sequence[str], feature: str = "") -> list[M
         raise package_error(f"source: {str(path)!r} is a LeRobot dataset, which", "pyarrow") from error
     try:
         info = read_json(path / INFO)
-        fps, entries = _check_info(info), _joint_names(info["features"])
+        fps, features = _check_info(info), _features(info["features"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"source: {str(path / INFO)!r} cannot be read: {_line(error)}") from error
-    angles = {name: list(addresses[ANGLE.name]) for name, addresses in entries.items() if addresses[ANGLE.name]}
-    feature = choose_entry(str(path), angles, joints, feature, "feature")
-    episode, frame, time, values = _read_frames(path, feature)
+    angles = {name: list(form.columns[ANGLE]) for name, form in features.items() if form.columns[ANGLE]}
+    selection = select(str(path), angles, joints, feature, "feature")
+    chosen = features[selection.entry]
+    beside = selection.gripper_entry or selection.entry
+    episode, frame, time, values, of_gripper = _read_frames(path, (selection.entry, beside))
     order = np.lexsort((frame, episode))
     numbers, starts = np.unique(episode[order], return_index=True)
-    final, columns = _final_values(path, feature), entries[feature]
-    motions = []
+    final = _final_values(path, selection.entry)
+    motions = {}
     for number, rows in zip(numbers, np.split(order, starts[1:]), strict=True):
-        times = _times(frame[rows], time[rows], fps)
-        samples = values[rows]
+        times, samples, gripper = _times(frame[rows], time[rows], fps), values[rows], of_gripper[rows]
         if int(number) in final:
             times, samples = np.append(times, times[-1] + 1 / fps), np.vstack([samples, final[int(number)]])
-        qpos, qvel = (_select(samples, columns[quantity.name], joints) for quantity in (ANGLE, VELOCITY))
-        assert qpos is not None  # `choose_entry` has checked it
-        motions.append(Motion(times, qpos, qvel))
-    return motions
+            gripper = samples if beside == selection.entry else np.vstack([gripper, gripper[-1:]])
+        qpos, qvel = (_select(samples, chosen.columns[quantity], selection.joints) for quantity in (ANGLE, VELOCITY))
+        assert qpos is not None  # `select` has checked it
+        opening = _select(gripper, features[beside].columns[ANGLE], selection.gripper) if selection.gripper else None
+        motions[f"episode {number}"] = Motion(times, qpos, qvel, opening)
+    robot = str(info.get("robot_type") or "")
+    return Recording(motions, tuple(selection.gripper), chosen.unit, robot, tuple(selection.notes))
 
 
 def _check_info(info: Mapping[str, Any]) -> float:
-    """The frames per second of a dataset of version 3."""
+    """The frames per second of a dataset of version 2 or 3."""
     version, fps = info.get("codebase_version"), info.get("fps")
-    if not str(version).startswith("v3."):
-        raise ValueError(f"expected codebase_version v3.0, got {version!r:.80}; LeRobot converts older datasets")
+    if not str(version).startswith(("v2.", "v3.")):
+        raise ValueError(
+            f"expected codebase_version v2.0 to v3.0, got {version!r:.80}; LeRobot converts older datasets"
+        )
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not 1e-3 <= fps <= 1e6:
         raise ValueError(f"expected frames per second in [0.001, 1e6] as fps, got {fps!r:.80}")
     return float(fps)
 
 
-def _joint_names(features: Mapping[str, Any]) -> dict[str, dict[str, dict[str, int]]]:
-    """The columns of angles and of velocities by joint, for each feature that is a vector of named numbers."""
-    entries: dict[str, dict[str, dict[str, int]]] = {}
+def _features(features: Mapping[str, Any]) -> dict[str, _Feature]:
+    """The features that are vectors of numbers."""
+    entries: dict[str, _Feature] = {}
     for feature, form in features.items():
-        names, shape = form.get("names"), form["shape"]
-        if isinstance(names, Mapping) and len(names) == 1:  # {"motors": [...]}, as older datasets have it
-            names = next(iter(names.values()))
-        if form["dtype"] not in _FLOATS or not isinstance(names, list | tuple) or list(shape) != [len(names)]:
+        names, size = _names(form.get("names"), list(form["shape"])), list(form["shape"])
+        if form["dtype"] not in _FLOATS or size != [len(names)] or str(feature).startswith(_NO_JOINTS):
             continue
-        found: dict[str, dict[str, int]] = {ANGLE.name: {}, VELOCITY.name: {}}
-        for column, name in enumerate(map(str, names)):
-            joint, _, quantity = name.rpartition(".")
-            if not joint or quantity not in found:
-                joint, quantity = name, ANGLE.name
-            found[quantity][joint.removeprefix(EXPERT)] = column
-        entries[str(feature)] = found
+        columns: dict[Quantity, dict[str, int]] = {ANGLE: {}, VELOCITY: {}}
+        units = [UNITS.get(str(unit).lower(), "") for unit in form.get("units") or ()]
+        for index, name in enumerate(names):
+            column = parse_column(name)
+            units.append(column.unit)
+            columns.setdefault(column.quantity, {})[column.joint.removeprefix(EXPERT)] = index
+        entries[str(feature)] = _Feature(columns, next(filter(None, units), ""))
     return entries
+
+
+def _names(names: Any, shape: list[int]) -> list[str]:
+    """Names of the columns of a feature, as datasets have them: a list, in a mapping or a list of one, or none."""
+    if isinstance(names, Mapping) and all(isinstance(index, int) for index in names.values()):
+        names = sorted(names, key=names.get)  # type: ignore[arg-type]
+    elif isinstance(names, Mapping | list | tuple) and len(names) == 1 and len(shape) == 1:
+        (inner,) = names.values() if isinstance(names, Mapping) else names
+        names = inner if isinstance(inner, list | tuple) else names
+    if names is None and len(shape) == 1:
+        return [str(number) for number in range(1, min(shape[0], _MAX_COLUMNS) + 1)]
+    return [str(name) for name in names] if isinstance(names, list | tuple) else []
 
 
 def _select(samples: np.ndarray, columns: Mapping[str, int], joints: Sequence[str]) -> np.ndarray | None:
@@ -100,25 +135,26 @@ def _times(frame: np.ndarray, timestamp: np.ndarray, fps: float) -> np.ndarray:
     return exact if np.allclose(timestamp, exact, rtol=0, atol=_TIME_TOLERANCE) else timestamp
 
 
-def _read_frames(path: Path, feature: str) -> tuple[np.ndarray, ...]:
-    """Episode, frame, time and values of each frame."""
+def _read_frames(path: Path, features: Sequence[str]) -> tuple[np.ndarray, ...]:
+    """Episode, frame, time and values of each feature, of each frame."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     files = sorted((path / DATA_FOLDER).glob("*/*.parquet"))
-    names = ["episode_index", "frame_index", "timestamp", feature]
+    names = ["episode_index", "frame_index", "timestamp", *features]
     if not files:
         raise ValueError(f"source: {str(path)!r} has no data, expected {DATA_FOLDER}/chunk-000/file-000.parquet")
     try:
         count = sum(_count_numbers(pq.read_metadata(check_file(file)), names) for file in files)
         if not 0 < count <= MAX_NUMBERS:
             raise ValueError(f"expected 1 to {MAX_NUMBERS:,} numbers, got {count:,}")
-        tables = [pq.ParquetFile(file).read(columns=names) for file in files]
+        tables = [pq.ParquetFile(file).read(columns=list(dict.fromkeys(names))) for file in files]
         columns = [np.concatenate([_numbers(table[name]) for table in tables]) for name in names]
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         raise ValueError(f"source: the data of {str(path)!r} cannot be read: {_line(error)}") from error
-    episode, frame, time, values = columns
-    return episode.astype(np.int64), frame.astype(np.int64), time.astype(float), values.reshape(len(time), -1)
+    episode, frame, time, *values = columns
+    vectors = (array.astype(float).reshape(len(time), -1) for array in values)
+    return episode.astype(np.int64), frame.astype(np.int64), time.astype(float), *vectors
 
 
 def _count_numbers(metadata: Any, names: Sequence[str]) -> int:

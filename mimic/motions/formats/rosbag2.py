@@ -18,9 +18,10 @@ from mimic.motions.formats.episodes import (
     ArmMotions,
     Episodes,
     Motion,
-    choose_entry,
+    Recording,
     package_error,
 )
+from mimic.motions.formats.names import Selection, select
 
 METADATA, BAG = "metadata.yaml", "episode_{:06d}"
 BAG_FILES = (".db3", ".mcap")  # a bag that is one file
@@ -31,6 +32,8 @@ _VERSION = 8  # of the format: that of ROS 2 Iron and Jazzy
 _FIELD = {ANGLE: "position", VELOCITY: "velocity", TORQUE: "effort"}  # of a message, for each kind of command
 _MAX_BAGS = 100_000
 _FLOATS_OF_JOINT = 3  # in a message
+_DISTINCT = 0.3  # least fraction of stamps that differ, of those of a clock: some messages are published twice
+_RESET = 10**9  # ns, a step back of a clock that starts anew; messages of several publishers arrive late by less
 
 
 def write_rosbag2(folder: Path, episodes: Episodes) -> None:
@@ -126,10 +129,10 @@ def _bags(path: Path) -> list[Path]:
     return sorted(child.parent for child in path.glob(f"*/{METADATA}")) if path.is_dir() else []
 
 
-def read_rosbag2(path: Path, joints: Sequence[str], topic: str = "") -> list[Motion]:
+def read_rosbag2(path: Path, joints: Sequence[str], topic: str = "") -> Recording:
     """The motions of joints, one for each bag. Needs rosbags.
 
-    Times are those of the messages' headers, or when the messages were recorded where a header has none. A message
+    Times are those of the messages' headers, or when the messages were recorded where headers have none. A message
     without all joints is left out.
 
     Args:
@@ -147,7 +150,7 @@ def read_rosbag2(path: Path, joints: Sequence[str], topic: str = "") -> list[Mot
     bags = _bags(path)
     if len(bags) > _MAX_BAGS:
         raise ValueError(f"source: {str(path)!r} has {len(bags):,} bags, expected at most {_MAX_BAGS:,}")
-    motions, read = [], 0
+    motions, notes, gripper, read = {}, {}, [], 0
     for bag in bags:
         try:
             messages = _joint_messages(bag, MAX_NUMBERS - read)
@@ -155,8 +158,13 @@ def read_rosbag2(path: Path, joints: Sequence[str], topic: str = "") -> list[Mot
             line = " ".join(str(error).split())[:300]
             raise ValueError(f"source: the bag {str(bag)!r} cannot be read: {line}") from error
         read += sum(_size(message) for topic_messages in messages.values() for _, message in topic_messages)
-        motions.append(_motion(str(bag), messages, joints, topic))
-    return motions
+        selection = _selection(str(bag), messages, joints, topic)
+        motions[bag.name], lines = _motion(messages[selection.entry], selection)
+        gripper = gripper or selection.gripper
+        if selection.gripper != gripper:
+            raise ValueError(f"source: {str(bag)!r} has the gripper {selection.gripper}, the bags before it {gripper}")
+        notes |= dict.fromkeys([*selection.notes, *lines])
+    return Recording(motions, tuple(gripper), notes=tuple(notes))
 
 
 def _joint_messages(bag: Path, limit: int) -> dict[str, list[tuple[int, Any]]]:
@@ -180,23 +188,54 @@ def _size(message: Any) -> int:
     return _FLOATS_OF_JOINT * max(len(message.name), 1)
 
 
-def _motion(bag: str, messages: Mapping[str, Sequence[tuple[int, Any]]], joints: Sequence[str], topic: str) -> Motion:
-    """The motion of joints in the messages of a bag."""
-    needed = set(joints)
-    names = {  # of a message with all joints; of the one with the most where there is none
-        name: max((message.name for _, message in rows), key=lambda present: (needed <= set(present), len(present)))
+def _selection(
+    bag: str, messages: Mapping[str, Sequence[tuple[int, Any]]], joints: Sequence[str], topic: str
+) -> Selection:
+    """The topic of the joints in a bag, and their names: those of any message of the topic."""
+    names = {
+        name: list(dict.fromkeys(present for _, message in rows for present in message.name))
         for name, rows in messages.items()
     }
-    rows = messages[choose_entry(bag, names, joints, topic, "topic")]
-    rows = [row for row in rows if needed <= set(row[1].name)]
-    columns = [[message.name.index(joint) for joint in joints] for _, message in rows]
+    return select(bag, names, joints, topic, "topic")
+
+
+def _motion(rows: Sequence[tuple[int, Any]], selection: Selection) -> tuple[Motion, list[str]]:
+    """The motion of joints in the messages of a topic, and what was assumed about its times."""
+    complete = [row for row in rows if set(selection.joints) <= set(row[1].name)]
+    if not complete:
+        raise ValueError(f"source: no message of {selection.entry} has all of the joints {', '.join(selection.joints)}")
+    nanoseconds, notes = _times(complete)
+    order = np.argsort(nanoseconds, kind="stable")
+    if np.any(np.diff(nanoseconds) < -_RESET):
+        order = np.arange(len(order))  # a clock that starts anew: `cleaned` begins a new motion there
+    qpos, qvel = (_values(complete, field, selection.joints) for field in ("position", "velocity"))
+    motion = Motion((nanoseconds - nanoseconds.min()) / 1e9, qpos, qvel).take(order)
+    if not selection.gripper:
+        return motion, notes
+    with_gripper = [row for row in rows if set(selection.gripper) <= set(row[1].name)]  # often messages of their own
+    if not with_gripper:
+        return motion, [*notes, f"gripper: no message has all of {', '.join(selection.gripper)}"]
+    times = (_times(with_gripper)[0] - nanoseconds.min()) / 1e9
+    values, order = _values(with_gripper, "position", selection.gripper), np.argsort(times, kind="stable")
+    assert values is not None
+    channels = [np.interp(motion.time, times[order], channel[order]) for channel in values.T]
+    return motion._replace(gripper=np.stack(channels, axis=1)), notes
+
+
+def _times(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
+    """The times of messages [ns]: their stamps, unless no clock has set them, and notes.
+
+    A simulation's clock begins at 0 s, so that a stamp of 0 alone says nothing; stamps that stand still do.
+    """
     stamps = np.array([message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for _, message in rows])
     recorded = np.array([time for time, _ in rows])
-    nanoseconds = stamps if np.all(stamps > 0) else recorded
-    order = np.argsort(nanoseconds, kind="stable")
-    time = (nanoseconds - nanoseconds.min())[order] / 1e9
-    qpos = np.array([row[1].position[column] for row, column in zip(rows, columns, strict=True)])[order]
-    if not all(len(message.velocity) == len(message.name) for _, message in rows):
-        return Motion(time, qpos, None)
-    qvel = np.array([row[1].velocity[column] for row, column in zip(rows, columns, strict=True)])[order]
-    return Motion(time, qpos, qvel)
+    if 1 < len(np.unique(stamps)) >= _DISTINCT * len(np.unique(recorded)):
+        return stamps, []
+    return recorded, ["times: when messages were recorded, since their headers state none that increase"]
+
+
+def _values(rows: Sequence[tuple[int, Any]], field: str, names: Sequence[str]) -> np.ndarray | None:
+    """The values of joints [messages, joints] in a field of messages; None where a message has none."""
+    if not all(len(getattr(message, field)) == len(message.name) for _, message in rows):
+        return None
+    return np.array([getattr(message, field)[[message.name.index(name) for name in names]] for _, message in rows])

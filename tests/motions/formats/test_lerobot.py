@@ -126,7 +126,7 @@ def test_without_commands_the_action_is_the_next_pose(tmp_path):
 def test_one_joint_has_scalar_actions(tmp_path):
     write_lerobot(tmp_path, episodes(robot=motions(("joint1",), 0), expert=False))
     assert str(data(tmp_path).schema.field("action").type) == "float"
-    assert read_lerobot(tmp_path, ["joint1"])[0].qpos.shape == (STEPS + 1, 1)
+    assert read_lerobot(tmp_path, ["joint1"]).motions["episode 0"].qpos.shape == (STEPS + 1, 1)
 
 
 def test_large_datasets_have_several_files(tmp_path, monkeypatch):
@@ -138,7 +138,7 @@ def test_large_datasets_have_several_files(tmp_path, monkeypatch):
     for row in rows:
         table = pq.read_table(files[row["data/file_index"]])
         assert set(table["episode_index"].to_pylist()) == {row["episode_index"]}
-    assert len(read_lerobot(tmp_path, EXPERT)) == 3
+    assert len(read_lerobot(tmp_path, EXPERT).motions) == 3
 
 
 @pytest.mark.parametrize("dt", [0.03, 2.0, 0.0999])

@@ -25,7 +25,7 @@ def test_what_was_written_is_read(written, joints, feature):
     assert is_lerobot(written) and not is_lerobot(written / "meta")
     source = episodes()
     arm = source.robot if feature else source.expert
-    for episode, motion in enumerate(read_lerobot(written, joints, feature)):
+    for episode, motion in enumerate(read_lerobot(written, joints, feature).motions.values()):
         steps = source.steps[episode]
         np.testing.assert_allclose(motion.time, DT * np.arange(steps + 1), atol=1e-12)  # exact multiples
         np.testing.assert_array_equal(motion.qpos, arm.qpos[episode, : steps + 1].astype(np.float32))
@@ -56,7 +56,7 @@ def foreign(folder, *, names, version="v3.0", fps=20, **columns):
 @pytest.mark.parametrize("names", [["b", "a"], ["b.pos", "a.pos"], {"motors": ["b", "a"]}])
 def test_datasets_of_others_are_read(tmp_path, names):
     folder, state = foreign(tmp_path / "set", names=names)
-    first, second = read_lerobot(folder, ["a", "b"])
+    first, second = read_lerobot(folder, ["a", "b"]).motions.values()
     np.testing.assert_array_equal(first.qpos, state[0][:, ::-1])
     np.testing.assert_array_equal(second.qpos, state[1][:, ::-1])
     np.testing.assert_allclose(second.time, np.arange(STEPS) / 20, atol=1e-12)  # exact multiples
@@ -66,7 +66,7 @@ def test_datasets_of_others_are_read(tmp_path, names):
 def test_recorded_times_are_kept(tmp_path):
     recorded = np.tile(np.arange(STEPS) ** 1.1, 2).astype(np.float32)
     folder, _ = foreign(tmp_path / "set", names=["a", "b"], timestamp=recorded)
-    np.testing.assert_array_equal(read_lerobot(folder, ["a", "b"])[0].time, recorded[:STEPS])
+    np.testing.assert_array_equal(read_lerobot(folder, ["a", "b"]).motions["episode 4"].time, recorded[:STEPS])
 
 
 NULLS = [None, *[[0.0, 0.0]] * (2 * STEPS - 1)]
@@ -75,7 +75,7 @@ NULLS = [None, *[[0.0, 0.0]] * (2 * STEPS - 1)]
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"version": "v2.1"}, r"expected codebase_version v3.0, got 'v2.1'; LeRobot converts older datasets"),
+        ({"version": "v1.6"}, r"expected codebase_version v2.0 to v3.0, got 'v1.6'; LeRobot converts older datasets"),
         ({"fps": 0}, r"expected frames per second in .* got 0"),
         ({"names": ["a"]}, r"has no feature with the joints a, b; its joint angles: none"),
         ({"names": ["a", "c"]}, r"its joint angles: observation.state \(a, c\); joints=\[...\] names"),
@@ -128,7 +128,7 @@ def test_several_features_with_the_joints_are_a_question(tmp_path):
         read_lerobot(tmp_path, EXPERT)
     with pytest.raises(ValueError, match=r"topic: expected a feature .*; got 'observation.image'"):
         read_lerobot(tmp_path, EXPERT, "observation.image")
-    assert len(read_lerobot(tmp_path, EXPERT, "observation.state")) == 3
+    assert len(read_lerobot(tmp_path, EXPERT, "observation.state").motions) == 3
 
 
 def test_a_missing_package_is_named(written, monkeypatch):

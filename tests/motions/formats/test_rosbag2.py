@@ -88,7 +88,7 @@ def test_what_was_written_is_read(written, joints, topic):
     assert is_rosbag2(written) and is_rosbag2(written / "episode_000000") and not is_rosbag2(written.parent)
     source = episodes()
     arm = source.robot if topic else source.expert
-    for episode, motion in enumerate(read_rosbag2(written, joints, topic)):
+    for episode, motion in enumerate(read_rosbag2(written, joints, topic).motions.values()):
         steps = source.steps[episode]
         np.testing.assert_allclose(motion.time, DT * np.arange(steps + 1), atol=1e-9)  # whole nanoseconds
         np.testing.assert_array_equal(motion.qpos, arm.qpos[episode, : steps + 1])
@@ -120,7 +120,7 @@ def foreign(path, *, names=("gripper", "b", "a"), stamp=0, velocity=False, plugi
 @pytest.mark.parametrize(("velocity", "stamp", "step"), [(False, 0, 2.0), (True, 50, 1.0)])
 def test_bags_of_others_are_read(tmp_path, plugin, velocity, stamp, step):
     bag, values = foreign(tmp_path / "bag", plugin=plugin, velocity=velocity, stamp=stamp)
-    (motion,) = read_rosbag2(bag, ["a", "b"])
+    (motion,) = read_rosbag2(bag, ["a", "b"]).motions.values()
     np.testing.assert_array_equal(motion.qpos, values[:, [2, 1]])
     np.testing.assert_array_equal(motion.time, step * np.arange(4))
     if velocity:
@@ -133,13 +133,16 @@ def test_a_single_file_is_a_bag(tmp_path):
     bag, values = foreign(tmp_path / "bag")
     (file,) = bag.glob("*.mcap")
     assert is_rosbag2(file)
-    np.testing.assert_array_equal(read_rosbag2(file, ["a"])[0].qpos, values[:, [2]])
+    np.testing.assert_array_equal(read_rosbag2(file, ["a"]).motions[file.name].qpos, values[:, [2]])
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"names": ("a", "c")}, r"has no topic with the joints a, b; its joint angles: /joint_states \(a, c\)"),
+        (
+            {"names": ("a", "c")},
+            r"has no topic with the joints a, b; its joint angles: /joint_states \(a, c, gripper\)",
+        ),
         ({"kind": "sensor_msgs/msg/Imu"}, "its joint angles: none"),
     ],
 )

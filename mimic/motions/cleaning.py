@@ -1,0 +1,183 @@
+"""Repairs recorded motions, or splits them where they cannot be: times, wraps, jumps, gaps, velocities.
+
+Nothing is changed or left out without a note.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from mimic.motions.formats.episodes import Motion
+from mimic.motions.resampling import angles_and_velocities
+
+FULL_TURN = 2 * np.pi - 1e-6  # rad: a range of a full rotation or more is that of a joint that turns on
+_MAX_ANGLE = 4 * np.pi  # rad, of such a joint: beyond, the angles are no rad
+_MAX_TURNS = 2  # by which a joint is rotated into its range
+OVERSHOOT = 0.02  # rad, 1 degree: how far measured angles may lie beyond a joint's range
+# A jump is what a joint cannot do between two samples: a step of more than 0.15 rad (9 deg) that would need more than
+# 100 rad/s^2, several times what arms reach, and that the samples before and after do not continue.
+_JUMP, _MAX_ACCELERATION = 0.15, 100.0
+_GAP, _GAP_SAMPLES, _GAP_MOTION = 0.5, 5.0, 0.05  # s, median intervals, rad: no samples for longer, while a joint moved
+_DISAGREEMENT, _SPEED_NOISE = 0.5, 0.05  # of stated and true velocities: relative RMS, and rad/s
+
+
+class Notes:
+    """What was changed in motions: each kind with the motions that it concerns."""
+
+    def __init__(self) -> None:
+        self._details: dict[str, list[str]] = {}
+
+    def add(self, kind: str, detail: str) -> None:
+        """Notes a change of a kind, with the motion that it concerns."""
+        self._details.setdefault(kind, []).append(detail)
+
+    def lines(self) -> list[str]:
+        """A line for each kind: how often, and where first."""
+        return [
+            f"{kind}: {details[0]}" + (f", and {len(details) - 1} more" if len(details) > 1 else "")
+            for kind, details in self._details.items()
+        ]
+
+
+def cleaned(
+    name: str, motion: Motion, joint_names: Sequence[str], joint_range: Float[np.ndarray, "joints 2"], notes: Notes
+) -> dict[str, Motion]:
+    """The parts of a motion, by name, between which nothing jumps, with angles [rad] within the range.
+
+    Args:
+      name: of the motion.
+      motion: angles in rad.
+      joint_names: for notes.
+      joint_range: [rad].
+      notes: get what is changed.
+
+    Raises:
+      ValueError: less than two samples, or a part whose angles are beyond the range.
+    """
+    motion = _finite(name, motion, notes)
+    parts = []
+    for forward in _forward_parts(name, motion, notes):
+        unwrapped = np.unwrap(forward.qpos, axis=0)
+        if wraps := int(np.sum(np.any(np.abs(np.diff(unwrapped - forward.qpos, axis=0)) > np.pi, axis=1))):
+            notes.add("full turns undone", f"{wraps} in {name}")
+        parts += _without_jumps(name, forward._replace(qpos=unwrapped), joint_names, notes)
+    parts = [part for part in parts if len(part.time) > 1]
+    if not parts:
+        raise ValueError(f"source: {name} needs two or more samples at times that increase")
+    names = [name] if len(parts) == 1 else [f"{name}, part {number}" for number in range(1, len(parts) + 1)]
+    return {
+        label: _checked_velocities(label, _in_range(label, part, joint_names, joint_range, notes), notes)
+        for label, part in zip(names, parts, strict=True)
+    }
+
+
+def _finite(name: str, motion: Motion, notes: Notes) -> Motion:
+    """The samples whose time and angles are numbers; without velocities where some are none."""
+    kept = np.isfinite(motion.time) & np.all(np.isfinite(motion.qpos), axis=1)
+    if not kept.all():
+        notes.add("samples without numbers left out", f"{np.sum(~kept)} of {len(kept)} in {name}")
+        motion = motion.take(kept)
+    if motion.qvel is not None and not np.all(np.isfinite(motion.qvel)):
+        notes.add("velocities computed, since the source's are no numbers", name)
+        motion = motion._replace(qvel=None)
+    return motion
+
+
+def _forward_parts(name: str, motion: Motion, notes: Notes) -> list[Motion]:
+    """The parts between steps back in time, each without repeated times."""
+    back = np.flatnonzero(np.diff(motion.time) < 0)
+    if len(back):
+        notes.add("split where time steps back", f"{name}, {len(back)} times, first after {motion.time[back[0]]:g} s")
+    parts = []
+    for rows in np.split(np.arange(len(motion.time)), back + 1):
+        part = motion.take(rows)
+        new = np.concatenate([[True], np.diff(part.time) > 0])
+        if not new.all():
+            notes.add("samples at repeated times left out", f"{np.sum(~new)} of {len(new)} in {name}")
+        parts.append(part.take(new))
+    return parts
+
+
+def _without_jumps(name: str, motion: Motion, joint_names: Sequence[str], notes: Notes) -> Iterator[Motion]:
+    """The parts between jumps of a joint, and between gaps in which a joint moved."""
+    interval, change = np.diff(motion.time), np.diff(motion.qpos, axis=0)
+    if not len(interval):
+        return
+    velocity = change / interval[:, None]
+    padded = np.concatenate([velocity[1:2], velocity, velocity[-2:-1]]) if len(velocity) > 1 else velocity[[0, 0, 0]]
+    surprise = np.min([np.abs(change - padded[i : i + len(change)] * interval[:, None]) for i in (0, 2)], axis=0)
+    jumps = surprise > _JUMP + _MAX_ACCELERATION * interval[:, None] ** 2 / 4
+    is_long = interval > max(_GAP, _GAP_SAMPLES * float(np.median(interval)))
+    gaps = is_long & np.any(np.abs(change) > _GAP_MOTION, axis=1)
+    for sample, joint in np.argwhere(jumps)[:1]:
+        notes.add(
+            "split where a joint jumps",
+            f"{name}, {np.sum(jumps.any(axis=1))} times, first {joint_names[joint]} by {change[sample, joint]:.3g} rad "
+            f"within {interval[sample]:.3g} s at {motion.time[sample]:g} s",
+        )
+    for sample in np.flatnonzero(gaps)[:1]:
+        notes.add(
+            "split at gaps",
+            f"{name}, {np.sum(gaps)} times, first {interval[sample]:.3g} s from {motion.time[sample]:g} s",
+        )
+    yield from map(motion.take, np.split(np.arange(len(motion.time)), np.flatnonzero(jumps.any(axis=1) | gaps) + 1))
+
+
+def _in_range(
+    name: str, motion: Motion, joint_names: Sequence[str], joint_range: Float[np.ndarray, "joints 2"], notes: Notes
+) -> Motion:
+    """The motion with joints rotated by full turns where only this brings them into their range.
+
+    Raises:
+      ValueError: an angle that is beyond the range by more than measurements are.
+    """
+    turns_on = np.ptp(joint_range, axis=1) >= FULL_TURN
+    lower, upper = joint_range.T
+    bounds = np.stack(
+        [
+            np.where(turns_on, np.minimum(lower, -_MAX_ANGLE), lower),
+            np.where(turns_on, np.maximum(upper, _MAX_ANGLE), upper),
+        ],
+        axis=1,
+    )
+    middle = (motion.qpos.min(axis=0) + motion.qpos.max(axis=0)) / 2
+    is_outside = np.any((motion.qpos < bounds[:, 0] - OVERSHOOT) | (motion.qpos > bounds[:, 1] + OVERSHOOT), axis=0)
+    turns = np.clip(np.round((middle - bounds.mean(axis=1)) / (2 * np.pi)), -_MAX_TURNS, _MAX_TURNS)
+    turns = np.where(is_outside, 2 * np.pi * turns, 0.0)
+    qpos = motion.qpos - turns
+    beyond = np.maximum(bounds[:, 0] - qpos, qpos - bounds[:, 1])
+    sample, joint = np.unravel_index(np.argmax(beyond), beyond.shape)
+    if beyond[sample, joint] > OVERSHOOT:
+        lower, upper = bounds[joint]
+        raise ValueError(
+            f"source: {joint_names[joint]} of {name} is at {motion.qpos[sample, joint]:.4g}, "
+            f"expected rad in [{lower:.4f}, {upper:.4f}]"
+        )
+    if beyond[sample, joint] > 1e-6:  # float32 rounds pi by 9e-8
+        notes.add(
+            "slightly beyond the joint range", f"{joint_names[joint]} of {name} by {beyond[sample, joint]:.2g} rad"
+        )
+    if turns.any():
+        notes.add("rotated by full turns into the joint range", f"{joint_names[int(np.argmax(turns != 0))]} of {name}")
+    return motion._replace(qpos=qpos)
+
+
+def _checked_velocities(name: str, motion: Motion, notes: Notes) -> Motion:
+    """The motion without its velocities where these are not those of its angles, as with drivers that publish zeros."""
+    if motion.qvel is None or len(motion.time) < 3:
+        return motion
+    _, true = angles_and_velocities(motion._replace(qvel=None), motion.time)
+    error, speed = (np.sqrt(np.mean(values**2, axis=0)) for values in (motion.qvel - true, true))
+    wrong = error > _DISAGREEMENT * speed + _SPEED_NOISE
+    if not motion.qvel.any():
+        wrong = np.ptp(motion.qpos, axis=0) > OVERSHOOT
+    if not wrong.any():
+        return motion
+    joint = int(np.argmax(wrong * error))
+    stated = np.abs(motion.qvel[:, joint]).max()
+    notes.add(
+        "velocities computed, since the source's are not those of its angles",
+        f"{name}, up to {stated:.3g} rad/s stated and {np.abs(true[:, joint]).max():.3g} rad/s true",
+    )
+    return motion._replace(qvel=None)

@@ -1,0 +1,175 @@
+"""Names of columns and joints in files of others: what a column holds, and which columns belong to an arm."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from mimic.motions.formats.episodes import ANGLE, TORQUE, VELOCITY, Quantity
+
+QUANTITIES = {  # words before or after the name of a joint
+    **dict.fromkeys(("q", "qpos", "pos", "position", "positions", "angle"), ANGLE),
+    **dict.fromkeys(("dq", "qd", "qdot", "qvel", "vel", "velocity", "velocities", "speed"), VELOCITY),
+    **dict.fromkeys(("tau", "torque", "torques", "effort", "current"), TORQUE),
+}
+_NEVER_AFTER = ("q", "angle")  # `wrist_angle` is the name of a joint
+UNITS = {
+    **dict.fromkeys(("rad", "radian", "radians", "rad/s"), "rad"),
+    **dict.fromkeys(("deg", "degree", "degrees", "deg/s", "°", "°/s"), "deg"),
+    **dict.fromkeys(("percent", "%"), "percent"),
+}
+SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+_BRACKETS = re.compile(r"(.+?)\s*[\[(](.+?)[\])]")
+_LAST, _FIRST = re.compile(r"(.+)[./_ ]([^./_ ]+)"), re.compile(r"([a-z]+)[./_ ]?(.+)", re.IGNORECASE)
+_LEAF = re.compile(r"(|.*[./])([^./]+)")
+_GRIPPER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
+
+
+class Column(NamedTuple):
+    """What a column holds.
+
+    Attributes:
+      joint: name of the joint.
+      quantity: what its numbers are.
+      unit: a value of `UNITS` or a key of `SECONDS`; empty where the name states none.
+    """
+
+    joint: str
+    quantity: Quantity
+    unit: str
+
+
+class Selection(NamedTuple):
+    """The columns of an arm in a source.
+
+    Attributes:
+      entry: the topic, feature or data set that has them.
+      joints: the source's names of the joints, base to tip.
+      gripper: those of the gripper's joints or opening.
+      gripper_entry: the entry that has these; empty without a gripper.
+      notes: what was assumed to find them.
+    """
+
+    entry: str
+    joints: list[str]
+    gripper: list[str]
+    gripper_entry: str
+    notes: list[str]
+
+
+def parse_column(text: str) -> Column:
+    """Splits the name of a column, as in `joint1.pos`, `qdot_joint1`, `q1`, `elbow [deg]` or `/arm/elbow/velocity`."""
+    name, unit = text.strip(), ""
+    if match := _BRACKETS.fullmatch(name):
+        name, stated = match[1], match[2].strip().lower()
+        unit = UNITS.get(stated, stated)
+    if not unit and (match := _LAST.fullmatch(name)) and match[2].lower() in UNITS:
+        name, unit = match[1], UNITS[match[2].lower()]
+    if (match := _LAST.fullmatch(name)) and match[2].lower() in QUANTITIES and match[2].lower() not in _NEVER_AFTER:
+        return Column(match[1], QUANTITIES[match[2].lower()], unit)
+    if (match := _FIRST.fullmatch(name)) and match[1].lower() in QUANTITIES:
+        return Column(match[2], QUANTITIES[match[1].lower()], unit)
+    return Column(name, ANGLE, unit)
+
+
+def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str], str] | None:
+    """The names in a source that belong to joints of an arm, base to tip, and the rule that found them.
+
+    The names are equal; or equal but for case and separators (`joint_1`, `Joint1`); or the source's have one prefix
+    (`panda_joint1`), or the arm's; or the source counts the joints from 1. None where no rule finds all, or where
+    several prefixes fit, as in a source with two arms.
+    """
+    if set(joints) <= set(present):
+        return list(joints), ""
+    by_key = {_key(name): name for name in present}
+    if len(by_key) < len(present):
+        return None
+    keys = [_key(joint) for joint in joints]
+    prefixes = [key.removesuffix(keys[0]) for key in by_key if key.endswith(keys[0])]
+    fitting = [prefix for prefix in prefixes if all(prefix + key in by_key for key in keys)]
+    if "" in fitting or len(fitting) == 1:
+        prefix = "" if "" in fitting else fitting[0]
+        return [by_key[prefix + key] for key in keys], "by name"
+    shared = next((n for n, letters in enumerate(zip(*keys, strict=False)) if len(set(letters)) > 1), 0)
+    for cut in () if fitting else range(1, shared + 1):
+        if all(key[cut:] in by_key for key in keys):
+            return [by_key[key[cut:]] for key in keys], "by name"
+    numbers = [str(number) for number in range(1, len(joints) + 1)]
+    if not fitting and set(numbers) <= set(by_key):
+        return [by_key[number] for number in numbers], "by their order"
+    return None
+
+
+def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str], entry: str, kind: str) -> Selection:
+    """Finds the columns of an arm: in the entry that is named, or in the only one that has all joints.
+
+    Measured angles go before commanded ones, which are those of an entry whose name says so.
+
+    Args:
+      path: of the source, for messages.
+      entries: names of the joints of each entry.
+      joints: names of the joints that are needed.
+      entry: name of the entry; empty for the only one.
+      kind: what an entry is called, for messages.
+
+    Raises:
+      ValueError: no entry has all joints, several have, or the named one has not.
+    """
+    listed = "; ".join(f"{name} ({', '.join(names)})" for name, names in entries.items()) or "none"
+    if entry and entry not in entries:
+        raise ValueError(f"topic: expected a {kind} of {path!r} with joint angles: {listed}; got {entry!r}")
+    considered = [entry] if entry else list(entries)
+    found = {name: rule for name in considered if (rule := find_joints(entries[name], joints))}
+    if not found:
+        raise ValueError(
+            f"source: {path!r} has no {kind} with the joints {', '.join(joints)}; its joint angles: {listed}; "
+            "joints=[...] names the arm's joints among these"
+        )
+    notes = []
+    if len(found) > 1 and len(measured := [name for name in found if not is_command(name)]) == 1:
+        others = [name for name in found if name not in measured]
+        notes.append(f"{measured[0]}: what was measured; topic={' or topic='.join(others)} is what was commanded")
+        found = {measured[0]: found[measured[0]]}
+    if len(found) > 1:
+        raise ValueError(
+            f"source: {path!r} has the joints {', '.join(joints)} in several {kind}s; "
+            f"expected one, as topic={' or topic='.join(found)}"
+        )
+    ((name, (columns, rule)),) = found.items()
+    if rule:
+        notes.append(f"joints: {', '.join(columns)}, found {rule}; joints=[...] names others")
+    gripper, gripper_entry = _gripper(entries, name, columns, joints)
+    return Selection(name, columns, gripper, gripper_entry, notes)
+
+
+def is_command(entry: str) -> bool:
+    """Whether an entry's name says that it is what was commanded, and not what was measured."""
+    return bool(re.search(r"action|command|target|desired|master|leader", entry, re.IGNORECASE))
+
+
+def _key(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _gripper(
+    entries: Mapping[str, Sequence[str]], entry: str, columns: Sequence[str], joints: Sequence[str]
+) -> tuple[list[str], str]:
+    """The gripper's columns, and the entry that has them: that of the joints, or else one beside it.
+
+    Where it has several grippers, those with the prefix of the joints.
+    """
+    others = [name for name in entries[entry] if name not in columns]
+    gripper = [name for name in others if _GRIPPER.search(name)]
+    prefix = _key(columns[0]).removesuffix(_key(joints[0]))
+    gripper = [name for name in gripper if prefix and _key(name).startswith(prefix)] or gripper
+    if not gripper and len(others) in (1, 2) and all(name.isdigit() for name in entries[entry]):
+        gripper = others  # a vector without names: the joints, then the opening or the two fingers
+    if gripper:
+        return gripper, entry
+    folder, leaf = _LEAF.fullmatch(entry).groups()  # type: ignore[union-attr]
+    beside = [
+        name for name in entries
+        if _GRIPPER.search(name) and not is_command(name) and _LEAF.fullmatch(name)[1] == folder  # type: ignore[index]
+    ]  # fmt: skip
+    same = [name for name in beside if name.removeprefix(folder).split("_")[0] == leaf.split("_")[0]]
+    chosen = same if len(beside) > 1 else beside
+    return (list(entries[chosen[0]]), chosen[0]) if len(chosen) == 1 else ([], "")

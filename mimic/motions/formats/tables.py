@@ -1,0 +1,203 @@
+"""Reads joint motions from tables of text: CSV, TSV, and a folder with a table for each quantity."""
+
+import gzip
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mimic.base.files import MAX_BYTES, open_file, read_text
+from mimic.motions.formats.episodes import ANGLE, VELOCITY, Motion, Quantity, Recording
+from mimic.motions.formats.names import QUANTITIES, SECONDS, Column, Selection, parse_column, select
+
+TABLES = tuple(suffix + packed for suffix in (".csv", ".tsv", ".txt", ".dat") for packed in ("", ".gz"))
+_TIMES = ("time", "times", "t", "timestamp", "timestamps", "stamp", "elapsed", "seconds", "sec")
+_DEMONSTRATIONS = ("demonstration", "demo", "episode", "episode_index", "trajectory", "trial")
+_CLOCKS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # units of times that large: a clock's, since 1970
+_SLOWEST = 0.99  # s between samples: with more, they are in another unit, or no motion
+
+
+def read_table(path: Path, joints: Sequence[str]) -> Recording:
+    """The motions of joints, one for each number in the column `demonstration`.
+
+    Cells are separated by commas, semicolons, tabs or blanks; with semicolons a comma may be the decimal point. A
+    header has the columns `time` and, for each joint, its angle: its name, `q_NAME`, `NAME.pos` or `q_1`, `q_2`, ...
+    by number; and optionally velocities, as `qdot_NAME`. Units may follow, as in `elbow [deg]`. Without a header the
+    columns are time, angles, and optionally velocities, of all joints in their order.
+
+    Raises:
+      ValueError: no table of numbers, or one that lacks columns.
+    """
+    header, table = _read_cells(path)
+    columns, notes = [parse_column(name) for name in header], []
+    if not header:
+        columns, notes = _default_columns(path, table.shape[1], len(joints))
+    names = {
+        quantity: {column.joint: i for i, column in enumerate(columns) if column.quantity == quantity}
+        for quantity in (ANGLE, VELOCITY)
+    }
+    time_at, number_at = (
+        next((i for i, column in enumerate(columns) if _word(column.joint) in words), None)
+        for words in (_TIMES, _DEMONSTRATIONS)
+    )
+    reserved = [column.joint for i, column in enumerate(columns) if i in (time_at, number_at)]
+    angles = {name: index for name, index in names[ANGLE].items() if name not in reserved}
+    if time_at is None:
+        raise ValueError(f"source: {str(path)!r} lacks time; got the columns {', '.join(header)}")
+    if not len(table):
+        raise ValueError(f"source: {str(path)!r} has no rows")
+    selection = select(str(path), {"columns": list(angles)}, joints, "", "table")
+    unit = columns[time_at].unit or re.split(r"[^a-zµ]+", columns[time_at].joint.lower())[-1]
+    time, line = _seconds(path, table[:, time_at], unit if unit in SECONDS else columns[time_at].unit)
+    qvel = _velocities(path, table, names[VELOCITY], selection)
+    gripper = table[:, [angles[name] for name in selection.gripper]] if selection.gripper else None
+    motion = Motion(time, table[:, [angles[name] for name in selection.joints]], qvel, gripper)
+    numbers = np.zeros(len(table)) if number_at is None else table[:, number_at]
+    motions = {f"demonstration {number:g}": motion.take(numbers == number) for number in np.unique(numbers)}
+    unit = next(filter(None, (columns[angles[name]].unit for name in selection.joints)), "")
+    lines = (*notes, *selection.notes, *filter(None, [line]))
+    return Recording(motions, tuple(selection.gripper), unit, notes=lines)
+
+
+def is_folder_of_tables(path: Path) -> bool:
+    """Whether a folder has tables of angles and of times, one for each quantity, as their names say."""
+    return {"time", ANGLE} <= set(_tables_by_quantity(path)) if path.is_dir() else False
+
+
+def read_folder_of_tables(folder: Path, joints: Sequence[str]) -> Recording:
+    """The motion in a folder with a table for the angles, one for the times, and optionally one for the velocities.
+
+    The word `position`, `time` or `velocity` is in the name of each file. A table has no header, and a sample of all
+    joints in a row, or in as many rows as there are joints.
+
+    Raises:
+      ValueError: tables of other sizes.
+    """
+    tables = {quantity: _read_cells(path) for quantity, path in _tables_by_quantity(folder).items()}
+    count, notes = tables["time"][1].size, []
+    arrays: dict[Quantity, np.ndarray] = {}
+    for quantity in (ANGLE, VELOCITY):
+        if quantity in tables:
+            table = tables[quantity][1]
+            if table.size != count * len(joints):
+                raise ValueError(
+                    f"source: {str(folder)!r} has {count} times and {table.size} numbers as {quantity.name}, "
+                    f"expected {count} of each of {', '.join(joints)}"
+                )
+            arrays[quantity] = table.reshape(count, len(joints))
+    notes.append(f"joints: the numbers of a sample in their order, as {', '.join(joints)}")
+    time, line = _seconds(folder, tables["time"][1].ravel(), "")
+    motion = Motion(time, arrays[ANGLE], arrays.get(VELOCITY))
+    return Recording({"demonstration 0": motion}, notes=(*notes, *filter(None, [line])))
+
+
+def _tables_by_quantity(folder: Path) -> dict[Quantity | str, Path]:
+    """The tables of a folder by quantity, or "time"; none where two have the same."""
+    found: dict[Quantity | str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        words = re.split(r"[^a-z]+", path.name.lower().split(".")[0])
+        kinds = ["time" for word in words if word in _TIMES] + [
+            QUANTITIES[word] for word in words if word in QUANTITIES
+        ]
+        if path.name.endswith(TABLES) and len(kinds) == 1:
+            if kinds[0] in found:
+                return {}
+            found[kinds[0]] = path
+    return found
+
+
+def _read_cells(path: Path) -> tuple[list[str], np.ndarray]:
+    """The header of a table, empty where it has none, and its numbers [rows, columns]; empty cells are NaN."""
+    try:
+        lines = [line for line in _text(path).splitlines() if line.strip(" ,;\t")]
+        comments = [line.lstrip("#% ") for line in lines if line.lstrip().startswith(("#", "%"))]
+        lines = [line for line in lines if not line.lstrip().startswith(("#", "%"))]
+        if not lines:
+            raise ValueError("it has no rows")
+        separator = next((mark for mark in ";\t," if mark in lines[0]), None)
+        header, rows = _cells(lines[0], separator), lines[1:]
+        if _are_numbers(header, separator):
+            header, rows = _cells(comments[-1], separator) if comments else [], lines
+            if _are_numbers(header, separator) or len(header) != len(_cells(lines[0], separator)):
+                header = []
+        cells = [[_number(cell, separator) for cell in _cells(row, separator)] for row in rows]
+        return header, np.array(cells, float).reshape(len(rows), len(header) or -1)
+    except (OSError, EOFError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"source: {str(path)!r} is no table of numbers below a header: {reason}") from error
+
+
+def _text(path: Path) -> str:
+    if path.suffix != ".gz":
+        return read_text(path)
+    with open_file(path) as file, gzip.GzipFile(fileobj=file) as packed:
+        content = packed.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"expected at most {MAX_BYTES:,} bytes")
+    return content.decode("utf-8-sig")
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    return [cell.strip().strip('"').strip() for cell in line.split(separator)]
+
+
+def _number(cell: str, separator: str | None) -> float:
+    return float((cell.replace(",", ".") if separator == ";" else cell) or "nan")
+
+
+def _are_numbers(cells: Sequence[str], separator: str | None) -> bool:
+    try:
+        return bool([_number(cell, separator) for cell in cells])
+    except ValueError:
+        return False
+
+
+def _default_columns(path: Path, count: int, joints: int) -> tuple[list[Column], list[str]]:
+    """The columns of a table without a header: time, angles, and as many velocities and torques as there are."""
+    blocks = {1: "angles", 2: "angles and velocities", 3: "angles, velocities and torques"}
+    if (count - 1) % joints or (count - 1) // joints not in blocks:
+        raise ValueError(
+            f"source: {str(path)!r} has no header and {count} columns; expected time and the angles of {joints} "
+            f"joints, optionally their velocities: {joints + 1} or {2 * joints + 1} columns"
+        )
+    names = ["time", *(f"{word}_{number + 1}" for word in ("q", "dq", "tau") for number in range(joints))]
+    note = f"no header: the columns are time, then the {blocks[(count - 1) // joints]} of {joints} joints"
+    return [parse_column(name) for name in names[:count]], [note]
+
+
+def _word(name: str) -> str:
+    """The last word of a column's name, without its unit: `time` of `/clock/time_ms`."""
+    words = [word for word in re.split(r"[^a-z]+", name.lower()) if word and word not in SECONDS]
+    return words[-1] if words else name.lower()
+
+
+def _seconds(path: Path, time: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
+    """Times in s, from a unit that is stated, or from the size of a clock's; and a line about what was found."""
+    line = ""
+    if not unit and len(time):
+        unit = next((unit for least, unit in _CLOCKS if np.nanmax(np.abs(time)) >= least), "")
+        line = f"times: in {unit}, as those of a clock since 1970" if unit else ""
+    if unit not in SECONDS:
+        raise ValueError(
+            f"source: the times of {str(path)!r} are in {unit!r}, expected {', '.join(filter(None, SECONDS))}"
+        )
+    seconds = (time - time[:1]) * SECONDS[unit]
+    if len(time) > 1 and not (interval := float(np.nanmedian(np.diff(seconds)))) < _SLOWEST:
+        raise ValueError(
+            f"source: the samples of {str(path)!r} are {interval:g} s apart; expected times in s, or a column that is "
+            "called time_ms, time_us or time_ns"
+        )
+    return seconds, line
+
+
+def _velocities(path: Path, table: np.ndarray, velocities: dict[str, int], selection: Selection) -> np.ndarray | None:
+    """The velocities of joints; None without any.
+
+    Raises:
+      ValueError: only some joints have them.
+    """
+    missing = [name for name in selection.joints if name not in velocities]
+    if missing and len(missing) < len(selection.joints):
+        raise ValueError(f"source: {str(path)!r} has velocities of some joints, but none of {', '.join(missing)}")
+    return None if missing else table[:, [velocities[name] for name in selection.joints]]
