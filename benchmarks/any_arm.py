@@ -29,8 +29,8 @@ from mimic.envs import env_config
 from mimic.envs.imitation import training_and_held_out
 from mimic.envs.many_arms import AnyArmEnv
 from mimic.evaluation.rollout_metrics import MIN_SPAN
-from mimic.metric.array_kinematics import link_states
-from mimic.metric.array_similarity import motion_similarity
+from mimic.metric.kinematics import link_states
+from mimic.metric.similarity import motion_similarity
 from mimic.retargeting.array_bound import closest_motion
 
 REAL = ("ur5e", "ur10e", "iiwa", "iiwa14", "kinova3", "gen3", "sawyer", "jaco", "xarm7", "fetch")

@@ -77,6 +77,16 @@ class ArmArrays:
     link_length: Float[Any, " links"]
 
     @property
+    def name(self) -> str:
+        """What errors call the arm."""
+        return "an arm as data"
+
+    @property
+    def num_joints(self) -> int:
+        """Number of its slots of joints."""
+        return self.home.shape[-1]
+
+    @property
     def chain_length(self) -> Any:
         """Sum of the link lengths [m]."""
         return self.link_length.sum(axis=-1)

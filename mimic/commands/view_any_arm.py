@@ -14,10 +14,10 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arm import Arm, ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays, arm_arrays
-from mimic.metric.array_kinematics import correspondence, link_states, make_metric
-from mimic.metric.array_similarity import centre_line
-from mimic.metric.distance import DistanceWeights
-from mimic.metric.similarity import similarity
+from mimic.metric.correspondence import arc_length_correspondence
+from mimic.metric.distance import DistanceWeights, Metric
+from mimic.metric.kinematics import link_states
+from mimic.metric.similarity import centre_line, similarity
 from mimic.retargeting.array_nearest import nearest_pose
 from mimic.trainers.pose_mapper.any_arm_mapper import AnyArmMapper
 from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, expert_pose
@@ -153,15 +153,15 @@ def _compile(mapper: AnyArmMapper) -> _Compiled:
         return model_of(weights)(mapper.params, expert_pose(mapper.model.expert, qpos), learner)
 
     def compare(qpos: Array, learner_qpos: Array, weights: Array, learner: ArmArrays) -> PoseComparison:
-        expert, matrix = mapper.model.expert, correspondence(mapper.model.expert, learner)
-        metric = make_metric(model_of(weights).weights, matrix)
+        expert, matrix = mapper.model.expert, arc_length_correspondence(mapper.model.expert, learner)
+        metric = Metric(matrix, model_of(weights).weights)
         links = metric.link_distances(link_states(expert, qpos), link_states(learner, learner_qpos))
         lines = centre_line(expert, qpos), centre_line(learner, learner_qpos)
         return PoseComparison(metric.reduced(links), matrix, links, similarity(*lines))
 
     def best(qpos: Array, guess: Array, weights: Array, learner: ArmArrays) -> tuple[Array, Array]:
         model, expert = model_of(weights), expert_pose(mapper.model.expert, qpos)
-        matrix, keys = correspondence(model.expert, learner), jax.random.split(jax.random.key(0), _GUESSES)
+        matrix, keys = arc_length_correspondence(model.expert, learner), jax.random.split(jax.random.key(0), _GUESSES)
         random = jax.vmap(lambda key: random_pose(learner, key))(keys)
         guesses = jnp.concatenate([random, jnp.stack([jnp.asarray(learner.home), guess])])
         poses = jax.vmap(lambda at: nearest_pose(learner, model.weights, matrix, expert.states, at, _STEPS).qpos)(

@@ -26,14 +26,10 @@ from mimic.envs.config import EnvConfig
 from mimic.envs.family import arms_config
 from mimic.envs.many_arms_control import Plan, make_plan, max_speed, planned_torque, torque_scale
 from mimic.envs.many_arms_observation import observation_size, observe
-from mimic.metric.array_kinematics import (
-    check_metric,
-    correspondence,
-    link_states,
-    make_metric,
-)
+from mimic.metric.config import check_metric
+from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import Metric
-from mimic.metric.kinematics import LinkStates
+from mimic.metric.kinematics import LinkStates, link_states
 from mimic.motions.demonstrations import Demonstrations
 from mimic.physics.physics import make_advance
 from mimic.physics.step import Load, PhysicsChoice
@@ -161,7 +157,7 @@ class AnyArmEnv(Env):
 
     def _planned(self, state: AnyArmState) -> AnyArmState:
         expert = self.expert_at(state.demonstration, state.step + 1)
-        matrix, dt = correspondence(self._expert_arrays, state.arm), self.config.control_dt
+        matrix, dt = arc_length_correspondence(self._expert_arrays, state.arm), self.config.control_dt
         problem = Problem(state.arm, self._weights, matrix, expert, dt)
         goals = next_goals(problem, state.followed, state.qpos, random_numbers(state.key, state.step))
         speed = max_speed(state.arm, self.config.limits)
@@ -175,7 +171,7 @@ class AnyArmEnv(Env):
 
     def metric_of(self, arm: ArmArrays) -> Metric:
         """The metric between the expert and an arm."""
-        return make_metric(self._weights, correspondence(self._expert_arrays, arm))
+        return Metric(arc_length_correspondence(self._expert_arrays, arm), self._weights)
 
     def begin(self, state: AnyArmState) -> State:
         """The brax state of an episode that starts in a state."""

@@ -8,8 +8,7 @@ from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays
 from mimic.envs.many_arms_control import Plan
-from mimic.metric.array_kinematics import joint_states, link_states_in_frames
-from mimic.metric.kinematics import LinkStates
+from mimic.metric.kinematics import LinkStates, axes_and_origins, frame_table, states_in_frames
 from mimic.retargeting.array_goals import Goals
 from mimic.retargeting.array_nearest import angle_limits
 
@@ -52,8 +51,8 @@ def observe(
       plan: the controller's plan of the step.
       control_dt: duration of a control step [s].
     """
-    frames = joint_states(arm, qpos, qvel)
-    states = link_states_in_frames(arm, frames)
+    frames = frame_table(arm, qpos, qvel)
+    states = states_in_frames(arm, frames)
     dt, limit, unit = control_dt, arm.velocity_limit, 1 / arm.chain_length
     own, step = arm.is_free, control_dt * limit
     inertia = jnp.diagonal(plan.inertia)
@@ -73,7 +72,8 @@ def observe(
         jnp.log(jnp.maximum(inertia, 1e-6)),
     ]
     of_joints = jnp.stack([own * x for x in numbers], axis=1)
-    joints = jnp.concatenate([of_joints, frames.rotation[1:, :, 2], unit * frames.origin[1:]], axis=1)
+    axes, origins = axes_and_origins(frames)
+    joints = jnp.concatenate([of_joints, axes, unit * origins], axis=1)
     has_link = (arm.link_length > 0)[:, None]
     links = [has_link * x for x in (states.position, states.direction, unit * arm.link_length[:, None])]
     assert expert.direction is not None and expert.angular_velocity is not None

@@ -19,9 +19,8 @@ from mimic.envs.family import SEEN, UNSEEN
 from mimic.envs.many_arms import AnyArmEnv, any_arm_state
 from mimic.evaluation.evaluator import Controller
 from mimic.evaluation.rollout_metrics import gaps
-from mimic.metric.array_kinematics import link_states
-from mimic.metric.array_similarity import motion_similarity
-from mimic.metric.kinematics import LinkStates
+from mimic.metric.kinematics import LinkStates, link_states
+from mimic.metric.similarity import motion_similarity
 from mimic.retargeting.array_bound import closest_motion
 from mimic.runs.files import write_csv
 

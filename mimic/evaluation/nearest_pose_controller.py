@@ -15,7 +15,8 @@ from mimic.envs.arm_state import arm_state
 from mimic.envs.imitation import ImitationEnv
 from mimic.envs.many_arms_control import make_plan, max_speed, planned_torque
 from mimic.envs.many_arms_observation import observe
-from mimic.metric.array_kinematics import check_metric, correspondence
+from mimic.metric.config import check_metric
+from mimic.metric.correspondence import arc_length_correspondence
 from mimic.retargeting.array_goals import Goals, Problem, chosen_goal, first_goals, next_goals, random_numbers
 
 Policy = Callable[[Float[Array, " observation"]], Float[Array, " actions"]]
@@ -56,7 +57,7 @@ def nearest_pose_controller(env: ImitationEnv, policy: Policy | None = None) -> 
         arrays, _ = masked_arrays(config.learner, config.limits, config.metric.links)
     with jax.ensure_compile_time_eval():
         expert_arm, arm = (_constants(x) for x in (arm_arrays(expert), arrays))
-        matrix = np.asarray(correspondence(expert_arm, arm))
+        matrix = np.asarray(arc_length_correspondence(expert_arm, arm))
         speed = max_speed(arm, config.limits)
     places = np.flatnonzero(arrays.is_free)  # of the environment's joints
     dt = config.control_dt

@@ -141,6 +141,23 @@ class MetricConfig:
         return LinkMatch(expert, learner, metric.link_fractions(expert, learner))
 
 
+def check_metric(config: MetricConfig) -> DistanceWeights:
+    """The weights of a metric between any arms.
+
+    Raises:
+      ValueError: a metric other than constant weights with the correspondence by arc length.
+    """
+    weights = config.make_weights()
+    expected = {"correspondence": "arc_length", "reduction": "mean", "rotation_measure": "cosine", "links": "kept"}
+    different = [f"{key}={getattr(config, key)}" for key, value in expected.items() if getattr(config, key) != value]
+    if different or not isinstance(weights, DistanceWeights):
+        raise ValueError(
+            "metric: expected the default one, with any constant weights, for arms as arrays, got "
+            + (", ".join(different) or f"adaptive={config.adaptive}, link_distance={config.link_distance!r}")
+        )
+    return weights
+
+
 def _adaptive_weights(distances: PairDistances, **velocities: float) -> DistanceWeights:
     """`adaptive_weights` with constant weights on velocities."""
     return dataclasses.replace(adaptive_weights(distances), **velocities)

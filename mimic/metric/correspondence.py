@@ -10,6 +10,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from mimic.arms.arrays import ArmArrays
 from mimic.arms.chain_match import ChainMatch, matched_chains
 from mimic.arms.embodiment import Embodiment
 
@@ -68,7 +69,7 @@ def overlap_correspondence(
 
 
 def arc_length_correspondence(
-    expert: Embodiment, learner: Embodiment, *, chains: ChainMatch = "name"
+    expert: Embodiment | ArmArrays, learner: Embodiment | ArmArrays, *, chains: ChainMatch = "name"
 ) -> Float[Array, "expert learner"]:
     """Static correspondence by arc length: W_ij = n n_hat o_ij, with o_ij as in `overlap_correspondence`.
 
@@ -77,15 +78,18 @@ def arc_length_correspondence(
     trees it is the mean over the pairs of corresponding chains; a link that several have in common counts in each.
 
     Args:
-      expert: n links.
-      learner: n_hat links.
+      expert: n links, or an arm as data.
+      learner: n_hat links, or an arm as data if the expert is one; W is 0 for its empty slots of links.
       chains: see `matched_chains`.
 
     Raises:
       ValueError: trees whose chains do not match.
     """
-    overlap, _, numpy = _overlaps(expert, learner, chains)
-    return jnp.asarray(expert.num_links * learner.num_links * overlap / numpy.sum(overlap))
+    if isinstance(expert, ArmArrays) or isinstance(learner, ArmArrays):
+        overlap, numpy = overlaps_of_chains(expert.link_length, learner.link_length, jnp)[0], jnp  # type: ignore[union-attr]
+    else:
+        overlap, _, numpy = _overlaps(expert, learner, chains)
+    return jnp.asarray(overlap.size * overlap / numpy.sum(overlap))
 
 
 def _overlaps(expert: Embodiment, learner: Embodiment, chains: ChainMatch) -> tuple[Any, Any, ModuleType]:

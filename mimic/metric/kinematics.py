@@ -1,4 +1,4 @@
-"""Link frames, twists and link states of an embodiment.
+"""Link frames, twists and link states of an arm: an embodiment, or an arm as data.
 
 Joint angles and velocities may have batch axes before that of the joints. These broadcast; `jax.vmap` gives the same.
 """
@@ -15,6 +15,7 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from mimic.arms.arrays import ArmArrays
 from mimic.arms.embodiment import LONG, Embodiment
 from mimic.base import spatial
 from mimic.base.batches import over_batch
@@ -52,7 +53,10 @@ class LinkStates:
 
 
 class JointFrame(NamedTuple):
-    """State of a joint's child body: its rotation from the zero pose, the joint's anchor, and their velocities."""
+    """State of a joint's child body: its rotation from the zero pose, the joint's anchor, and their velocities.
+
+    That of an arm as data is the rotation of the joint's frame, see mimic/arms/arrays.py.
+    """
 
     rotation: Rotation
     anchor: Vector
@@ -102,7 +106,7 @@ def _frames(arm: Embodiment, qpos: Float[Array, " joints"]) -> Frames:
 
 
 def link_states(
-    arm: Embodiment,
+    arm: Embodiment | ArmArrays,
     qpos: Float[ArrayLike, "*#batch joints"],
     qvel: Float[ArrayLike, "*#batch joints"] | None = None,
     *,
@@ -111,7 +115,7 @@ def link_states(
     """Positions, directions and velocities of the links (paper, eqs. 8-10).
 
     Args:
-      arm: the embodiment.
+      arm: the embodiment, or an arm as data, whose empty slots of links are at the base.
       qpos: joint angles [rad].
       qvel: joint velocities [rad/s]; zero where None.
       normalized: divide positions and linear velocities by the chain length.
@@ -129,8 +133,13 @@ def link_states(
 
 
 def _link_states(
-    arm: Embodiment, normalized: bool, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"] | None = None
+    arm: Embodiment | ArmArrays,
+    normalized: bool,
+    qpos: Float[Array, " joints"],
+    qvel: Float[Array, " joints"] | None = None,
 ) -> LinkStates:
+    if isinstance(arm, ArmArrays):
+        return states_in_frames(arm, frame_table(arm, qpos, qvel), normalized=normalized)
     if arm.num_joints > LONG:
         arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, qpos.dtype), arm)
         return _states_of_long_arm(arm, qpos, jnp.zeros_like(qpos) if qvel is None else qvel, normalized)
@@ -144,11 +153,52 @@ def _states_of_long_arm(arm: Embodiment, qpos: Array, qvel: Array, normalized: b
     frames = (_frames_of_chain if arm.is_serial else _frames_of_tree)(arm, qpos, qvel)
     anchors = jnp.concatenate([jnp.zeros((1, 3), qpos.dtype), arm.joint_anchor])  # the base's first
     frame_index = np.asarray(arm.link_joint) + 1
-    frames = jax.tree.map(lambda leaf: leaf[frame_index], frames)
     offsets, directions = arm.link_position - anchors[frame_index], arm.link_rotation[:, :, 0]
-    links = link_state(frames, spatial.vector(offsets.T), spatial.vector(directions.T))
-    unit = 1 / arm.chain_length if normalized else 1.0
+    of_links = jax.tree.map(lambda leaf: leaf[frame_index], frames)
+    return _states_of_links(of_links, offsets, directions, 1 / arm.chain_length if normalized else 1.0)
+
+
+def _states_of_links(of_links: JointFrame, offsets: Any, directions: Any, unit: Any) -> LinkStates:
+    """States of links by array operations; see `link_state`.
+
+    Args:
+      of_links: frame of the body of each link, arrays [links].
+      offsets: [links, 3] of the links' origins, in the frames' axes.
+      directions: [links, 3] in the frames' axes.
+      unit: factor on lengths.
+    """
+    links = link_state(of_links, *(spatial.vector(jnp.asarray(x).T) for x in (offsets, directions)))
     return LinkStates(*(jnp.stack(x, axis=-1) for x in _in_units(unit, links)))
+
+
+FrameTable = Float[Array, "frames 18"]  # rows of frames of the base and of each joint: the numbers of a `JointFrame`
+
+
+def frame_table(
+    arm: ArmArrays, qpos: Float[Array, " joints"], qvel: Float[Array, " joints"] | None = None
+) -> FrameTable:
+    """Frames of the base and of each joint of an arm as data, one sample; batch with `jax.vmap`.
+
+    Args:
+      arm: the arm.
+      qpos: joint angles [rad].
+      qvel: joint velocities [rad/s]; zero where None.
+    """
+    frames = joint_frames(arm.astype(qpos.dtype), qpos, qvel)
+    return spatial.stack([jax.tree.leaves(frame) for frame in frames], qpos.dtype)
+
+
+def axes_and_origins(frames: FrameTable) -> tuple[Float[Array, "joints 3"], Float[Array, "joints 3"]]:
+    """Axes and origins [m] of the joints of an arm as data, in the base frame."""
+    return frames[1:, 2:9:3], frames[1:, 9:12]
+
+
+def states_in_frames(arm: ArmArrays, frames: FrameTable, *, normalized: bool = True) -> LinkStates:
+    """Link states of an arm as data, from `frame_table`."""
+    arm = arm.astype(frames.dtype)
+    of_links = jax.tree.unflatten(jax.tree.structure(BASE), list(frames[arm.link_joint + 1].T))
+    unit = 1 / arm.chain_length if normalized else 1.0
+    return _states_of_links(of_links, arm.link_position, arm.link_direction, unit)
 
 
 def _frames_of_chain(arm: Embodiment, qpos: Array, qvel: Array) -> JointFrame:
@@ -303,7 +353,7 @@ def joint_axes(arm: Embodiment, frames: Sequence[JointFrame]) -> list[Vector]:
 
 
 def joint_frames(
-    arm: Embodiment, qpos: Sequence[spatial.Scalar] | Array, qvel: Sequence[spatial.Scalar] | Array | None
+    arm: Embodiment | ArmArrays, qpos: Sequence[spatial.Scalar] | Array, qvel: Sequence[spatial.Scalar] | Array | None
 ) -> list[JointFrame]:
     """Frames of the base and of each joint's child body, in the base frame and the arm's own unit of length.
 
@@ -312,6 +362,8 @@ def joint_frames(
       qpos: angle of each joint [rad].
       qvel: velocity of each joint [rad/s]; zero where None.
     """
+    if isinstance(arm, ArmArrays):
+        return _frames_of_arrays(arm, qpos, qvel)
     frames, anchors = [BASE], [spatial.ZERO]  # anchors in the zero pose
     for joint, parent in enumerate(arm.joint_parent):
         axis, anchor = spatial.vector(arm.joint_axis[joint]), spatial.vector(arm.joint_anchor[joint])
@@ -319,6 +371,28 @@ def joint_frames(
         frames.append(child_frame(frames[parent + 1], offset, axis, qpos[joint], speed))
         anchors.append(anchor)
     return frames
+
+
+def _frames_of_arrays(
+    arm: ArmArrays, qpos: Sequence[spatial.Scalar] | Array, qvel: Sequence[spatial.Scalar] | Array | None
+) -> list[JointFrame]:
+    """`joint_frames` of the transforms that mimic/arms/arrays.py describes."""
+    base = JointFrame(spatial.rotation(arm.base_rotation), spatial.vector(arm.base_position), *BASE[2:])
+    frames = [base]
+    for joint in range(arm.num_joints):
+        twist, offset = ((1.0, 0.0), spatial.ZERO) if joint == 0 else (arm.twist[joint], (*arm.offset[joint], 0.0))
+        angle, speed = qpos[joint] + arm.reference[joint], 0.0 if qvel is None else qvel[joint]
+        parent = frames[-1]._replace(rotation=_about_x(frames[-1].rotation, twist[0], twist[1]))
+        frames.append(child_frame(parent, offset, (0.0, 0.0, 1.0), angle, speed))
+    return [BASE, *frames[1:]]
+
+
+def _about_x(rotation: Rotation, cosine: spatial.Scalar, sine: spatial.Scalar) -> Rotation:
+    """A frame after a rotation about its x-axis."""
+    x, y, z = spatial.transpose(rotation)
+    turned_y = spatial.add(spatial.scale(cosine, y), spatial.scale(sine, z))
+    turned_z = spatial.subtract(spatial.scale(cosine, z), spatial.scale(sine, y))
+    return spatial.transpose((x, turned_y, turned_z))
 
 
 def child_frame(
@@ -380,7 +454,7 @@ def _zero_offset(arm: Embodiment, link: int, joint: int) -> Vector:
     return spatial.subtract(spatial.vector(arm.link_position[link]), anchor)
 
 
-def joint_values(arm: Embodiment, values: ArrayLike, name: str) -> Array:
+def joint_values(arm: Embodiment | ArmArrays, values: ArrayLike, name: str) -> Array:
     """The values as a floating-point array, checked to be [..., joints].
 
     Args:

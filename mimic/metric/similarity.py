@@ -16,6 +16,7 @@ from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from mimic.arms.arrays import ArmArrays
 from mimic.arms.chain_match import matched_chains
 from mimic.arms.embodiment import Embodiment, segment_arm
 from mimic.base.spatial import array_library
@@ -44,17 +45,26 @@ class CentreLine:
     chains: tuple[str, ...] = struct.field(pytree_node=False, default=())
 
 
-def centre_line(arm: Embodiment, qpos: Float[ArrayLike, "*batch joints"], *, samples: int = SAMPLES) -> CentreLine:
+def centre_line(
+    arm: Embodiment | ArmArrays, qpos: Float[ArrayLike, "*batch joints"], *, samples: int = SAMPLES
+) -> CentreLine:
     """Centre line of an arm in one pose, or in each pose of a batch.
 
     Args:
-      arm: the embodiment.
+      arm: the embodiment, or an arm as data, whose segments are its links: of merged links, their chords.
       qpos: joint angles [rad].
       samples: number of points at equal arc length.
 
     Raises:
       ValueError: `qpos` is not [..., joints], or `samples` is below 1.
     """
+    if isinstance(arm, ArmArrays):
+        _check_samples(samples)
+        states = link_states(arm, qpos, normalized=False)
+        assert states.direction is not None
+        lengths = jnp.asarray(arm.link_length, states.position.dtype)
+        start = states.position - 0.5 * lengths[:, None] * states.direction
+        return _sampled_chain(start, states.direction, lengths, lengths.sum(), samples)
     return _sampled(arm, link_states(segment_arm(arm), qpos, normalized=False), samples)
 
 
@@ -70,38 +80,49 @@ def centre_line_table(
 
 def _sampled(arm: Embodiment, segments: LinkStates, samples: int) -> CentreLine:
     """The centre line, from the starts [m] and directions of its segments."""
-    if samples < 1:
-        raise ValueError(f"samples: expected at least 1, got {samples}")
+    _check_samples(samples)
     start, direction = segments.position, segments.direction
     assert direction is not None
+    lengths = np.linalg.norm(np.asarray(arm.segment_end) - np.asarray(arm.segment_start), axis=1)
     if len(arm.chains) == 1:
-        return _sampled_chain(arm, start, direction, samples)
+        return _sampled_chain(start, direction, lengths, float(np.cumsum(lengths)[-1]), samples)
+    reach = float(segment_arm(arm).chain_length)
     segment_chains = [np.array([s for s, link in enumerate(arm.segment_link) if link in chain]) for chain in arm.chains]
-    lines = [_sampled_chain(arm, start, direction, samples, segments) for segments in segment_chains]
+    lines = [
+        _sampled_chain(start[..., own, :], direction[..., own, :], lengths[own], reach, samples)
+        for own in segment_chains
+    ]
     numpy = array_library(start)
     points, tangents = (numpy.stack([getattr(line, name) for line in lines], -3) for name in ("points", "tangents"))
     hands = (numpy.stack([getattr(line, f"hand_{name}") for line in lines], -2) for name in ("position", "direction"))
     return CentreLine(points, tangents, *hands, chains=arm.chain_names)
 
 
-def _sampled_chain(
-    arm: Embodiment, start: Any, direction: Any, samples: int, segments: np.ndarray | None = None
-) -> CentreLine:
-    """The centre line of the segments of one chain, all of the arm's where None."""
-    numpy = array_library(start)
-    lengths = np.linalg.norm(np.asarray(arm.segment_end) - np.asarray(arm.segment_start), axis=1)
-    reach = float(np.cumsum(lengths)[-1])
-    if segments is not None:
-        start, direction, lengths = start[..., segments, :], direction[..., segments, :], lengths[segments]
-        reach = float(segment_arm(arm).chain_length)
-    ends = np.cumsum(lengths)
+def _check_samples(samples: int) -> None:
+    if samples < 1:
+        raise ValueError(f"samples: expected at least 1, got {samples}")
+
+
+def _sampled_chain(start: Any, direction: Any, lengths: Any, reach: Any, samples: int) -> CentreLine:
+    """The centre line of the segments of one chain.
+
+    Args:
+      start: [*batch, segments, 3] of the segments [m].
+      direction: [*batch, segments, 3] unit vectors.
+      lengths: [segments] of the segments [m]; 0 for empty slots, none of which has a sample.
+      reach: length that is the unit of the result [m].
+      samples: number of points.
+    """
+    numpy, of_lengths = array_library(start), array_library(lengths)
+    ends = of_lengths.cumsum(lengths)
     arc = (np.arange(samples) + 0.5) / samples * ends[-1]
-    index = np.minimum(np.searchsorted(ends, arc), len(ends) - 1)
+    hand = of_lengths.max(of_lengths.where(lengths > 0, np.arange(len(lengths)), 0))
+    index = of_lengths.minimum(of_lengths.sum(ends < arc[:, None], axis=1), hand)
     offset = (arc - (ends - lengths)[index]).astype(start.dtype)
     points = start[..., index, :] + offset[:, None] * direction[..., index, :]
-    hand = start[..., -1, :] + numpy.asarray(lengths[-1], start.dtype) * direction[..., -1, :]
+    tip = start[..., hand, :] + numpy.asarray(lengths[hand], start.dtype) * direction[..., hand, :]
     unit = numpy.asarray(1 / reach, start.dtype)
-    return CentreLine(unit * points, direction[..., index, :], unit * hand, direction[..., -1, :])
+    return CentreLine(unit * points, direction[..., index, :], unit * tip, direction[..., hand, :])
 
 
 def centre_line_distance(expert: CentreLine, learner: CentreLine) -> Float[Any, "*batch"]:
@@ -217,6 +238,23 @@ def similarity(expert: CentreLine, learner: CentreLine) -> dict[str, Float[Any, 
     if is_tree:
         values = tuple(value.mean(axis=-1) for value in values)
     return dict(zip(MEASURES, values, strict=True))
+
+
+def motion_similarity(
+    expert: ArmArrays,
+    learner: ArmArrays,
+    expert_qpos: Float[Array, "time joints"],
+    learner_qpos: Float[Array, "time joints"],
+) -> dict[str, Float[Array, " time"]]:
+    """The measures of `similarity` of two arms as data at each time; batch with `jax.vmap`.
+
+    Args:
+      expert: the arm that is imitated.
+      learner: the arm that imitates.
+      expert_qpos: the expert's angles, those of its locked joints included [rad].
+      learner_qpos: the learner's angles at the same times [rad].
+    """
+    return similarity(centre_line(expert, expert_qpos), centre_line(learner, learner_qpos))
 
 
 def _matched(expert: CentreLine, learner: CentreLine) -> tuple[CentreLine, CentreLine]:

@@ -84,10 +84,14 @@ def loaded(joints: Sequence[JointNumbers], mass: Scalar, damping: Scalar) -> lis
 
 
 def inverse(
-    joints: Sequence[JointNumbers], qpos: Sequence[Scalar], qvel: Sequence[Scalar], qacc: Sequence[Scalar]
+    joints: Sequence[JointNumbers],
+    qpos: Sequence[Scalar],
+    qvel: Sequence[Scalar],
+    qacc: Sequence[Scalar],
+    trigonometry: Callable[[Scalar], PLANE] = cosine_and_sine,
 ) -> list[Scalar]:
     """Inverse dynamics: joint torques [N m] for joint accelerations [rad/s^2]; see `acceleration` for the arguments."""
-    turns = _turns(joints, qpos, True, cosine_and_sine)
+    turns = _turns(joints, qpos, True, trigonometry)
     totals = list(inertial_wrenches(joints, turns, qvel, qacc))
     torque: list[Scalar] = [0.0] * len(joints)
     for i in reversed(range(len(joints))):

@@ -5,9 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import MAX_JOINTS, ArmArrays
-from mimic.metric.array_kinematics import link_states
 from mimic.metric.distance import DistanceWeights, Metric
-from mimic.metric.kinematics import LinkStates
+from mimic.metric.kinematics import LinkStates, link_states
 from mimic.retargeting.array_nearest import angle_limits, solve_free
 from mimic.retargeting.kinematic_bound import MIN_SPEED, ClosestMotion, SearchSpace, search_motion
 

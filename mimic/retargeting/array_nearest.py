@@ -12,14 +12,36 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mimic.arms.arrays import ArmArrays
-from mimic.metric.array_kinematics import joint_states, link_jacobians, link_states_in_frames
+from mimic.arms.arrays import MAX_JOINTS, ArmArrays
 from mimic.metric.distance import DistanceWeights
-from mimic.metric.kinematics import LinkStates
+from mimic.metric.kinematics import FrameTable, LinkStates, axes_and_origins, frame_table, states_in_frames
 from mimic.physics.dynamics import solve
 
 _MIN_DISTANCE = 0.02  # chain lengths; the curvature of a pair's translation is not above the inverse of it
 _DAMPING = 1e-3  # of the Hessian, relative to the mean of its diagonal
+
+
+class Jacobians(NamedTuple):
+    """Derivatives of the positions and directions of the links by the joint angles; 0 for locked joints.
+
+    Attributes:
+      position: [joints, links, 3] in chain lengths.
+      direction: [joints, links, 3].
+    """
+
+    position: Float[Array, "joints links 3"]
+    direction: Float[Array, "joints links 3"]
+
+
+def link_jacobians(arm: ArmArrays, frames: FrameTable, states: LinkStates) -> Jacobians:
+    """Jacobians of the links, from the axes of the joints."""
+    joint_axes, origins = axes_and_origins(frames)
+    axes, arms = joint_axes[:, None], states.position - origins[:, None] / arm.chain_length
+    moves = (jnp.arange(MAX_JOINTS)[:, None] <= arm.link_joint) * arm.is_free[:, None]
+    assert states.direction is not None
+    return Jacobians(
+        moves[..., None] * jnp.cross(axes, arms), moves[..., None] * jnp.cross(axes, states.direction[None])
+    )
 
 
 class PoseQuadratic(NamedTuple):
@@ -66,8 +88,8 @@ def pose_quadratic(
       expert: link states of the expert.
       qpos: the learner's pose [rad].
     """
-    frames = joint_states(arm, qpos)
-    states = link_states_in_frames(arm, frames)
+    frames = frame_table(arm, qpos)
+    states = states_in_frames(arm, frames)
     jacobians = link_jacobians(arm, frames, states)
     assert expert.direction is not None and expert.angular_velocity is not None
     shares = matrix / matrix.size

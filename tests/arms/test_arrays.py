@@ -9,7 +9,7 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, arm_arrays, lock_joints, masked_arrays
-from mimic.metric.array_kinematics import link_states
+from mimic.metric.kinematics import link_states
 from mimic.physics.dynamics import torque_of_arm
 from tests.helpers import random_arms
 from tests.helpers.array_cases import acceleration, arm_of, assert_near, looped, padded, random_motion, unrolled

@@ -9,7 +9,7 @@ import pytest
 from mimic.arms import sampler
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, stack_arms
-from mimic.metric.array_kinematics import link_states
+from mimic.metric.kinematics import link_states
 from mimic.physics.dynamics import inertia_matrix
 
 COUNT = 200

@@ -18,7 +18,7 @@ from mimic.envs.wrappers import fresh_episodes
 from mimic.evaluation.evaluator import Evaluator
 from mimic.evaluation.nearest_pose_controller import nearest_pose_controller
 from mimic.evaluation.tracking_controllers import run_controller
-from mimic.metric.array_kinematics import link_states
+from mimic.metric.kinematics import link_states
 
 HORIZON, COUNT, HELD_OUT = 20, 3, 2  # 2 s
 

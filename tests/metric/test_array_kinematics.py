@@ -12,13 +12,9 @@ import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints, stack_arms
 from mimic.arms.sampler import random_arm
-from mimic.metric.array_kinematics import (
-    correspondence,
-    joint_states,
-    link_jacobians,
-    link_states,
-    link_states_in_frames,
-)
+from mimic.metric.correspondence import arc_length_correspondence
+from mimic.metric.kinematics import axes_and_origins, frame_table, link_states, states_in_frames
+from mimic.retargeting.array_nearest import link_jacobians
 from tests.helpers import random_arms
 from tests.helpers.array_cases import Batch, random_source
 
@@ -49,17 +45,6 @@ def test_links_are_those_of_mujoco(batch, states):
             np.testing.assert_allclose(scale * actual, values, rtol=0, atol=ATOL)
 
 
-@pytest.mark.slow
-def test_links_are_those_of_the_embodiment(x64, batch, states):
-    """Of one arm of each number of joints, for the time that each takes to trace."""
-    for i in range(MAX_JOINTS):
-        arm, (qpos, qvel, *_) = batch.arms[i], batch.motions[i]
-        expected = mimic.link_states(arm.embodiment, qpos, qvel)
-        for name in FIELDS:
-            actual = getattr(states, name)[i, : arm.embodiment.num_links]
-            np.testing.assert_allclose(actual, getattr(expected, name), rtol=0, atol=ATOL)
-
-
 def test_empty_slots_of_links_rest_at_the_base(batch, states):
     for i, arm in enumerate(batch.arms):
         empty = slice(arm.embodiment.num_links, None)
@@ -68,20 +53,10 @@ def test_empty_slots_of_links_rest_at_the_base(batch, states):
         np.testing.assert_array_equal(states.direction[i, empty], np.eye(3)[[0] * len(states.direction[i, empty])])
 
 
-def test_links_without_velocity(x64, batch, states):
-    arm, qpos = jax.tree.map(lambda x: x[-1], batch.arrays), batch.qpos[-1]
-    rest = jax.jit(link_states)(arm, qpos)
-    for name in ("position", "direction"):
-        np.testing.assert_allclose(getattr(rest, name), getattr(states, name)[-1], rtol=0, atol=ATOL)
-    assert not np.any(rest.linear_velocity) and not np.any(rest.angular_velocity)
-
-
 def test_axes_of_the_joints_are_those_of_the_embodiment(x64, batch):
-    every = jax.jit(jax.vmap(joint_states))(batch.arrays, jnp.zeros_like(batch.qpos))
+    every = jax.jit(jax.vmap(lambda *x: axes_and_origins(frame_table(*x))))(batch.arrays, jnp.zeros_like(batch.qpos))
     for i, arm in enumerate(batch.arms):
-        frames = jax.tree.map(lambda x, i=i: x[i], every)
-        count = arm.embodiment.num_joints
-        axes, origins = frames.rotation[1 : count + 1, :, 2], frames.origin[1 : count + 1]
+        axes, origins = (x[i, : arm.embodiment.num_joints] for x in every)
         np.testing.assert_allclose(axes, arm.embodiment.joint_axis, atol=ATOL)
         moment_arms = np.cross(arm.embodiment.joint_anchor - origins, axes)  # 0 for a point on the axis
         np.testing.assert_allclose(moment_arms, 0, atol=ATOL)
@@ -90,25 +65,13 @@ def test_axes_of_the_joints_are_those_of_the_embodiment(x64, batch):
 def test_jacobians_are_the_derivatives_and_0_for_locked_joints(x64, batch):
     locked = np.arange(MAX_JOINTS) == 2
     arm = lock_joints(jax.tree.map(lambda x: x[-1], batch.arrays), locked)  # of 8 joints
-    qpos = batch.qpos[-1]
-    frames = joint_states(arm, qpos)
-    actual = link_jacobians(arm, frames, link_states_in_frames(arm, frames))
+    qpos = jnp.asarray(batch.qpos[-1])
+    frames = frame_table(arm, qpos)
+    actual = link_jacobians(arm, frames, states_in_frames(arm, frames))
     expected = jax.jit(jax.jacfwd(lambda qpos: link_states(arm, qpos)))(qpos)
     for jacobian, derivative in ((actual.position, expected.position), (actual.direction, expected.direction)):
         np.testing.assert_allclose(jacobian[~locked], np.moveaxis(derivative, -1, 0)[~locked], rtol=0, atol=ATOL)
         assert not np.any(jacobian[2]) and np.any(derivative[..., 2])
-
-
-def test_velocities_are_the_jacobians_times_qvel(x64, batch):
-    arm = jax.tree.map(lambda x: x[-1], batch.arrays)
-    qpos, qvel = batch.qpos[-1], batch.qvel[-1]
-    frames = joint_states(arm, qpos, qvel)
-    states = link_states_in_frames(arm, frames)
-    jacobian = link_jacobians(arm, frames, states)
-    assert states.direction is not None and states.angular_velocity is not None
-    np.testing.assert_allclose(np.tensordot(qvel, jacobian.position, 1), states.linear_velocity, atol=ATOL)
-    turning = jnp.cross(states.angular_velocity, states.direction)
-    np.testing.assert_allclose(np.tensordot(qvel, jacobian.direction, 1), turning, atol=ATOL)
 
 
 def test_correspondence_is_that_by_arc_length(x64, batch):
@@ -117,7 +80,7 @@ def test_correspondence_is_that_by_arc_length(x64, batch):
         expert, learner = (batch.arms[k].embodiment for k in (i, j))
         expected = np.asarray(mimic.arc_length_correspondence(expert, learner))
         arrays = [jax.tree.map(lambda x, k=k: x[k], batch.arrays) for k in (i, j)]
-        actual = np.asarray(correspondence(*arrays))
+        actual = np.asarray(arc_length_correspondence(*arrays))
         own = actual[: expert.num_links, : learner.num_links]
         np.testing.assert_allclose(own / own.sum(), expected / expected.sum(), rtol=0, atol=ATOL)
         assert actual.mean() == pytest.approx(1.0)
@@ -129,7 +92,7 @@ def test_correspondence_of_drawn_arms_integrates_along_both_chains():
     """In single precision, of traced experts and learners, some without a link in the first slot: links by length."""
     drawn = jax.jit(jax.vmap(random_arm))(jax.random.split(jax.random.PRNGKey(1), 128))
     experts, learners = (jax.tree.map(lambda x, half=half: x[half], drawn) for half in (slice(64), slice(64, None)))
-    matrix = np.asarray(jax.jit(jax.vmap(correspondence))(experts, learners))
+    matrix = np.asarray(jax.jit(jax.vmap(arc_length_correspondence))(experts, learners))
     shares = matrix / matrix.sum(axis=(1, 2), keepdims=True)
     for arms, axis in ((experts, 2), (learners, 1)):
         lengths = np.asarray(arms.link_length)

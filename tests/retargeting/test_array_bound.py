@@ -10,8 +10,10 @@ import pytest
 import mimic
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import arm_arrays, stack_arms
-from mimic.metric.array_kinematics import check_metric, correspondence, link_states, make_metric
-from mimic.metric.config import MetricConfig
+from mimic.metric.config import MetricConfig, check_metric
+from mimic.metric.correspondence import arc_length_correspondence
+from mimic.metric.distance import Metric
+from mimic.metric.kinematics import link_states
 from mimic.retargeting.array_bound import closest_motion
 from tests.helpers.array_cases import padded
 
@@ -46,7 +48,7 @@ def solve(arms, qpos, qvel):
 
     def of_arm(arm):
         TRACES.append(arm)
-        metric = make_metric(WEIGHTS, correspondence(expert, arm))
+        metric = Metric(arc_length_correspondence(expert, arm), WEIGHTS)
         states = jax.vmap(lambda *motion: link_states(expert, *motion))(qpos, qvel)
         closest = closest_motion(arm, metric, states, qpos)
         own_states = jax.vmap(lambda *motion: link_states(arm, *motion))(closest.qpos, closest.qvel)
@@ -121,7 +123,7 @@ def test_other_arms_compile_nothing(batch):
 
 def test_bad_input_is_rejected(unchecked):
     arm = arrays(())
-    metric = make_metric(WEIGHTS, correspondence(arm, arm))
+    metric = Metric(arc_length_correspondence(arm, arm), WEIGHTS)
     states = jax.vmap(lambda qpos: link_states(arm, qpos))(jnp.zeros((3, 8)))
     for guess in (jnp.zeros((3, 7)), jnp.zeros((2, 8)), jnp.zeros(8)):
         with pytest.raises(ValueError, match=r"guess: expected shape \(3, 8\)"):

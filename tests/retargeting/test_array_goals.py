@@ -7,8 +7,9 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
-from mimic.metric.array_kinematics import correspondence, link_states
+from mimic.metric.correspondence import arc_length_correspondence
 from mimic.metric.distance import DistanceWeights
+from mimic.metric.kinematics import link_states
 from mimic.retargeting import array_goals as goals
 from mimic.retargeting.array_goals import Problem, chosen_goal, first_goals, next_goals, random_numbers
 
@@ -35,7 +36,7 @@ def problem(panda):
     """A 4-joint Panda and an expert in a pose that this arm can take."""
     expert = link_states(panda, jnp.array([0.6, 0.7, 0.0, -1.3, 0.9, 0.0, 0.0, 0.0]))
     learner = lock_joints(panda, ELBOW)
-    return Problem(learner, WEIGHTS, correspondence(panda, learner), expert, 0.1)
+    return Problem(learner, WEIGHTS, arc_length_correspondence(panda, learner), expert, 0.1)
 
 
 @pytest.fixture(scope="module")

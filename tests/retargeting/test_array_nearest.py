@@ -7,8 +7,9 @@ import pytest
 
 from mimic.arms.arm import ArmConfig, build_arm
 from mimic.arms.arrays import MAX_JOINTS, arm_arrays, lock_joints
-from mimic.metric.array_kinematics import correspondence, link_states, make_metric
-from mimic.metric.distance import DistanceWeights
+from mimic.metric.correspondence import arc_length_correspondence
+from mimic.metric.distance import DistanceWeights, Metric
+from mimic.metric.kinematics import link_states
 from mimic.retargeting.array_nearest import angle_limits, nearest_pose, pose_quadratic
 
 WEIGHTS = DistanceWeights(1.0, 1.0, 0.0, 0.0)
@@ -27,9 +28,9 @@ def motion(seed):
 
 
 def test_the_gradient_is_that_of_the_metric(x64, panda):
-    learner, matrix = lock_joints(panda, LOCKED), correspondence(panda, panda)
+    learner, matrix = lock_joints(panda, LOCKED), arc_length_correspondence(panda, panda)
     expert, qpos = link_states(panda, *motion(0)), motion(1)[0] * learner.is_free
-    metric = make_metric(WEIGHTS, matrix)
+    metric = Metric(matrix, WEIGHTS)
     expected = jax.jit(jax.grad(lambda q: metric(expert, link_states(learner, q))))(qpos) * learner.is_free
     near = jax.jit(lambda q: pose_quadratic(learner, WEIGHTS, matrix, expert, q))(qpos)
     np.testing.assert_allclose(near.gradient, expected, rtol=0, atol=1e-13)  # rounding of a few hundred operations
@@ -40,7 +41,7 @@ def test_the_gradient_is_that_of_the_metric(x64, panda):
 def test_steps_lead_to_an_equal_arm_and_its_velocity(x64, panda):
     """The damping of the Hessian, 1e-3 of its mean, slows the steps and the velocity of joints that move little."""
     qpos, qvel = motion(2)
-    expert, matrix = link_states(panda, qpos, qvel), correspondence(panda, panda)
+    expert, matrix = link_states(panda, qpos, qvel), arc_length_correspondence(panda, panda)
     start = qpos + 0.2 * motion(3)[0]
     found, velocity, _ = nearest_pose(panda, WEIGHTS, matrix, expert, start, 60)
     np.testing.assert_allclose(found[:6], qpos[:6], rtol=0, atol=1e-5)
@@ -50,8 +51,8 @@ def test_steps_lead_to_an_equal_arm_and_its_velocity(x64, panda):
 
 @pytest.mark.slow
 def test_steps_reduce_the_distance_and_leave_locked_joints(x64, panda):
-    learner, matrix = lock_joints(panda, LOCKED), correspondence(panda, panda)
-    metric, expert = make_metric(WEIGHTS, matrix), link_states(panda, *motion(4))
+    learner, matrix = lock_joints(panda, LOCKED), arc_length_correspondence(panda, panda)
+    metric, expert = Metric(matrix, WEIGHTS), link_states(panda, *motion(4))
     pose, distances = jnp.zeros(MAX_JOINTS), []
     for _ in range(8):
         distances.append(float(metric(expert, link_states(learner, pose))))
@@ -66,6 +67,6 @@ def test_poses_stay_within_ranges(x64, panda):
     learner = panda.replace(joint_range=ranges)
     lower, upper = angle_limits(learner)
     assert lower[1] == -0.1 and upper[1] == 0.2 and np.isinf(lower[0])  # the others rotate by a full revolution
-    expert, matrix = link_states(panda, qpos, qvel), correspondence(panda, panda)
+    expert, matrix = link_states(panda, qpos, qvel), arc_length_correspondence(panda, panda)
     found, *_ = nearest_pose(learner, WEIGHTS, matrix, expert, jnp.zeros(MAX_JOINTS), 10)
     assert float(found[1]) in (-0.1, 0.2)

@@ -19,7 +19,9 @@ from mimic.base.distribution import VERSION
 from mimic.envs.imitation import layout_of, observation_layout, torque_scale
 from mimic.envs.many_arms_control import make_plan, max_speed, planned_torque
 from mimic.envs.many_arms_observation import observation_size, observe
-from mimic.metric.array_kinematics import check_metric, correspondence, link_states
+from mimic.metric.config import check_metric
+from mimic.metric.correspondence import arc_length_correspondence
+from mimic.metric.kinematics import link_states
 from mimic.retargeting.array_goals import NEW_POSES, OTHERS, Problem, chosen_goal, first_goals, next_goals
 from mimic.runs.checkpoints import load_checkpoint
 from mimic.trainers.config import PPOConfig, TrainConfig
@@ -165,7 +167,7 @@ def _any_arm_policy(trained: TrainConfig, run_dir: Path, steps: int) -> Exported
         arm = described_arm(learner)
         motion = (jnp.pad(x, (0, MAX_JOINTS - expert.num_joints)) for x in (expert_qpos, expert_qvel))
         states = link_states(expert_arrays, *motion)
-        problem = Problem(arm, weights, correspondence(expert_arrays, arm), states, dt)
+        problem = Problem(arm, weights, arc_length_correspondence(expert_arrays, arm), states, dt)
         poses = memory.reshape(-1, MAX_JOINTS)
         before = first_goals(qpos)
         before = before._replace(goal=before.goal._replace(qpos=poses[0]), others=poses[1:])

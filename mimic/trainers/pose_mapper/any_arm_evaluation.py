@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mimic.arms.arrays import ArmArrays
-from mimic.metric.array_kinematics import correspondence
-from mimic.metric.array_similarity import motion_similarity
+from mimic.metric.correspondence import arc_length_correspondence
+from mimic.metric.similarity import motion_similarity
 from mimic.retargeting.array_nearest import nearest_pose
 from mimic.trainers.pose_mapper.any_arm_model import AnyArmMapperModel, ExpertPose, Params, expert_pose
 from mimic.trainers.pose_mapper.any_arm_training import random_pose
@@ -115,7 +115,7 @@ def _newton_path(
     model: AnyArmMapperModel, expert: ExpertPose, arm: ArmArrays, initial: Float[Array, "n joints"], steps: int
 ) -> Float[Array, "steps n joints"]:
     """The initial poses, and the poses after each Newton step; one loop, which halves the time to compile."""
-    matrix = correspondence(expert.arm, arm)
+    matrix = arc_length_correspondence(expert.arm, arm)
 
     def step(poses: Array, _: None) -> tuple[Array, Array]:
         after = jax.vmap(lambda qpos: nearest_pose(arm, model.weights, matrix, expert.states, qpos, 1).qpos)(poses)

@@ -14,16 +14,10 @@ from mimic.arms.arm import build_arm
 from mimic.arms.arrays import MAX_JOINTS, MAX_LINKS, ArmArrays, arm_arrays
 from mimic.envs.config import EnvConfig
 from mimic.envs.family import arms_config
-from mimic.metric.array_kinematics import (
-    check_metric,
-    correspondence,
-    joint_states,
-    link_states,
-    link_states_in_frames,
-    make_metric,
-)
-from mimic.metric.distance import DistanceWeights
-from mimic.metric.kinematics import LinkStates
+from mimic.metric.config import check_metric
+from mimic.metric.correspondence import arc_length_correspondence
+from mimic.metric.distance import DistanceWeights, Metric
+from mimic.metric.kinematics import LinkStates, axes_and_origins, frame_table, link_states, states_in_frames
 from mimic.retargeting.array_nearest import angle_limits, nearest_pose
 from mimic.trainers.config import PoseMapperConfig
 from mimic.trainers.networks import Transformer
@@ -131,7 +125,7 @@ class AnyArmMapperModel:
 
     def distance(self, expert: ExpertPose, learner: ArmArrays, qpos: Float[Array, " joints"]) -> Float[Array, ""]:
         """Embodiment distance between the expert's pose and a learner's, both at rest."""
-        metric = make_metric(self.weights, correspondence(expert.arm, learner))
+        metric = Metric(arc_length_correspondence(expert.arm, learner), self.weights)
         return metric(expert.states, link_states(learner, qpos))
 
     def distances(self, expert: ExpertPose, learner: ArmArrays, poses: Float[Array, "n joints"]) -> Float[Array, " n"]:
@@ -148,7 +142,7 @@ class AnyArmMapperModel:
         self, params: Params, expert: ExpertPose, learner: ArmArrays
     ) -> tuple[Float[Array, "starts joints"], Float[Array, " starts"]]:
         """The initial poses after the Newton steps, and their distances."""
-        matrix = correspondence(expert.arm, learner)
+        matrix = arc_length_correspondence(expert.arm, learner)
 
         def refine(qpos: Array) -> Array:
             return nearest_pose(learner, self.weights, matrix, expert.states, qpos, self.refinements).qpos
@@ -169,12 +163,13 @@ class AnyArmMapperModel:
         The learner is described in its home pose. Lengths are in chain lengths; the place of a link on the chain is the
         arc length of its middle.
         """
-        frames = joint_states(learner, learner.home)
-        states = link_states_in_frames(learner, frames)
+        frames = frame_table(learner, learner.home)
+        states = states_in_frames(learner, frames)
         unit = 1 / learner.chain_length
         own, has_link = learner.is_free[:, None], (learner.link_length > 0).astype(unit.dtype)
-        joints = [own, own * learner.joint_range / jnp.pi, own * frames.rotation[1:, :, 2]]
-        joints = jnp.concatenate([*joints, own * unit * frames.origin[1:]], axis=1)
+        axes, origins = axes_and_origins(frames)
+        joints = [own, own * learner.joint_range / jnp.pi, own * axes, own * unit * origins]
+        joints = jnp.concatenate(joints, axis=1)
         moved_by = jax.nn.one_hot(learner.link_joint, MAX_JOINTS, dtype=unit.dtype)
         links = [states.position, states.direction, _arcs(learner), moved_by]
         links = has_link[:, None] * jnp.concatenate([x for x in links if x is not None], axis=1)
