@@ -17,15 +17,20 @@ from mimic.commands.demonstrations_plot import plot_demonstrations
 from mimic.commands.printed import train_command
 from mimic.envs.config import DemonstrationConfig, EnvConfig, ObservationConfig, RewardConfig
 from mimic.metric.kinematics import link_state_table
-from mimic.motions.mocap.arms import SIDES, find_arms
+from mimic.motions.mocap.arms import find_arms, find_facing, unnamed
 from mimic.motions.mocap.ball_chain import ball_chain_xml, zero_frames
 from mimic.motions.mocap.clips import Windows, relative_speeds, slow_down_for, turned, windows
+from mimic.motions.mocap.conventions import segments
 from mimic.motions.mocap.link_motion import BOTH, LinkMotion, arm_motion, rigid_error, sides
+from mimic.motions.mocap.names import parts_of
 from mimic.motions.mocap.picture import draw_skeleton
-from mimic.motions.mocap.points import PointMotion, bridge_gaps, gaps, jumps, segment_lengths
+from mimic.motions.mocap.points import SIDES, ArmPoints, PointMotion, bridge_gaps, gaps, jumps, segment_lengths
 from mimic.motions.mocap.reading import read_motion
 
 MOTION_CAPTURE = (".bvh", ".c3d", ".trc")  # CSV and npz files may be those of joint angles
+_RATIO = 0.75, 1.7  # of the lengths of upper arm and forearm of people
+_DIFFERENT = 0.1  # of a length: arms that differ by more are named
+_CHECK = "check the points (capture.shoulder= elbow= wrist=)"
 _CHANGING = 0.02  # of a length: a segment that changes more is named
 _NAMED = 5  # segments
 _STILL = 1e-5  # of a chain: single precision rounds by 1e-7
@@ -60,13 +65,13 @@ def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0)
     Raises:
       ValueError: what `read_motion` and `arm_motion` reject.
     """
-    body = read_motion(source, unit=config.unit, up=config.up)
-    arms = find_arms(body)
+    body = read_body(source, config, side)
+    arms, facing = find_arms(body), find_facing(body)
     if not set(sides(side)) <= set(arms):
-        found, valid = " and ".join(arms) or "none", f"{', '.join(SIDES)} or {BOTH}"
-        raise ValueError(f"arm: expected {valid}, of which {str(source)!r} has {found}, got {side!r}")
-    # Of the other arm, the shoulder shows where the body faces.
-    groups = [*(group for one in sides(side) for group in arms[one][1:]), *(arm.shoulder for arm in arms.values())]
+        found, valid = " and ".join(arms) or f"none: {unnamed(body)}", f"{', '.join(SIDES)} or {BOTH}"
+        raise ValueError(f"arm: expected {valid}, got {side!r}; {str(source)!r} has {found}")
+    # The other shoulder shows where the body faces.
+    groups = [*(group for one in sides(side) for group in arms[one][1:]), *facing.values()]
     names = [name for group in groups for name in group]
     used = body.select(list(dict.fromkeys(names)))
     pieces, bridged = bridge_gaps(used)
@@ -77,15 +82,35 @@ def read_arm(source: Path, side: str, config: CaptureConfig, fixed: float = 0.0)
     if not pieces:
         raise ValueError(f"source: {str(source)!r} has no time at which all points of {label} are known")
     longest = max(pieces, key=lambda piece: len(piece.positions))
-    chain = arm_motion(longest, side, arms=arms).chain_length
-    settings: dict[str, Any] = {
-        "arms": arms, "cutoff": config.cutoff, "trunk": trunk_length(chain, config, fixed),
-    }  # fmt: skip
+    settings: dict[str, Any] = {"arms": arms, "facing": facing, "cutoff": config.cutoff}
+    settings["trunk"] = trunk_length(arm_motion(longest, side, **settings).chain_length, config, fixed)
     angles = np.radians([config.yaw, config.pitch, config.roll])
     parts = [turned(arm_motion(piece, side, **settings), *angles) for piece in pieces]
     starts = [piece.begin for piece in pieces]
-    lengths = np.median([part.link_lengths for part in parts], axis=0)  # one body
+    spans = np.concatenate([part.end - part.start for part in parts])
+    lengths = np.median(np.linalg.norm(spans, axis=2), axis=0)  # of one body
     return Capture(body, [_with_lengths(part, lengths) for part in parts], starts, bridged)
+
+
+def read_body(source: Path, config: CaptureConfig, side: str = "") -> PointMotion:
+    """Reads all points of a file; for the points that the config names see `read_motion`.
+
+    Raises:
+      ValueError: what `read_motion` rejects, or points that are named for both arms.
+    """
+    return read_motion(source, unit=config.unit, up=config.up, subject=config.subject, arm=named_arm(config, side))
+
+
+def named_arm(config: CaptureConfig, side: str) -> ArmPoints | None:
+    """The points of an arm that a config names; None where it names none."""
+    texts = config.shoulder, config.elbow, config.wrist, config.hand
+    if not any(texts):
+        return None
+    if side == BOTH:
+        raise ValueError(
+            f"capture.shoulder, elbow, wrist and hand: expected with arm=left or arm=right, got arm={side}"
+        )
+    return ArmPoints(side, *(tuple(name.strip() for name in text.split("+") if name.strip()) for text in texts))
 
 
 def trunk_length(chain: float, config: CaptureConfig, fixed: float) -> float:
@@ -165,7 +190,7 @@ def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | 
     Raises:
       ValueError: what `read_motion` rejects.
     """
-    body = read_motion(source, unit=config.unit, up=config.up)
+    body = read_body(source, config)
 
     def run() -> None:
         console = Console()
@@ -188,9 +213,7 @@ def prepare_capture_inspection(source: Path, config: CaptureConfig, out: Path | 
 def body_lines(body: PointMotion) -> list[str]:
     """What a captured motion has: size, conventions, arms, gaps, jumps and lengths that change."""
     lines = [f"{len(body.names)} points, {body.duration:.2f} s at {body.rate:.5g} Hz", *body.notes]
-    for side, arm in find_arms(body).items():
-        names = " - ".join("+".join(group) for group in arm[1:] if group)
-        lines.append(f"{side} arm: {names}")
+    lines += _arm_lines(body)
     missing = gaps(body)
     if missing:
         longest = max(length for _, length in missing) / body.rate
@@ -205,6 +228,27 @@ def body_lines(body: PointMotion) -> list[str]:
     if changing:
         rest = f" and {len(changing) - _NAMED} more" if len(changing) > _NAMED else ""
         lines.append(f"lengths that change: {', '.join(changing[:_NAMED])}{rest}")
+    return lines
+
+
+def _arm_lines(body: PointMotion) -> list[str]:
+    """The points of each arm, and what is unusual about them."""
+    arms, lengths = find_arms(body), {}
+    lines = [] if arms else [unnamed(body)]
+    for side, arm in arms.items():
+        lines.append(f"{side} arm: {' - '.join('+'.join(group) for group in arm[1:] if group)}")
+        lengths[side] = segments(body, arm)
+        if not _RATIO[0] <= lengths[side][0] / lengths[side][1] <= _RATIO[1]:
+            upper, forearm = lengths[side]
+            lines.append(f"{side} arm: an upper arm of {upper:.2f} m and a forearm of {forearm:.2f} m; {_CHECK}")
+    if len(arms) == len(SIDES):
+        left, right = (sum(lengths[side]) for side in SIDES)
+        if abs(left - right) > _DIFFERENT * max(left, right):
+            lines.append(f"arms of {left:.2f} m (left) and {right:.2f} m (right), shoulder to wrist; {_CHECK}")
+    if not body.named and not any(part and part.side for arm in arms.values() for part in parts_of(arm.elbow)):
+        lines += ["the names state no side: taken for the right arm"] if arms else []
+    if arms and not find_facing(body):
+        lines.append("the other shoulder is unknown: forward is the x-axis of the capture (capture.yaw= turns it)")
     return lines
 
 

@@ -210,6 +210,9 @@ class CaptureConfig:
     Attributes:
       unit: of the file, see `read_motion`. Default "": found out.
       up: axis of the file that points up, see `read_motion`. Default "": found out.
+      subject: person to read where a file has several, see `read_motion`. Default "": the first.
+      shoulder, elbow, wrist, hand: points of the arm, as in `STYLr+STYLu` for the middle of two. Default "": found by
+        their names.
       yaw, pitch, roll: turn the person about z, then y, then x of the robot's base [deg]. By default up is up, and
         forward is the x-axis of the robot's base.
       trunk: length of an upright link below the shoulder [m], where the base frame then is; 0 for none. Default None:
@@ -223,6 +226,11 @@ class CaptureConfig:
 
     unit: str = ""
     up: str = ""
+    subject: str = ""
+    shoulder: str = ""
+    elbow: str = ""
+    wrist: str = ""
+    hand: str = ""
     yaw: float = number(0.0, at_least=-360.0, at_most=360.0)
     pitch: float = number(0.0, at_least=-360.0, at_most=360.0)
     roll: float = number(0.0, at_least=-360.0, at_most=360.0)

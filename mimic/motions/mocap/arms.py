@@ -1,139 +1,194 @@
 """Finds the arms of a body among captured points, by their names and by the skeleton."""
 
-import re
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from mimic.motions.mocap.points import PointMotion
+from mimic.motions.mocap.names import INNER, OUTER, Part, is_thumb, is_twist, parts_of
+from mimic.motions.mocap.points import SIDES, ArmPoints, PointMotion, median_length
 
-SIDES = ("left", "right")
-_SHORT = 0.25  # of the forearm's length; a shorter segment beyond the wrist is not the hand
+# Of the forearm's length: a point beyond the wrist that is nearer is not the hand, and one farther away a prop.
+_SHORT, _LONG = 0.25, 0.9
+_CLUSTER = 0.8  # of the forearm's length: a point on the upper arm that is nearer to the elbow is not the shoulder
+_NAMED = 40  # points in a message
 
-# Words of a name without its side: of skeletons (BVH, SMPL-X, pose estimators) and marker sets (Plug-in Gait).
-_UPPER_ARM = {"arm", "upperarm", "uparm", "humerus"}
-_SHOULDER = {"shoulder", "sho", "shldr", "acromion", "gh", *_UPPER_ARM}
-_ELBOW = {"elbow", "forearm", "lowerarm", "lowarm", "radius", "elb", "elbl", "elbm"}
-_WRIST = {"wrist", "hand", "wra", "wrb", "wri", "wrl", "wrm"}
-_HAND = {
-    "middle1",
-    "middlefinger1",
-    "handmiddle1",
-    "middle",
-    "fingerbase",
-    "index",
-    "index1",
-    "handindex1",
-    "fin",
-    "hand",
-}
-_SIDE_WORDS = {"l": "left", "left": "left", "r": "right", "right": "right"}
-
-
-class ArmPoints(NamedTuple):
-    """Names of an arm's points; several names stand for their mean.
-
-    Attributes:
-      side: "left" or "right".
-      shoulder, elbow, wrist, hand: names; `hand` is empty where no point beyond the wrist is known.
-    """
-
-    side: str
-    shoulder: tuple[str, ...]
-    elbow: tuple[str, ...]
-    wrist: tuple[str, ...]
-    hand: tuple[str, ...]
+_Named = Mapping[int, Part]  # of points that name a part of the body, by their index
 
 
 def find_arms(motion: PointMotion) -> dict[str, ArmPoints]:
-    """The arms of a body by their side, those that are complete from shoulder to wrist."""
-    words = {name: _words(name) for name in motion.names}
+    """The arms of a body by their side, those that are complete from shoulder to wrist.
+
+    An arm whose points the user has named counts as it is. Where no name states a side, the only arm is "right".
+    """
+    named = {i: part for i, part in enumerate(parts_of(motion.names)) if part is not None}
+    named = {i: part for i, part in named.items() if _is_seen(motion, i)} or named
+    has_skeleton = any(parent >= 0 for parent in motion.parents)
     arms = {}
-    for side in SIDES:
-        own = {name: word for name, (of_side, word) in words.items() if of_side == side}
-        find = _in_skeleton if any(parent >= 0 for parent in motion.parents) else _among_markers
+    for side, own in _by_side(named).items():
+        find = _in_skeleton if has_skeleton else _among_markers
         if arm := find(motion, side, own):
             arms[side] = arm
-    return arms
+    if motion.named:
+        arms[motion.named.side] = motion.named
+    return {side: arms[side] for side in SIDES if side in arms}
 
 
-def _among_markers(motion: PointMotion, side: str, own: Mapping[str, str]) -> ArmPoints | None:
-    def named(among: set[str]) -> tuple[str, ...]:
-        return tuple(name for name, word in own.items() if word in among)
+def find_facing(motion: PointMotion) -> dict[str, tuple[str, ...]]:
+    """Names of the left and right points between which the body faces: of the shoulders, or else of the hips.
 
-    # A collar is called shoulder where the shoulder is called arm, and a wrist hand where it has no other name.
-    shoulder = named(_UPPER_ARM) or named(_SHOULDER)
-    elbow, wrist = named(_ELBOW), named(_WRIST - {"hand"}) or named({"hand"})
-    hand = next((points for word in sorted(_HAND) if (points := named({word})) and points != wrist), ())
-    return ArmPoints(side, shoulder, elbow, wrist, hand) if shoulder and elbow and wrist else None
+    A shoulder may be that of an arm that is not complete. Empty where neither is known on both sides.
+    """
+    named = {i: part for i, part in enumerate(parts_of(motion.names)) if part is not None and _is_seen(motion, i)}
+    joints = any(part.part == "elbow" for part in named.values())
+    sides = {side: own for side, own in _by_side(named).items() if side}
+    pick = (lambda own: _pick(own, "shoulder")) if joints else (lambda own: _shoulder(own, joints))
+    shoulders = {side: _names(motion, pick(own)) for side, own in sides.items()}
+    shoulders |= {side: arm.shoulder for side, arm in find_arms(motion).items()}
+    hips = {side: _names(motion, [i for i in own if own[i].part == "hip"]) for side, own in sides.items()}
+    return next((points for points in (shoulders, hips) if all(points.values())), {})
 
 
-def _in_skeleton(motion: PointMotion, side: str, own: Mapping[str, str]) -> ArmPoints | None:
-    """From the elbow: the shoulder is the joint before it, the wrist and the hand follow it."""
-    names = motion.names
-    elbows = [name for name, word in own.items() if word in _ELBOW and word not in ("elbm", "elbl")]
-    for elbow in elbows:
-        index = names.index(elbow)
-        shoulder = _ancestor(motion, index)
-        wrist = _descendant(motion, index, 0.0, prefer=_WRIST)
+def persons(motion: PointMotion) -> dict[str, list[int]]:
+    """Indices of the points of each person with an arm, by the person's name: a prefix, or the root of a skeleton."""
+    groups: dict[str, list[int]] = {}
+    if any(parent >= 0 for parent in motion.parents):
+        roots: list[int] = []
+        for index, parent in enumerate(motion.parents):
+            roots.append(roots[parent] if parent >= 0 else index)
+            groups.setdefault(motion.names[roots[index]], []).append(index)
+    else:
+        for index, part in enumerate(parts_of(motion.names)):
+            if part is not None:
+                groups.setdefault(part.prefix, []).append(index)
+    return {name: indices for name, indices in groups.items() if find_arms(motion.subset(indices))}
+
+
+def unnamed(motion: PointMotion) -> str:
+    """What to do where no arm is found, with the names of the points that were seen."""
+    names = [name for index, name in enumerate(motion.names) if _is_seen(motion, index)]
+    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return (
+        "no arm was found whose points have names that are known, and were seen: state them by capture.shoulder= "
+        f"capture.elbow= capture.wrist= capture.hand=, of {', '.join(names[:_NAMED]) or 'none'}{rest}"
+    )
+
+
+def _by_side(named: _Named) -> dict[str, dict[int, Part]]:
+    sides = {side: {i: part for i, part in named.items() if part.side == side} for side in SIDES}
+    elbows = [part for part in named.values() if part.part in ("elbow", "forearm")]
+    prefixes = {part.prefix for part in elbows}
+    if not any(part.side for part in elbows) and len(prefixes) == 1:
+        own = {i: part for i, part in named.items() if not part.side and part.prefix in prefixes}
+        sides["right"] |= {i: part._replace(side="right") for i, part in own.items()}
+    return sides
+
+
+def _is_seen(motion: PointMotion, index: int) -> bool:
+    return bool(np.isfinite(motion.positions[:, index]).all(axis=1).any())
+
+
+def _names(motion: PointMotion, indices: Iterable[int]) -> tuple[str, ...]:
+    return tuple(motion.names[index] for index in indices)
+
+
+def _among_markers(motion: PointMotion, side: str, own: _Named) -> ArmPoints | None:
+    # Where elbows are named, so are the other joints: a marker on the forearm is no elbow then.
+    joints = any(part.part == "elbow" for part in own.values())
+    shoulder = _shoulder(own, joints)
+    elbow = _pick(own, "elbow") or _pick(own, "forearm")
+    wrist = _pick(own, "wrist") or _pick(own, "hand")
+    beyond = {i: part for i, part in own.items() if i not in wrist}
+    hand = _pick(beyond, "hand") or _pick(beyond, "index")
+    if not shoulder or not elbow or not wrist:
+        return None
+    if joints and own[shoulder[0]].part == "upper_arm":
+        upper, forearm = (_distance(motion, elbow[0], points[0]) for points in (shoulder, wrist))
+        if upper < _CLUSTER * forearm:
+            return None
+    return ArmPoints(side, *(_names(motion, points) for points in (shoulder, elbow, wrist, hand)))
+
+
+def _shoulder(own: _Named, joints: bool) -> list[int]:
+    """By joints the shoulder; by segments the upper arm, and the collar is called shoulder."""
+    order = ("shoulder", "upper_arm") if joints else ("upper_arm", "shoulder")
+    return next((points for part in order if (points := _pick(own, part))), [])
+
+
+def _pick(own: _Named, part: str) -> list[int]:
+    """The points of a joint: two on both sides of it, or those of the best word and the lowest number."""
+    found = {i: of for i, of in own.items() if of.part == part}
+    for rank in sorted({of.rank for of in found.values()}):
+        pair = [i for i, of in found.items() if of.rank == rank and of.place]
+        if {found[i].place for i in pair} == {INNER, OUTER}:
+            return pair
+    best = min((of.rank for of in found.values()), default=0)
+    numbers = {i: of.number for i, of in found.items() if of.rank == best}
+    return [i for i, number in numbers.items() if number == min(numbers.values())]
+
+
+def _in_skeleton(motion: PointMotion, side: str, own: _Named) -> ArmPoints | None:
+    """From the elbow: the shoulder is an ancestor, the wrist and the hand are descendants."""
+    elbows = [i for i, part in own.items() if part.part in ("elbow", "forearm")]
+    for elbow in sorted(elbows):  # parents come first: of two halves of a forearm the upper one
+        shoulder, wrist = _ancestor(motion, elbow, own), _first_below(motion, elbow, own)
         if shoulder is None or wrist is None:
             continue
-        forearm = _distance(motion, index, wrist)
-        hand = _descendant(motion, wrist, _SHORT * forearm, prefer=_HAND)
-        return ArmPoints(
-            side, (names[shoulder],), (elbow,), (names[wrist],), (names[hand],) if hand is not None else ()
-        )
+        hand = _hand(motion, wrist, own, _distance(motion, elbow, wrist))
+        points = [shoulder], [elbow], [wrist], [] if hand is None else [hand]
+        return ArmPoints(side, *(_names(motion, indices) for indices in points))
     return None
 
 
-def _ancestor(motion: PointMotion, index: int) -> int | None:
-    """The nearest ancestor at another place."""
-    parent = motion.parents[index]
-    while parent >= 0 and _distance(motion, parent, index) <= 0:
-        parent = motion.parents[parent]
-    return parent if parent >= 0 else None
+def _ancestor(motion: PointMotion, elbow: int, own: _Named) -> int | None:
+    """The nearest ancestor at another place; of two halves of an upper arm the upper one."""
+    above = [i for i in _line(motion.parents, elbow) if _is_joint(motion, i) and _distance(motion, i, elbow) > 0]
+    if not above:
+        return None
+    nearest = above[0]
+    if nearest not in own or own[nearest].part != "upper_arm":
+        return nearest
+    halves = [i for i in above if i in own and own[i].part == "upper_arm"]
+    return halves[-1]
 
 
-def _descendant(motion: PointMotion, index: int, beyond: float, prefer: set[str]) -> int | None:
-    """The first descendant further away than a distance, along the children with preferred names, never the thumb."""
-    current = index
+def _line(parents: Sequence[int], index: int) -> list[int]:
+    """The ancestors of a joint, the nearest first."""
+    line = []
+    while (index := parents[index]) >= 0:
+        line.append(index)
+    return line
+
+
+def _is_joint(motion: PointMotion, index: int) -> bool:
+    return not is_twist(motion.names[index])
+
+
+def _first_below(motion: PointMotion, elbow: int, own: _Named) -> int | None:
+    """The first descendant at another place, if possible one that is called wrist or hand."""
+    below = [i for i in range(elbow + 1, len(motion.names)) if elbow in _line(motion.parents, i)]
+    below = [i for i in below if _is_joint(motion, i) and not is_thumb(motion.names[i])]
+    below = [i for i in below if _distance(motion, elbow, i) > 0]
+    named = [i for i in below if i in own and own[i].part in ("wrist", "hand")]
+    depth: Callable[[int], int] = lambda i: len(_line(motion.parents, i))  # noqa: E731
+    return min(named or below, key=depth, default=None)
+
+
+def _hand(motion: PointMotion, wrist: int, own: _Named, forearm: float) -> int | None:
+    """The first descendant of the wrist that is neither too near nor, as a prop, too far away."""
+    current = wrist
     while True:
         children = [i for i, parent in enumerate(motion.parents) if parent == current]
-        fingers = [i for i in children if "thumb" not in motion.names[i].lower()]
-        if not fingers:
+        children = [i for i in children if not is_thumb(motion.names[i]) and _is_joint(motion, i)]
+        children = [i for i in children if _distance(motion, wrist, i) <= _LONG * forearm]
+        if not children:
             return None
-        preferred = [i for i in fingers if _words(motion.names[i])[1] in prefer]
-        current = (preferred or fingers)[0]
-        if _distance(motion, index, current) > beyond:
+        fingers = [i for i in children if i in own and own[i].part in ("hand", "index")]
+        current = (fingers or children)[0]
+        if _distance(motion, wrist, current) > _SHORT * forearm:
             return current
 
 
 def _distance(motion: PointMotion, first: int, second: int) -> float:
     """Median distance of two points, in the unit of the motion; 0 where they coincide."""
-    distance = np.linalg.norm(motion.positions[:, first] - motion.positions[:, second], axis=1)
-    median = float(np.nanmedian(distance)) if np.isfinite(distance).any() else 0.0
+    median = median_length(motion.positions[:, first] - motion.positions[:, second])
     return median if median > 1e-9 else 0.0
-
-
-def _words(name: str) -> tuple[str | None, str]:
-    """Side of a point, if its name states one, and the rest of the name in lower case without separators."""
-    base = re.split(r"[:|]", name)[-1]
-    words = re.findall(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+", base)
-    words = [word.lower() for word in words if word.lower() not in ("bip", "def", "org", "jnt")]
-    for position, word in enumerate(words):
-        if word in _SIDE_WORDS:
-            rest = words[:position] + words[position + 1 :]
-            return _SIDE_WORDS[word], "".join(_without_numbers_of_biped(rest))
-    joined = "".join(words)
-    known = _SHOULDER | _ELBOW | _WRIST | _HAND
-    if joined[:1] in _SIDE_WORDS and joined[1:] in known:  # markers: LSHO, and lradius
-        return _SIDE_WORDS[joined[0]], joined[1:]
-    if words and words[0][:1] in _SIDE_WORDS and "".join([words[0][1:], *words[1:]]) in known:  # Poser: lForeArm
-        return _SIDE_WORDS[words[0][0]], "".join([words[0][1:], *words[1:]])
-    return None, joined
-
-
-def _without_numbers_of_biped(words: Sequence[str]) -> Sequence[str]:
-    """3ds Max names joints "Bip01 L Forearm"."""
-    return words[1:] if len(words) > 1 and words[0].isdigit() else words

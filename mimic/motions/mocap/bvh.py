@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from mimic.base.files import read_text
+from mimic.motions.mocap.names import END
+from mimic.motions.mocap.tables import numbers
 
-END = "_end"  # appended to the name of a joint for its end site
 _AXES = {"x": 0, "y": 1, "z": 2}
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 _MAX_BYTES = 2**30
@@ -52,6 +53,8 @@ def read_bvh(path: Path) -> Bvh:
       ValueError: what is missing or wrong, with its line where it has one.
     """
     text = read_text(path, errors="replace")
+    if "\0" in text:
+        raise ValueError("expected text in UTF-8, got another encoding, as UTF-16")
     head, *motion = re.split(r"^\s*MOTION\b", text, maxsplit=1, flags=re.MULTILINE | re.IGNORECASE)
     if not motion:
         raise ValueError("it has no MOTION section")
@@ -80,6 +83,14 @@ def joint_positions(bvh: Bvh) -> np.ndarray:
             positions.append(positions[joint.parent] + (parent @ local[:, :, None])[:, :, 0])
             rotations.append(parent @ rotation)
     return np.stack(positions, axis=1)
+
+
+def rest_positions(bvh: Bvh) -> np.ndarray:
+    """Positions of the joints without rotations [joints, 3], a root at 0."""
+    positions: list[np.ndarray] = []
+    for joint in bvh.joints:
+        positions.append(positions[joint.parent] + joint.offset if joint.parent >= 0 else np.zeros(3))
+    return np.stack(positions)
 
 
 def _rotations(axis: int, angles: np.ndarray) -> np.ndarray:
@@ -169,8 +180,8 @@ def _motion(text: str, channels: int) -> tuple[np.ndarray, float, tuple[str, ...
         raise ValueError(
             f"MOTION: expected numbers of frames and seconds, got {header[1]!r:.30}, {header[2]!r:.30}"
         ) from error
-    if not 1e-5 <= frame_time <= 10:
-        raise ValueError(f"Frame Time: expected seconds from 1e-5 to 10, got {frame_time:g}")
+    if not 1e-5 <= frame_time <= 1:
+        raise ValueError(f"Frame Time: expected seconds from 1e-5 to 1, got {frame_time:g}")
     if not channels:
         raise ValueError("it has no channels")
     values = _numbers(text[header.end() :].split(), "MOTION")
@@ -184,10 +195,7 @@ def _motion(text: str, channels: int) -> tuple[np.ndarray, float, tuple[str, ...
 
 
 def _numbers(words: list[str], where: str) -> np.ndarray:
-    try:
-        values = np.array(words, float)
-    except ValueError as error:
-        raise ValueError(f"{where}: expected numbers, got {' '.join(str(error).split()[-3:])!r:.60}") from error
+    values = numbers(words, where)
     if not np.all(np.isfinite(values)) or np.any(np.abs(values) > _MAX_VALUE):
         raise ValueError(f"{where}: expected finite numbers of at most {_MAX_VALUE:g}")
     return values

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mimic.motions.mocap.tables import Table
 
+_OUTPUTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")  # of models, which are no markers
 _SECONDS, _MEMORY = 60, 4 * 2**30  # an hour of 100 markers at 100 Hz takes some seconds
 
 
 def read_c3d(path: Path) -> "Table":
-    """Markers of a C3D file; those without a label are left out.
+    """Markers of a C3D file; those without a label, and outputs of models, are left out.
 
     Raises:
       ValueError: ezc3d is not installed, or it cannot read the file.
@@ -49,12 +50,26 @@ def _arrays(content: Any) -> dict[str, Any]:
     import numpy as np
 
     points, parameters = content["data"]["points"], content["parameters"]["POINT"]
-    labels = [str(label).split(":")[-1].strip() for label in parameters["LABELS"]["value"]][: points.shape[1]]
-    named = [i for i, label in enumerate(labels) if label and not label.startswith("*")]  # * is what was not identified
+
+    def values(name: str) -> list[Any]:
+        """Values of a parameter, which goes on in others with a number where it has more than 255."""
+        names = [name, *(f"{name}{number}" for number in range(2, 100))]
+        return [value for name in names if name in parameters for value in parameters[name]["value"]]
+
+    outputs = {str(label) for group in _OUTPUTS for label in values(group)}
+    labels = [str(label) for label in values("LABELS")][: points.shape[1]]
+    own = [label.split(":")[-1].strip() for label in labels]  # without the subject
+    named = [
+        i for i, name in enumerate(own) if name and not name.startswith("*") and labels[i] not in outputs
+    ]  # * unknown
+    names, short = ([texts[i].strip() for i in named] for texts in (labels, own))
     arrays = {
-        "names": np.array([labels[i] for i in named], dtype=str),
+        "names": np.array(short if len(set(short)) == len(short) else names, dtype=str),  # of one subject
         "positions": np.moveaxis(points[:3, named], 0, -1).swapaxes(0, 1).astype(float),
-        "rate": np.array(float(parameters["RATE"]["value"][0])),
+        "rate": np.array(float(values("RATE")[0])),
     }
-    units = parameters["UNITS"]["value"] if "UNITS" in parameters else []
-    return {**arrays, "unit": np.array(str(units[0]))} if units else arrays
+    # The screen's y-axis is the vertical; its sign is no use, since Qualisys writes -Z where z points up.
+    for key, name in (("unit", "UNITS"), ("up", "Y_SCREEN")):
+        if values(name):
+            arrays[key] = np.array(str(values(name)[0]).lstrip("+-").lower())
+    return arrays

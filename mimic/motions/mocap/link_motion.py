@@ -8,9 +8,9 @@ from jaxtyping import Float
 from scipy import signal
 
 from mimic.metric.kinematics import LinkStates
-from mimic.motions.mocap.arms import SIDES, ArmPoints, find_arms
+from mimic.motions.mocap.arms import find_arms, find_facing
 from mimic.motions.mocap.conventions import mean_point
-from mimic.motions.mocap.points import PointMotion
+from mimic.motions.mocap.points import SIDES, ArmPoints, PointMotion
 
 CUTOFF = 6.0  # Hz; usual for human motion (Winter, Biomechanics and Motor Control of Human Movement)
 ARM_LINKS = ("upper_arm", "forearm", "hand")
@@ -91,6 +91,7 @@ def arm_motion(
     side: str = "right",
     *,
     arms: dict[str, ArmPoints] | None = None,
+    facing: dict[str, tuple[str, ...]] | None = None,
     trunk: float = 0.0,
     cutoff: float = CUTOFF,
     name: str = "",
@@ -104,7 +105,8 @@ def arm_motion(
     Args:
       motion: all points must be known at all times; see `bridge_gaps`.
       side: "left", "right" or "both".
-      arms: names of the points of both arms; found where None.
+      arms: names of the points of the arms; found where None.
+      facing: see `find_facing`; found where None.
       trunk: length of a link that stands upright below the shoulder [m], as the base column of most robots; the base
         frame is then at its lower end. 0 for none.
       cutoff: of the facing direction [Hz].
@@ -116,8 +118,9 @@ def arm_motion(
     arms = find_arms(motion) if arms is None else arms
     if not set(sides(side)) <= set(arms):
         raise ValueError(f"arm: expected one of {', '.join(arms) or 'none that was found'}, got {side!r}")
+    facing = find_facing(motion) if facing is None else facing
     shoulders = [mean_point(motion, arms[arm].shoulder) for arm in sides(side)]
-    origin, frames = np.mean(shoulders, axis=0), facing_frames(motion, arms, cutoff)
+    origin, frames = np.mean(shoulders, axis=0), facing_frames(motion, facing, cutoff)
     names: list[str] = []
     parents: list[int] = []
     start, end = [], []
@@ -135,17 +138,15 @@ def arm_motion(
 
 
 def link_ends_from_shoulder(
-    motion: PointMotion, side: str, *, arms: dict[str, ArmPoints], trunk: float, cutoff: float
+    motion: PointMotion, arm: ArmPoints, *, facing: dict[str, tuple[str, ...]], trunk: float, cutoff: float
 ) -> Float[np.ndarray, "time ends 3"]:
     """Ends of the links of one arm in its base frame, in the order of the chain [m]; arguments as for `arm_motion`.
 
     Raises:
-      ValueError: the body has no such arm, or a point is missing at some time.
+      ValueError: a point is missing at some time.
     """
-    if side not in arms:
-        raise ValueError(f"arm: expected one of {', '.join(arms) or 'none that was found'}, got {side!r}")
-    origin = mean_point(motion, arms[side].shoulder)
-    return _link_ends(motion, arms[side], origin, facing_frames(motion, arms, cutoff), trunk)
+    origin = mean_point(motion, arm.shoulder)
+    return _link_ends(motion, arm, origin, facing_frames(motion, facing, cutoff), trunk)
 
 
 def sides(side: str) -> tuple[str, ...]:
@@ -170,12 +171,12 @@ def _link_ends(
 
 
 def facing_frames(
-    motion: PointMotion, arms: dict[str, ArmPoints], cutoff: float = CUTOFF
+    motion: PointMotion, facing: dict[str, tuple[str, ...]], cutoff: float = CUTOFF
 ) -> Float[np.ndarray, "time 3 3"]:
     """Rotation at each time whose columns are forward, left and up of the body, in the frame of the capture."""
-    if len(arms) < 2:
+    if not facing:
         return np.tile(np.eye(3), (len(motion.positions), 1, 1))
-    left = mean_point(motion, arms["left"].shoulder) - mean_point(motion, arms["right"].shoulder)
+    left = mean_point(motion, facing["left"]) - mean_point(motion, facing["right"])
     left = low_pass(left * np.array([1.0, 1.0, 0.0]), motion.rate, cutoff)
     length = np.linalg.norm(left, axis=1, keepdims=True)
     if np.any(~(length > _SHORTEST)):

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mimic.motions.mocap.arms import ArmPoints, find_arms
+from mimic.motions.mocap.arms import find_arms
 from mimic.motions.mocap.ball_chain import ball_chain_pose
 from mimic.motions.mocap.clips import turn_matrix, turned
 from mimic.motions.mocap.conventions import UNITS, arm_length, guessed_units, z_up
 from mimic.motions.mocap.link_motion import LinkMotion, arm_motion, link_ends_from_shoulder
-from mimic.motions.mocap.points import PointMotion
+from mimic.motions.mocap.points import ArmPoints, PointMotion
 
 MAX_POINTS = 2000
 _MAX_NAME = 200  # characters
@@ -91,6 +91,7 @@ class LiveArm:
       trunk: length of the upright link below the shoulder [m], see `arm_motion`.
       turn: yaw, pitch and roll by which the person is turned [rad], see `turned`.
       zero: frames of the links in the zero pose, see `ball_chain_xml`.
+      facing: see `find_facing`. Default None: the shoulders of the arms.
     """
 
     arms: dict[str, ArmPoints]
@@ -100,12 +101,18 @@ class LiveArm:
     trunk: float
     turn: tuple[float, float, float]
     zero: Float[np.ndarray, "links 3 3"] | None = None
+    facing: dict[str, tuple[str, ...]] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the points that a sample must have: those of the arm and the shoulders."""
-        groups = [*self.arms[self.side][1:], *(arm.shoulder for arm in self.arms.values())]
+        """Names of the points that a sample must have: those of the arm, and those between which the body faces."""
+        groups = [*self.arms[self.side][1:], *self._facing.values()]
         return tuple(dict.fromkeys(name for group in groups for name in group))
+
+    @property
+    def _facing(self) -> dict[str, tuple[str, ...]]:
+        shoulders = {side: arm.shoulder for side, arm in self.arms.items()}
+        return self.facing if self.facing is not None else shoulders if len(shoulders) > 1 else {}
 
     def has_all(self, sample: Sample) -> bool:
         """Whether all points of the arm were seen."""
@@ -113,7 +120,8 @@ class LiveArm:
 
     def motion(self, samples: Sequence[Sample]) -> LinkMotion:
         """Links of the arm in some samples, without a filter, which would delay them."""
-        links = arm_motion(self._body(samples), self.side, arms=self.arms, trunk=self.trunk, cutoff=np.inf)
+        settings: Any = {"arms": self.arms, "facing": self._facing, "trunk": self.trunk, "cutoff": np.inf}
+        links = arm_motion(self._body(samples), self.side, **settings)
         return turned(links, *self.turn)
 
     def _body(self, samples: Sequence[Sample]) -> PointMotion:
@@ -129,7 +137,7 @@ class LiveArm:
         """
         assert self.zero is not None, "the arm has no zero pose"
         ends = link_ends_from_shoulder(
-            self._body([sample]), self.side, arms=self.arms, trunk=self.trunk, cutoff=np.inf
+            self._body([sample]), self.arms[self.side], facing=self._facing, trunk=self.trunk, cutoff=np.inf
         )[0]
         span = np.diff(ends, axis=0) @ turn_matrix(*self.turn).T
         length = np.linalg.norm(span, axis=1, keepdims=True)

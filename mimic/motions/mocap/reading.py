@@ -7,14 +7,26 @@ from pathlib import Path
 import numpy as np
 
 from mimic.base.config import check_choice
-from mimic.motions.mocap.arms import find_arms
-from mimic.motions.mocap.bvh import joint_positions, read_bvh
-from mimic.motions.mocap.conventions import STATED_ARM_LENGTH, UNITS, UPS, arm_length, guessed_units, guessed_up, z_up
-from mimic.motions.mocap.points import PointMotion
+from mimic.motions.mocap.arms import find_arms, find_facing, persons, unnamed
+from mimic.motions.mocap.bvh import joint_positions, read_bvh, rest_positions
+from mimic.motions.mocap.conventions import (
+    STATED_ARM_LENGTH,
+    UNITS,
+    UPS,
+    arm_length,
+    find_up,
+    guessed_units,
+    looks_mirrored,
+    z_up,
+)
+from mimic.motions.mocap.names import parts_of
+from mimic.motions.mocap.points import ArmPoints, PointMotion
 from mimic.motions.mocap.tables import Table, read_csv, read_npz, read_trc
 
 KINDS = (".bvh", ".c3d", ".trc", ".csv", ".npz")
 _UNEVEN = 1e-3  # of an interval: larger differences between times are resampled
+_RATES = 5.0, 5000.0  # 1/s; of a capture, in a unit of time that is not stated
+_TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _SYNONYMS = {
     "meters": "m",
     "meter": "m",
@@ -27,17 +39,21 @@ _SYNONYMS = {
 _UP = {".bvh": "y", ".trc": "y", ".c3d": "z", ".csv": "z", ".npz": "z"}  # where neither file nor body says
 
 
-def read_motion(path: str | os.PathLike[str], *, unit: str = "", up: str = "") -> PointMotion:
+def read_motion(
+    path: str | os.PathLike[str], *, unit: str = "", up: str = "", subject: str = "", arm: ArmPoints | None = None
+) -> PointMotion:
     """Reads a motion capture file.
 
     Where neither the file nor an argument says: the unit is that in which the arms have the length of an adult's, and
-    up is the axis from the feet to the head. Notes of the result say what was found. A unit that the file states is
-    rejected where the arms are not those of a person in it.
+    up is found by `find_up`. Notes of the result say what was found. A unit that the file states is rejected where the
+    arms are not those of a person in it.
 
     Args:
       path: a BVH, C3D, TRC, CSV or npz file.
       unit: "m", "dm", "cm", "mm", "inch", "foot", or "cmu" for the BVH files of the CMU database (0.0564 m).
       up: "x", "y", "z", "-x", "-y" or "-z".
+      subject: the person to read, of several: the prefix of its points, or the root of its skeleton. "": the first.
+      arm: names of points of an arm, in place of those that are found; no names where they are found.
 
     Raises:
       ValueError: no file, or one of another kind, damaged, or without a unit that can be found.
@@ -52,43 +68,80 @@ def read_motion(path: str | os.PathLike[str], *, unit: str = "", up: str = "") -
         if value:
             check_choice(name, value, choices)
     try:
-        table, notes = _read(source, suffix)
-        motion = _even(table, notes)
+        table = _read(source, suffix)
+        motion = _with_arm(_one_person(_even(_in_seconds(table)), subject), arm)
         stated = _stated(table.unit, UNITS)
         if stated and not unit:
             _check_stated(motion, stated)
-        return _in_metres_z_up(motion, unit or stated, up or _stated(table.up, UPS), _UP[suffix])
+        if not up:
+            rest = None if table.rest is None else table.rest[[table.names.index(name) for name in motion.names]]
+            up, how = find_up(motion, _UP[suffix], _stated(table.up, UPS), rest)
+            motion = _noted(motion, f"up: {up}, {how}")
+        return _in_metres_z_up(motion, unit or stated, up)
     except (ValueError, OSError) as error:
         raise ValueError(f"source: {str(source)!r}: {error}") from error
 
 
-def _read(path: Path, suffix: str) -> tuple[Table, tuple[str, ...]]:
+def _read(path: Path, suffix: str) -> Table:
     if suffix == ".bvh":
         bvh = read_bvh(path)
         time = np.arange(len(bvh.values)) * bvh.frame_time
         names, parents = zip(*((joint.name, joint.parent) for joint in bvh.joints), strict=True)
-        return Table(names, joint_positions(bvh), time, parents=parents), bvh.notes
+        return Table(
+            names, joint_positions(bvh), time, parents=parents, rate=1 / bvh.frame_time, notes=bvh.notes,
+            rest=rest_positions(bvh),
+        )  # fmt: skip
     if suffix == ".c3d":
         from mimic.motions.mocap.c3d import read_c3d
 
-        return read_c3d(path), ()
-    return {".trc": read_trc, ".csv": read_csv, ".npz": read_npz}[suffix](path), ()
+        return read_c3d(path)
+    return {".trc": read_trc, ".csv": read_csv, ".npz": read_npz}[suffix](path)
 
 
-def _even(table: Table, notes: tuple[str, ...]) -> PointMotion:
-    """The motion at equal intervals."""
+def _noted(motion: PointMotion, note: str) -> PointMotion:
+    return dataclasses.replace(motion, notes=(*motion.notes, note))
+
+
+def _in_seconds(table: Table) -> Table:
+    """The table with times in seconds, where theirs can only be a smaller unit."""
     interval = float(np.median(np.diff(table.time)))
-    positions, rate = table.positions, (len(table.time) - 1) / (table.time[-1] - table.time[0])
-    if np.abs(np.diff(table.time) - interval).max() > _UNEVEN * interval:
-        rate = 1 / interval
-        samples = int((table.time[-1] - table.time[0]) / interval * (1 + 1e-9)) + 1
-        if samples > 10 * len(table.time):
-            raise ValueError(f"time: expected samples every {interval:g} s, got gaps of more than ten times the whole")
-        even = table.time[0] + np.arange(samples) * interval
-        positions = _resampled(table, even, interval)
-        notes += (f"times differ by up to {np.abs(np.diff(table.time) - interval).max():.3g} s: resampled",)
+    if interval <= 1:
+        return table
+    for name, unit in _TIMES.items():
+        if _RATES[0] <= 1 / (interval * unit) <= _RATES[1]:
+            time = (table.time - table.time[0]) * unit
+            return table._replace(time=time, notes=(*table.notes, f"time: taken for {name}"))
+    return table
+
+
+def _even(table: Table) -> PointMotion:
+    """The motion at equal intervals."""
     parents = table.parents or (-1,) * len(table.names)
-    return PointMotion(table.names, parents, positions, float(rate), notes)
+    count, span = len(table.time), float(table.time[-1] - table.time[0])
+    steps = np.diff(table.time)
+    if not table.rate and not np.all(steps > 0):
+        raise ValueError("time: expected numbers that rise from row to row")
+    interval = float(np.median(steps))
+    for rate in (table.rate, (count - 1) / span if span > 0 else None):
+        if rate and (_is_even(table.time, rate) or np.abs(steps - 1 / rate).max() <= _UNEVEN / rate):
+            return PointMotion(table.names, parents, table.positions, float(rate), table.notes)
+    if not np.all(steps > 0):
+        raise ValueError(
+            f"time: expected numbers that rise from row to row, or samples at the {table.rate:g} Hz stated"
+        )
+    samples = int(span / interval * (1 + 1e-9)) + 1
+    if samples > 10 * count:
+        raise ValueError(f"time: expected samples every {interval:g} s, got gaps of more than ten times the whole")
+    positions = _resampled(table, table.time[0] + np.arange(samples) * interval, interval)
+    notes = (*table.notes, f"times differ by up to {np.abs(steps - interval).max():.3g} s: resampled")
+    return PointMotion(table.names, parents, positions, 1 / interval, notes)
+
+
+def _is_even(time: np.ndarray, rate: float) -> bool:
+    """Whether times are those of a rate, as far as they are rounded."""
+    deviation = np.abs(time - time[0] - np.arange(len(time)) / rate).max()
+    digits = next((n for n in range(9) if np.allclose(time, np.round(time, n), rtol=0, atol=1e-9)), 9)
+    return bool(deviation <= min(1.01 * 10.0**-digits, 3 / rate))
 
 
 def _resampled(table: Table, even: np.ndarray, interval: float) -> np.ndarray:
@@ -121,21 +174,51 @@ def _check_stated(motion: PointMotion, unit: str) -> None:
         )
 
 
-def _in_metres_z_up(motion: PointMotion, unit: str, up: str, usual_up: str) -> PointMotion:
-    notes = list(motion.notes)
-    arms = find_arms(motion)
+def _one_person(motion: PointMotion, subject: str) -> PointMotion:
+    """The points of one of several persons, with those that are no other person's."""
+    found = persons(motion)
+    if subject and subject not in found:
+        raise ValueError(f"subject: expected one of {', '.join(map(repr, found)) or 'none'}, got {subject!r}")
+    if len(found) < 2:
+        return motion
+    chosen = subject or next(iter(found))
+    others = {index for name, indices in found.items() if name != chosen for index in indices}
+    motion = motion.subset([index for index in range(len(motion.names)) if index not in others])
+    return _noted(motion, f"persons: {', '.join(found)}, of which {chosen} is read (capture.subject=)")
+
+
+def _with_arm(motion: PointMotion, arm: ArmPoints | None) -> PointMotion:
+    """The motion with the points of an arm that the user names."""
+    if arm is None:
+        return motion
+    named = [tuple(_full_name(motion, name) for name in group) for group in arm[1:]]
+    sides = [part.side for part in parts_of([name for group in named for name in group]) if part and part.side]
+    side = arm.side or (sides or ["right"])[0]
+    found = find_arms(motion).get(side, ArmPoints(side, (), (), (), ()))
+    groups = [own or other for own, other in zip(named, found[1:], strict=True)]
+    if not all(groups[:3]):
+        raise ValueError(f"arm: expected shoulder, elbow and wrist of the {side} arm, {unnamed(motion)}")
+    return dataclasses.replace(motion, named=ArmPoints(side, *groups))
+
+
+def _full_name(motion: PointMotion, name: str) -> str:
+    """A point by its name, also without a prefix that ends in a colon."""
+    full = [point for point in motion.names if point.split(":")[-1] == name]
+    return full[0] if name not in motion.names and len(full) == 1 else motion.names[motion.index(name)]
+
+
+def _in_metres_z_up(motion: PointMotion, unit: str, up: str) -> PointMotion:
     if not unit:
+        arms = find_arms(motion)
         fitting = guessed_units(motion, arms)
         if len(fitting) != 1:
             lengths = ", ".join(f"{arm_length(motion, arm):.4g}" for arm in arms.values())
             units = " and in ".join(fitting) or "no unit"
-            known = f"its arms have lengths of {lengths}, as an adult's in {units}" if lengths else "no arm was found"
+            known = f"its arms have lengths of {lengths}, as an adult's in {units}" if lengths else unnamed(motion)
             raise ValueError(f"unit: expected one of {', '.join(UNITS)}, since {known}")
         unit = fitting[0]
-        notes.append(f"unit: {unit}, found from the length of the arms")
-    if not up:
-        found = guessed_up(motion)
-        up = found or usual_up
-        notes.append(f"up: {up}, {'from the feet to the head' if found else 'as usual for such files'}")
-    positions = z_up(motion.positions, up) * UNITS[unit]
-    return dataclasses.replace(motion, positions=positions, notes=tuple(notes))
+        motion = _noted(motion, f"unit: {unit}, found from the length of the arms")
+    motion = dataclasses.replace(motion, positions=z_up(motion.positions, up) * UNITS[unit])
+    if looks_mirrored(motion, find_facing(motion)):
+        motion = _noted(motion, "left and right are exchanged, or the file is mirrored: the toes point backwards")
+    return motion

@@ -1,10 +1,13 @@
 """Readers of motion capture: the generated person comes back from each format, unit and axis convention."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from mimic.motions.mocap.arms import find_arms
 from mimic.motions.mocap.conventions import UNITS, UPS, z_up
+from mimic.motions.mocap.points import ArmPoints
 from mimic.motions.mocap.reading import read_motion
 from tests.helpers.bodies import RATE, bvh_text, person
 
@@ -155,27 +158,6 @@ def test_uneven_times_are_resampled(tmp_path, expected):
 
 
 @pytest.mark.parametrize(
-    ("prefix", "names"),
-    [
-        ("", ("l_shoulder", "l_elbow", "l_wrist", "l_middle1")),
-        ("", ("left_shoulder", "left_elbow", "left_wrist", "left_index")),
-        ("", ("LeftUpperArm", "LeftForeArm", "LeftHand", "LeftHandIndex1")),
-        ("Bip01 ", ("L UpperArm", "L Forearm", "L Hand", "L Finger1")),
-        ("mixamorig:", ("LeftArm", "LeftForeArm", "LeftHand", "LeftHandMiddle1")),
-        ("", ("lShldr", "lForeArm", "lHand", "lMid1")),
-        ("", ("lhumerus", "lradius", "lhand", "lfingers")),
-        ("", ("upper_arm.L", "forearm.L", "hand.L", "palm.L")),
-    ],
-)
-def test_arms_are_found_by_the_names_of_many_tools(expected, prefix, names):
-    chain = ["Hips", *(f"{prefix}{name}" for name in names)]
-    positions = np.stack([expected.point("Hips"), *(expected.point(name) for name in ARM)], axis=1)
-    motion = type(expected)(tuple(chain), (-1, 0, 1, 2, 3), positions, RATE)
-    arm = find_arms(motion)["left"]
-    assert [arm.shoulder, arm.elbow, arm.wrist, arm.hand] == [(name,) for name in chain[1:]]
-
-
-@pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda text: text.replace("MOTION", "", 1), "it has no MOTION section"),
@@ -230,3 +212,170 @@ def test_a_damaged_c3d_cannot_end_the_process(tmp_path):
         (tmp_path / "bad.c3d").write_bytes(content)
         with pytest.raises(ValueError, match="bad.c3d.*ezc3d cannot read it"):
             read_motion(tmp_path / "bad.c3d")
+
+
+def _trc(path, motion, *, time=None, rate=RATE, separator="\t", y_up=True):
+    """Writes a TRC file in mm; points that were not seen are empty."""
+    order = [1, 2, 0] if y_up else [0, 1, 2]
+    time = np.arange(len(motion.positions)) / motion.rate if time is None else time
+    lines = [
+        ["PathFileType", "4", "(X/Y/Z)", path.name],
+        ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"],
+        [f"{rate}", f"{rate}", f"{len(time)}", f"{len(motion.names)}", "mm"],
+        ["Frame#", "Time", *(cell for name in motion.names for cell in (name, "", ""))],
+        [""] * (2 + 3 * len(motion.names)),
+    ]
+    for i, row in enumerate(1000 * motion.positions[..., order].reshape(len(time), -1)):
+        lines.append([str(i + 1), f"{time[i]:.10g}", *("" if np.isnan(value) else f"{value:.6f}" for value in row)])
+    path.write_text("\n".join(map(separator.join, lines)))
+    return path
+
+
+def _markers(expected, names):
+    """Some joints of the person, under the names of markers."""
+    chosen = expected.select(list(names))
+    return dataclasses.replace(chosen, names=tuple(names.values()))
+
+
+MARKERS = {
+    "LeftArm": "LSHO", "LeftForeArm": "LELB", "LeftHand": "LWRI", "RightArm": "RSHO", "RightForeArm": "RELB",
+    "RightHand": "RWRI", "Head": "LFHD", "LeftFoot": "LANK", "RightFoot": "RANK",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("value", [0.0, -9999.0, 9999999.0])
+def test_placeholders_of_what_was_not_seen_are_no_positions(tmp_path, expected, value):
+    markers = _markers(expected, MARKERS)
+    positions = markers.positions.copy()
+    positions[20:60, markers.names.index("RWRI")] = value / 1000
+    motion = read_motion(_trc(tmp_path / "clip.trc", dataclasses.replace(markers, positions=positions)))
+    assert np.isnan(motion.point("RWRI")[20:60]).all() and np.isfinite(motion.point("RWRI")[:20]).all()
+    assert f"not seen: 40 positions whose three coordinates are equal ({value:g})" in motion.notes
+
+
+@pytest.mark.parametrize(("digits", "rate"), [(2, 250.0), (2, 59.94), (3, 60.0)])
+def test_rounded_times_are_those_of_the_stated_rate(tmp_path, expected, digits, rate):
+    time = np.round(np.arange(SAMPLES) / rate, digits)
+    motion = read_motion(_trc(tmp_path / "clip.trc", _markers(expected, MARKERS), time=time, rate=rate))
+    assert motion.rate == rate and len(motion.positions) == SAMPLES
+    time[40:] += 0.1  # a gap is one, whatever the header states
+    if digits == 3:
+        gap = read_motion(_trc(tmp_path / "gap.trc", _markers(expected, MARKERS), time=time, rate=rate))
+        assert np.isnan(gap.point("RWRI")).any() and "resampled" in " ".join(gap.notes)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e9, "nanoseconds")])
+def test_times_in_smaller_units(tmp_path, expected, factor, unit):
+    np.savez(
+        tmp_path / "p.npz", names=np.array(expected.names), positions=expected.positions,
+        time=np.arange(SAMPLES) / RATE * factor + 1e6 * factor,
+    )  # fmt: skip
+    motion = read_motion(tmp_path / "p.npz")
+    assert motion.rate == pytest.approx(RATE, rel=1e-6) and f"time: taken for {unit}" in motion.notes
+
+
+def test_separators_and_cells_without_numbers(tmp_path, expected):
+    markers = _markers(expected, MARKERS)
+    motion = read_motion(_trc(tmp_path / "clip.trc", markers, separator=","))
+    np.testing.assert_allclose(motion.positions, markers.positions, atol=1e-6)
+    header = ";".join(["Time (s)", *(f"{name}_{axis}" for name in markers.names for axis in "xyz")])
+    rows = [f"{i / RATE};" + ";".join(map(str, row)) for i, row in enumerate(markers.positions.reshape(SAMPLES, -1))]
+    rows[7] = f"{7 / RATE};-;-;-;" + rows[7].split(";", 4)[4]
+    (tmp_path / "clip.csv").write_text("\n".join([header, *rows]))
+    motion = read_motion(tmp_path / "clip.csv")
+    assert np.isnan(motion.positions[7, 0]).all() and np.isfinite(motion.positions).sum() == motion.positions.size - 3
+
+
+def test_a_person_who_lies_or_stands_on_the_hands_is_not_turned(tmp_path):
+    for name, turn, seen in (("lying", "0 90 0", "-x"), ("handstand", "180 0 0", "-y")):
+        text = bvh_text(SAMPLES)
+        root = ("0.0 95.0 0.0 " + "0.000000000 0.000000000 0.000000000").split()
+        lines = text.splitlines()
+        start = next(i for i, line in enumerate(lines) if line.startswith("Frame Time")) + 1
+        lines[start:] = [" ".join([*root[:3], *turn.split(), *line.split()[6:]]) for line in lines[start:]]
+        motion = read_motion(_bvh(tmp_path, "\n".join(lines), f"{name}.bvh"))
+        assert motion.notes[0].startswith("up: y, as usual for such files, though the body is along"), (name, seen)
+
+
+def test_up_of_markers_that_were_seen(tmp_path, expected):
+    """The head is named but never seen, and a wheelchair has no heel."""
+    names = {**MARKERS, "LeftFoot": "WheelchairRearL", "RightFoot": "WheelchairRearR", "Hips": "LASI", "Spine": "C7"}
+    markers = _markers(expected, names)
+    positions = markers.positions.copy()
+    positions[:, markers.names.index("LFHD")] = np.nan
+    motion = read_motion(_trc(tmp_path / "clip.trc", dataclasses.replace(markers, positions=positions)))
+    assert motion.notes == ("up: y, from the hips to the neck",)
+
+
+def test_up_that_the_file_states_where_the_body_shows_none(tmp_path, expected):
+    arms = expected.select(ARM)
+    for stated, found in (("y", "up: y, as the file states"), ("", "up: z, as usual for such files: a guess")):
+        content = {"up": np.array(stated)} if stated else {}
+        path = tmp_path / f"p{stated}.npz"
+        np.savez(path, names=np.array(ARM), positions=arms.positions, rate=np.array([RATE]), **content)
+        assert any(note.startswith(found) for note in read_motion(path).notes)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_mirrored_points_are_named(tmp_path, expected, mirrored):
+    feet = {side: expected.point(f"{side}Foot") + [0.15, 0, -0.04] for side in ("Left", "Right")}
+    positions = np.concatenate([expected.positions, np.stack(list(feet.values()), axis=1)], axis=1)
+    positions = positions * [1, -1 if mirrored else 1, 1]
+    np.savez(
+        tmp_path / "p.npz", names=np.array([*expected.names, "LeftToe", "RightToe"]), positions=positions, rate=RATE
+    )
+    assert any("toes point backwards" in note for note in read_motion(tmp_path / "p.npz").notes) is mirrored
+
+
+def test_one_of_several_persons_is_read(tmp_path, expected):
+    markers = _markers(expected, MARKERS)
+    names = tuple(f"{person}_{name}" for person in ("Ann", "Bob") for name in markers.names)
+    positions = np.concatenate([markers.positions, markers.positions + [2, 0, 0]], axis=1)
+    path = _trc(tmp_path / "clip.trc", type(markers)(names, (-1,) * len(names), positions, RATE))
+    motion = read_motion(path)
+    assert "persons: ann, bob, of which ann is read (capture.subject=)" in motion.notes
+    assert motion.names[0] == "Ann_LSHO"
+    np.testing.assert_allclose(read_motion(path, subject="bob").point("Bob_LSHO"), positions[:, 9], atol=1e-6)
+    with pytest.raises(ValueError, match="subject: expected one of 'ann', 'bob', got 'Eve'"):
+        read_motion(path, subject="Eve")
+
+
+def test_the_first_of_points_with_one_name_counts(tmp_path, expected):
+    markers = _markers(expected, MARKERS)
+    twice = dataclasses.replace(
+        markers, names=(*markers.names, "RANK"), parents=(-1,) * 10,
+        positions=np.concatenate([markers.positions, markers.positions[:, :1]], axis=1),
+    )  # fmt: skip
+    motion = read_motion(_trc(tmp_path / "clip.trc", twice))
+    np.testing.assert_allclose(motion.point("RANK"), expected.point("RightFoot"), atol=1e-6)
+    assert "names that occur twice, of which the first point is read: RANK" in motion.notes
+
+
+def test_points_that_the_user_names(tmp_path, expected):
+    names = {"RightArm": "p1", "RightForeArm": "p2", "RightHand": "p3", "Head": "p4"}
+    path = _trc(tmp_path / "clip.trc", _markers(expected, names))
+    assert find_arms(read_motion(path)) == {}
+    named = ArmPoints("right", ("p1",), ("p2",), ("p3",), ())
+    assert find_arms(read_motion(path, arm=named)) == {"right": named}
+    with pytest.raises(ValueError, match="expected shoulder, elbow and wrist of the left arm, .* of p1, p2"):
+        read_motion(path, arm=ArmPoints("left", ("p1",), (), (), ()))
+    with pytest.raises(ValueError, match="point: expected one of p1, p2, p3, p4, got 'p9'"):
+        read_motion(path, arm=ArmPoints("left", ("p9",), (), (), ()))
+
+
+def test_c3d_with_many_labels_outputs_of_models_and_a_vertical(tmp_path, expected):
+    ezc3d = pytest.importorskip("ezc3d", reason="the extra [mocap] is not installed")
+    names = [*(f"X{i}" for i in range(260)), *(MARKERS[joint] for joint in list(MARKERS)[:6]), "LShoulderAngles"]
+    points = np.ones((4, len(names), 3))
+    points[:3] = np.random.default_rng(0).uniform(0, 900, (3, len(names), 3))
+    points[:3, 260:266] = 1000 * np.moveaxis(_markers(expected, MARKERS).positions[:3, :6], -1, 0).swapaxes(1, 2)
+    file = ezc3d.c3d()
+    labels = {"LABELS": names[:255], "LABELS2": names[255:], "ANGLES": names[-1:], "UNITS": ["mm"], "Y_SCREEN": ["-Y"]}
+    for key, value in labels.items():
+        file.add_parameter("POINT", key, value)
+    file["parameters"]["POINT"]["RATE"]["value"] = [RATE]
+    file["data"]["points"] = points
+    file.write(str(tmp_path / "clip.c3d"))
+    motion = read_motion(tmp_path / "clip.c3d")
+    assert motion.names == tuple(names[:-1]) and motion.notes == ("up: y, as the file states",)
+    assert set(find_arms(motion)) == {"left", "right"}
