@@ -37,14 +37,14 @@ def prepare_recording(config: RecordingConfig) -> Callable[[], None]:
     out, plot = _files(config)
     env, console = config.resolve(), Console()
     if config.source and (config.arm or Path(config.source).suffix.lower() in MOTION_CAPTURE):
-        _check_unused(config, "kind", "count", "seed", "limits", "joints", "topic", "units")
+        _check_unused(config, "kind", "count", "seed", "limits", "joints", "topic", "units", "rate")
         return prepare_capture(config, env, out, plot)
     arm = build_arm(env.expert, env.limits)
     if config.source:
         return _prepare_import(config, env, arm, out, plot)
     if config.joints:
         raise ValueError("joints: expected only with source=FILE, as the names of its joints")
-    for key in ("topic", "units"):
+    for key in ("topic", "units", "rate"):
         if getattr(config, key):
             raise ValueError(f"{key}: expected only with source=, got {getattr(config, key)!r}")
     demonstrations, redrawn = _record(arm, env, console)
@@ -78,6 +78,7 @@ def _prepare_import(config: RecordingConfig, env: EnvConfig, arm: Arm, out: Path
         joints=config.joints,
         topic=config.topic,
         units=config.units,
+        rate=config.rate,
         joint_range=model.embodiment.joint_range,
     )
 

@@ -12,13 +12,14 @@ from mimic.motions.cleaning import Notes, cleaned
 from mimic.motions.demonstrations import RECORDED_SPEED, Demonstrations, check_effort
 from mimic.motions.formats.archives import read_archive
 from mimic.motions.formats.episodes import Motion, Recording
+from mimic.motions.formats.hdf5 import SUFFIXES, is_hdf5, read_hdf5
 from mimic.motions.formats.lerobot_reading import is_lerobot, read_lerobot
 from mimic.motions.formats.rosbag2 import BAG_FILES, is_rosbag2, read_rosbag2
 from mimic.motions.formats.tables import TABLES, is_folder_of_tables, read_folder_of_tables, read_table
 from mimic.motions.resampling import angles_and_velocities
 from mimic.motions.units import find_unit, in_rad
 
-SOURCES = (*TABLES, ".npz", *BAG_FILES)
+SOURCES = (*TABLES, ".npz", *SUFFIXES, *BAG_FILES)
 _ROUNDING = 1e-6  # relative tolerance of a duration and of a velocity limit
 
 
@@ -32,6 +33,7 @@ def import_demonstrations(
     joints: Sequence[str] = (),
     topic: str = "",
     units: str = "",
+    rate: float | None = None,
     joint_range: Float[np.ndarray, "joints 2"] | None = None,
 ) -> tuple[Demonstrations, list[str]]:
     """Reads motions, resamples them at control steps, cuts them into windows, and checks the arm's limits.
@@ -44,7 +46,7 @@ def import_demonstrations(
       arm: the expert.
       dt: control step [s].
       horizon: steps of a demonstration.
-      joints, topic, units, joint_range: see `read_recording`.
+      joints, topic, units, rate, joint_range: see `read_recording`.
 
     Returns:
       The demonstrations, and lines about what was assumed, changed or left out.
@@ -53,7 +55,9 @@ def import_demonstrations(
       ValueError: what `read_recording` rejects; all motions are shorter than the horizon; most windows exceed the arm's
         velocity limits.
     """
-    recording = read_recording(path, arm, dt=dt, joints=joints, topic=topic, units=units, joint_range=joint_range)
+    recording = read_recording(
+        path, arm, dt=dt, joints=joints, topic=topic, units=units, rate=rate, joint_range=joint_range
+    )
     notes, windows = list(recording.notes), []
     short, lost, duration = [], 0.0, dt * horizon
     for name, motion in recording.motions.items():
@@ -91,6 +95,7 @@ def read_recording(
     joints: Sequence[str] = (),
     topic: str = "",
     units: str = "",
+    rate: float | None = None,
     joint_range: Float[np.ndarray, "joints 2"] | None = None,
 ) -> Recording:
     """Reads the motions of an arm in full, at the times of the source, in rad, repaired and checked.
@@ -100,13 +105,15 @@ def read_recording(
     out, unless these are most.
 
     Args:
-      path: a table (.csv, .tsv, .txt), an .npz file in LocoMuJoCo's format, a LeRobot dataset, a rosbag2 or a
-        folder of them, or a folder of tables, one for each quantity.
+      path: a table (.csv, .tsv, .txt), an .npz file in LocoMuJoCo's format, a LeRobot dataset, a rosbag2, an HDF5
+        file, a folder of these, or a folder of tables, one for each quantity.
       arm: whose joints are read.
       dt: scale at which velocities are compared [s].
       joints: names of the arm's joints in the source, base to tip; the arm's own names where empty.
-      topic: topic of a rosbag2, or feature of a LeRobot dataset; only needed where several have the joints.
+      topic: topic of a rosbag2, feature of a LeRobot dataset, or data set of an HDF5 file; only needed where several
+        have the joints.
       units: "rad", "deg" or "percent" of each joint's range; where empty, what the source states, or what is found.
+      rate: samples per second, of HDF5 files that do not state it.
       joint_range: of the arm's model [rad], where the arm itself has wider ones, as with limits=none.
 
     Raises:
@@ -116,7 +123,7 @@ def read_recording(
     source, names = Path(path), tuple(joints) or arm.joint_names
     if len(names) != arm.num_joints:
         raise ValueError(f"joints: expected {arm.num_joints} names, of {', '.join(arm.joint_names)}, got {len(names)}")
-    recording = _read(source, names, topic)
+    recording = _read(source, names, topic, rate)
     model_range = np.asarray(arm.joint_range if joint_range is None else joint_range, float)
     unit, line = find_unit(str(source), recording, arm.joint_names, model_range, units)
     recording = in_rad(recording, unit, model_range)
@@ -143,22 +150,29 @@ def _summary(motions: Mapping[str, Motion]) -> str:
     source = {len(motions): "from the source", 0: "computed from the angles"}.get(
         stated, f"from the source in {stated}"
     )
-    return f"{len(motions)} motions, {seconds:.4g} s, {1 / interval:.4g} samples a second; velocities: {source}"
+    count = f"{len(motions)} motion{'s' * (len(motions) > 1)}"
+    return f"{count}, {seconds:.4g} s, {1 / interval:.4g} samples a second; velocities: {source}"
 
 
-def _read(source: Path, names: Sequence[str], topic: str) -> Recording:
+def _read(source: Path, names: Sequence[str], topic: str, rate: float | None) -> Recording:
     """The motions of a file or a folder, as it has them."""
     if is_lerobot(source):
         return read_lerobot(source, names, topic)
     if is_rosbag2(source):
         return read_rosbag2(source, names, topic)
+    if is_hdf5(source):
+        return read_hdf5(source, names, topic, rate)
+    if rate:
+        raise ValueError(f"rate: expected only for HDF5 files, got {rate:g} for {str(source)!r}")
     if topic:
-        raise ValueError(f"topic: expected only for a LeRobot dataset or a rosbag2, got {topic!r} for {str(source)!r}")
+        raise ValueError(
+            f"topic: expected only for a LeRobot dataset, a rosbag2 or HDF5 files, got {topic!r} for {str(source)!r}"
+        )
     if is_folder_of_tables(source):
         return read_folder_of_tables(source, names)
     if source.is_dir():
         raise ValueError(
-            f"source: expected a folder of a LeRobot dataset, of rosbag2 or of tables, got {str(source)!r}"
+            f"source: expected a folder of a LeRobot dataset, of rosbag2, HDF5 or tables, got {str(source)!r}"
         )
     if not source.is_file():
         raise ValueError(f"source: no file at {str(source)!r}")

@@ -67,7 +67,7 @@ def _fit(unit: str, low: np.ndarray, high: np.ndarray, joint_range: np.ndarray, 
     """Why values may be in a unit, to append to a line; empty where they are not."""
     turns_on = np.ptp(joint_range, axis=1) >= FULL_TURN
     if unit == "percent":
-        return ", as no unit else fits" * bool(
+        return ", as no other unit fits" * bool(
             not turns_on.any() and np.all(low >= -_REACH) and np.all(high <= _REACH) and not _in_servo_steps(recording)
         )
     full = 2 * np.pi * _MAX_TURNS

@@ -281,8 +281,11 @@ def test_a_time_step_that_lerobot_does_not_have(reason, recorded, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["source={folder}"], "expected a folder of a LeRobot dataset, of rosbag2 or of tables"),
-        (["source={csv}", "topic=/joint_states"], "topic: expected only for a LeRobot dataset or a rosbag2"),
+        (["source={folder}"], "expected a folder of a LeRobot dataset, of rosbag2, HDF5 or tables"),
+        (
+            ["source={csv}", "topic=/joint_states"],
+            "topic: expected only for a LeRobot dataset, a rosbag2 or HDF5 files",
+        ),
         (["topic=/joint_states"], "topic: expected only with source="),
     ],
 )

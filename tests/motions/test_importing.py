@@ -54,7 +54,7 @@ def test_a_table_becomes_demonstrations_that_training_takes(tmp_path):
     out = tmp_path / "swing.npz"
     said = run("demonstrations", f"source={source}", f"out={out}")
     assert (
-        "1 demonstrations, 50 steps of 0.1 s\n1 motions, 5.98 s, 50 samples a second; velocities: from the source"
+        "1 demonstrations, 50 steps of 0.1 s\n1 motion, 5.98 s, 50 samples a second; velocities: from the source"
         in said
     )
     assert {path.name for path in tmp_path.iterdir()} == {"swing.csv", "swing.npz", "swing.png"}

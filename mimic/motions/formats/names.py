@@ -1,5 +1,6 @@
 """Names of columns and joints in files of others: what a column holds, and which columns belong to an arm."""
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -21,6 +22,7 @@ SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "
 _BRACKETS = re.compile(r"(.+?)\s*[\[(](.+?)[\])]")
 _LAST, _FIRST = re.compile(r"(.+)[./_ ]([^./_ ]+)"), re.compile(r"([a-z]+)[./_ ]?(.+)", re.IGNORECASE)
 _LEAF = re.compile(r"(|.*[./])([^./]+)")
+_BY_ORDER = "by their order"
 _GRIPPER = re.compile(r"gripper|finger|jaw|knuckle", re.IGNORECASE)
 
 
@@ -89,13 +91,15 @@ def find_joints(present: Sequence[str], joints: Sequence[str]) -> tuple[list[str
     if "" in fitting or len(fitting) == 1:
         prefix = "" if "" in fitting else fitting[0]
         return [by_key[prefix + key] for key in keys], "by name"
+    if fitting:
+        return None
+    numbers = [str(number) for number in range(1, len(joints) + 1)]
+    if set(numbers) <= set(by_key):
+        return [by_key[number] for number in numbers], _BY_ORDER
     shared = next((n for n, letters in enumerate(zip(*keys, strict=False)) if len(set(letters)) > 1), 0)
-    for cut in () if fitting else range(1, shared + 1):
+    for cut in range(1, shared + 1):
         if all(key[cut:] in by_key for key in keys):
             return [by_key[key[cut:]] for key in keys], "by name"
-    numbers = [str(number) for number in range(1, len(joints) + 1)]
-    if not fitting and set(numbers) <= set(by_key):
-        return [by_key[number] for number in numbers], "by their order"
     return None
 
 
@@ -125,6 +129,8 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
             "joints=[...] names the arm's joints among these"
         )
     notes = []
+    if 0 < len(named := [name for name in found if found[name][1] != _BY_ORDER]) < len(found):
+        found = {name: found[name] for name in named}
     if len(found) > 1 and len(measured := [name for name in found if not is_command(name)]) == 1:
         others = [name for name in found if name not in measured]
         notes.append(f"{measured[0]}: what was measured; topic={' or topic='.join(others)} is what was commanded")
@@ -137,7 +143,7 @@ def select(path: str, entries: Mapping[str, Sequence[str]], joints: Sequence[str
     ((name, (columns, rule)),) = found.items()
     if rule:
         notes.append(f"joints: {', '.join(columns)}, found {rule}; joints=[...] names others")
-    gripper, gripper_entry = _gripper(entries, name, columns, joints)
+    gripper, gripper_entry = _gripper(entries, name, columns)
     return Selection(name, columns, gripper, gripper_entry, notes)
 
 
@@ -150,26 +156,27 @@ def _key(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
-def _gripper(
-    entries: Mapping[str, Sequence[str]], entry: str, columns: Sequence[str], joints: Sequence[str]
-) -> tuple[list[str], str]:
+def _gripper(entries: Mapping[str, Sequence[str]], entry: str, columns: Sequence[str]) -> tuple[list[str], str]:
     """The gripper's columns, and the entry that has them: that of the joints, or else one beside it.
 
-    Where it has several grippers, those with the prefix of the joints.
+    Where there are several grippers, as in a source with two arms, those whose names begin as those of the joints do.
     """
     others = [name for name in entries[entry] if name not in columns]
-    gripper = [name for name in others if _GRIPPER.search(name)]
-    prefix = _key(columns[0]).removesuffix(_key(joints[0]))
-    gripper = [name for name in gripper if prefix and _key(name).startswith(prefix)] or gripper
-    if not gripper and len(others) in (1, 2) and all(name.isdigit() for name in entries[entry]):
-        gripper = others  # a vector without names: the joints, then the opening or the two fingers
-    if gripper:
+    if gripper := _alike([name for name in others if _GRIPPER.search(name)], columns[0]):
         return gripper, entry
+    if len(others) in (1, 2) and all(name.isdigit() for name in entries[entry]):
+        return others, entry  # a vector without names: the joints, then the opening or the two fingers
     folder, leaf = _LEAF.fullmatch(entry).groups()  # type: ignore[union-attr]
     beside = [
         name for name in entries
         if _GRIPPER.search(name) and not is_command(name) and _LEAF.fullmatch(name)[1] == folder  # type: ignore[index]
     ]  # fmt: skip
-    same = [name for name in beside if name.removeprefix(folder).split("_")[0] == leaf.split("_")[0]]
-    chosen = same if len(beside) > 1 else beside
+    chosen = _alike(beside, folder + leaf) if len(beside) > 1 else beside
     return (list(entries[chosen[0]]), chosen[0]) if len(chosen) == 1 else ([], "")
+
+
+def _alike(names: list[str], example: str) -> list[str]:
+    """The names that share the most letters with an example from the start; all where none shares two."""
+    shared = {name: len(os.path.commonprefix([_key(name), _key(example)])) for name in names}
+    most = max(shared.values(), default=0)
+    return [name for name in names if most < 2 or shared[name] == most]

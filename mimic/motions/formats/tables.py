@@ -12,7 +12,7 @@ from mimic.motions.formats.episodes import ANGLE, VELOCITY, Motion, Quantity, Re
 from mimic.motions.formats.names import QUANTITIES, SECONDS, Column, Selection, parse_column, select
 
 TABLES = tuple(suffix + packed for suffix in (".csv", ".tsv", ".txt", ".dat") for packed in ("", ".gz"))
-_TIMES = ("time", "times", "t", "timestamp", "timestamps", "stamp", "elapsed", "seconds", "sec")
+TIMES = ("time", "times", "t", "timestamp", "timestamps", "stamp", "elapsed", "seconds", "sec")
 _DEMONSTRATIONS = ("demonstration", "demo", "episode", "episode_index", "trajectory", "trial")
 _CLOCKS = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))  # units of times that large: a clock's, since 1970
 _SLOWEST = 0.99  # s between samples: with more, they are in another unit, or no motion
@@ -39,7 +39,7 @@ def read_table(path: Path, joints: Sequence[str]) -> Recording:
     }
     time_at, number_at = (
         next((i for i, column in enumerate(columns) if _word(column.joint) in words), None)
-        for words in (_TIMES, _DEMONSTRATIONS)
+        for words in (TIMES, _DEMONSTRATIONS)
     )
     reserved = [column.joint for i, column in enumerate(columns) if i in (time_at, number_at)]
     angles = {name: index for name, index in names[ANGLE].items() if name not in reserved}
@@ -49,7 +49,7 @@ def read_table(path: Path, joints: Sequence[str]) -> Recording:
         raise ValueError(f"source: {str(path)!r} has no rows")
     selection = select(str(path), {"columns": list(angles)}, joints, "", "table")
     unit = columns[time_at].unit or re.split(r"[^a-zµ]+", columns[time_at].joint.lower())[-1]
-    time, line = _seconds(path, table[:, time_at], unit if unit in SECONDS else columns[time_at].unit)
+    time, line = seconds(path, table[:, time_at], unit if unit in SECONDS else columns[time_at].unit)
     qvel = _velocities(path, table, names[VELOCITY], selection)
     gripper = table[:, [angles[name] for name in selection.gripper]] if selection.gripper else None
     motion = Motion(time, table[:, [angles[name] for name in selection.joints]], qvel, gripper)
@@ -87,7 +87,7 @@ def read_folder_of_tables(folder: Path, joints: Sequence[str]) -> Recording:
                 )
             arrays[quantity] = table.reshape(count, len(joints))
     notes.append(f"joints: the numbers of a sample in their order, as {', '.join(joints)}")
-    time, line = _seconds(folder, tables["time"][1].ravel(), "")
+    time, line = seconds(folder, tables["time"][1].ravel(), "")
     motion = Motion(time, arrays[ANGLE], arrays.get(VELOCITY))
     return Recording({"demonstration 0": motion}, notes=(*notes, *filter(None, [line])))
 
@@ -97,9 +97,7 @@ def _tables_by_quantity(folder: Path) -> dict[Quantity | str, Path]:
     found: dict[Quantity | str, Path] = {}
     for path in sorted(folder.iterdir()):
         words = re.split(r"[^a-z]+", path.name.lower().split(".")[0])
-        kinds = ["time" for word in words if word in _TIMES] + [
-            QUANTITIES[word] for word in words if word in QUANTITIES
-        ]
+        kinds = ["time" for word in words if word in TIMES] + [QUANTITIES[word] for word in words if word in QUANTITIES]
         if path.name.endswith(TABLES) and len(kinds) == 1:
             if kinds[0] in found:
                 return {}
@@ -172,7 +170,7 @@ def _word(name: str) -> str:
     return words[-1] if words else name.lower()
 
 
-def _seconds(path: Path, time: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
+def seconds(path: Path, time: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
     """Times in s, from a unit that is stated, or from the size of a clock's; and a line about what was found."""
     line = ""
     if not unit and len(time):

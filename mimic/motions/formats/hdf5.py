@@ -1,0 +1,232 @@
+"""Reads joint motions from HDF5 files: robosuite and robomimic, ACT and ALOHA, DROID, and others with such names."""
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from mimic.base.files import check_file, read_text
+from mimic.motions.formats.episodes import MAX_NUMBERS, Motion, Recording, package_error
+from mimic.motions.formats.names import Selection, parse_column, select
+from mimic.motions.formats.tables import TIMES, seconds
+
+SUFFIXES = (".hdf5", ".h5")
+_EPISODE = re.compile(r"(demo|traj|trajectory|episode|ep|rollout|run)_?\d+", re.IGNORECASE)
+_ANGLES = re.compile(r"(.*_)?(qpos|q|joint_?(pos|positions?|states?|angles?|qpos))|gripper_(states?|positions?|width)")
+_VELOCITIES = {"qpos": "qvel", "positions": "velocities", "position": "velocity", "pos": "vel"}  # names' ends
+_STATES, _MODEL = "states", "model_file"  # robosuite's: MuJoCo's time, qpos and qvel, and the model that they are of
+_OTHER_COPIES = "next_obs"  # robomimic's: the observations of the next sample
+_RATES = ("control_freq", "fps", "frequency", "hz", "rate")  # attributes; in Hz
+_ENVIRONMENTS = ("env_args", "env_info", "env_kwargs")  # attributes with such keys, as JSON
+_SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}  # of qpos and qvel, by MuJoCo's joints
+
+
+class _Episode(NamedTuple):
+    """An episode: its group, its data sets by their path within it, and the attributes from the file's to its own."""
+
+    group: Any
+    sets: dict[str, Any]
+    attributes: list[Mapping[str, Any]]
+
+
+class _Layout(NamedTuple):
+    """Columns of qpos and qvel in flattened states by the names of joints."""
+
+    qpos: dict[str, int]
+    qvel: dict[str, int]
+
+
+def is_hdf5(path: Path) -> bool:
+    """Whether a path is an HDF5 file or a folder with such files."""
+    return bool(_files(path))
+
+
+def read_hdf5(path: Path, joints: Sequence[str], entry: str = "", rate: float | None = None) -> Recording:
+    """The motions of joints, one for each episode. Needs h5py.
+
+    An episode is a group such as `demo_1`, or else a file. A data set of angles is called `joint_pos`, `qpos` or the
+    like, and has the joints in their order, perhaps the gripper after them; or it is called `states`, in MuJoCo's order
+    of the joints of the episode's model. Times are those of the states, of a data set `time` or `timestamps`, or those
+    of the rate that an attribute states.
+
+    Args:
+      path: a file, or a folder of files.
+      joints: names of the joints, base to tip; or their numbers in the data set, from 1.
+      entry: the data set, as its path in an episode; empty for the only one that has the joints.
+      rate: samples per second, where the file does not state it.
+
+    Raises:
+      ValueError: a file that cannot be read, or that lacks the joints or their times.
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        raise package_error(f"source: {str(path)!r} is an HDF5 file, which", "h5py") from error
+    motions: dict[str, Motion] = {}
+    selection, numbers, files = None, 0, _files(path)
+    for file in files:
+        try:
+            with h5py.File(check_file(file, None), "r") as content:
+                for name, episode in _episodes(content):
+                    layout = _layout(file, episode)
+                    selection = selection or select(str(path), _entries(episode, layout), joints, entry, "data set")
+                    motion = _motion(episode, layout, selection, rate)
+                    numbers += motion.qpos.size
+                    if numbers > MAX_NUMBERS:
+                        raise ValueError(f"expected at most {MAX_NUMBERS:,} numbers")
+                    motions[" ".join(filter(None, (file.stem if len(files) > 1 else "", name)))] = motion
+        except (OSError, KeyError, RuntimeError, TypeError, ValueError, ElementTree.ParseError) as error:
+            line = " ".join(str(error).split())[:400]
+            raise ValueError(
+                line if line.startswith(("source", "topic")) else f"source: {str(file)!r}: {line}"
+            ) from error
+    if selection is None:
+        raise ValueError(f"source: {str(path)!r} has no data sets of angles")
+    return Recording(motions, tuple(selection.gripper), notes=tuple(selection.notes))
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_dir():
+        return sorted(file for file in path.iterdir() if file.suffix in SUFFIXES)
+    return [path] if path.suffix in SUFFIXES and path.is_file() else []
+
+
+def _episodes(file: Any) -> Iterator[tuple[str, _Episode]]:
+    """The episodes of a file by name, in the order of their numbers; only data that the file itself holds."""
+    sets: dict[str, dict[str, Any]] = {}
+
+    def visit(name: str, item: Any) -> None:  # of what hard links lead to: others might lead out of the file
+        if not hasattr(item, "dtype") or item.dtype.kind not in "biuf" or item.ndim not in (1, 2):
+            return
+        if item.is_virtual or item.external:
+            raise ValueError(f"{name} is stored in another file")
+        parts = name.split("/")
+        depth = next((index + 1 for index, part in enumerate(parts) if _EPISODE.fullmatch(part)), 0)
+        if parts[depth] != _OTHER_COPIES:
+            sets.setdefault("/".join(parts[:depth]), {})["/".join(parts[depth:])] = item
+
+    file.visititems(visit)
+    in_episodes = {name: found for name, found in sets.items() if name} or sets
+    for name in sorted(in_episodes, key=lambda name: [int(part) for part in re.findall(r"\d+", name)]):
+        group = file[name] if name else file
+        parents = [
+            file,
+            *(file["/".join(name.split("/")[: depth + 1])] for depth in range(name.count("/") + 1) if name),
+        ]
+        yield name.split("/")[-1], _Episode(group, in_episodes[name], [parent.attrs for parent in parents])
+
+
+def _entries(episode: _Episode, layout: _Layout | None) -> dict[str, list[str]]:
+    """The data sets of angles with the names of their columns: numbers from 1, where nothing names them."""
+    entries = {
+        name: [str(number) for number in range(1, (item.shape[1] if item.ndim == 2 else 1) + 1)]
+        for name, item in episode.sets.items()
+        if _ANGLES.fullmatch(name.split("/")[-1])
+    }
+    return entries | ({_STATES: list(layout.qpos)} if layout else {})
+
+
+def _motion(episode: _Episode, layout: _Layout | None, selection: Selection, rate: float | None) -> Motion:
+    """The motion of an episode."""
+    samples = _columns(episode.sets[selection.entry])
+    gripper = None
+    if selection.entry == _STATES and layout:
+        qpos = samples[:, [layout.qpos[name] for name in selection.joints]]
+        qvel = samples[:, [layout.qvel[name] for name in selection.joints]]
+    else:
+        qpos = samples[:, [int(name) - 1 for name in selection.joints]]
+        of_velocities = _velocities(episode, selection.entry)
+        qvel = None if of_velocities is None else of_velocities[:, [int(name) - 1 for name in selection.joints]]
+    if selection.gripper:
+        channels = _columns(episode.sets[selection.gripper_entry])
+        at = layout.qpos if selection.gripper_entry == _STATES and layout else None
+        gripper = channels[:, [at[name] if at else int(name) - 1 for name in selection.gripper]]
+    return Motion(_times(episode, samples, layout, rate), qpos, qvel, gripper)
+
+
+def _columns(item: Any) -> np.ndarray:
+    if item.size > MAX_NUMBERS:
+        raise ValueError(f"{item.name} has {item.size:,} numbers, expected at most {MAX_NUMBERS:,}")
+    return np.asarray(item[()], float).reshape(len(item), -1)
+
+
+def _velocities(episode: _Episode, entry: str) -> np.ndarray | None:
+    """The data set beside that of the angles that has their velocities."""
+    for end, other in _VELOCITIES.items():
+        if entry.endswith(end) and (name := entry.removesuffix(end) + other) in episode.sets:
+            return _columns(episode.sets[name])
+    return None
+
+
+def _times(episode: _Episode, samples: np.ndarray, layout: _Layout | None, rate: float | None) -> np.ndarray:
+    """The times of samples [s]: what the user states, or the file's."""
+    count = len(samples)
+    if rate is None and layout:
+        states = _columns(episode.sets[_STATES])[:, 0]
+        if len(states) == count and np.all(np.diff(states) > 0):
+            return states
+    for name, item in episode.sets.items() if rate is None else ():
+        if parse_column(name.split("/")[-1]).joint.lower() in TIMES and item.shape in ((count,), (count, 1)):
+            return seconds(item.name, _columns(item)[:, 0], "")[0]
+    rates = [rate] if rate else [value for attributes in reversed(episode.attributes) for value in _rates(attributes)]
+    if not rates:
+        raise ValueError("it states no times: no data set time or timestamps; expected rate=, samples per second")
+    return np.arange(count) / rates[0]
+
+
+def _rates(attributes: Mapping[str, Any]) -> Iterator[float]:
+    """The rates that attributes state, of numbers and of environments in JSON."""
+    for key in _RATES:
+        if key in attributes and np.size(attributes[key]) == 1 and float(attributes[key]) > 0:
+            yield float(attributes[key])
+    for key in _ENVIRONMENTS:
+        if key in attributes:
+            content = json.loads(_text(attributes[key]))
+            for settings in (content, content.get("env_kwargs", {})):
+                yield from (float(settings[rate]) for rate in _RATES if isinstance(settings.get(rate), int | float))
+
+
+def _layout(file: Path, episode: _Episode) -> _Layout | None:
+    """The columns of an episode's states, from its model; None without one."""
+    if _STATES not in episode.sets or _MODEL not in episode.group.attrs:
+        return None
+    text = _text(episode.group.attrs[_MODEL])
+    if not text.lstrip().startswith("<"):
+        text = read_text(file.parent / Path(text).name)  # beside the file: robosuite 1.0
+    if "<!" in text.replace("<!--", ""):
+        raise ValueError("the model declares a document type, expected elements alone")
+    root = ElementTree.fromstring(text)
+    types = {
+        default.get("class"): joint.get("type")
+        for default in root.iter("default") for joint in default.findall("joint") if joint.get("type")
+    }  # fmt: skip
+    names, sizes = [], []
+    for body in root.findall("worldbody"):
+        for joint in _joints(body):
+            kind = "free" if joint.tag == "freejoint" else joint.get("type") or types.get(joint.get("class"), "hinge")
+            names.append(joint.get("name", f"unnamed joint {len(names) + 1}"))
+            sizes.append(_SIZES[str(kind)])
+    ends = np.cumsum(sizes, axis=0).reshape(-1, 2)
+    starts, width = ends - np.reshape(sizes, (-1, 2)), 1 + int(ends[-1].sum() if len(ends) else 0)
+    if episode.sets[_STATES].ndim != 2 or episode.sets[_STATES].shape[1] < width:
+        raise ValueError(f"states: expected {width} columns for the model, got {list(episode.sets[_STATES].shape)}")
+    qvel = 1 + int(ends[-1, 0]) if len(ends) else 1
+    return _Layout(
+        {name: 1 + int(start) for name, (start, _) in zip(names, starts, strict=True)},
+        {name: qvel + int(start) for name, (_, start) in zip(names, starts, strict=True)},
+    )
+
+
+def _joints(body: ElementTree.Element) -> Iterator[ElementTree.Element]:
+    """The joints of a body and those of its children, in MuJoCo's order."""
+    yield from (element for element in body if element.tag in ("joint", "freejoint"))
+    for child in body.findall("body"):
+        yield from _joints(child)
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)

@@ -1,0 +1,75 @@
+"""Names of columns and joints as files of others have them."""
+
+import pytest
+
+from mimic.motions.formats.episodes import ANGLE, TORQUE, VELOCITY
+from mimic.motions.formats.names import find_joints, parse_column, select
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("joint1", ("joint1", ANGLE, "")),
+        ("shoulder_pan.pos", ("shoulder_pan", ANGLE, "")),
+        ("joint1.vel", ("joint1", VELOCITY, "")),
+        ("q_3", ("3", ANGLE, "")),
+        ("qdot3", ("3", VELOCITY, "")),
+        ("dq_elbow", ("elbow", VELOCITY, "")),
+        ("/joint_states/panda_joint1/position", ("/joint_states/panda_joint1", ANGLE, "")),
+        ("elbow [deg]", ("elbow", ANGLE, "deg")),
+        ("elbow_velocity (rad/s)", ("elbow", VELOCITY, "rad")),
+        ("left_arm_joint_1_rad", ("left_arm_joint_1", ANGLE, "rad")),
+        ("tau_2", ("2", TORQUE, "")),
+        ("wrist_angle", ("wrist_angle", ANGLE, "")),
+        ("time [ms]", ("time", ANGLE, "ms")),
+    ],
+)
+def test_columns(text, expected):
+    assert parse_column(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("present", "joints", "expected"),
+    [
+        (["x", "b", "a"], ["a", "b"], ["a", "b"]),
+        (["joint_1", "joint_2", "gripper"], ["joint1", "joint2"], ["joint_1", "joint_2"]),
+        (
+            ["panda_joint1", "panda_joint2", "panda_finger_joint1"],
+            ["joint1", "joint2"],
+            ["panda_joint1", "panda_joint2"],
+        ),
+        (["main_shoulder_pan", "main_elbow"], ["shoulder_pan", "elbow"], ["main_shoulder_pan", "main_elbow"]),
+        (["joint1", "joint2"], ["panda_joint1", "panda_joint2"], ["joint1", "joint2"]),
+        (["1", "2", "3"], ["shoulder", "elbow"], ["1", "2"]),
+        (["left_joint1", "left_joint2", "right_joint1", "right_joint2"], ["joint1", "joint2"], None),
+        (["left_joint1", "right_joint2"], ["joint1", "joint2"], None),
+        (["a", "A"], ["b"], None),
+    ],
+)
+def test_joints_are_found_by_name_prefix_or_order(present, joints, expected):
+    found = find_joints(present, joints)
+    assert (found and found[0]) == expected
+
+
+def test_what_was_measured_goes_before_what_was_commanded():
+    names = ["joint1", "joint2", "gripper"]
+    selection = select("set", {"action": names, "observation.state": names}, names[:2], "", "feature")
+    assert selection.entry == "observation.state" and selection.gripper == ["gripper"]
+    assert selection.notes == ["observation.state: what was measured; topic=action is what was commanded"]
+    assert (
+        select("set", {"action": names, "observation.state": names}, names[:2], "action", "feature").entry == "action"
+    )
+
+
+@pytest.mark.parametrize(
+    ("entries", "joints", "expected"),
+    [
+        ({"s": ["left_joint1", "left_gripper", "right_joint1", "right_gripper"]}, ["left_joint1"], ["left_gripper"]),
+        ({"s": ["1", "2", "3"]}, ["a", "b"], ["3"]),
+        ({"s": ["1", "2", "3", "4", "5"]}, ["a", "b"], []),
+        ({"o.joints": ["a"], "o.gripper": ["1"], "action.gripper": ["1"]}, ["a"], ["1"]),
+        ({"s": ["a", "camera_tilt"]}, ["a"], []),
+    ],
+)
+def test_the_gripper_of_the_joints_is_found(entries, joints, expected):
+    assert select("set", entries, joints, "", "entry").gripper == expected
